@@ -1,0 +1,50 @@
+# make demo      install, then turn examples/still_life into a baked asset, turntable, mesh and point cloud under runs/demo
+# make test      install, then run the tests
+# make torture   kill -9 a run at 30 moments and compare its artifacts with those of an undisturbed run
+# make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
+# make docs      rewrite the pages under docs/ that are made from the code
+# make lint      ruff and mypy
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.PHONY: demo test torture gpu docs lint install clean
+
+demo: $(INSTALLED)
+	$(BIN)/enerf run examples/still_life --out runs/demo
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest
+
+torture: $(INSTALLED)
+	$(BIN)/python benchmarks/torture.py
+
+gpu: $(INSTALLED)
+	@if $(BIN)/python -c "import sys, torch; sys.exit(not torch.cuda.is_available())"; then \
+		$(BIN)/python -m pytest -m gpu && $(BIN)/python benchmarks/gpu.py; \
+	else \
+		echo "make gpu: no CUDA device that torch can use; nothing was run."; \
+	fi
+
+docs: $(INSTALLED)
+	$(BIN)/python docs/make_settings.py
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+install: $(INSTALLED)
+
+# torch first and on its own: its version decides the rest.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c "import sys; sys.exit('$(PYTHON) is %d.%d; Python 3.11 or newer is needed. Try: make PYTHON=python3.11 ...' % sys.version_info[:2] if sys.version_info < (3, 11) else 0)"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet torch==2.13.0
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+# Runs are kept: they are the user's.
+clean:
+	rm -rf $(VENV) build .mypy_cache .ruff_cache .pytest_cache
