@@ -231,10 +231,8 @@ def _fold(top: np.ndarray, bottom: np.ndarray, limit: float = np.inf) -> float:
     """The radius up to which r top(r^2) / bottom(r^2) grows: beyond it the model says nothing about the lens."""
     times_s = np.array([0.0, 1.0])
     # d/dr [r top/bottom] = (top bottom + 2 s (top' bottom - top bottom')) / bottom^2
-    slope = polynomial.polyadd(
-        polynomial.polymul(top, bottom),
-        2 * polynomial.polymul(times_s, polynomial.polysub(polynomial.polymul(polynomial.polyder(top), bottom), polynomial.polymul(top, polynomial.polyder(bottom)))),
-    )
+    bend = polynomial.polysub(polynomial.polymul(polynomial.polyder(top), bottom), polynomial.polymul(top, polynomial.polyder(bottom)))
+    slope = polynomial.polyadd(polynomial.polymul(top, bottom), 2 * polynomial.polymul(times_s, bend))
     for coefficients in (slope, bottom):
         coefficients = np.trim_zeros(coefficients, "b")
         if len(coefficients) > 1:

@@ -143,10 +143,10 @@ def load(folder: Path) -> Scene:
     """Read folder/scene.json, checked; BadInput names what is wrong with it."""
     path = folder / "scene.json"
     document = _Reader(_read_json(path), str(path))
-    version = document.integer("format")
+    version = document.integer("format")  # also refuses what is not an object
     if version != FORMAT:
         raise BadInput(f"{path}: format version {version}; this build reads {FORMAT}. Upgrade efficientnerf, or run the poses stage again.")
-    background = document.value["background"] if "background" in document.value else None
+    background = document.value.get("background")
     transform, orbit = document.reader("world_from_capture"), document.reader("orbit")
     views = tuple(_view_from_json(_Reader(view, f"{path}: views[{i}]"), folder) for i, view in enumerate(document.items("views")))
     scene = Scene(
@@ -305,7 +305,8 @@ def _view_from_json(data: _Reader, folder: Path) -> View:
     split = data.text("split")
     near, far = data.number("near"), data.number("far")
     if split not in SPLITS or not 0 <= near < far:
-        raise BadInput(f"{data.where}: split {split!r}, near {near}, far {far}; expected one of {', '.join(SPLITS)} and 0 <= near < far. Run the poses stage again.")
+        expected = f"one of {', '.join(SPLITS)} and 0 <= near < far"
+        raise BadInput(f"{data.where}: split {split!r}, near {near}, far {far}; expected {expected}. Run the poses stage again.")
     mask = data.text("mask") if data.value.get("mask") is not None else None
     for relative in (data.text("image"), mask):
         if relative is not None and (Path(relative).is_absolute() or ".." in Path(relative).parts):
