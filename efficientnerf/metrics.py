@@ -1,0 +1,103 @@
+"""How close an image is to the photograph: PSNR and SSIM as published in the NeRF literature.
+
+Images are floating point, sRGB, 0 to 1, and are compared as they are (not rounded to 8 bits); whoever holds values outside 0 to 1 clips them first.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+SSIM_RADIUS = 5  # an 11 x 11 window
+SSIM_SIGMA = 1.5
+SSIM_K1 = 0.01
+SSIM_K2 = 0.03
+
+
+def mean_squared_error(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Mean over pixels and channels of the squared difference.
+
+    image, truth  (H, W, 3) or (H, W)  floating point
+    mask          (H, W) bool, True where a pixel counts; None: all
+    Raises ValueError on different shapes, on integers and where no pixel counts.
+    """
+    image, truth, mask = _checked(image, truth, mask)
+    squared = (image - truth) ** 2
+    return float(squared.mean() if mask is None else squared[mask].mean())
+
+
+def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Peak signal to noise ratio in decibels for a peak of 1; infinite where the images are equal. Arguments as for mean_squared_error."""
+    error = mean_squared_error(image, truth, mask)
+    return math.inf if error == 0.0 else -10.0 * math.log10(error)
+
+
+def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Structural similarity, 1 where the images are equal: the mean of ssim_map over channels and over the windows that lie inside the image.
+
+    With a mask, a window counts where its middle pixel does, and pixels that do not count are taken to be equal in both images, so that nothing
+    outside the mask can lower the figure.
+
+    Arguments as for mean_squared_error. Raises ValueError as that does, and for images smaller than a window.
+    """
+    image, truth, mask = _checked(image, truth, mask)
+    if mask is None:
+        return float(ssim_map(image, truth).mean())
+    outside = ~mask
+    image = image.copy()
+    image[outside] = truth[outside]
+    middle = mask[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
+    similarity = ssim_map(image, truth)
+    if not middle.any():
+        raise ValueError("ssim: the mask leaves no pixel that is the middle of a whole window")
+    return float(similarity[middle].mean())
+
+
+def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Similarity of the window around each pixel that has a whole one.
+
+    image, truth  (H, W, 3) or (H, W)  floating point, data range 1
+    returns       (H - 10, W - 10, 3) or (H - 10, W - 10)
+
+    Wang, Bovik, Sheikh and Simoncelli 2004, equation 13, with an 11 x 11 Gaussian of sigma 1.5, K1 = 0.01, K2 = 0.03 and population (not sample)
+    covariances; scikit-image calls the same `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`.
+    """
+    image, truth, _ = _checked(image, truth, None)
+    if min(image.shape[:2]) < 2 * SSIM_RADIUS + 1:
+        raise ValueError(f"ssim: an image of {image.shape[1]} x {image.shape[0]} pixels is smaller than the window of 11 x 11")
+    mean_i, mean_t = _windowed(image), _windowed(truth)
+    variance_i = _windowed(image * image) - mean_i * mean_i
+    variance_t = _windowed(truth * truth) - mean_t * mean_t
+    covariance = _windowed(image * truth) - mean_i * mean_t
+    c1, c2 = SSIM_K1**2, SSIM_K2**2
+    numerator = (2.0 * mean_i * mean_t + c1) * (2.0 * covariance + c2)
+    return numerator / ((mean_i**2 + mean_t**2 + c1) * (variance_i + variance_t + c2))
+
+
+def _windowed(values: np.ndarray) -> np.ndarray:
+    """Gaussian-weighted mean over each whole window: rows, then columns."""
+    from scipy.ndimage import correlate1d
+
+    offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
+    weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
+    weights /= weights.sum()
+    inner = slice(SSIM_RADIUS, -SSIM_RADIUS)
+    rows = correlate1d(values, weights, axis=0)[inner]  # (H - 10, W, ...): the border mode touches only what is cut off
+    return np.asarray(correlate1d(rows, weights, axis=1)[:, inner])
+
+
+def _checked(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    image, truth = np.asarray(image), np.asarray(truth)
+    if image.shape != truth.shape or image.ndim not in (2, 3):
+        raise ValueError(f"metrics: images of shapes {image.shape} and {truth.shape} cannot be compared")
+    for array in (image, truth):
+        if not np.issubdtype(array.dtype, np.floating):
+            raise ValueError(f"metrics: found {array.dtype} values, expected floating point from 0 to 1; divide 8-bit images by 255")
+    if mask is not None:
+        mask = np.asarray(mask, bool)
+        if mask.shape != image.shape[:2]:
+            raise ValueError(f"metrics: a mask of shape {mask.shape} for images of shape {image.shape}")
+        if not mask.any():
+            raise ValueError("metrics: the mask leaves no pixel to compare")
+    return image.astype(np.float64), truth.astype(np.float64), mask

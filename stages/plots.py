@@ -1,0 +1,137 @@
+"""Pictures for people: contact sheets and curves, the same bytes for the same input."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+MARGIN = 8
+LABEL_HEIGHT = 18
+PAPER = (255, 255, 255)
+INK = (32, 32, 32)
+
+
+def contact_sheet(
+    rows: Sequence[Sequence[np.ndarray | None]], labels: Sequence[Sequence[str]] | None, path: Path, *, thumbnail: int = 240, title: str = ""
+) -> None:
+    """Write a PNG with rows of thumbnails, a label under each.
+
+    rows       images of any size: (H, W), (H, W, 3) or (H, W, 4), uint8 or floating point 0 to 1, sRGB; None leaves a gap. Rows may differ in length.
+    labels     one text for each image, or None; too long ones lose their middle
+    thumbnail  longest side of a thumbnail in pixels; smaller images are not enlarged beyond it, but are to it
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    if not any(len(row) for row in rows):
+        raise ValueError(f"{path}: a contact sheet of no images")
+    thumbnails = [[None if image is None else thumbnail_of(image, thumbnail) for image in row] for row in rows]
+    there = [image for row in thumbnails for image in row if image is not None]
+    cell_w = max((image.width for image in there), default=thumbnail)
+    heights = [max((image.height for image in row if image is not None), default=0) for row in thumbnails]
+    label_h = LABEL_HEIGHT if labels is not None else 0
+    top = MARGIN + (LABEL_HEIGHT + MARGIN if title else 0)
+    columns = max(len(row) for row in rows)
+    sheet = Image.new("RGB", (MARGIN + columns * (cell_w + MARGIN), top + sum(height + label_h + MARGIN for height in heights)), PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
+    if title:
+        draw.text((MARGIN, MARGIN), _fitted(title, sheet.width - 2 * MARGIN, draw, font), INK, font)
+    for i, row in enumerate(thumbnails):
+        for j, image in enumerate(row):
+            x = MARGIN + j * (cell_w + MARGIN)
+            if image is not None:
+                sheet.paste(image, (x + (cell_w - image.width) // 2, top))
+            if labels is not None and labels[i][j]:
+                draw.text((x, top + heights[i] + 2), _fitted(labels[i][j], cell_w, draw, font), INK, font)
+        top += heights[i] + label_h + MARGIN
+    sheet.save(path, "PNG", compress_level=6)
+
+
+def grid_sheet(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, thumbnail: int = 160, title: str = "") -> None:
+    """A contact sheet of one list of images, filled row by row in about the shape of a screen."""
+    columns = max(1, min(len(images), int(np.ceil(np.sqrt(len(images) * 1.5)))))
+    starts = range(0, len(images), columns)
+    contact_sheet([images[s : s + columns] for s in starts], [labels[s : s + columns] for s in starts], path, thumbnail=thumbnail, title=title)
+
+
+def thumbnail_of(image: np.ndarray, longest: int) -> Image.Image:
+    """An image as a PIL RGB image whose longest side is `longest`; transparency is shown over a light grey."""
+    from PIL import Image
+
+    pixels = eight_bits(image)
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[:, :, None], 3, axis=2)
+    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    scale = longest / max(picture.size)
+    size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
+    picture = picture.resize(size, Image.Resampling.LANCZOS if scale < 1 else Image.Resampling.NEAREST)
+    if picture.mode == "RGBA":
+        paper = Image.new("RGBA", picture.size, (224, 224, 224, 255))
+        picture = Image.alpha_composite(paper, picture)
+    return picture.convert("RGB")
+
+
+def eight_bits(image: np.ndarray) -> np.ndarray:
+    """uint8 of an image whose floating-point values run from 0 to 1 (clipped, rounded to nearest, nan is 0); uint8 passes through."""
+    image = np.asarray(image)
+    if image.dtype == np.uint8:
+        return image
+    if not np.issubdtype(image.dtype, np.floating) and image.dtype != np.bool_:
+        raise ValueError(f"an image of {image.dtype}: expected uint8 or floating point 0 to 1")
+    return (np.clip(np.nan_to_num(image.astype(np.float32)), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def error_picture(image: np.ndarray, truth: np.ndarray, *, full: float = 0.25) -> np.ndarray:
+    """Mean absolute difference over the channels as colours: black for none, light yellow for `full` and more.
+
+    image, truth  (H, W, 3) floating point 0 to 1
+    returns       (H, W, 3) uint8
+    """
+    from matplotlib import colormaps
+
+    error = np.abs(image - truth).mean(axis=2)
+    return np.asarray(eight_bits(colormaps["inferno"](np.clip(error / full, 0.0, 1.0))[:, :, :3]))
+
+
+def curve(
+    path: Path, series: Mapping[str, tuple[Sequence[float], Sequence[float]]], *, x_label: str, y_label: str, title: str = "", log_y: bool = False
+) -> None:
+    """Write a PNG of curves over one axis.
+
+    series  name -> (x, y) of equal length; values that are not finite are left out
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.5), dpi=100, layout="tight")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for name, (x, y) in series.items():
+        xs, ys = np.asarray(x, float), np.asarray(y, float)
+        finite = np.isfinite(xs) & np.isfinite(ys) & ((ys > 0) | (not log_y))
+        axes.plot(xs[finite], ys[finite], label=name, linewidth=1.2, marker="." if finite.sum() < 20 else None)
+    if log_y:
+        axes.set_yscale("log")
+    axes.set(xlabel=x_label, ylabel=y_label, title=title)
+    axes.grid(alpha=0.3)
+    if series:
+        axes.legend(frameon=False)
+    # the program's name and version are left out: the same curve is the same file
+    canvas.print_png(path, metadata={"Software": None})
+
+
+def _fitted(text: str, width: int, draw: object, font: object) -> str:
+    """The text, its middle replaced by an ellipsis where it is wider than `width` pixels."""
+    length = draw.textlength  # type: ignore[attr-defined]
+    if length(text, font=font) <= width:
+        return text
+    for kept in range(len(text) - 1, 1, -1):
+        shorter = text[: (kept + 1) // 2] + "…" + text[len(text) - kept // 2 :]
+        if length(shorter, font=font) <= width:
+            return shorter
+    return "…"

@@ -1,0 +1,82 @@
+"""PSNR and SSIM against closed forms and against scikit-image."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from efficientnerf.metrics import mean_squared_error, psnr, ssim, ssim_map
+
+
+def pair(seed: int = 0, height: int = 40, width: int = 53) -> tuple[np.ndarray, np.ndarray]:
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[0:height, 0:width] / 10.0
+    truth = np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.5 + 0.4 * np.sin(x + y)], -1)
+    return np.clip(truth + random.normal(0, 0.05, truth.shape), 0, 1).astype(np.float32), truth.astype(np.float32)
+
+
+def test_psnr_of_a_constant_difference() -> None:
+    truth = np.full((4, 5, 3), 0.25)
+    assert psnr(truth + 0.1, truth) == pytest.approx(20.0)
+    assert psnr(truth + 0.01, truth) == pytest.approx(40.0)
+    assert psnr(truth, truth) == math.inf
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_both_agree_with_scikit_image(seed: int) -> None:
+    image, truth = pair(seed)
+    assert psnr(image, truth) == pytest.approx(peak_signal_noise_ratio(truth.astype(float), image.astype(float), data_range=1.0), abs=1e-9)
+    # scikit-image mirrors the border and then averages only where the window was whole, which is our definition
+    expected, full = structural_similarity(
+        truth.astype(float), image.astype(float), data_range=1.0, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
+    )
+    assert ssim(image, truth) == pytest.approx(expected, abs=1e-9)
+    np.testing.assert_allclose(ssim_map(image, truth), full[5:-5, 5:-5], atol=1e-9)
+
+
+def test_ssim_of_constant_images_is_the_luminance_term() -> None:
+    a, b = 0.3, 0.7
+    expected = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
+    assert ssim(np.full((12, 15, 3), a), np.full((12, 15, 3), b)) == pytest.approx(expected)
+
+
+def test_ssim_is_one_for_equal_images_and_symmetric() -> None:
+    image, truth = pair()
+    assert ssim(image, image) == pytest.approx(1.0)
+    assert ssim(image, truth) == pytest.approx(ssim(truth, image), abs=1e-12)
+    assert ssim(image[..., 0], truth[..., 0]) < 1.0
+
+
+def test_a_mask_of_all_changes_nothing_and_what_it_hides_does_not_count() -> None:
+    image, truth = pair()
+    everything = np.ones(truth.shape[:2], bool)
+    assert psnr(image, truth, everything) == psnr(image, truth)
+    assert ssim(image, truth, everything) == pytest.approx(ssim(image, truth), abs=1e-12)
+    mask = everything.copy()
+    mask[:, :20] = False
+    spoilt = image.copy()
+    spoilt[:, :20] = 1.0 - spoilt[:, :20]
+    assert psnr(spoilt, truth, mask) == psnr(image, truth, mask)
+    assert ssim(spoilt, truth, mask) == ssim(image, truth, mask)
+    spoilt[~mask] = truth[~mask]
+    spoilt[mask] = truth[mask]
+    assert ssim(spoilt, truth, mask) == pytest.approx(1.0)
+    assert mean_squared_error(spoilt, truth, mask) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("image", "truth", "mask", "words"),
+    [
+        (np.zeros((20, 20, 3)), np.zeros((20, 21, 3)), None, "cannot be compared"),
+        (np.zeros((20, 20, 3), np.uint8), np.zeros((20, 20, 3), np.uint8), None, "divide 8-bit images by 255"),
+        (np.zeros((20, 20, 3)), np.zeros((20, 20, 3)), np.ones((3, 3), bool), "a mask of shape"),
+        (np.zeros((20, 20, 3)), np.zeros((20, 20, 3)), np.zeros((20, 20), bool), "no pixel"),
+        (np.zeros((10, 20, 3)), np.zeros((10, 20, 3)), None, "smaller than the window"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        ssim(image, truth, mask)

@@ -1,0 +1,147 @@
+"""Stand-ins with closed forms: a ball that answers like a NerfTree, and a renderer of it with surroundings that answers like a FieldRenderer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.cameras import Camera, Similarity, rays
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What NerfTree.render hands over; see there."""
+
+    colour: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BallTree:
+    """A ball of uniform density inside a box, with the interface of a NerfTree.
+
+    Its colour is sRGB 0.2 + 0.6 (x - bounds_min) / size, from where a ray enters it.
+    """
+
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    radius: float = 0.6
+    sigma: float = 40.0
+    shape: tuple[int, int, int] = (16, 16, 16)
+    brick: int = 4
+    voxel: float = 2.0 / 64
+    background: tuple[float, float, float] | None = WHITE
+    similarity: Similarity = field(default_factory=Similarity.identity)
+    forward_facing: bool = False
+
+    @property
+    def bounds_min(self) -> np.ndarray:
+        return -0.5 * np.asarray(self.shape) * self.brick * self.voxel
+
+    @property
+    def bounds_max(self) -> np.ndarray:
+        return -self.bounds_min
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        s = self.similarity
+        return {
+            "world_from_capture": {"scale": s.scale, "rotation": s.rotation.tolist(), "translation": list(s.translation)},
+            "orbit": {"centre": [0.0, 0.0, 0.0], "radius": 4.0, "elevation": 30.0, "forward_facing": self.forward_facing, "heading": 90.0},
+            "metric": False,
+            "provenance": {"source": "a ball"},
+        }
+
+    def density(self, points: np.ndarray) -> np.ndarray:
+        points = np.asarray(points, np.float64)
+        inside = np.linalg.norm(points - self.centre, axis=-1) < self.radius
+        return np.where(inside, self.sigma, 0.0).astype(np.float32)
+
+    def colour(self, points: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
+        size = self.bounds_max - self.bounds_min
+        return np.clip(0.2 + 0.6 * (np.asarray(points) - self.bounds_min) / size, 0.0, 1.0).astype(np.float32)
+
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        away = np.asarray(points, np.float64) - self.centre
+        return (away / np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), 1e-12)).astype(np.float32)
+
+    def density_block(self, lo: tuple[int, int, int], hi: tuple[int, int, int]) -> np.ndarray:
+        axes = [self.bounds_min[k] + (np.arange(lo[k], hi[k]) + 0.5) * self.voxel for k in range(3)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+        size = np.asarray(self.shape) * self.brick
+        inside = np.ones(points.shape[:3], bool)
+        for k in range(3):
+            index = np.arange(lo[k], hi[k])
+            ok = (index >= 0) & (index < size[k])
+            inside &= ok.reshape([-1 if axis == k else 1 for axis in range(3)])
+        return np.where(inside, self.density(points), 0.0).astype(np.float32)
+
+    def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
+        """Closed form: opacity 1 - exp(-sigma chord), depth where the transmittance has fallen to one half."""
+        to_centre = np.asarray(self.centre) - origins
+        middle = (to_centre * directions).sum(-1)
+        half = np.sqrt(np.maximum(self.radius**2 - ((to_centre**2).sum(-1) - middle**2), 0.0))
+        near, far = np.maximum(middle - half, 0.0), np.maximum(middle + half, 0.0)
+        opacity = 1.0 - np.exp(-self.sigma * (far - near))
+        hit = origins + near[:, None] * directions
+        colour = self.colour(hit) * opacity[:, None]
+        depth = np.where(opacity >= 0.5, near + np.log(2.0) / self.sigma, np.inf)
+        normal = np.where(opacity[:, None] > 0, self.normal(hit), 0.0)
+        return Rendering(colour.astype(np.float32), opacity.astype(np.float32), depth.astype(np.float32), normal.astype(np.float32))
+
+    def render(self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
+        origins, directions = rays(camera)
+        flat = self.render_rays(origins, directions)
+        size = (camera.height, camera.width)
+        colour = flat.colour
+        if background is not None:
+            colour = colour + (1.0 - flat.opacity[:, None]) * np.asarray(background, np.float32)
+        depth = flat.depth * (directions @ camera.forward).astype(np.float32)
+        return Rendering(colour.reshape(*size, 3), flat.opacity.reshape(size), depth.reshape(size), flat.normal.reshape(*size, 3))
+
+
+@dataclass(frozen=True)
+class FieldRendering:
+    """What FieldRenderer.render hands over; see there."""
+
+    colour: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    before: np.ndarray
+    behind: np.ndarray
+    inside_opacity: np.ndarray
+
+
+@dataclass
+class BallField:
+    """The same ball before a background that is a smooth function of the direction (or one colour), as a FieldRenderer sees it.
+
+    noise  added to its colour, as a chequered pattern
+    """
+
+    tree: BallTree
+    background: tuple[float, float, float] | None = None
+    noise: float = 0.0
+    calls: list[tuple[str, int, int]] = field(default_factory=list)
+
+    def render(self, camera: Camera, progress: Any = None) -> FieldRendering:
+        self.calls.append((camera.name, camera.width, camera.height))
+        inner = self.tree.render(camera)
+        size = (camera.height, camera.width)
+        if self.background is None:
+            _, directions = rays(camera)
+            behind = (0.5 + 0.3 * np.sin(2.0 * directions)).reshape(*size, 3).astype(np.float32)
+        else:
+            behind = np.broadcast_to(np.asarray(self.background, np.float32), (*size, 3)).copy()
+        colour = inner.colour + (1.0 - inner.opacity[..., None]) * behind
+        if self.noise:
+            pattern = np.indices(size).sum(0) % 2 * 2.0 - 1.0
+            colour = colour + (self.noise * pattern[..., None]).astype(np.float32)
+        if progress is not None:
+            progress(camera.width * camera.height, camera.width * camera.height)
+        return FieldRendering(colour, inner.opacity, inner.depth, np.zeros((*size, 4), np.float32), behind, inner.opacity)
