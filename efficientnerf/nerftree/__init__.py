@@ -1,0 +1,1 @@
+"""The baked asset: structure, baking, file format."""

@@ -1,0 +1,217 @@
+"""NerfTree: coarse dense voxels over sparse bricks (EfficientNeRF, section 3.5), as it lies in memory.
+
+The grid has shape * brick voxels a side, cubic, of `voxel` world units. A coarse cell is either empty, and then space in it has no
+density whatever its neighbours hold, or it owns a brick of brick^3 voxels, of which those that matter are stored.
+Values sit at voxel centres and are interpolated linearly between the stored ones.
+
+B bricks, N stored voxels, K harmonics, R rays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.harmonics import harmonics_count
+
+if TYPE_CHECKING:
+    from efficientnerf.cameras import Camera
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera (or a bundle of rays) sees of a scene.
+
+    colour   (..., 3) float32, sRGB, premultiplied by the opacity, or over the background that was asked for
+    opacity  (...)    float32, 0 to 1
+    depth    (...)    float32, world units, along the view axis for cameras and along the ray for rays; where half of the light is
+                      absorbed, infinity where less than half ever is
+    normal   (..., 3) float32, unit, world frame, out of the surface; zero where nothing is hit
+    """
+
+    colour: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class NerfTree:
+    """The baked asset.
+
+    shape        coarse cells along x, y, z
+    brick        voxels along a side of a coarse cell (the paper's D_f)
+    voxel        side of a voxel, world units
+    bounds_min   (3,) float64, corner of the grid, world units
+    brick_index  shape int32: which brick a coarse cell owns, -1 where it is empty
+    voxel_index  (B, brick^3) int32: which stored voxel, -1 where none (x slowest, z fastest)
+    density      (N,) float32, per world unit, >= 0
+    sh           (N, K, 3) float32
+    background   sRGB colour that the training images lay on, or None for photographs with surroundings
+    """
+
+    shape: tuple[int, int, int]
+    brick: int
+    voxel: float
+    bounds_min: np.ndarray
+    brick_index: np.ndarray
+    voxel_index: np.ndarray
+    density_values: np.ndarray
+    sh: np.ndarray
+    background: tuple[float, float, float] | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Voxels along x, y, z."""
+        x, y, z = self.shape
+        return x * self.brick, y * self.brick, z * self.brick
+
+    @property
+    def bounds_max(self) -> np.ndarray:
+        return self.bounds_min + np.asarray(self.resolution) * self.voxel
+
+    @cached_property
+    def leap(self) -> np.ndarray:
+        """How many coarse cells a ray in an empty cell may leap: shape uint8, 0 in occupied cells.
+
+        The chessboard distance to the nearest occupied cell: a cube of that radius minus one around the cell is empty.
+        """
+        from scipy.ndimage import distance_transform_cdt
+
+        empty = self.brick_index < 0
+        if empty.all():
+            return np.full(self.shape, 255, np.uint8)
+        return np.ascontiguousarray(np.minimum(distance_transform_cdt(empty, metric="chessboard"), 255).astype(np.uint8))
+
+    @staticmethod
+    def load(path: str | Path) -> NerfTree:
+        """Read and verify an asset file; `efficientnerf.nerftree.format.FormatError` where it is not one."""
+        from efficientnerf.nerftree.format import load
+
+        return load(path)
+
+    def save(self, path: str | Path) -> None:
+        from efficientnerf.nerftree.format import save
+
+        save(self, path)
+
+    def render(self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
+        """The picture that a camera in the training frame takes.
+
+        background   sRGB colour to composite over; None leaves the colour premultiplied
+        supersample  rays along each side of a pixel
+        """
+        from efficientnerf.render import render_tree
+
+        return render_tree(self, camera, background=background, supersample=supersample)
+
+    def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
+        """What rays see: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray."""
+        from efficientnerf.kernels.cpu_tree import render_rays
+
+        return Rendering(*render_rays(self, origins, directions))
+
+    def density(self, points: np.ndarray) -> np.ndarray:
+        """Density at points (N, 3) of the world: (N,) float32, per world unit."""
+        from efficientnerf.kernels.cpu_tree import density_at
+
+        return density_at(self, points)
+
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        """Unit vectors down the density's gradient at points (N, 3); zero where it is flat."""
+        from efficientnerf.kernels.cpu_tree import normal_at
+
+        return normal_at(self, points)
+
+    def colour(self, points: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
+        """sRGB colour at points (N, 3), seen along unit directions (N, 3), or its view-independent part: (N, 3) float32, 0 to 1.
+
+        Grey where no voxel is stored.
+        """
+        from efficientnerf.kernels.cpu_tree import colour_at
+
+        return colour_at(self, points, directions)
+
+    def density_block(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        """Density at the voxel centres low <= (i, j, k) < high: float32, zero outside of the grid and where nothing is stored."""
+        low_a, high_a = np.asarray(low), np.asarray(high)
+        if (high_a < low_a).any():
+            raise ValueError(f"density_block from {tuple(low)} to {tuple(high)}: the upper corner lies below the lower one")
+        axes = [np.arange(a, b) for a, b in zip(low_a, high_a, strict=True)]
+        inside = [(a >= 0) & (a < n) for a, n in zip(axes, self.resolution, strict=True)]
+        out = np.zeros(tuple(high_a - low_a), np.float32)
+        i, j, k = (a[m] for a, m in zip(axes, inside, strict=True))
+        if not (len(i) and len(j) and len(k)):
+            return out
+        d = self.brick
+        brick = self.brick_index[np.ix_(i // d, j // d, k // d)]
+        local = ((i % d)[:, None, None] * d + (j % d)[:, None]) * d + (k % d)
+        index = np.where(brick >= 0, self.voxel_index[np.maximum(brick, 0), local], -1)
+        out[np.ix_(*inside)] = np.where(index >= 0, self.density_values[np.maximum(index, 0)], 0)
+        return out
+
+    def with_metadata(self, **entries: Any) -> NerfTree:
+        return replace(self, metadata={**self.metadata, **entries})
+
+
+def tree_from_voxels(
+    shape: tuple[int, int, int],
+    voxel: float,
+    bounds_min: np.ndarray,
+    indices: np.ndarray,
+    density: np.ndarray,
+    sh: np.ndarray,
+    *,
+    brick: int = 4,
+    background: tuple[float, float, float] | None = None,
+    metadata: dict[str, Any] | None = None,
+) -> NerfTree:
+    """Build a tree from a list of voxels.
+
+    indices  (N, 3) integer voxel coordinates, each once, inside shape * brick
+    density  (N,)   per world unit
+    sh       (N, K, 3)
+
+    Voxels are stored brick by brick in the order of the coarse cells (x slowest), inside a brick likewise: the order is part of the format.
+    """
+    indices = np.asarray(indices, np.int64)
+    cells = np.asarray(shape, np.int64)
+    if len(indices) and ((indices < 0).any() or (indices >= cells * brick).any()):
+        raise ValueError(f"voxel coordinates outside of the grid of {tuple(cells * brick)} voxels")
+    harmonics_count(round(sh.shape[1] ** 0.5) - 1)
+    cell = indices // brick
+    local = indices - cell * brick
+    cell_flat = (cell[:, 0] * cells[1] + cell[:, 1]) * cells[2] + cell[:, 2]
+    local_flat = (local[:, 0] * brick + local[:, 1]) * brick + local[:, 2]
+    key = cell_flat * brick**3 + local_flat
+    order = np.argsort(key, kind="stable")
+    if len(key) > 1 and (np.diff(key[order]) == 0).any():
+        raise ValueError("a voxel is listed twice")
+    occupied, brick_of = np.unique(cell_flat[order], return_inverse=True)
+    brick_index = np.full(int(cells.prod()), -1, np.int32)
+    brick_index[occupied] = np.arange(len(occupied), dtype=np.int32)
+    voxel_index = np.full((len(occupied), brick**3), -1, np.int32)
+    voxel_index[brick_of, local_flat[order]] = np.arange(len(order), dtype=np.int32)
+    x, y, z = (int(c) for c in cells)
+    return NerfTree(
+        shape=(x, y, z),
+        brick=brick,
+        voxel=float(voxel),
+        bounds_min=np.asarray(bounds_min, np.float64),
+        brick_index=brick_index.reshape(x, y, z),
+        voxel_index=voxel_index,
+        density_values=np.ascontiguousarray(density[order], np.float32),
+        sh=np.ascontiguousarray(sh[order], np.float32),
+        background=background,
+        metadata=dict(metadata or {}),
+    )
