@@ -1,0 +1,90 @@
+"""Write docs/settings.md and docs/commands.md from the code; with --check, say whether they are up to date."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from stages.settings import SettingInfo, describe_settings
+from workflows.asset import STAGES
+from workflows.cli import main as enerf
+from workflows.resolve import preset_names, read_preset, shown
+
+FOLDER = Path(__file__).parent
+NOTE = "<!-- Made from the code by `make docs`; changes belong there. -->"
+
+
+def limits(info: SettingInfo) -> str:
+    """What a setting may be, for the third column."""
+    if info.choices is not None:
+        return ", ".join(f"`{shown(choice)}`" for choice in info.choices)
+    bounds = [f"at least {info.minimum:g}"] if info.minimum is not None else []
+    bounds += [f"at most {info.maximum:g}"] if info.maximum is not None else []
+    return ", ".join([info.type_name, *bounds])
+
+
+def cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def settings_page() -> str:
+    lines = [
+        NOTE,
+        "# Settings",
+        "",
+        "Any of these can be given to `enerf run` as `--set stage.name=value`, or in a TOML file to `--config`. The order is: defaults, preset,",
+        "file, `--set`, dedicated options. The columns of the presets are empty where a preset keeps the default.",
+        "",
+        "## Presets",
+        "",
+    ]
+    presets = [read_preset(name) for name in preset_names()]
+    lines += [f"- **{preset.name}**: {preset.description}" for preset in presets]
+    for stage in STAGES:
+        described = describe_settings(stage.settings)
+        lines += ["", f"## {stage.name}", ""]
+        if not described:
+            lines.append("No settings.")
+            continue
+        changing = [preset for preset in presets if preset.table.get(stage.name)]
+        lines.append("| setting | default | may be | meaning |" + "".join(f" {preset.name} |" for preset in changing))
+        lines.append("|---|---|---|---|" + "---|" * len(changing))
+        for info in described:
+            meaning = info.doc + (f" ({info.unit})" if info.unit else "")
+            values = [preset.table[stage.name].get(info.name) for preset in changing]
+            columns = [f"`{info.name}`", f"`{shown(info.default)}`", limits(info), meaning]
+            columns += ["" if value is None else f"`{shown(value)}`" for value in values]
+            lines.append("| " + " | ".join(cell(column) for column in columns) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def commands_page() -> str:
+    lines = [NOTE, "# Commands", ""]
+    context = click.Context(enerf, info_name="enerf", terminal_width=110, max_content_width=110)
+    lines += ["```", enerf.get_help(context), "```"]
+    for name in enerf.list_commands(context):
+        command = enerf.get_command(context, name)
+        assert command is not None
+        inner = click.Context(command, info_name=name, parent=context, terminal_width=110, max_content_width=110)
+        lines += ["", f"## enerf {name}", "", "```", command.get_help(inner), "```"]
+    return "\n".join(lines) + "\n"
+
+
+PAGES = {"settings.md": settings_page, "commands.md": commands_page}
+
+
+def main() -> int:
+    stale = [name for name, make in PAGES.items() if not (FOLDER / name).exists() or (FOLDER / name).read_text(encoding="utf-8") != make()]
+    if "--check" in sys.argv[1:]:
+        print("\n".join(f"docs/{name} is out of date; run `make docs`." for name in stale) or "The pages are up to date.")
+        return 1 if stale else 0
+    for name in stale:
+        (FOLDER / name).write_text(PAGES[name](), encoding="utf-8")
+        print(f"docs/{name} written")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

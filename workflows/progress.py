@@ -1,0 +1,229 @@
+"""How a run shows itself: bars on a terminal, lines in a log, one JSON object per event, or nothing but warnings.
+
+Each display is a callable that takes the engine's events. Everything for people goes to standard error; standard output is left to
+results.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, TextIO
+
+Event = Mapping[str, Any]
+
+# In a log, one line per ten seconds or per tenth of the way, whichever comes first, but no more than one a second.
+SECONDS_BETWEEN_LINES = 10.0
+SECONDS_BETWEEN_TENTHS = 1.0
+
+
+def duration(seconds: float) -> str:
+    """`8.1 s`, `2 min 05 s`, `1 h 02 min`."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def size(count: float) -> str:
+    """Bytes in decimal units: `812 B`, `3.4 MB`."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 999.5:
+            return f"{count:.0f} {unit}" if unit == "B" or count >= 99.95 else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} TB"
+
+
+def facts(event: Event) -> str:
+    """What an event says beside its text, as `loss 0.0123, psnr 24.1`."""
+    known = {"event", "stage", "time", "done", "total", "text"}
+    shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in event.items() if name not in known]
+    return ", ".join(shown)
+
+
+def sentence(event: Event) -> str:
+    """An event in words, without its stage; empty for those that say nothing to people."""
+    match event["event"]:
+        case "stage_started":
+            reason = event.get("reason")
+            return f"started ({reason})" if reason else "started"
+        case "stage_done":
+            seconds = event.get("seconds")
+            return "done" if seconds is None else f"done in {duration(seconds)}"
+        case "stage_skipped":
+            return "up to date"
+        case "message":
+            return str(event.get("text", ""))
+        case "warning":
+            return f"warning: {event.get('text', '')}"
+        case _:
+            # stage_failed and interrupted end the run: the error that follows says it all.
+            return ""
+
+
+class Lines:
+    """Plain lines, for logs and pipes."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self.stream = stream or sys.stderr
+        self.started: dict[str, float] = {}
+        self.last_time = 0.0
+        self.last_share = 0.0
+
+    def __enter__(self) -> Lines:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.stream.flush()
+
+    def __call__(self, event: Event) -> None:
+        stage = event.get("stage") or ""
+        if event["event"] == "stage_started":
+            self.started[stage] = self.last_time = time.monotonic()
+            self.last_share = 0.0
+        if event["event"] == "progress":
+            self._progress(stage, event)
+        elif words := sentence(event):
+            self._line(stage, words)
+
+    def _line(self, stage: str, words: str) -> None:
+        print(f"{stage:<9} {words}" if stage else words, file=self.stream, flush=True)
+
+    def _progress(self, stage: str, event: Event) -> None:
+        now, total = time.monotonic(), event.get("total") or 0
+        share = event.get("done", 0) / total if total else 0.0
+        if share < self.last_share:
+            self.last_share = 0.0  # the stage has come to its next part
+        waited = now - self.last_time
+        if waited < SECONDS_BETWEEN_LINES and (waited < SECONDS_BETWEEN_TENTHS or share - self.last_share < 0.1):
+            return
+        self.last_time, self.last_share = now, share
+        words = [f"{share:4.0%}" if total else "", str(event.get("text", "")), facts(event)]
+        self._line(stage, "  ".join(word for word in words if word))
+
+
+class Bars:
+    """A bar with the time left for the stage at work, on a terminal."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self.console = Console(stderr=True, highlight=False)
+        self.progress = Progress(
+            TextColumn("{task.fields[stage]:<9}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.description}"),
+            console=self.console,
+            transient=True,
+        )
+        self.task: TaskID | None = None
+        self.part: tuple[Any, ...] = ()
+
+    def __enter__(self) -> Bars:
+        self.progress.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.progress.stop()
+
+    def __call__(self, event: Event) -> None:
+        stage = event.get("stage") or ""
+        if event["event"] == "progress":
+            self._advance(stage, event)
+            return
+        if event["event"] in ("stage_done", "stage_failed", "interrupted"):
+            self._clear()
+        if words := sentence(event):
+            style = "yellow" if event["event"] == "warning" else None
+            self.console.print(f"{stage:<9} {words}" if stage else words, style=style, markup=False, soft_wrap=True)
+
+    def _clear(self) -> None:
+        if self.task is not None:
+            self.progress.remove_task(self.task)
+        self.task, self.part = None, ()
+
+    def _advance(self, stage: str, event: Event) -> None:
+        total, text = event.get("total") or None, str(event.get("text", ""))
+        # A bar of its own for each part of a stage, so that the time left is that of the part.
+        if (stage, total) != self.part:
+            self._clear()
+            self.task, self.part = self.progress.add_task(text, total=total, stage=stage), (stage, total)
+        if self.task is not None:
+            words = "  ".join(word for word in (text, facts(event)) if word)
+            self.progress.update(self.task, completed=event.get("done", 0), description=words.replace("[", "\\["))
+
+
+class JsonLines:
+    """One JSON object per event on standard output."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self.quiet = quiet
+
+    def __enter__(self) -> JsonLines:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        sys.stdout.flush()
+
+    def __call__(self, event: Event) -> None:
+        if not (self.quiet and event["event"] == "progress"):
+            write_json(event)
+
+
+class Quiet:
+    """Warnings, and nothing else."""
+
+    def __enter__(self) -> Quiet:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        pass
+
+    def __call__(self, event: Event) -> None:
+        if event["event"] == "warning":
+            print(f"{event.get('stage') or '':<9} {sentence(event)}".strip(), file=sys.stderr, flush=True)
+
+
+def write_json(value: Any, *, indent: int | None = None) -> None:
+    """One JSON object on standard output; a reader that went away is no reason to stop a run."""
+    try:
+        print(json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False), flush=True)
+    except BrokenPipeError:
+        import os
+
+        # Python would complain again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON can hold it: paths and arrays become text and lists, numbers that are not finite become null."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return value if value - value == 0 else None
+    return str(value)
+
+
+def display(*, as_json: bool, quiet: bool) -> Lines | Bars | JsonLines | Quiet:
+    """The display that fits where the output goes."""
+    if as_json:
+        return JsonLines(quiet)
+    if quiet:
+        return Quiet()
+    return Bars() if sys.stderr.isatty() else Lines()
