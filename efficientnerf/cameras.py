@@ -187,6 +187,16 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, width=width, height=height, model=model, params=tuple(named[p] for p in MODELS[model]))
 
 
+def quarter_turned(camera: Camera) -> Camera:
+    """The camera of the picture turned clockwise by 90 degrees; width and height change places. A world point stays on its spot of the picture."""
+    k = camera.intrinsics
+    turned = k | {"fx": k["fy"], "fy": k["fx"], "cx": camera.height - k["cy"], "cy": k["cx"], "f": k["fx"], "p1": k["p2"], "p2": -k["p1"]}
+    pose = camera.world_from_camera.copy()
+    pose[:3, 0], pose[:3, 1] = -camera.world_from_camera[:3, 1], camera.world_from_camera[:3, 0]  # right of the turned picture is up of the old one
+    params = tuple(turned[p] for p in MODELS[camera.model])
+    return replace(camera, width=camera.height, height=camera.width, params=params, world_from_camera=pose)
+
+
 def pose_from_opengl(world_from_camera: np.ndarray) -> np.ndarray:
     """(4, 4) of Blender, NeRF, nerfstudio, glTF (x right, y up, looking along -z) -> (4, 4) with the project's axes. Its own inverse."""
     return np.asarray(world_from_camera, np.float64) @ _OPENGL_AXES
