@@ -117,12 +117,13 @@ class Settings:
         refused = None
         for reading in readings:
             try:
-                checked = settings_from(self.types[stage], {name: reading}, where=stage)
+                checked: Any = settings_from(self.types[stage], {name: reading}, where=stage)
                 self.values[stage][name] = getattr(checked, name)
                 return
             except UsageError as error:
                 refused = refused or error
-        raise UsageError(f"{origin}: {refused}.")
+        text = f"{origin}: {refused}"
+        raise UsageError(text if text.endswith((".", "?")) else f"{text}.")
 
     def put_table(self, table: Table, origin: str) -> None:
         for stage, entries in table.items():

@@ -1,0 +1,164 @@
+"""Settings from presets, files and options: typed, checked, the last word wins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import PipelineError, UnknownSetting, UsageError
+from stages.settings import describe_settings, name_of_type, setting
+from workflows.resolve import Settings, parse_value, read_config, read_preset, shown, table_of
+
+
+@dataclass(frozen=True)
+class Toy:
+    steps: int = setting(10, "How many.", minimum=1, maximum=100)
+    rate: float = setting(0.5, "How fast.", minimum=0.0, unit="per second")
+    kind: str = setting("plain", "Which.", choices=("plain", "fancy"))
+    label: str = setting("", "What to call it.")
+    box: tuple[float, float, float] | None = setting(None, "Where.")
+    flag: bool = setting(False, "Whether.")
+    seed: int = setting(0, "Of the random numbers.")
+
+
+@dataclass(frozen=True)
+class Other:
+    steps: int = setting(3, "How many.")
+
+
+TYPES = {"toy": Toy, "other": Other}
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ("toy.steps=20", 20),
+        ("toy.rate=1", 1.0),
+        ("toy.rate=1e-3", 0.001),
+        ("toy.kind=fancy", "fancy"),
+        ("toy.label=some words", "some words"),
+        ("toy.label=8", "8"),
+        ('toy.label="8"', "8"),
+        ("toy.label=a=b", "a=b"),
+        ("toy.label=", ""),
+        ("toy.box=[1, 2, 3.5]", (1.0, 2.0, 3.5)),
+        ("toy.box=1,2,3", (1.0, 2.0, 3.0)),
+        ("toy.box=none", None),
+        ("toy.flag=true", True),
+    ],
+)
+def test_options_are_read_in_the_type_of_the_setting(option: str, expected: object) -> None:
+    settings = Settings(TYPES)
+    settings.put_option(option)
+    name = option.partition("=")[0].partition(".")[2]
+    found = getattr(settings.resolved()["toy"], name)
+    assert found == expected
+    assert type(found) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("option", "error", "words"),
+    [
+        ("toy.stepps=1", UnknownSetting, "toy.steps"),
+        ("steps=1", UsageError, "stage.name=value"),
+        ("toy.steps", UsageError, "stage.name=value"),
+        ("tow.steps=1", UnknownSetting, "Nearest: toy."),
+        ("toy.steps=many", UsageError, "whole number"),
+        ("toy.steps=1.5", UsageError, "whole number"),
+        ("toy.steps=true", UsageError, "whole number"),
+        ("toy.steps=0", UsageError, "at least 1"),
+        ("toy.steps=101", UsageError, "at most 100"),
+        ("toy.rate=nan", UsageError, "finite"),
+        ("toy.kind=fancier", UsageError, "plain, fancy"),
+        ("toy.box=[1, 2]", UsageError, "3"),
+        ("toy.flag=1", UsageError, "true or false"),
+        ("toy.label=x\nsteps = 3", None, ""),
+    ],
+)
+def test_what_does_not_fit_is_refused(option: str, error: type[PipelineError] | None, words: str) -> None:
+    settings = Settings(TYPES)
+    if error is None:
+        settings.put_option(option)
+        assert settings.resolved()["toy"] == Toy(label=option.partition("=")[2])
+        return
+    with pytest.raises(error) as caught:
+        settings.put_option(option)
+    assert words in str(caught.value)
+    assert f"--set {option}" in str(caught.value)
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)
+
+
+def test_the_last_word_wins() -> None:
+    settings = Settings(TYPES)
+    settings.put_table({"toy": {"steps": 2, "rate": 2}, "other": {"steps": 5}}, "preset")
+    settings.put_table({"toy": {"steps": 3}}, "config")
+    settings.put_option("toy.seed=1")
+    settings.put_seed(7)
+    assert settings.resolved() == {"toy": Toy(steps=3, rate=2.0, seed=7), "other": Other(steps=5)}
+    assert table_of(settings.resolved())["toy"]["box"] is None
+
+
+def test_what_a_run_recorded_comes_back() -> None:
+    before = Settings(TYPES)
+    before.put_option("toy.box=[0, 0, 1]")
+    after = Settings(TYPES)
+    assert after.put_recorded(table_of(before.resolved())) == []
+    assert after.resolved() == before.resolved()
+
+
+def test_recorded_settings_of_another_version_are_named() -> None:
+    settings = Settings(TYPES)
+    assert settings.put_recorded({"toy": {"steps": 4, "gone": 1}, "lost": {"x": 1}}) == ["toy.gone", "lost.x"]
+    assert settings.resolved()["toy"].steps == 4
+
+
+def test_config_files(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('preset = "tiny"\nseed = 3\n[toy]\nsteps = 4\nbox = "none"\n', encoding="utf-8")
+    config = read_config(path)
+    assert config.options == {"preset": "tiny", "seed": 3}
+    settings = Settings(TYPES)
+    settings.put_table(config.table, "config")
+    assert settings.resolved()["toy"] == Toy(steps=4)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"steps = ", "not valid TOML"),
+        (b"\xff\xfe", "not a text file"),
+        (b"steps = 3", "outside a table"),
+        (b"seed = 'x'", "whole number"),
+        (None, "cannot be read"),
+    ],
+)
+def test_broken_config_files(tmp_path: Path, content: bytes | None, words: str) -> None:
+    path = tmp_path / "mine.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(PipelineError, match=words) as caught:
+        read_config(path)
+    assert str(path) in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_an_unknown_preset_names_the_nearest() -> None:
+    with pytest.raises(UsageError, match=r"Nearest: preview\."):
+        read_preset("previw")
+
+
+def test_values_are_shown_as_they_are_given() -> None:
+    for value in (None, True, 3, 0.25, [1, 2], "words"):
+        assert value in parse_value(shown(value))
+
+
+def test_what_settings_say_about_themselves() -> None:
+    about = {info.name: info for info in describe_settings(Toy)}
+    assert about["rate"].unit == "per second"
+    assert about["steps"].minimum == 1
+    assert about["kind"].choices == ("plain", "fancy")
+    assert name_of_type(tuple[int, ...]) == "list of whole number"
+    assert about["box"].type_name == "3 x number or none"

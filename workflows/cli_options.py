@@ -1,0 +1,22 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+C = TypeVar("C", bound=Callable[..., Any])
+
+json_option = click.option("--json", "as_json", is_flag=True, help="JSON on standard output instead of text.")
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="Nothing but warnings and errors.")
+set_option = click.option("--set", "sets", multiple=True, metavar="STAGE.NAME=VALUE", help="A setting of a stage; may be repeated. 'enerf presets' lists them.")
+device_option = click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where to compute; auto takes CUDA where there is one.")
+folder_type = click.Path(path_type=Path)
+
+
+def common_options(command: C) -> C:
+    """--debug, which main() looks for itself: it must work before a command line has been understood."""
+    return click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")(command)
