@@ -1,0 +1,49 @@
+"""OpenEXR: linear colour premultiplied by alpha, depth and normals, float32, as compositors read them.
+
+Channels: R G B A (linear light, Rec. 709 primaries), depth.Z (along the view axis, in the capture's units; infinity where nothing is hit),
+normal.X normal.Y normal.Z (unit, in the capture's frame; zero where nothing is hit).
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.cameras import Similarity
+
+
+def write_exr(
+    path: Path, *, colour: np.ndarray, opacity: np.ndarray, depth: np.ndarray, normal: np.ndarray, world_from_capture: Similarity | None = None
+) -> None:
+    """Write one rendering.
+
+    colour   (H, W, 3)  sRGB, premultiplied by the opacity, over no background
+    opacity  (H, W)
+    depth    (H, W)     along the view axis, world units
+    normal   (H, W, 3)  unit, world frame
+    world_from_capture  what takes depth and normals back to the capture's frame; None: they are in it
+
+    Written aside, synced and renamed.
+    """
+    import OpenEXR
+
+    from efficientnerf.colour import linear_premultiplied
+
+    scale, rotation = (1.0, np.eye(3)) if world_from_capture is None else (world_from_capture.scale, world_from_capture.rotation)
+    rgba = np.concatenate([linear_premultiplied(colour, opacity), opacity[..., None]], axis=-1)
+    in_capture = normal @ rotation  # rows times R: the transpose of R applied to each
+    # OpenEXR writes arrays that are not contiguous wrongly and says nothing; float64 it refuses.
+    channels = {"RGBA": _plane(rgba), "depth.Z": _plane(depth / scale)}
+    channels |= {f"normal.{axis}": _plane(in_capture[..., k]) for k, axis in enumerate("XYZ")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    aside = path.with_name(f".{path.name}.partial")
+    OpenEXR.File(header, channels).write(str(aside))
+    with aside.open("rb") as file:
+        os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def _plane(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, np.float32)
