@@ -1,0 +1,177 @@
+"""Reading a photograph the way it is meant to be seen: upright, eight bits sRGB, at a working size."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm; the "35 mm equivalent" focal length refers to it
+
+_ORIENTATION, _MAKE, _MODEL, _EXIF = 274, 271, 272, 34665
+_FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 37386, 41989, 41486, 41488, 40962
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+
+
+class UnreadableImage(Exception):
+    """An image file that cannot be decoded, or a mask that does not fit; the text says why."""
+
+
+@dataclass(frozen=True)
+class UprightPhoto:
+    """One photograph after EXIF rotation.
+
+    rgb            (h, w, 3) uint8 sRGB at working size
+    opaque         (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
+    width, height  of the source, upright, pixels
+    orientation    EXIF's number, 1 where there is none
+    focal          pixels of the source, from EXIF, or None
+    maker          make and model
+    """
+
+    rgb: np.ndarray
+    opaque: np.ndarray | None
+    width: int
+    height: int
+    orientation: int
+    focal: float | None
+    maker: str
+
+
+def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
+    """The size at most `max_side` that keeps the aspect best, so that one scale serves both axes.
+
+    Sizes down to 2 % below `max_side` are tried: rounding the shorter side alone changes the aspect by up to 0.1 %.
+    """
+    longest = max(width, height)
+    if longest <= max_side:
+        return width, height
+    sides = np.arange(max_side, max(1, int(max_side * 0.98)) - 1, -1)
+    w, h = np.maximum(1, np.rint(width * sides / longest)), np.maximum(1, np.rint(height * sides / longest))
+    best = int(np.argmin(np.round(np.abs(w / h * height / width - 1), 9)))  # the first of equals: the largest
+    return int(w[best]), int(h[best])
+
+
+def upright_photo(path: Path, max_side: int) -> UprightPhoto:
+    """Decode a photograph; raises UnreadableImage."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
+            with Image.open(path) as image:
+                exif = image.getexif()
+                details = exif.get_ifd(_EXIF)
+                orientation = exif.get(_ORIENTATION, 1)
+                orientation = orientation if orientation in range(1, 9) else 1
+                full = image.size
+                _draft(image, max_side)
+                rgb, alpha = _pixels(image)
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise UnreadableImage(f"cannot be read ({reason.splitlines()[0] if reason else type(error).__name__})") from error
+    width, height = full if orientation < 5 else full[::-1]
+    rgb = _resized(_upright(rgb, orientation), working_size(width, height, max_side))
+    opaque = None
+    if alpha is not None and (alpha < 128).any():
+        opaque = _resized(_upright(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
+    maker = " ".join(str(exif.get(tag, "")).strip(" \0") for tag in (_MAKE, _MODEL)).strip()
+    return UprightPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *full), maker)
+
+
+def mask_of(path: Path, photo: UprightPhoto) -> np.ndarray:
+    """(h, w) bool at the photograph's working size, True where the mask is not black; raises UnreadableImage."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            mask = np.asarray(image.convert("L"))
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        raise UnreadableImage(f"{path.name} cannot be read") from error
+    if photo.orientation >= 5 and _same_aspect(mask.shape[::-1], (photo.height, photo.width)):
+        mask = _upright(mask, photo.orientation)  # drawn over the pixels as stored
+    if not _same_aspect(mask.shape, (photo.height, photo.width)):
+        raise UnreadableImage(f"{path.name} is {mask.shape[1]}x{mask.shape[0]}, the photograph {photo.width}x{photo.height}")
+    height, width = photo.rgb.shape[:2]
+    rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * mask.shape[1] / width).astype(int)
+    return mask[rows][:, columns] > 0
+
+
+def _same_aspect(shape: tuple[int, ...], other: tuple[int, int]) -> bool:
+    return abs(shape[0] * other[1] - shape[1] * other[0]) <= max(shape[0], shape[1], *other)
+
+
+def focal_from_exif(details: Any, width: int, height: int) -> float | None:
+    """Focal length in pixels of an image of this size, or None.
+
+    The 35 mm equivalent is defined by the diagonal of the frame (CIPA DCG-001); else the focal length in millimetres with the pixel
+    density of the sensor, which is that of the image as taken (PixelXDimension), not as scaled since.
+    """
+    equivalent, focal = _number(details.get(_FOCAL_35)), _number(details.get(_FOCAL))
+    if equivalent:
+        return equivalent / FULL_FRAME_DIAGONAL * float(np.hypot(width, height))
+    density, unit = _number(details.get(_PLANE_X)), _UNIT_MM.get(details.get(_PLANE_UNIT, 2))
+    if focal and density and unit:
+        taken = _number(details.get(_PIXELS_X)) or width
+        pixels = focal * density / unit * width / taken
+        return pixels if 0.2 < pixels / max(width, height) < 20 else None  # many writers state a wrong density
+    return None
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if np.isfinite(number) and number > 0 else None
+
+
+def _draft(image: Any, max_side: int) -> None:
+    """Let the JPEG decoder halve the image where that is exact: several times faster, and still above the working size."""
+    if image.format == "JPEG" and image.mode in ("RGB", "L"):
+        scale = 1
+        while scale < 8 and max(image.size) >= 2 * scale * max_side and all(side % (2 * scale) == 0 for side in image.size):
+            scale *= 2
+        if scale > 1:
+            image.draft(image.mode, (image.size[0] // scale, image.size[1] // scale))
+
+
+def _pixels(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """(rgb, alpha or None) as uint8; sixteen bits are cut to eight, which Pillow's own conversion would clip."""
+    if image.mode.startswith("I") or image.mode == "F":
+        values = np.asarray(image).astype(np.float64)
+        values = values / 257.0 if values.max(initial=0) > 255 else values
+        return np.repeat(np.clip(np.rint(values), 0, 255).astype(np.uint8)[..., None], 3, axis=2), None
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        rgba = np.asarray(image.convert("RGBA"))
+        return rgba[..., :3], rgba[..., 3]
+    return np.asarray(image.convert("RGB")), None
+
+
+def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Undo EXIF's orientation (tag 274): where row 0 and column 0 of the stored image belong."""
+    if orientation >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    flip_rows, flip_columns = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
+    return pixels[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1]
+
+
+def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    import cv2
+
+    pixels = np.ascontiguousarray(pixels)
+    return pixels if pixels.shape[1::-1] == size else np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Lossless and appearing by rename; barely compressed, as it is read once and thrown away."""
+    from PIL import Image
+
+    aside = path.with_name(path.name + ".part")
+    Image.fromarray(np.ascontiguousarray(pixels)).save(aside, format="PNG", compress_level=1)
+    os.replace(aside, path)
