@@ -129,7 +129,8 @@ def _opacity(sigma: np.ndarray, low: np.ndarray, threshold: float) -> np.ndarray
     value may be the level itself: every vertex must lie inside one grid edge, strictly.
     """
     opacity = (1 - np.exp2(-sigma.astype(np.float64) / threshold)).astype(np.float32)
-    index = [(np.arange(low[axis], low[axis] + sigma.shape[axis]) + 1).astype(np.uint32) * np.uint32(prime) for axis, prime in enumerate((73856093, 19349663, 83492791))]
+    first = [np.arange(start, start + count) + 1 for start, count in zip(low, sigma.shape)]
+    index = [each.astype(np.uint32) * np.uint32(prime) for each, prime in zip(first, (73856093, 19349663, 83492791))]
     mixed = index[0][:, None, None] ^ index[1][None, :, None] ^ index[2][None, None, :]
     mixed = (mixed ^ (mixed >> np.uint32(15))) * np.uint32(2246822519)
     opacity += (mixed >> np.uint32(16)).astype(np.float32) * np.float32(1e-3 / 65536)
@@ -169,8 +170,8 @@ def visible_parts(vertices: np.ndarray, faces: np.ndarray, min_component: float)
     if len(walls):
         inside[large] = [_crossings(vertices[first[piece]], walls) % 2 == 1 for piece in np.flatnonzero(large)]
     kept = large & ~inside
-    facts = {"components_found": len(area), "small_removed": int((~hollow & ~large).sum()), "hollows_removed": int(hollow.sum()), "hidden_removed": int(inside.sum())}
-    return *compact(vertices, faces[kept[label]]), facts
+    counts = {"small_removed": ~hollow & ~large, "hollows_removed": hollow, "hidden_removed": inside}
+    return *compact(vertices, faces[kept[label]]), {"components_found": len(area), **{name: int(which.sum()) for name, which in counts.items()}}
 
 
 def _crossings(point: np.ndarray, triangles: np.ndarray) -> int:
@@ -256,9 +257,19 @@ def surface(
 
 
 def points(
-    tree: Any, count: int = 200_000, threshold: float | None = None, *, min_component: float = 0.01, rounds: int = 5, seed: int = 0, progress: Progress = _silent
+    tree: Any,
+    count: int = 200_000,
+    threshold: float | None = None,
+    *,
+    min_component: float = 0.01,
+    rounds: int = 5,
+    seed: int = 0,
+    progress: Progress = _silent,
 ) -> PointCloud:
-    """`count` points spread evenly over the tree's surface (before decimation), with normals and colours; the same for the same seed. Raises NoSurface."""
+    """`count` points spread evenly over the tree's surface (before decimation), with normals and colours. Raises NoSurface.
+
+    The same for the same seed; the other arguments as for `surface`.
+    """
     vertices, triangles, _ = _shape(tree, threshold, min_component, rounds, progress)
     face, weight = sample(vertices, triangles, count, seed)
     corners = triangles[face]  # (N, 3)

@@ -1,0 +1,110 @@
+"""The asset as a mesh: PLY in the capture's frame, GLB for viewers, a report, and a picture to look at."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.errors import StageFailed
+from pipeline.stage import Job, Stage
+from stages.settings import setting
+
+if TYPE_CHECKING:
+    from efficientnerf.mesh import Mesh
+    from stages.exporters import SourceFrame
+
+
+@dataclass(frozen=True)
+class MeshSettings:
+    faces: int = setting(200_000, "most faces of the mesh; it is decimated to this many", minimum=100)
+    threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
+    min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area are removed", minimum=0.0, maximum=1.0)
+    smooth: int = setting(5, "rounds of smoothing (Taubin's, which keeps the volume); 0: none", minimum=0, maximum=200)
+
+
+def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:
+    """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
+    from efficientnerf.surface import NoSurface, surface
+
+    try:
+        return surface(
+            tree,
+            settings.threshold,
+            faces=settings.faces,
+            min_component=settings.min_component,
+            rounds=settings.smooth,
+            progress=progress,
+        )
+    except NoSurface as error:
+        raise StageFailed(f"mesh: {error}. {remedy('mesh', settings.threshold)}") from error
+
+
+def remedy(stage: str, threshold: float | None) -> str:
+    """What to do where no surface was found."""
+    if threshold is None:
+        return f"The asset is nearly empty: train longer, or set {stage}.threshold by hand."
+    return f"Lower {stage}.threshold (found {threshold:g}), or leave it out to have it chosen."
+
+
+def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:
+    """A mesh of the training frame in the capture's."""
+    from efficientnerf.mesh import moved
+
+    back = frame.world_from_capture.inverse()
+    return moved(mesh, back.scale, back.rotation, back.translation)
+
+
+def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
+    """What the report says of a mesh in the capture's frame: counts, whether it is closed, bounds, area, volume, and how it was made."""
+    from dataclasses import asdict
+
+    from efficientnerf.mesh import face_areas, face_volumes, topology
+
+    found = topology(mesh.vertices, mesh.faces)
+    return {
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        **asdict(found),
+        "bounds": [mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()],
+        "unit": "metre" if frame.metric else "unknown",
+        "area": float(face_areas(mesh.vertices, mesh.faces).sum()),
+        "volume": float(face_volumes(mesh.vertices, mesh.faces).sum()) if found.watertight else None,
+        **mesh.facts,
+    }
+
+
+def run(job: Job) -> None:
+    from PIL import Image
+
+    from efficientnerf.nerftree.format import load
+    from stages.exporters import MESH_EXPORTERS
+    from stages.exporters.writing import source_frame
+    from stages.shading import draw_sides
+
+    def progress(done: int, total: int, text: str) -> None:
+        job.safe_point()
+        job.progress(done, total, text)
+
+    tree = load(job.inputs["bake"] / "asset.nerftree")
+    frame = source_frame(tree.metadata)
+    found = mesh_of(tree, job.settings, progress)
+    job.safe_point()
+    orbit = tree.metadata.get("orbit", {})
+    elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
+    Image.fromarray(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=elevation)).save(job.out / "preview.png")
+    job.safe_point()
+    mesh = in_capture(found, frame)
+    for extension in (".ply", ".glb"):
+        MESH_EXPORTERS[extension](mesh, job.out / f"mesh{extension}", frame)
+    report = describe(mesh, frame)
+    (job.out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    if not report["watertight"]:
+        job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['crowded_edges']} crowded edges")
+    job.say(f"{report['faces']} faces in {report['components']} pieces", faces=report["faces"], components=report["components"], watertight=report["watertight"])
+
+
+STAGE = Stage(name="mesh", version=1, settings=MeshSettings, needs=("bake",), run=run)

@@ -1,0 +1,66 @@
+"""The asset as a point cloud with normals and colours: points spread evenly over its surface, as PLY in the capture's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import StageFailed
+from pipeline.stage import Job, Stage
+from stages.mesh import remedy
+from stages.settings import setting
+
+if TYPE_CHECKING:
+    from efficientnerf.mesh import PointCloud
+    from stages.exporters import SourceFrame
+
+
+@dataclass(frozen=True)
+class PointsSettings:
+    count: int = setting(200_000, "points", minimum=1)
+    threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
+    min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area get no points", minimum=0.0, maximum=1.0)
+    smooth: int = setting(5, "rounds of smoothing of the surface that the points lie on; 0: none", minimum=0, maximum=200)
+    seed: int = setting(0, "where on the surface the points fall", minimum=0)
+
+
+def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None]) -> PointCloud:
+    """Points on the tree's surface in the capture's frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
+    from efficientnerf.mesh import PointCloud
+    from efficientnerf.surface import NoSurface, points
+
+    try:
+        cloud = points(
+            tree,
+            settings.count,
+            settings.threshold,
+            min_component=settings.min_component,
+            rounds=settings.smooth,
+            seed=settings.seed,
+            progress=progress,
+        )
+    except NoSurface as error:
+        raise StageFailed(f"points: {error}. {remedy('points', settings.threshold)}") from error
+    back = frame.world_from_capture.inverse()
+    return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
+
+
+def run(job: Job) -> None:
+    from efficientnerf.nerftree.format import load
+    from stages.exporters import POINT_EXPORTERS
+    from stages.exporters.writing import source_frame
+
+    def progress(done: int, total: int, text: str) -> None:
+        job.safe_point()
+        job.progress(done, total, text)
+
+    tree = load(job.inputs["bake"] / "asset.nerftree")
+    frame = source_frame(tree.metadata)
+    cloud = points_of(tree, job.settings, frame, progress)
+    job.safe_point()
+    POINT_EXPORTERS[".ply"](cloud, job.out / "points.ply", frame)
+    job.say(f"{len(cloud.positions)} points", points=len(cloud.positions))
+
+
+STAGE = Stage(name="points", version=1, settings=PointsSettings, needs=("bake",), run=run)
