@@ -1,0 +1,105 @@
+"""The turntable stage: its files, and that a stop in the middle changes none of their bytes."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import OpenEXR
+import pytest
+
+from efficientnerf.metrics import psnr
+from pipeline.errors import Interrupted
+from pipeline.stage import Job
+from stages.exporters.frames import read_png
+from stages.paths import turntable_cameras
+from stages.turntable import STAGE, TurntableSettings, draw_turntable
+from tests.fakes import BallTree
+
+SETTINGS = TurntableSettings(frames=5, width=64, height=48, fps=10)
+
+
+class CountingTree(BallTree):
+    calls: int = 0
+
+    def render(self, camera: Any, **options: Any) -> Any:
+        type(self).calls += 1
+        return super().render(camera, **options)
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+
+
+def job_in(folder: Path, out: str = "out", settings: TurntableSettings = SETTINGS, **more: Any) -> Job:
+    return Job(settings=settings, out=folder / out, work=folder / "work", **more)
+
+
+def test_it_writes_frames_a_video_of_them_and_one_exr(tmp_path: Path) -> None:
+    job = job_in(tmp_path)
+    draw_turntable(BallTree(), job)
+    assert sorted(digests(job.out)) == ["frame_0000.exr", *(f"frame_000{k}.png" for k in range(5)), "turntable.mp4"]
+    frames = [read_png(job.out / f"frame_000{k}.png") for k in range(5)]
+    assert all(frame.shape == (48, 64, 3) for frame in frames)
+    assert (frames[0][0, 0] == 255).all()
+    assert not (frames[0] == frames[1]).all()
+    with av.open(str(job.out / "turntable.mp4")) as container:
+        decoded = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(decoded) == 5
+    assert min(psnr(a / 255.0, b / 255.0) for a, b in zip(decoded, frames, strict=True)) > 30
+    with OpenEXR.File(str(job.out / "frame_0000.exr"), separate_channels=True) as file:
+        channels = {name: channel.pixels.copy() for name, channel in file.channels().items()}
+    assert channels["A"][24, 32] > 0.99
+    camera = turntable_cameras(BallTree(), frames=5, width=64, height=48)[0]
+    assert channels["depth.Z"][24, 32] == pytest.approx(np.linalg.norm(camera.centre) - 0.6, abs=0.05)
+    assert np.isinf(channels["depth.Z"][0, 0])
+
+
+@pytest.mark.parametrize("moment", [1, 3, 6, 8])
+def test_a_stop_anywhere_and_going_on_gives_the_same_bytes(tmp_path: Path, moment: int) -> None:
+    whole = job_in(tmp_path / "whole")
+    draw_turntable(BallTree(), whole)
+    asked = iter(range(100))
+    with pytest.raises(Interrupted):
+        draw_turntable(BallTree(), job_in(tmp_path, "first", stop=lambda: 2 if next(asked) >= moment else None))
+    CountingTree.calls = 0
+    job = job_in(tmp_path, "second")
+    draw_turntable(CountingTree(), job)
+    assert digests(job.out) == digests(whole.out)
+    assert CountingTree.calls == max(0, 5 - moment), "finished frames are not drawn again"
+
+
+def test_half_written_frames_are_drawn_again(tmp_path: Path) -> None:
+    whole = job_in(tmp_path / "whole")
+    draw_turntable(BallTree(), whole)
+    frames = tmp_path / "work" / "frames"
+    frames.mkdir(parents=True)
+    (frames / ".frame_0000.png.partial").write_bytes(b"half")
+    (frames / "frame_0000.exr").write_bytes(b"half")
+    job = job_in(tmp_path)
+    draw_turntable(BallTree(), job)
+    assert digests(job.out) == digests(whole.out)
+
+
+def test_progress_ends_at_the_last_frame(tmp_path: Path) -> None:
+    events: list[dict[str, Any]] = []
+    draw_turntable(BallTree(), job_in(tmp_path, report=events.append))
+    progress = [event for event in events if event["event"] == "progress"]
+    assert (progress[-1]["done"], progress[-1]["total"]) == (5, 5)
+
+
+def test_the_stage_reads_an_asset_file(tmp_path: Path) -> None:
+    from efficientnerf.nerftree.tree import tree_from_voxels
+
+    indices = np.stack(np.meshgrid(*[np.arange(2, 6)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    tree = tree_from_voxels((2, 2, 2), 0.25, np.full(3, -1.0), indices, np.full(64, 40.0), np.zeros((64, 1, 3)), background=(1.0, 1.0, 1.0))
+    (tmp_path / "bake").mkdir()
+    tree.save(tmp_path / "bake" / "asset.nerftree")
+    job = job_in(tmp_path, settings=TurntableSettings(frames=2, width=40, height=40, background="#000000"), inputs={"bake": tmp_path / "bake"})
+    STAGE.run(job)
+    frame = read_png(job.out / "frame_0000.png").astype(int)
+    assert (frame[0, 0] == 0).all()
+    assert abs(frame[20, 20] - 128).max() <= 3, "coefficients of zero are the middle of the sigmoid"
