@@ -125,8 +125,9 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
 
     where  put before names in errors, e.g. "train": `train.iterations: ...`
 
-    Types are int, float (an int will do), bool, str, None, Literal, tuples (lists will do) and unions of these. A field's metadata may hold
-    "choices", "min" and "max". Raises UnknownSetting, naming the nearest setting, and UsageError for a wrong type or value.
+    Types are int, float (an int will do), bool, str, None, Literal, tuples (lists will do) and unions of these. A field's metadata may
+    hold "choices", "minimum" and "maximum" (of a tuple: of each of its numbers). Raises UnknownSetting, which names the
+    nearest, and UsageError for a wrong type or value.
     """
     prefix = f"{where}." if where else ""
     if not isinstance(mapping, Mapping):
@@ -194,7 +195,7 @@ def _decoded(hint: Any, value: Any) -> Any:
 
 
 def _decoded_union(arms: tuple[Any, ...], value: Any) -> Any:
-    for arm in arms:
+    for arm in sorted(arms, key=lambda option: type(value) is not option):  # the exact type first: 1 stays an int where both fit
         try:
             return _decoded(arm, value)
         except TypeError:
@@ -208,13 +209,18 @@ def _check_range(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
         near = difflib.get_close_matches(str(value), [str(choice) for choice in choices], n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise UsageError(f"{name}: found {_shown(value)}, expected one of {', '.join(map(str, choices))}.{hint}")
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return
-    least, most = metadata.get("min"), metadata.get("max")
-    if least is not None and value < least:
-        raise UsageError(f"{name}: found {value}, expected at least {least}")
-    if most is not None and value > most:
-        raise UsageError(f"{name}: found {value}, expected at most {most}")
+    least, most = metadata.get("minimum"), metadata.get("maximum")
+    for number in _numbers(value):
+        if least is not None and number < least:
+            raise UsageError(f"{name}: found {_shown(value)}, expected at least {least}")
+        if most is not None and number > most:
+            raise UsageError(f"{name}: found {_shown(value)}, expected at most {most}")
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for item in value for number in _numbers(item)]
+    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
 
 
 def _type_text(hint: Any) -> str:

@@ -1,0 +1,229 @@
+"""Whether a stage has to run, and why. Looks, and changes nothing: neither the run nor the source.
+
+    missing  never run
+    fresh    nothing to do
+    stale    made by another request: other settings, other inputs, another version
+    partial  work on the present request was cut short; what stands, if anything does, is of another request
+    corrupt  what lies on disk is not what was written
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pipeline import artifact, files, manifest
+from pipeline.errors import BadInput, CorruptArtifact, PipelineError
+from pipeline.hashes import Hashes
+from pipeline.manifest import ABSENT, Manifest, Request
+from pipeline.run import Run
+from pipeline.stage import Stage, settings_dict, settings_from
+
+_CHANGES_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was found about one stage.
+
+    state     fresh, stale, missing, partial or corrupt
+    reason    why it has to run; None if and only if fresh
+    note      what else is worth saying
+    request   what it would be run with now; None where that cannot be known, and then
+    obstacle  the error that says what stands in the way
+    manifest  of the artifact that stands, if it can be read
+    extra     files in its folder that it did not write
+    """
+
+    stage: str
+    state: str
+    reason: str | None
+    note: str | None = None
+    request: Request | None = None
+    obstacle: PipelineError | None = None
+    manifest: Manifest | None = None
+    extra: tuple[str, ...] = ()
+
+    @property
+    def fresh(self) -> bool:
+        return self.state == "fresh"
+
+
+def why_run(stage: Stage, run: Run) -> str | None:
+    """The reason why the stage has to run on what the run has now, or None. No side effects.
+
+    Stages before it are taken as they lie on disk; survey() also sees that they are about to change.
+    """
+    return decide(stage, run).reason
+
+
+def survey(stages: Sequence[Stage], run: Run, *, forced: Collection[str] = (), hashes: Hashes | None = None) -> list[Decision]:
+    """A decision for each stage, in order. One that needs a stage which has to run is stale, too: it may turn out to stay as it is.
+
+    forced  names of stages that count as stale whatever is found
+    """
+    hashes = hashes or Hashes(run.cache)
+    found: dict[str, Decision] = {}
+    for stage in stages:
+        decision = decide(stage, run, hashes)
+        if decision.fresh and stage.name in forced:
+            decision = replace(decision, state="stale", reason="forced")
+        pending = [found[need] for need in stage.needs if need in found and not found[need].fresh]
+        if decision.fresh and pending:
+            reason = "inputs changed: " + ", ".join(f"{before.stage} is {before.state}" for before in pending)
+            decision = replace(decision, state="stale", reason=reason)
+        found[stage.name] = decision
+    return list(found.values())
+
+
+def decide(stage: Stage, run: Run, hashes: Hashes | None = None) -> Decision:
+    """What why_run says, with all that was found on the way. Raises UsageError if the run's settings of the stage make no sense."""
+    hashes = hashes or Hashes(run.cache)
+    folder = run.folder(stage.name)
+    recorded, damage = _recorded(folder, stage)
+    request, obstacle, note = _request(stage, run, recorded, hashes)
+
+    def decision(state: str, reason: str | None, extra: tuple[str, ...] = ()) -> Decision:
+        return Decision(stage.name, state, reason, note, request, obstacle, recorded, extra)
+
+    if damage is not None:
+        return decision("corrupt", damage)
+    if recorded is None:
+        return decision(*(_cut_short(stage, run, request) or ("missing", "never run")))
+    found = artifact.differences(folder, recorded.outputs, hashes)
+    changes = _changes(recorded.request, request, obstacle)
+    if found.damaged:
+        return decision("corrupt", "; ".join([f"output altered on disk: {found.text()}", *changes]), found.extra)
+    if not changes:
+        return decision("fresh", None, found.extra)
+    state, reason = _cut_short(stage, run, request) or ("stale", "")
+    return decision(state, "; ".join([reason, *changes] if reason else changes), found.extra)
+
+
+def _recorded(folder: Path, stage: Stage) -> tuple[Manifest | None, str | None]:
+    """The manifest of the artifact that stands, or what is wrong with it."""
+    if not files.exists(folder):
+        return None, None
+    try:
+        recorded = manifest.read_manifest(folder)
+    except CorruptArtifact as error:
+        return None, f"manifest unreadable: {error}"
+    if recorded.request.stage != stage.name:
+        return None, f"manifest unreadable: it is of the stage {recorded.request.stage!r:.40}"
+    return recorded, None
+
+
+def _cut_short(stage: Stage, run: Run, request: Request | None) -> tuple[str, str] | None:
+    """State and reason if work on this request lies about."""
+    if files.exists(run.path / artifact.WORK / f"old-{stage.name}") and not files.exists(run.folder(stage.name)):
+        return "partial", "incomplete: its replacement was cut short; the next run completes it"
+    if request is None:
+        return None
+    place = artifact.workplace(run.path, stage.name, request)
+    if not place.folder.is_dir():
+        return None
+    if files.exists(place.out / manifest.NAME):
+        return "partial", "incomplete: done, but cut short before it was published"
+    has_scratch = place.scratch.is_dir() and not files.is_empty(place.scratch)
+    return "partial", "incomplete: cut short; it goes on where it stopped" if has_scratch else "incomplete: cut short; it starts anew"
+
+
+def _request(stage: Stage, run: Run, recorded: Manifest | None, hashes: Hashes) -> tuple[Request | None, PipelineError | None, str | None]:
+    """(what the stage would be run with, or None; then what stands in the way; a note)."""
+    settings = settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name)
+    inputs = {}
+    for need in stage.needs:
+        try:
+            inputs[need] = manifest.read_manifest(run.folder(need)).digest
+        except CorruptArtifact as error:
+            if files.exists(run.folder(need)):
+                return None, CorruptArtifact(f"{stage.name} needs {need}, which is corrupt ({error}).", error.files), None
+            return None, BadInput(f"{stage.name} needs {need}, which this run does not have."), None
+    source, note = None, None
+    if stage.reads_source:
+        former = None if recorded is None else recorded.request.source
+        try:
+            source, note = _source(stage, run, settings, former, hashes)
+        except PipelineError as error:
+            return None, error, None
+    return Request(stage.name, stage.version, settings_dict(settings), inputs, source), None, note
+
+
+def _source(stage: Stage, run: Run, settings: Any, former: dict[str, str] | None, hashes: Hashes) -> tuple[dict[str, str], str | None]:
+    """Digests of the source's files by path relative to it, and a note. Raises BadInput if the source cannot be used."""
+    source = run.source
+    if source is None or _is_gone(source):
+        what = "the run names no source" if source is None else f"{source} is not there, or empty"
+        if former is not None:
+            return former, f"{what}; {stage.name} stands as it was made"
+        raise BadInput(f"{stage.name} needs the source: {what}. Name it: {run.command().replace('enerf run', 'enerf run SOURCE')}")
+    base = source if source.is_dir() else source.parent
+    digests = {}
+    try:
+        for path in _source_files(stage, source, settings):
+            name = Path(os.path.relpath(path, base)).as_posix()
+            digests[name] = hashes.digest(f"source:{name}", path) if path.is_file() else ABSENT
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{source}: cannot be read ({error})") from error
+    hashes.forget("source:", {f"source:{name}" for name in digests})
+    return dict(sorted(digests.items())), None
+
+
+def _is_gone(source: Path) -> bool:
+    """An empty folder counts as gone: that is what is left of a disk that is not mounted."""
+    try:
+        return not source.exists() or (source.is_dir() and files.is_empty(source))
+    except OSError:
+        return True
+
+
+def _source_files(stage: Stage, source: Path, settings: Any) -> list[Path]:
+    if stage.source_files is not None:
+        return stage.source_files(source, settings)
+    return [source / name for name, _ in files.walk(source)] if source.is_dir() else [source]
+
+
+def _changes(old: Request, new: Request | None, obstacle: PipelineError | None) -> list[str]:
+    """In words, what differs between two requests."""
+    if new is None:
+        return [f"inputs changed: {obstacle}"]
+    changes = []
+    if old.version != new.version:
+        changes.append(f"version changed: {old.version} -> {new.version}")
+    if old.settings != new.settings:
+        changes.append("settings changed: " + _settings_changes(old.settings, new.settings))
+    inputs = [need for need in sorted(old.inputs.keys() | new.inputs.keys()) if old.inputs.get(need) != new.inputs.get(need)]
+    if inputs:
+        changes.append("inputs changed: " + ", ".join(inputs))
+    if old.source != new.source:
+        changes.append("inputs changed: " + _source_changes(old.source or {}, new.source or {}))
+    return changes
+
+
+def _settings_changes(old: dict[str, Any], new: dict[str, Any]) -> str:
+    changed = [name for name in sorted(old.keys() | new.keys()) if old.get(name, ...) != new.get(name, ...)]
+    texts = [f"{name} {_value(old.get(name, ...))} -> {_value(new.get(name, ...))}" for name in changed[:_CHANGES_SHOWN]]
+    more = len(changed) - _CHANGES_SHOWN
+    return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+
+
+def _value(value: Any) -> str:
+    if value is ...:
+        return "(not there)"
+    text = files.canonical_json(value).decode("ascii")
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _source_changes(old: dict[str, str], new: dict[str, str]) -> str:
+    """ "3 source files (1 changed: a.jpg; 1 new: b.jpg; 1 gone: c.jpg)"."""
+    kinds = {
+        "changed": [name for name in sorted(old.keys() & new.keys()) if old[name] != new[name]],
+        "new": [name for name in sorted(new.keys() - old.keys())],
+        "gone": [name for name in sorted(old.keys() - new.keys())],
+    }
+    count = sum(map(len, kinds.values()))
+    parts = [f"{len(names)} {kind}: {artifact.listed(names)}" for kind, names in kinds.items() if names]
+    return f"{count} source file{'s' if count != 1 else ''} ({'; '.join(parts)})"

@@ -1,0 +1,147 @@
+"""The few operations on files that everything else is made of: durable writes, bounded reads, canonical JSON, safe names.
+
+What must survive a kill or a power cut goes through these functions and no others, so that tests can cut the power at each of them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+MAX_JSON = 64 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
+
+
+class Unreadable(ValueError):
+    """A JSON file that is too large, cut off or no JSON; the text says which."""
+
+
+def canonical_json(value: Any) -> bytes:
+    """The one spelling of a plain value: keys sorted, no spaces, ASCII. Raises ValueError for NaN and infinity."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii")
+
+
+def pretty_json(value: Any) -> bytes:
+    """For files that people look into."""
+    return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
+
+
+def read_json(path: Path, limit: int = MAX_JSON) -> Any:
+    """The value in a file of at most `limit` bytes. Raises Unreadable; FileNotFoundError if there is none."""
+    try:
+        with open(path, "rb") as file:
+            data = file.read(limit + 1)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise Unreadable(error.strerror or str(error)) from None
+    if len(data) > limit:
+        raise Unreadable(f"larger than {limit} bytes")
+    if not data.strip():
+        raise Unreadable("the file is empty")
+    try:
+        return json.loads(data, parse_constant=_refused)
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
+        text = str(error) if isinstance(error, ValueError) else "nested too deeply"
+        raise Unreadable(f"not JSON ({text.splitlines()[0][:120]})") from None
+
+
+def _refused(name: str) -> Any:
+    raise ValueError(f"{name} is no number")
+
+
+def is_safe_name(name: str) -> bool:
+    """Whether a relative posix path stays where it is put: not absolute, no "..", no empty part, no NUL."""
+    if not name or "\0" in name or name != str(PurePosixPath(name)):
+        return False
+    path = PurePosixPath(name)
+    return not path.is_absolute() and all(part not in ("..", ".") for part in path.parts)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """The file has either its old content or all of the new, whatever happens meanwhile."""
+    aside = path.with_name(f".{path.name}.tmp")
+    with open(aside, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    rename(aside, path)
+    sync_folder(path.parent)
+
+
+def rename(source: Path, target: Path) -> None:
+    """Atomic on one file system; a file at the target is replaced."""
+    os.replace(source, target)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames within the folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_tree(folder: Path) -> None:
+    """Every file and folder below, then the folder itself."""
+    for parent, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            sync_file(Path(parent, name))
+        sync_folder(Path(parent))
+
+
+def sync_file(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def remove(path: Path) -> None:
+    """Whatever it is, with all that is in it; a link goes, not what it points to."""
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+    else:
+        shutil.rmtree(path)
+
+
+def discard(path: Path, trash: Path) -> None:
+    """Remove so that a kill never leaves a half-removed folder under the old name: it goes to the folder `trash` first."""
+    if not os.path.lexists(path):
+        return
+    doomed = trash / f"trash-{os.getpid()}-{time.time_ns()}"
+    rename(path, doomed)
+    remove(doomed)
+
+
+def walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
+    """(relative posix name, lstat) of everything in the folder that is not itself a plain folder, sorted within each folder."""
+    pending = [("", folder)]
+    while pending:
+        prefix, current = pending.pop()
+        with os.scandir(current) as entries:
+            found = sorted(entries, key=lambda entry: entry.name)
+        for entry in found:
+            if entry.is_dir(follow_symlinks=False):
+                pending.append((f"{prefix}{entry.name}/", Path(entry.path)))
+            else:
+                yield prefix + entry.name, os.stat(entry.path, follow_symlinks=False)
+
+
+def exists(path: Path) -> bool:
+    """Also for a link that points nowhere."""
+    return os.path.lexists(path)
+
+
+def is_empty(folder: Path) -> bool:
+    with os.scandir(folder) as entries:
+        return next(entries, None) is None
+
+
+SafePoint = Callable[[], None]

@@ -1,0 +1,107 @@
+"""Ctrl-C and SIGTERM: the first asks to stop at the next safe point, a second Ctrl-C ends the process at once."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_DONE = b"\0"  # no signal has the number 0
+_GRACE = 0.3  # seconds for Python's own handler to end the process before the watching thread does
+
+
+class Stop:
+    """Whether a signal has asked to stop. Calling it gives the number of the first, or None."""
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self.presses = 0
+
+    def __call__(self) -> int | None:
+        return self.number
+
+
+@contextmanager
+def stopping() -> Iterator[Stop]:
+    """While open, SIGINT and SIGTERM set the returned Stop; the former handlers are restored afterwards.
+
+    Outside of the main thread signals cannot be handled, and a signal that is ignored (nohup) stays ignored.
+    """
+    stop = Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handled = [number for number, handler in former.items() if handler not in (signal.SIG_IGN, None)]
+
+    def arrived(number: int, frame: FrameType | None) -> None:
+        if stop.number is None:
+            stop.number = number
+        if number == signal.SIGINT:
+            stop.presses += 1
+            if stop.presses > 1:
+                signal.signal(signal.SIGINT, signal.SIG_DFL)
+                os.kill(os.getpid(), signal.SIGINT)
+
+    def restore() -> None:
+        for number in handled:
+            signal.signal(number, former[number])
+
+    with _watching(), _undone_in_children(restore):
+        for number in handled:
+            signal.signal(number, arrived)
+        try:
+            yield stop
+        finally:
+            restore()
+
+
+@contextmanager
+def _watching() -> Iterator[None]:
+    """Python runs its handlers between two bytecodes of the main thread: never, while that is inside a long foreign call. A thread
+    that reads the bytes which the C handler writes ends the process at the second Ctrl-C even then."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    former = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        presses = 0
+        while (received := os.read(reading, 1)) != _DONE:
+            if former >= 0:
+                with contextlib.suppress(OSError):
+                    os.write(former, received)
+            presses += received[0] == signal.SIGINT
+            if presses > 1:
+                time.sleep(_GRACE)
+                os._exit(128 + signal.SIGINT)
+
+    thread = threading.Thread(target=watch, name="second Ctrl-C", daemon=True)
+    thread.start()
+    try:
+        with _undone_in_children(lambda: signal.set_wakeup_fd(former)):
+            yield
+    finally:
+        signal.set_wakeup_fd(former)
+        os.write(writing, _DONE)  # closing would not do: a forked child may hold the pipe open
+        thread.join()
+        os.close(writing)
+        os.close(reading)
+
+
+# Worker processes that a stage forks must die of SIGTERM as usual, and the Ctrl-C that a terminal sends to all of them is still one.
+_in_children: list[Callable[[], object]] = []
+os.register_at_fork(after_in_child=lambda: [undo() for undo in reversed(_in_children)])
+
+
+@contextmanager
+def _undone_in_children(undo: Callable[[], object]) -> Iterator[None]:
+    _in_children.append(undo)
+    try:
+        yield
+    finally:
+        _in_children.remove(undo)

@@ -1,0 +1,88 @@
+"""One writer at a time: an operating system's lock on RUN/.lock, and beside it who holds it.
+
+The lock vanishes with its process, so what a dead process left behind never stands in the way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline import files
+from pipeline.errors import BadInput, RunLocked
+
+LOCK = ".lock"
+HOLDER = ".lock.json"
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who writes a run; `since` in seconds since 1970."""
+
+    pid: int
+    host: str
+    since: float
+    command: str
+
+    def text(self) -> str:
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.since))
+        return f"process {self.pid} on {self.host} since {since} ({self.command})"
+
+
+def holder_of(run: Path) -> Holder | None:
+    """Who wrote down that it holds the lock, if it may still be alive. Takes no lock, writes nothing."""
+    try:
+        value = files.read_json(run / HOLDER, limit=2**16)
+        holder = Holder(int(value["pid"]), str(value["host"]), float(value["since"]), str(value["command"]))
+    except (OSError, ValueError, TypeError, KeyError, OverflowError):
+        return None
+    return holder if holder.host != socket.gethostname() or _is_alive(holder.pid) else None
+
+
+def _is_alive(pid: int) -> bool:
+    if pid <= 0:
+        return False
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+@contextmanager
+def lock(run: Path) -> Iterator[None]:
+    """Hold the run's lock. Raises RunLocked at once if another holds it, BadInput if the run cannot be written."""
+    import filelock  # not needed by the commands that only read
+
+    guard = filelock.FileLock(run / LOCK, timeout=0, thread_local=False)
+    try:
+        guard.acquire()
+    except filelock.Timeout:
+        holder = holder_of(run)
+        who = holder.text() if holder is not None else "a process that did not say who it is"
+        raise RunLocked(f"{run}: being written by {who}. Wait until it is done, or stop it.") from None
+    except OSError as error:
+        raise BadInput(f"{run}: cannot be locked for writing ({error.strerror or error})") from None
+    try:
+        _write_holder(run)
+        yield
+    finally:
+        (run / HOLDER).unlink(missing_ok=True)
+        guard.release()
+
+
+def _write_holder(run: Path) -> None:
+    command = shlex.join([Path(sys.argv[0] or "python").name, *sys.argv[1:]])[:500]
+    holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": time.time(), "command": command}
+    with contextlib.suppress(OSError):  # the lock holds without it: only the message of a second run would be poorer
+        files.write_atomically(run / HOLDER, files.pretty_json(holder))

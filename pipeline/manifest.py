@@ -1,0 +1,216 @@
+"""What made an artifact, and what it consists of: manifest.json, the last file written into an artifact's folder.
+
+    request   stage, version, settings, digests of the inputs, digests of the source's files. Its SHA-256 names the work folder
+    outputs   name -> SHA-256, size, and whether it depends on the clock (volatile)
+    digest    of the names and SHA-256 of the outputs that do not: all that later requests see
+    the rest  seconds, peak memory, tool versions: for people, outside of every digest
+    checksum  of all of the above, so that a damaged manifest is known as such
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import platform
+import re
+import sys
+import time
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pipeline import files
+from pipeline.errors import CorruptArtifact
+
+NAME = "manifest.json"
+FORMAT = "enerf-manifest"
+VERSION = 1
+ABSENT = "absent"  # stands for the digest of a source file that is listed but not there
+DISTRIBUTION = "efficientnerf"  # its requirements are the packages whose versions are written down
+
+
+@dataclass(frozen=True)
+class Request:
+    """All that decides the bytes of an artifact.
+
+    settings  plain JSON values
+    inputs    need -> digest of its artifact
+    source    path relative to the source -> SHA-256 (or ABSENT); None for a stage that does not read the source
+    """
+
+    stage: str
+    version: int
+    settings: dict[str, Any]
+    inputs: dict[str, str]
+    source: dict[str, str] | None = None
+
+    def plain(self) -> dict[str, Any]:
+        return {"stage": self.stage, "version": self.version, "settings": self.settings, "inputs": self.inputs, "source": self.source}
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(files.canonical_json(self.plain())).hexdigest()
+
+
+@dataclass(frozen=True)
+class Output:
+    """One file of an artifact; size in bytes."""
+
+    sha256: str
+    size: int
+    volatile: bool = False
+
+
+@cache
+def tool_versions() -> tuple[tuple[str, str], ...]:
+    """(name, version) of Python, the platform and the packages that this distribution requires and that are installed."""
+    found = {"python": platform.python_version(), "platform": platform.platform(), "implementation": sys.implementation.name}
+    try:
+        requirements = [DISTRIBUTION, *(importlib.metadata.requires(DISTRIBUTION) or [])]
+    except importlib.metadata.PackageNotFoundError:
+        requirements = []
+    for requirement in requirements:
+        name = re.match(r"[A-Za-z0-9._-]+", requirement)
+        if name is None or "extra ==" in requirement:
+            continue
+        try:
+            found[name.group().lower()] = importlib.metadata.version(name.group())
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return tuple(sorted(found.items()))
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """See the module.
+
+    seconds      wall clock of the process that finished it
+    peak_memory  bytes, of that process during the stage
+    resumed      whether it went on from the scratch of an earlier process
+    made         seconds since 1970
+    """
+
+    request: Request
+    outputs: dict[str, Output]
+    seconds: float = 0.0
+    peak_memory: int = 0
+    resumed: bool = False
+    made: float = field(default_factory=time.time)
+    versions: dict[str, str] = field(default_factory=lambda: dict(tool_versions()))
+
+    @property
+    def digest(self) -> str:
+        return artifact_digest(self.outputs)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all outputs."""
+        return sum(output.size for output in self.outputs.values())
+
+    def to_bytes(self) -> bytes:
+        value = {
+            "format": FORMAT,
+            "format_version": VERSION,
+            "request": self.request.plain(),
+            "request_digest": self.request.digest,
+            "outputs": {name: _plain_output(output) for name, output in self.outputs.items()},
+            "digest": self.digest,
+            "seconds": self.seconds,
+            "peak_memory": self.peak_memory,
+            "resumed": self.resumed,
+            "made": self.made,
+            "versions": self.versions,
+        }
+        value["checksum"] = hashlib.sha256(files.canonical_json(value)).hexdigest()
+        return files.pretty_json(value)
+
+
+def artifact_digest(outputs: dict[str, Output]) -> str:
+    """SHA-256 over the sorted names and hashes of the outputs that do not depend on the clock."""
+    rows = [[name, outputs[name].sha256] for name in sorted(outputs) if not outputs[name].volatile]
+    return hashlib.sha256(files.canonical_json(["artifact", rows])).hexdigest()
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """The manifest in an artifact's folder. What it says is checked, not trusted. Raises CorruptArtifact."""
+    path = folder / NAME
+    where = f"{folder.name}/{NAME}"
+    try:
+        return _parsed(files.read_json(path))
+    except (FileNotFoundError, NotADirectoryError):
+        raise CorruptArtifact(f"{where}: is not there", (where,)) from None
+    except (files.Unreadable, _Bad) as error:
+        raise CorruptArtifact(f"{where}: {error}", (where,)) from None
+
+
+class _Bad(ValueError):
+    """A manifest that says something it must not."""
+
+
+def _plain_output(output: Output) -> dict[str, Any]:
+    plain: dict[str, Any] = {"sha256": output.sha256, "size": output.size}
+    return {**plain, "volatile": True} if output.volatile else plain
+
+
+def _parsed(value: Any) -> Manifest:
+    value = _typed(value, dict, "the manifest")
+    if value.get("format") != FORMAT:
+        raise _Bad(f"format {value.get('format')!r:.40}, expected {FORMAT!r}")
+    if value.get("format_version") != VERSION:
+        raise _Bad(f"format version {value.get('format_version')!r:.20}; this build reads {VERSION}. Upgrade {DISTRIBUTION}")
+    rest = {key: item for key, item in value.items() if key != "checksum"}
+    if value.get("checksum") != hashlib.sha256(files.canonical_json(rest)).hexdigest():
+        raise _Bad("its checksum is not that of its content: it was altered or damaged")
+    outputs = {_name(name): _output(name, entry) for name, entry in _typed(value.get("outputs"), dict, "outputs").items()}
+    manifest = Manifest(
+        request=_request(value.get("request")),
+        outputs=outputs,
+        seconds=float(_typed(value.get("seconds"), (int, float), "seconds")),
+        peak_memory=_typed(value.get("peak_memory"), int, "peak_memory"),
+        resumed=_typed(value.get("resumed"), bool, "resumed"),
+        made=float(_typed(value.get("made"), (int, float), "made")),
+        versions={_typed(k, str, "versions"): _typed(v, str, "versions") for k, v in _typed(value.get("versions"), dict, "versions").items()},
+    )
+    if value.get("digest") != manifest.digest or value.get("request_digest") != manifest.request.digest:
+        raise _Bad("its digests are not those of what it lists")
+    return manifest
+
+
+def _request(value: Any) -> Request:
+    value = _typed(value, dict, "request")
+    source = value.get("source")
+    inputs = _typed(value.get("inputs"), dict, "inputs")
+    return Request(
+        stage=_typed(value.get("stage"), str, "stage"),
+        version=_typed(value.get("version"), int, "version"),
+        settings=_typed(value.get("settings"), dict, "settings"),
+        inputs={name: _hex(digest) for name, digest in inputs.items()},
+        source=None if source is None else {name: d if d == ABSENT else _hex(d) for name, d in _typed(source, dict, "source").items()},
+    )
+
+
+def _output(name: str, value: Any) -> Output:
+    value = _typed(value, dict, name)
+    size = _typed(value.get("size"), int, f"size of {name}")
+    if size < 0:
+        raise _Bad(f"{name}: size {size}")
+    return Output(_hex(value.get("sha256")), size, _typed(value.get("volatile", False), bool, f"volatile of {name}"))
+
+
+def _name(name: str) -> str:
+    if not files.is_safe_name(name) or name == NAME:
+        raise _Bad(f"output {name!r:.80} is no name of a file in its folder")
+    return name
+
+
+def _hex(value: Any) -> str:
+    if not isinstance(value, str) or re.fullmatch(r"[0-9a-f]{64}", value) is None:
+        raise _Bad(f"{value!r:.80} is no SHA-256")
+    return value
+
+
+def _typed(value: Any, kind: Any, what: str) -> Any:
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise _Bad(f"{what}: found {type(value).__name__}, expected {getattr(kind, '__name__', 'number')}")
+    return value
