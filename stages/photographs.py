@@ -14,9 +14,9 @@ import numpy as np
 
 from efficientnerf.cameras import Camera, rays, resized
 from pipeline.errors import BadInput
-from stages import matching
+from stages import matches
 from stages.capture import Capture, Photo, SparsePoints
-from stages.matching import WorkImage
+from stages.matches import WorkImage
 
 EXHAUSTIVE_UP_TO = 100  # photographs; beyond it, every pair would take longer than everything else together
 FEWEST = 3  # photographs that make a model
@@ -34,7 +34,7 @@ def find_cameras(
     *,
     max_side: int = 1600,
     features: int = 4096,
-    matching_pairs: str = "auto",
+    matching: str = "auto",
     seed: int = 0,
     masks: Mapping[str, Path] | None = None,
     work: Path,
@@ -47,7 +47,7 @@ def find_cameras(
     folder, names   the photographs, paths relative to the folder; any order
     max_side        longest side at which features are searched, pixels
     features        most features of a photograph
-    matching_pairs  "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
+    matching        "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
     masks           of some or all names: no features where the mask is black
     work            scratch folder; what a killed call left in it is used again, and the result is the same to the bit
     returns         a Capture of kind "photographs"; photographs that failed are in `rejected`, with the reason
@@ -56,7 +56,7 @@ def find_cameras(
     """
     masks = masks or {}
     work.mkdir(parents=True, exist_ok=True)
-    images, unreadable = matching.prepare(
+    images, unreadable = matches.prepare(
         folder, names, max_side=max_side, features=features, seed=seed, masks=masks, work=work, progress=progress, safe_point=safe_point, warn=warn
     )
     if len(images) < FEWEST:
@@ -64,26 +64,26 @@ def find_cameras(
             f"{folder}: {len(images)} readable photographs; at least {FEWEST} are needed, and 20 or more all round a subject are better."
             + (f" Unreadable: {_listed([name for name, _ in unreadable])}." if unreadable else "")
         )
-    if matching_pairs == "auto":
-        matching_pairs = "exhaustive" if len(images) <= EXHAUSTIVE_UP_TO else "sequential"
-    matching.open_database(work, images)
-    matching.extract(work, images, features=features, progress=progress, safe_point=safe_point)
-    matching.match(work, images, how=matching_pairs, seed=seed, progress=progress, safe_point=safe_point)
+    if matching == "auto":
+        matching = "exhaustive" if len(images) <= EXHAUSTIVE_UP_TO else "sequential"
+    matches.open_database(work, images)
+    matches.extract(work, images, features=features, progress=progress, safe_point=safe_point)
+    matches.match(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
     models = _map(work, len(images), seed, STRICT, progress, safe_point)
     if _registered(models) < max(FEWEST, len(images) / 2):
         models = max((models, _map(work, len(images), seed, RELAXED, progress, safe_point)), key=_registered)
     rejected = [*unreadable, *_left_out(work, images, models)]
     if _registered(models) < max(FEWEST, len(images) / 2):
-        raise BadInput(_failure(folder, images, models, rejected, matching_pairs))
+        raise BadInput(_failure(folder, images, models, rejected, matching))
     capture = _capture(folder, work, images, models[0], masks, rejected)
     for sentence in capture.warnings:
         warn(sentence)
     return capture
 
 
-def _map(work: Path, count: int, seed: int, demands: Mapping[str, float], progress: matching.Progress, safe_point: matching.SafePoint) -> list[Any]:
+def _map(work: Path, count: int, seed: int, demands: Mapping[str, float], progress: matches.Progress, safe_point: matches.SafePoint) -> list[Any]:
     """Every model that the mapper finds, the one with most photographs (then points) first; on one thread, as two are not repeatable."""
-    with matching.quiet_pycolmap() as pycolmap:
+    with matches.quiet_pycolmap() as pycolmap:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = options.mapper.num_threads = 1
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -103,7 +103,7 @@ def _map(work: Path, count: int, seed: int, demands: Mapping[str, float], progre
         pycolmap.set_random_seed(seed)
         safe_point()
         models = pycolmap.incremental_mapping(
-            matching.database_path(work), work / "images", output, options, initial_image_pair_callback=registered, next_image_callback=registered
+            matches.database_path(work), work / "images", output, options, initial_image_pair_callback=registered, next_image_callback=registered
         )
         shutil.rmtree(output)
     safe_point()
@@ -124,11 +124,11 @@ def _left_out(work: Path, images: Sequence[WorkImage], models: Sequence[Any]) ->
     missing = [image for image in images if not held or image.file not in held[0]]
     if not missing:
         return []
-    with matching.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matching.database_path(work)) as database:
+    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
         features = {image.file: database.num_keypoints_for_image(ids[image.file]) for image in missing}
         best: dict[int, int] = {}
-        for pair in matching.verified_pairs(matching.database_path(work)):
+        for pair in matches.verified_pairs(matches.database_path(work)):
             inliers = len(database.read_two_view_geometry(*pair).inlier_matches)
             for image_id in pair:
                 best[image_id] = max(best.get(image_id, 0), inliers)
@@ -237,11 +237,11 @@ def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: floa
     cameras  by COLMAP's image id, at working size
     """
     agreeing = total = 0
-    with matching.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matching.database_path(work)) as database:
+    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
         directions = {
             image_id: rays(camera, np.asarray(database.read_keypoints(image_id), np.float64)[:, :2])[1] for image_id, camera in cameras.items()
         }  # (N, 3) each
-        for first, second in matching.verified_pairs(matching.database_path(work)):
+        for first, second in matches.verified_pairs(matches.database_path(work)):
             if first not in cameras or second not in cameras:
                 continue
             inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)

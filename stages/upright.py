@@ -83,6 +83,19 @@ def upright_photo(path: Path, max_side: int) -> UprightPhoto:
     return UprightPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *full), maker)
 
 
+def alpha_channel(path: Path) -> np.ndarray | None:
+    """(H, W) uint8, upright, of an image file at full size; None if it has none. Raises UnreadableImage."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
+                return None
+            return _upright(np.asarray(image.convert("RGBA"))[..., 3], image.getexif().get(_ORIENTATION, 1))
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        raise UnreadableImage(f"{path.name} cannot be read") from error
+
+
 def mask_of(path: Path, photo: UprightPhoto) -> np.ndarray:
     """(h, w) bool at the photograph's working size, True where the mask is not black; raises UnreadableImage."""
     from PIL import Image

@@ -1,0 +1,185 @@
+"""The box of interest of a capture: round its sparse points, its silhouettes, or the volume that its cameras see together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from efficientnerf.cameras import Camera, Similarity, project, resized
+from stages.capture import Capture, Photo, SparsePoints
+
+FEWEST_POINTS = 50  # sparse points that make a box
+IN_VIEW = 0.75  # of the best seen points' share of cameras: what fewer than this see is surroundings
+MOST_CAMERAS = 64  # that are asked; more, spread evenly over the capture, would change nothing
+SILHOUETTE = 160  # px, longest side at which alpha is read
+GRID = 48  # voxels to a side of the region searched
+
+
+def box_of_interest(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool) -> tuple[np.ndarray, np.ndarray, str]:
+    """Corners of an axis-aligned box in the turned frame, and a word on how it was found.
+
+    turned      the rotation from the capture's frame to one with z up
+    focus       what the cameras look at, in the turned frame
+    converging  whether their axes meet there
+    """
+    photos = [photo for photo in capture.photos if photo.split in (None, "train")] or list(capture.photos)
+    photos = photos[:: -(-len(photos) // MOST_CAMERAS)]
+    cameras = [turned.camera(photo.camera) for photo in photos]
+    if capture.points is not None and len(capture.points.xyz) >= FEWEST_POINTS:
+        found = box_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, focus, converging)
+        if found is not None:
+            return *found, "sparse points"
+    ranges = [(photo.near, photo.far) for photo in photos]
+    low, high = box_seen_together(cameras, ranges, focus, converging)
+    if capture.background is not None:
+        hull = box_of_silhouettes(photos, cameras, low, high)
+        if hull is not None:
+            return *hull, "silhouettes"
+    return low, high, "volume seen together"
+
+
+def box_of_points(points: SparsePoints, cameras: Sequence[Camera], focus: np.ndarray, converging: bool) -> tuple[np.ndarray, np.ndarray] | None:
+    """A box round the points that most cameras have in view; None if too few remain.
+
+    What lies behind a subject is seen from one side only, and what is seen by few is not what the photographs are of. Where the cameras look the
+    same way they all see the background: there, depth is limited instead, as far as the parallax still carries.
+    """
+    share = in_view(points.xyz, cameras).mean(0)
+    keep = share >= IN_VIEW * np.quantile(share, 0.95)
+    count = np.array([len(observers) for observers in points.observers]) if points.observers else np.full(len(points.xyz), 3)
+    keep &= count >= min(3, int(np.quantile(count, 0.9)))
+    if np.isfinite(points.error).any():
+        keep &= ~(points.error > 3 * np.nanmedian(points.error))
+    depth = np.median([project(camera, points.xyz)[1] for camera in cameras], axis=0)
+    keep &= depth > 0
+    if keep.sum() < FEWEST_POINTS:
+        return None
+    if not converging:
+        keep &= depth < 2.5 * np.median(depth[keep])
+    kept = points.xyz[keep]
+    kept = kept[~isolated(kept)]
+    if len(kept) < FEWEST_POINTS:
+        return None
+    return np.quantile(kept, 0.002, axis=0), np.quantile(kept, 0.998, axis=0)
+
+
+def isolated(xyz: np.ndarray, *, neighbours: int = 5, factor: float = 4.0) -> np.ndarray:
+    """(N,) bool: points much farther from their neighbours than points usually are."""
+    from scipy.spatial import cKDTree
+
+    count = min(neighbours, len(xyz) - 1)
+    if count < 1:
+        return np.zeros(len(xyz), bool)
+    distance = cKDTree(xyz).query(xyz, k=count + 1)[0][:, -1]
+    return np.asarray(distance > factor * np.median(distance))
+
+
+def in_view(xyz: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """(C, N) bool: which cameras have which points inside their picture."""
+    rows = []
+    for camera in cameras:
+        pixels, depth = project(camera, xyz)
+        with np.errstate(invalid="ignore"):
+            inside = (pixels >= 0).all(1) & (pixels[:, 0] <= camera.width) & (pixels[:, 1] <= camera.height)
+        rows.append(inside & (depth > 0))
+    return np.array(rows).reshape(len(cameras), len(xyz))
+
+
+def box_seen_together(
+    cameras: Sequence[Camera], ranges: Sequence[tuple[float | None, float | None]], focus: np.ndarray, converging: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """A box round the volume that nine tenths of the cameras (or as many as agree anywhere) have in view.
+
+    ranges  near and far of each camera where the source states them: nothing nearer or farther counts. Far surroundings would fill the
+            box; it ends where four fifths of the range in 1 / depth, that is of the parallax, are inside.
+    """
+    centres = np.array([camera.centre for camera in cameras])
+    reach = float(np.linalg.norm(focus - centres, axis=1).max())
+    limits = [_depth_limits(near, far) for near, far in ranges]
+    deepest = max((far for _, far in limits if np.isfinite(far)), default=0.0)
+    reach = max(reach, deepest) if not converging else reach
+    low, high = focus - reach, focus + reach
+    for _ in range(2):  # the second pass looks closely at what the first one found
+        xyz, step = grid(low, high)
+        seen = in_view(xyz, cameras)
+        for row, camera, (near, far) in zip(seen, cameras, limits, strict=True):
+            depth = (xyz - camera.centre) @ camera.forward
+            row &= (depth >= near) & (depth <= far)
+        share = seen.mean(0)
+        kept = xyz[share >= min(0.9, 0.9 * float(share.max()))]
+        if not len(kept) or share.max() == 0:
+            break
+        low, high = kept.min(0) - step / 2, kept.max(0) + step / 2
+    return low, high
+
+
+def _depth_limits(near: float | None, far: float | None) -> tuple[float, float]:
+    if near and far and far > near > 0:
+        return near, 1.0 / (1.0 / far + 0.2 * (1.0 / near - 1.0 / far))
+    return 0.0, np.inf
+
+
+def box_of_silhouettes(photos: Sequence[Photo], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """A box round the visual hull: what no photograph shows as transparent; None where there is no alpha.
+
+    A voxel is left out where its whole projection is transparent in more than a few photographs (one in fifty may have a damaged alpha
+    channel), so that thin parts stay.
+    """
+    masks = [(camera, alpha_of(photo)) for camera, photo in zip(cameras, photos, strict=True)]
+    views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in masks if mask is not None]
+    if len(views) < 3:
+        return None
+    for _ in range(2):
+        xyz, step = grid(low, high)
+        against = np.zeros(len(xyz), int)
+        for camera, mask in views:
+            against += _transparent(camera, mask, xyz, float(np.linalg.norm(step)) / 2)
+        kept = xyz[against <= len(views) // 50]
+        if not len(kept):
+            return None
+        low, high = kept.min(0) - step / 2, kept.max(0) + step / 2
+    return low, high
+
+
+def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: float) -> np.ndarray:
+    """(N,) bool: balls of this radius whose image, as far as it lies in the picture, has no opaque pixel; balls out of the picture are not."""
+    import cv2
+
+    pixels, depth = project(camera, xyz)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        reach = np.ceil(radius * camera.intrinsics["fx"] / depth) + 1  # px
+        column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
+        inside = (depth > radius) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    # Distance to the nearest opaque pixel, once per picture, answers for every ball.
+    away = cv2.distanceTransform(np.where(mask, np.uint8(0), np.uint8(1)), cv2.DIST_C, 3) if mask.any() else np.full(mask.shape, np.inf)
+    out = np.zeros(len(xyz), bool)
+    out[inside] = away[row[inside].astype(int), column[inside].astype(int)] > reach[inside]
+    return out
+
+
+def alpha_of(photo: Photo) -> np.ndarray | None:
+    """(h, w) bool, upright, longest side at most SILHOUETTE: whether any pixel below is not wholly transparent; None without an alpha channel
+    or where nothing is transparent."""
+    from stages.upright import UnreadableImage, alpha_channel
+
+    try:
+        alpha = alpha_channel(photo.image)
+    except UnreadableImage:
+        return None
+    if alpha is None or not (alpha == 0).any():
+        return None
+    factor = -(-max(alpha.shape) // SILHOUETTE)
+    height, width = -(-alpha.shape[0] // factor) * factor, -(-alpha.shape[1] // factor) * factor
+    if (height, width) != alpha.shape and factor > 1:
+        # Whole blocks only: the last ones are filled up with transparent pixels, which moves nothing by more than a pixel.
+        alpha = np.pad(alpha, ((0, height - alpha.shape[0]), (0, width - alpha.shape[1])))
+    return np.asarray(alpha.reshape(height // factor, factor, width // factor, factor).max((1, 3)) > 0)
+
+
+def grid(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(GRID^3, 3) voxel centres of a box and the (3,) sides of a voxel."""
+    step = (high - low) / GRID
+    axes = [low[d] + (np.arange(GRID) + 0.5) * step[d] for d in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), step
