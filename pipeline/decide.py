@@ -133,7 +133,7 @@ def _cut_short(stage: Stage, run: Run, request: Request | None) -> tuple[str, st
 
 def _request(stage: Stage, run: Run, recorded: Manifest | None, hashes: Hashes) -> tuple[Request | None, PipelineError | None, str | None]:
     """(what the stage would be run with, or None; then what stands in the way; a note)."""
-    settings = settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name)
+    settings: Any = settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name)
     inputs = {}
     for need in stage.needs:
         try:
@@ -161,14 +161,14 @@ def _source(stage: Stage, run: Run, settings: Any, former: dict[str, str] | None
             return former, f"{what}; {stage.name} stands as it was made"
         raise BadInput(f"{stage.name} needs the source: {what}. Name it: {run.command().replace('enerf run', 'enerf run SOURCE')}")
     base = source if source.is_dir() else source.parent
-    digests = {}
+    prefix, digests = f"source of {stage.name}:", {}
     try:
         for path in _source_files(stage, source, settings):
             name = Path(os.path.relpath(path, base)).as_posix()
-            digests[name] = hashes.digest(f"source:{name}", path) if path.is_file() else ABSENT
+            digests[name] = hashes.digest(f"{prefix}{name}", path) if path.is_file() else ABSENT
     except (OSError, ValueError) as error:
         raise BadInput(f"{source}: cannot be read ({error})") from error
-    hashes.forget("source:", {f"source:{name}" for name in digests})
+    hashes.forget(prefix, {prefix + name for name in digests})
     return dict(sorted(digests.items())), None
 
 
@@ -221,8 +221,8 @@ def _source_changes(old: dict[str, str], new: dict[str, str]) -> str:
     """ "3 source files (1 changed: a.jpg; 1 new: b.jpg; 1 gone: c.jpg)"."""
     kinds = {
         "changed": [name for name in sorted(old.keys() & new.keys()) if old[name] != new[name]],
-        "new": [name for name in sorted(new.keys() - old.keys())],
-        "gone": [name for name in sorted(old.keys() - new.keys())],
+        "new": sorted(new.keys() - old.keys()),
+        "gone": sorted(old.keys() - new.keys()),
     }
     count = sum(map(len, kinds.values()))
     parts = [f"{len(names)} {kind}: {artifact.listed(names)}" for kind, names in kinds.items() if names]

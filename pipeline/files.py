@@ -5,6 +5,7 @@ What must survive a kill or a power cut goes through these functions and no othe
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -130,7 +131,8 @@ def walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
         for entry in found:
             if entry.is_dir(follow_symlinks=False):
                 pending.append((f"{prefix}{entry.name}/", Path(entry.path)))
-            else:
+                continue
+            with contextlib.suppress(FileNotFoundError):  # a reader takes no lock: a file may vanish under its eyes
                 yield prefix + entry.name, os.stat(entry.path, follow_symlinks=False)
 
 

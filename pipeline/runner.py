@@ -1,0 +1,329 @@
+"""Executes what decide says, and checks what a run holds."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import shlex
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from pipeline import artifact
+from pipeline.artifact import Workplace
+from pipeline.decide import Decision, decide, survey
+from pipeline.errors import BadInput, CorruptArtifact, Interrupted, UsageError
+from pipeline.executors import local
+from pipeline.executors.local import Usage
+from pipeline.failures import interruption_in, translated
+from pipeline.hashes import Hashes
+from pipeline.interrupt import Stop, stopping
+from pipeline.manifest import Manifest, Request, read_manifest
+from pipeline.run import Run, disk_full, is_disk_full
+from pipeline.stage import Job, Report, Stage, settings_from
+
+Executor = Callable[[Stage, Job], Usage]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one stage.
+
+    action   "ran", "skipped" (it was fresh), "would run" or, of a dry run, "may run" (if those before it give something new)
+    reason   why it ran; None if it was fresh
+    seconds  that it took, also when it was fresh
+    size     bytes of its artifact
+    digest   of its artifact
+    """
+
+    stage: str
+    action: str
+    reason: str | None = None
+    seconds: float = 0.0
+    size: int = 0
+    digest: str | None = None
+
+
+def run_stages(
+    run: Run,
+    stages: Sequence[Stage],
+    *,
+    until: str | None = None,
+    start: str | None = None,
+    only: str | None = None,
+    force: bool = False,
+    device: str = "cpu",
+    report: Report | None = None,
+    dry_run: bool = False,
+    execute: Executor = local.execute,
+) -> list[Outcome]:
+    """Bring a run up to date; returns an outcome for each stage looked at, in order.
+
+    stages   the workflow: each after those that it needs
+    until    the last stage to look at, in the order of the list
+    start    run this stage and those after it even if they are fresh; those before it if they are not
+    only     look at this stage alone, with what the run has of those before it; says so if they are not fresh
+    force    run whatever is looked at, even if it is fresh
+    device   handed to the stages
+    report   takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
+    dry_run  say what would be done, and do nothing
+
+    Raises what errors.py draws. What was published before stays; what was cut short goes on with the next call.
+    """
+    chosen, forced = _selection(stages, until=until, start=start, only=only, force=force)
+    if dry_run:
+        if only is not None:
+            _warn_of_stale_needs(run, stages, only, report, Hashes(run.cache))
+        return _plan(run, chosen, forced, report)
+    with run.locked(), stopping() as stop:
+        return _Runner(run, device, report, stop, execute).all(stages, chosen, forced, only)
+
+
+class _Runner:
+    """One call of run_stages."""
+
+    def __init__(self, run: Run, device: str, report: Report | None, stop: Stop, execute: Executor) -> None:
+        self.run = run
+        self.work = run.path / artifact.WORK
+        self.device = device
+        self.stop = stop
+        self.execute = execute
+        self._report = report
+        self.hashes = Hashes(run.cache, safe_point=self.safe_point)
+
+    def all(self, stages: Sequence[Stage], chosen: Sequence[Stage], forced: frozenset[str], only: str | None) -> list[Outcome]:
+        outcomes: list[Outcome] = []
+        current = ""
+        try:
+            for text in artifact.recover(self.run.path):
+                self.emit("message", text.partition(":")[0], text=text)
+            if only is not None:
+                _warn_of_stale_needs(self.run, stages, only, self._report, self.hashes)
+            for stage in chosen:
+                current = stage.name
+                self.safe_point()
+                outcomes.append(self.one(stage, forced=stage.name in forced))
+        except (Interrupted, KeyboardInterrupt) as error:
+            raise self._interrupted(error, current, only) from error
+        except OSError as error:  # outside of a stage: while looking, or while putting right
+            if is_disk_full(error):
+                raise disk_full(self.run.path, str(self.run.path)) from error
+            raise
+        finally:
+            self.hashes.save()
+        return outcomes
+
+    def one(self, stage: Stage, *, forced: bool) -> Outcome:
+        """Look at one stage, and run it if it has to."""
+        decision = decide(stage, self.run, self.hashes)
+        if decision.note:
+            self.emit("warning" if not decision.fresh else "message", stage.name, text=decision.note)
+        if decision.fresh and not forced and decision.manifest is not None:
+            self.emit("stage_skipped", stage.name, reason="up to date", digest=decision.manifest.digest)
+            return _outcome(stage, "skipped", None, decision.manifest)
+        reason = decision.reason or "forced"
+        request = self._runnable(stage, decision, reason)
+        place = artifact.workplace(self.run.path, stage.name, request)
+        started = time.monotonic()
+        try:
+            made = artifact.finished(place)
+            if made is None:
+                made = self._make(stage, request, place, reason)
+            else:
+                self.emit("message", stage.name, text=f"{stage.name} was done before; only its publication had been cut short")
+            artifact.publish(self.run.path, stage.name, place)
+        except (Exception, KeyboardInterrupt) as error:
+            self._failed(stage, place, error)
+        self.hashes.forget(f"{stage.name}/", {f"{stage.name}/{name}" for name in made.outputs})
+        facts = {"seconds": time.monotonic() - started, "size": made.size, "digest": made.digest, "files": len(made.outputs), "peak_memory": made.peak_memory}
+        self.emit("stage_done", stage.name, reason=reason, **facts)
+        return _outcome(stage, "ran", reason, made)
+
+    def _make(self, stage: Stage, request: Request, place: Workplace, reason: str) -> Manifest:
+        """Run the stage and seal what it left."""
+        resumed = artifact.prepare(place, self.work)
+        self.emit("stage_started", stage.name, reason=reason, resumed=resumed)
+        job = Job(
+            settings=settings_from(stage.settings, self.run.settings.get(stage.name, {}), where=stage.name),
+            inputs={need: self.run.folder(need) for need in stage.needs},
+            source=self.run.source if stage.reads_source else None,
+            out=place.out,
+            work=place.scratch,
+            device=self.device,
+            stage=stage.name,
+            report=self._report,
+            stop=self.stop,
+        )
+        usage = self.execute(stage, job)
+        outputs = artifact.outputs_of(place.out, stage, self.hashes)
+        made = Manifest(request, outputs, usage.seconds, usage.peak_memory, resumed)
+        artifact.seal(place.out, made)
+        return made
+
+    def _runnable(self, stage: Stage, decision: Decision, reason: str) -> Request:
+        """The request to run; raises what stands in the way."""
+        until = f"{self.run.command()} --until {stage.name}"
+        if decision.request is None:
+            obstacle = decision.obstacle
+            if isinstance(obstacle, CorruptArtifact):
+                raise CorruptArtifact(f"{obstacle} Make it anew: {until}", obstacle.files) from obstacle
+            if isinstance(obstacle, BadInput) and any(not self.run.folder(need).exists() for need in stage.needs):
+                raise BadInput(f"{obstacle} Make it first: {until}") from obstacle
+            raise obstacle or BadInput(f"{stage.name}: cannot be run")
+        if decision.note is not None:
+            raise BadInput(f"{stage.name} has to run ({reason}), but {decision.note.partition(';')[0]}. Put the source back, or undo the change.")
+        for need in stage.needs:
+            made = read_manifest(self.run.folder(need))
+            found = artifact.differences(self.run.folder(need), made.outputs, self.hashes)
+            if found.damaged:
+                names = tuple(f"{need}/{name}" for name in found.damaged)
+                raise CorruptArtifact(f"{stage.name} needs {need}, which is corrupt: {found.text()}. Make it anew: {until}", names)
+        return decision.request
+
+    def _failed(self, stage: Stage, place: Workplace, error: BaseException) -> NoReturn:
+        """Clear up after a stage that raised, and raise what the user is to see."""
+        failure = interruption_in(error, self.stop()) or translated(error, stage.name, self.run.path)
+        with contextlib.suppress(OSError):  # else the next start clears up; the error that brought us here is the one to tell
+            artifact.abandon(place, self.work)
+        if isinstance(failure, Interrupted):
+            raise failure from error
+        self.emit("stage_failed", stage.name, text=str(failure), exit_code=failure.exit_code)
+        if failure is error:
+            raise error
+        raise failure from error
+
+    def _interrupted(self, error: BaseException, stage: str, only: str | None) -> Interrupted:
+        number = error.number if isinstance(error, Interrupted) else signal.SIGINT
+        go_on = self.run.command() if only is None else f"enerf stage {only} {shlex.quote(str(self.run.path))}"
+        during = f" in {stage}" if stage else ""
+        told = Interrupted(number, f"interrupted by {signal.Signals(number).name}{during}; what is done is kept. Go on with: {go_on}")
+        self.emit("interrupted", stage, text=str(told), resume=go_on, exit_code=told.exit_code)
+        return told
+
+    def safe_point(self) -> None:
+        number = self.stop()
+        if number is not None:
+            raise Interrupted(number)
+
+    def emit(self, event: str, stage: str, **facts: Any) -> None:
+        _emit(self._report, event, stage, **facts)
+
+
+def verify(run: Run, stages: Sequence[Stage], report: Report | None = None) -> list[Outcome]:
+    """Read every file of every artifact and compare it with its manifest; returns an outcome with action "verified" for each artifact.
+
+    Takes no lock and writes nothing. A file too many is a warning. Raises CorruptArtifact that lists what is damaged, after all was read.
+    """
+    damaged: list[str] = []
+    outcomes = []
+    for stage in stages:
+        folder = run.folder(stage.name)
+        if not folder.exists():
+            continue
+        try:
+            made = read_manifest(folder)
+        except CorruptArtifact as error:
+            damaged.extend(error.files or (stage.name,))
+            _emit(report, "warning", stage.name, text=str(error), state="corrupt")
+            continue
+        found = artifact.differences(folder, made.outputs)
+        if found.extra:
+            text = f"{stage.name}: {artifact.listed(found.extra)} not written by it"
+            _emit(report, "warning", stage.name, text=text, extra=list(found.extra))
+        if found.damaged:
+            damaged.extend(f"{stage.name}/{name}" for name in found.damaged)
+            facts = {"altered": list(found.altered), "missing": list(found.missing)}
+            _emit(report, "warning", stage.name, text=f"{stage.name}: {found.text()}", state="corrupt", **facts)
+            continue
+        _emit(report, "message", stage.name, text=f"{stage.name}: {len(made.outputs)} files as they were written", size=made.size)
+        outcomes.append(_outcome(stage, "verified", None, made))
+    if damaged:
+        files = artifact.listed(damaged)
+        raise CorruptArtifact(f"{run.path}: {files} not as written. Make anew what is damaged: {run.command()}", tuple(damaged))
+    return outcomes
+
+
+def _outcome(stage: Stage, action: str, reason: str | None, made: Manifest) -> Outcome:
+    return Outcome(stage.name, action, reason, made.seconds, made.size, made.digest)
+
+
+def _emit(report: Report | None, event: str, stage: str, **facts: Any) -> None:
+    if report is not None:
+        report({**facts, "event": event, "stage": stage, "time": time.time()})
+
+
+def _selection(
+    stages: Sequence[Stage], *, until: str | None, start: str | None, only: str | None, force: bool
+) -> tuple[list[Stage], frozenset[str]]:
+    """(the stages to look at, the names of those to run even if fresh)."""
+    names = _checked_names(stages)
+    for name in (until, start, only):
+        if name is not None and name not in names:
+            near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+            raise UsageError(f"{name}: no such stage. " + (f"Did you mean {near[0]}?" if near else f"There are: {', '.join(names)}."))
+    if only is not None:
+        if until is not None or start is not None:
+            raise UsageError("a single stage goes together with neither a first nor a last one")
+        chosen = [stages[names.index(only)]]
+        return chosen, frozenset([only] if force else [])
+    last = len(names) - 1 if until is None else names.index(until)
+    first = last + 1 if start is None else names.index(start)
+    if start is not None and first > last:
+        raise UsageError(f"nothing to do from {start} until {until}: {until} comes first")
+    chosen = list(stages[: last + 1])
+    return chosen, frozenset(names[: last + 1] if force else names[first : last + 1])
+
+
+def _checked_names(stages: Sequence[Stage]) -> list[str]:
+    names: list[str] = []
+    for stage in stages:
+        missing = [need for need in stage.needs if need not in names]
+        if missing:
+            raise ValueError(f"stage {stage.name} stands before {missing[0]}, which it needs")
+        if stage.name in names:
+            raise ValueError(f"two stages are named {stage.name}")
+        names.append(stage.name)
+    return names
+
+
+def _ancestors(stages: Sequence[Stage], name: str) -> set[str]:
+    needs = {stage.name: stage.needs for stage in stages}
+    found: set[str] = set()
+    pending = list(needs[name])
+    while pending:
+        need = pending.pop()
+        if need not in found:
+            found.add(need)
+            pending.extend(needs[need])
+    return found
+
+
+def _warn_of_stale_needs(run: Run, stages: Sequence[Stage], only: str, report: Report | None, hashes: Hashes) -> None:
+    """Name each stage before a single one that is not up to date."""
+    before = _ancestors(stages, only)
+    for decision in survey([stage for stage in stages if stage.name in before], run, hashes=hashes):
+        if not decision.fresh:
+            text = f"{decision.stage} is {decision.state} ({decision.reason}); {only} uses what the run has. To bring all up to date: {run.command()}"
+            _emit(report, "warning", only, text=text, about=decision.stage, state=decision.state, reason=decision.reason)
+
+
+def _plan(run: Run, chosen: Sequence[Stage], forced: frozenset[str], report: Report | None) -> list[Outcome]:
+    """A dry run."""
+    outcomes = []
+    for decision in survey(chosen, run, forced=forced):
+        action = "skipped" if decision.fresh else "may run" if _only_follows(decision) else "would run"
+        text = f"{decision.stage}: up to date" if decision.fresh else f"{decision.stage}: {action} ({decision.reason})"
+        _emit(report, "message", decision.stage, text=text, action=action, reason=decision.reason, state=decision.state)
+        made = decision.manifest
+        facts = (made.seconds, made.size, made.digest) if made is not None else ()
+        outcomes.append(Outcome(decision.stage, action, decision.reason, *facts))
+    return outcomes
+
+
+def _only_follows(decision: Decision) -> bool:
+    """Whether it is stale for no other reason than that a stage before it has to run."""
+    made, request = decision.manifest, decision.request
+    return decision.state == "stale" and decision.reason != "forced" and made is not None and request is not None and made.request == request
+
