@@ -165,6 +165,66 @@ def _folded(faces: np.ndarray, count: int) -> np.ndarray:
     return folded
 
 
+def separate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Give sheets that touch in an edge vertices of their own, so that each edge has two faces; the surface must be closed.
+
+    Around a vertex, the opposite sides of its faces form directed circuits, as many in as out of each neighbour. A circuit that passes a
+    neighbour twice is cut there into simple ones, and each gets a copy of the vertex, drawn a hundredth of the way to its own neighbours:
+    readers that join equal positions would sew the sheets together again. Collapsing edges leaves such places where a surface is thin.
+    """
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    pairs, uses = np.unique(edges, axis=0, return_counts=True)
+    crowded = np.unique(pairs[uses > 2])
+    if not len(crowded):
+        return vertices, faces
+    faces, added, moves, count = faces.copy(), [], {}, len(vertices)
+    around: dict[int, list[int]] = {int(vertex): [] for vertex in crowded}
+    touched = np.isin(faces, crowded)
+    for row, column in zip(*np.nonzero(touched)):
+        around[int(faces[row, column])].append(int(row))
+    for vertex, rows in around.items():
+        circuits = _simple_circuits(vertex, rows, faces)
+        for number, circuit in enumerate(circuits if len(circuits) > 1 else []):
+            ring = np.unique(faces[circuit])
+            ring = ring[ring != vertex]
+            places = np.array([vertices[v] if v < len(vertices) else added[v - len(vertices)] for v in ring])
+            moved_to = 0.99 * vertices[vertex] + 0.01 * places.mean(0)
+            if number == 0:
+                moves[vertex] = moved_to
+                continue
+            corner = faces[circuit]
+            faces[circuit] = np.where(corner == vertex, count, corner)
+            added.append(moved_to)
+            count += 1
+    vertices = vertices.copy()
+    for vertex, place in moves.items():
+        vertices[vertex] = place
+    return (np.concatenate([vertices, np.array(added)]) if added else vertices), faces
+
+
+def _simple_circuits(vertex: int, rows: list[int], faces: np.ndarray) -> list[list[int]]:
+    """The faces around a vertex (their rows), grouped into circuits that pass no neighbour twice."""
+    leaving: dict[int, list[tuple[int, int]]] = {}
+    for row in rows:
+        a, b, c = faces[row].tolist()
+        start, end = (b, c) if a == vertex else (c, a) if b == vertex else (a, b)
+        leaving.setdefault(start, []).append((end, row))
+    circuits = []
+    for start in list(leaving):
+        while leaving[start]:
+            nodes, path, at = [start], [], start
+            while leaving[at]:
+                at, row = leaving[at].pop()
+                path.append(row)
+                if at in nodes:
+                    place = nodes.index(at)
+                    circuits.append(path[place:])
+                    nodes, path = nodes[: place + 1], path[:place]
+                else:
+                    nodes.append(at)
+    return circuits
+
+
 def smooth(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
     """(V, 3) vertices after `rounds` of Taubin's smoothing: a step towards the mean of the neighbours, then a slightly longer one back.
 

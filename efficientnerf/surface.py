@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .mesh import Mesh, PointCloud, compact, decimate, face_areas, face_components, face_volumes, sample, smooth, tidy, vertex_normals
+from .mesh import Mesh, PointCloud, compact, decimate, face_areas, face_components, face_volumes, sample, separate, smooth, tidy, vertex_normals
 
 Progress = Callable[[int, int, str], None]
 BLOCK = 64  # voxels a side that are in memory at a time
@@ -251,7 +251,7 @@ def surface(
     """
     vertices, triangles, facts = _shape(tree, threshold, min_component, rounds, progress)
     facts["faces_before_decimation"] = len(triangles)
-    vertices, triangles = tidy(*decimate(vertices, triangles, faces))
+    vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     normals = vertex_normals(vertices, triangles)
     return Mesh(vertices, triangles, normals, surface_colours(tree, vertices, normals, progress), facts)
 

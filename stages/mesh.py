@@ -104,7 +104,8 @@ def run(job: Job) -> None:
     (job.out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     if not report["watertight"]:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['crowded_edges']} crowded edges")
-    job.say(f"{report['faces']} faces in {report['components']} pieces", faces=report["faces"], components=report["components"], watertight=report["watertight"])
+    facts = {name: report[name] for name in ("faces", "components", "watertight")}
+    job.say(f"{report['faces']} faces in {report['components']} pieces", **facts)
 
 
 STAGE = Stage(name="mesh", version=1, settings=MeshSettings, needs=("bake",), run=run)

@@ -48,9 +48,11 @@ def _axes(heading: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.
 
 def _front_samples(x: np.ndarray, y: np.ndarray, height: np.ndarray, size: int) -> np.ndarray:
     """(size, size) which sample, of those with x and y in -1..1, is nearest to the viewer in each pixel; -1 where there is none."""
-    column = np.clip((x * 0.97 + 1) / 2 * size, 0, size - 1).astype(np.int64)
-    row = np.clip((1 - y * 0.97) / 2 * size, 0, size - 1).astype(np.int64)
     order = np.argsort(height, kind="stable")
-    front = np.full(size * size, -1)
-    np.maximum.at(front, (row * size + column)[order], np.arange(len(order)))
-    return np.where(front >= 0, order[front], -1).reshape(size, size)
+    column = ((x * 0.97 + 1) / 2 * (size - 1)).astype(np.int64)[order]
+    row = ((1 - y * 0.97) / 2 * (size - 1)).astype(np.int64)[order]
+    front = np.full((size, size), -1)
+    # Each sample covers two by two pixels: what lies behind must not shine through where samples happen to be sparse.
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        np.maximum.at(front, (row + i, column + j), np.arange(len(order)))
+    return np.where(front >= 0, order[front], -1)
