@@ -15,6 +15,7 @@ import numpy as np
 from .mesh import Mesh, PointCloud, compact, decimate, face_areas, face_components, face_volumes, sample, separate, smooth, tidy, vertex_normals
 
 Progress = Callable[[int, int, str], None]
+POOL = 2  # voxels along a side of the cells in which enclosed space is looked for
 BLOCK = 64  # voxels a side that are in memory at a time
 _CHUNK = 1 << 16  # points whose colours are looked up at a time
 
@@ -76,11 +77,63 @@ def _met_on_the_way(sigma: np.ndarray, voxel: float) -> np.ndarray:
     return np.maximum.accumulate(sigma[opaque], 1)[np.arange(len(half)), half]
 
 
-def isosurface(tree: Any, threshold: float, progress: Progress = _silent, block: int = BLOCK) -> tuple[np.ndarray, np.ndarray]:
+def enclosed_cells(tree: Any, threshold: float, viewpoints: np.ndarray) -> np.ndarray:
+    """Empty space that nobody outside can see, because everything around it is dense: bool, one value per cell of POOL^3 voxels.
+
+    viewpoints  (N, 3) places that are outside by definition, besides the boundary of the volume: a camera may stand in a closed room
+
+    A cell counts as dense if one of its voxels is, so that light does not creep in through pinholes of the size of a voxel.
+    """
+    from scipy.ndimage import label
+
+    grid = _grid(tree)
+    cells = -(-grid // POOL)
+    dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
+    step = POOL * 16
+    for start in range(0, int(grid[0]), step):
+        sigma = np.asarray(tree.density_block((start, 0, 0), (start + step, *(cells[1:] * POOL).tolist())))
+        pooled = (sigma >= threshold).reshape(step // POOL, POOL, cells[1], POOL, cells[2], POOL).any((1, 3, 5))
+        first = start // POOL
+        last = min(first + len(pooled), int(cells[0]))
+        dense[1 + first : 1 + last, 1:-1, 1:-1] = pooled[: last - first]
+    region, _ = label(~dense)
+    outside = {int(region[0, 0, 0])}
+    at = np.floor((viewpoints - np.asarray(tree.bounds_min)) / (float(tree.voxel) * POOL)).astype(np.int64)  # (N, 3)
+    at = at[((at >= 0) & (at < cells)).all(1)] + 1
+    outside |= set(region[tuple(at.T)].tolist())
+    return (~dense & ~np.isin(region, list(outside)))[1:-1, 1:-1, 1:-1]
+
+
+def _filled_block(tree: Any, low: np.ndarray, high: np.ndarray, threshold: float, enclosed: np.ndarray | None) -> np.ndarray:
+    """`tree.density_block` with infinite density in enclosed space.
+
+    What is enclosed grows by a few voxels, as far as nothing dense is in the way: into the corners that its coarse cells left out, and
+    into the pinholes, which it stops up. The margin that is read makes the result the same for both blocks that share a plane.
+    """
+    from scipy.ndimage import binary_dilation
+
+    if enclosed is None:
+        return np.asarray(tree.density_block(low, high))
+    margin = POOL + 1
+    axes = [np.arange(a - margin, b + margin) // POOL for a, b in zip(low, high)]
+    known = [(axis >= 0) & (axis < count) for axis, count in zip(axes, enclosed.shape)]
+    seed = enclosed[np.ix_(*(np.clip(axis, 0, count - 1) for axis, count in zip(axes, enclosed.shape)))]
+    seed &= known[0][:, None, None] & known[1][:, None] & known[2]
+    if not seed.any():
+        return np.asarray(tree.density_block(low, high))
+    sigma = np.asarray(tree.density_block(low - margin, high + margin))
+    filled = binary_dilation(seed, iterations=margin, mask=sigma < threshold)
+    return np.where(filled, np.float32(np.inf), sigma)[margin:-margin, margin:-margin, margin:-margin]
+
+
+def isosurface(
+    tree: Any, threshold: float, progress: Progress = _silent, *, enclosed: np.ndarray | None = None, block: int = BLOCK
+) -> tuple[np.ndarray, np.ndarray]:
     """The closed surface where the density passes `threshold` -> vertices (V, 3) float64, faces (F, 3) int64.
 
     Blocks of `block` voxels share the samples of the plane between them, and so its vertices; those are joined by the grid edge that they
-    lie on, not by their coordinates. Beyond the volume the density is zero, so the surface closes at its boundary.
+    lie on, not by their coordinates. Beyond the volume the density is zero, so the surface closes at its boundary. Cells that are `enclosed`
+    (of `enclosed_cells`) count as solid.
 
     Marching cubes (Lewiner's, by scikit-image) runs on the opacity f = 1 - 2^(-sigma / threshold) at level 1/2 instead of on sigma: densities
     jump from nothing to hundreds within a voxel, and vertices interpolated on them would all sit at the same end of their edges.
@@ -96,7 +149,7 @@ def isosurface(tree: Any, threshold: float, progress: Progress = _silent, block:
             for z in starts[2]:
                 low = np.array([x, y, z])
                 high = np.minimum(low + block, grid)  # the last sample, included
-                opacity = _opacity(np.asarray(tree.density_block(low, high + 1)), low, threshold)
+                opacity = _opacity(_filled_block(tree, low, high + 1, threshold, enclosed), low, threshold)
                 done += 1
                 progress(done, total, "marching cubes")
                 if opacity.min() > 0.5 or opacity.max() < 0.5:
@@ -147,23 +200,28 @@ def _on_seams(local: np.ndarray, low: np.ndarray, high: np.ndarray, grid: np.nda
     return rows, ((corner[:, 0] * (grid[1] + 3) + corner[:, 1]) * (grid[2] + 3) + corner[:, 2]) * 3 + axis
 
 
-def visible_parts(vertices: np.ndarray, faces: np.ndarray, min_component: float) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
+def visible_parts(
+    vertices: np.ndarray, faces: np.ndarray, min_component: float, viewpoints: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
     """The closed mesh without what nobody needs: small pieces, hollows, and what lies in hollows.
 
     min_component   pieces with less than this share of the largest piece's area are removed
     returns         vertices, faces, and how many pieces went for which reason
 
     A piece that encloses a negative volume is the wall of a hollow inside something solid. Its density is real (photographs do not say what
-    is inside a body) but it cannot be seen from anywhere outside, and neither can the pieces in it.
+    is inside a body) but it cannot be seen from anywhere outside, and neither can the pieces in it. All of this is kept where one of the
+    `viewpoints` (N, 3) lies in a hollow: that is a room, seen from inside.
     """
     label = face_components(faces, len(vertices))
     areas, volumes = face_areas(vertices, faces), face_volumes(vertices, faces)
     area, volume = np.bincount(label, areas), np.bincount(label, volumes)
     hollow = volume <= 0
-    if hollow.all():
-        hollow[:] = False
     large = ~hollow & (area >= min_component * area[~hollow].max())
     walls = vertices[faces[hollow[label]]]  # (F, 3, 3)
+    if any(_crossings(viewpoint, walls) % 2 for viewpoint in viewpoints):
+        hollow[:] = False
+        walls = walls[:0]
+        large = area >= min_component * area.max()
     first = np.full(len(area), -1)
     first[label[::-1]] = faces[::-1, 0]
     inside = np.zeros(len(area), bool)
@@ -225,19 +283,32 @@ def _looking_at(normal: np.ndarray) -> list[np.ndarray]:
     return [-normal, *slanted]
 
 
-def _shape(tree: Any, threshold: float | None, min_component: float, rounds: int, progress: Progress) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
+def _shape(
+    tree: Any, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
+) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
     level = automatic_threshold(tree) if threshold is None else float(threshold)
     if not (np.isfinite(level) and level > 0):
         raise NoSurface(f"threshold {level:g}: expected a density above zero")
-    vertices, faces = isosurface(tree, level, progress)
+    enclosed = enclosed_cells(tree, level, viewpoints)
+    vertices, faces = isosurface(tree, level, progress, enclosed=enclosed if enclosed.any() else None)
     if not len(faces):
         raise NoSurface(f"the density nowhere reaches {level:.4g} per unit")
-    vertices, faces, facts = visible_parts(vertices, faces, min_component)
+    vertices, faces, facts = visible_parts(vertices, faces, min_component, viewpoints)
     return smooth(vertices, faces, rounds), faces, {"threshold": level, "threshold_chosen": "automatic" if threshold is None else "given", **facts}
 
 
+_NOBODY = np.zeros((0, 3))
+
+
 def surface(
-    tree: Any, threshold: float | None = None, *, faces: int = 200_000, min_component: float = 0.01, rounds: int = 5, progress: Progress = _silent
+    tree: Any,
+    threshold: float | None = None,
+    *,
+    faces: int = 200_000,
+    min_component: float = 0.01,
+    rounds: int = 5,
+    viewpoints: np.ndarray = _NOBODY,
+    progress: Progress = _silent,
 ) -> Mesh:
     """The tree's surface as a closed, coloured mesh in the training frame.
 
@@ -245,13 +316,15 @@ def surface(
     faces          budget that it is decimated to
     min_component  pieces with less than this share of the largest piece's area are removed
     rounds         of smoothing
+    viewpoints     (N, 3) where somebody may look from who is inside the volume: what can be seen from there is not filled
     progress       called with (done, total, text); what it raises stops the work
 
     Raises NoSurface.
     """
-    vertices, triangles, facts = _shape(tree, threshold, min_component, rounds, progress)
+    vertices, triangles, facts = _shape(tree, threshold, min_component, rounds, viewpoints, progress)
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
+    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints)  # crumbs that had hung on by an edge
     normals = vertex_normals(vertices, triangles)
     return Mesh(vertices, triangles, normals, surface_colours(tree, vertices, normals, progress), facts)
 
@@ -263,6 +336,7 @@ def points(
     *,
     min_component: float = 0.01,
     rounds: int = 5,
+    viewpoints: np.ndarray = _NOBODY,
     seed: int = 0,
     progress: Progress = _silent,
 ) -> PointCloud:
@@ -270,7 +344,7 @@ def points(
 
     The same for the same seed; the other arguments as for `surface`.
     """
-    vertices, triangles, _ = _shape(tree, threshold, min_component, rounds, progress)
+    vertices, triangles, _ = _shape(tree, threshold, min_component, rounds, viewpoints, progress)
     face, weight = sample(vertices, triangles, count, seed)
     corners = triangles[face]  # (N, 3)
     normals = (vertex_normals(vertices, triangles)[corners] * weight[..., None]).sum(1)

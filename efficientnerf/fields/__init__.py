@@ -1,0 +1,24 @@
+"""Fields: position in; density (before its activation) and harmonics out. One contract, one file per field.
+
+    field(points)          (N, 3) grid coordinates -> (N, 1 + 3K)
+    field.density(points)  (N, 3) -> (N,) the density alone, before its activation
+    field.activation       "exp" or "softplus"
+    field.degree           of the harmonics
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+
+class Field(Protocol):
+    activation: str
+    degree: int
+
+    def __call__(self, points: Tensor) -> Tensor: ...
+
+    def density(self, points: Tensor) -> Tensor: ...
+
+    def parameters(self) -> object: ...

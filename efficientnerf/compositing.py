@@ -1,0 +1,81 @@
+"""From densities and colours of samples to the colours of rays: volume rendering (Max 1995), in plain torch.
+
+Samples of all rays lie end to end, those of one ray together and in order of distance ("packed"); `first` says where each ray begins.
+R rays, N samples, K harmonics.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+LARGEST_LOGIT = 15.0
+
+
+def activate(raw: Tensor, activation: str) -> Tensor:
+    """Density, >= 0, from what a field says before its activation ("exp" or "softplus").
+
+    exp is capped at e^15, far beyond opaque. softplus is shifted by one so that an untrained field is thin: with it, and a density that never
+    dies, thin scenes do not collapse to the background as they do with ReLU.
+    """
+    if activation == "exp":
+        return torch.exp(raw.clamp(max=LARGEST_LOGIT))
+    if activation == "softplus":
+        return torch.nn.functional.softplus(raw - 1)
+    raise ValueError(f"activation {activation!r}: expected 'exp' or 'softplus'")
+
+
+def ray_of_sample(first: Tensor, samples: int) -> Tensor:
+    """(N,) which ray each packed sample belongs to; first (R + 1,) offsets."""
+    counts = first[1:] - first[:-1]
+    return torch.repeat_interleave(torch.arange(len(counts), device=first.device), counts, output_size=samples)
+
+
+def sample_weights(depth: Tensor, first: Tensor) -> Tensor:
+    """How much each sample contributes to its ray's colour.
+
+        w_i = T_i (1 - exp(-d_i)),  T_i = exp(-sum_{j<i} d_j)
+
+    depth   (N,)    optical depth of each sample: density times length, >= 0
+    first   (R + 1,) offsets of the rays
+    returns (N,)    the weights of one ray sum to at most 1
+
+    EfficientNeRF, equations 2 and 3.
+    """
+    ray = ray_of_sample(first, len(depth))
+    # Summed in float64: the running sum goes on over all rays, and a ray's own part is a small difference of large numbers.
+    total = torch.cumsum(depth.double(), dim=0)
+    before = torch.cat([total.new_zeros(1), total])[first[:-1]]
+    passed = total - depth.double() - before[ray]
+    return (torch.exp(-passed) * -torch.expm1(-depth.double())).to(depth.dtype)
+
+
+class Composite(NamedTuple):
+    """colour (R, 3) over the background, opacity (R,), weight (N,), sample_colour (N, 3)."""
+
+    colour: Tensor
+    opacity: Tensor
+    weight: Tensor
+    sample_colour: Tensor
+
+
+def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
+    """Colours of rays from what a field says at their samples.
+
+    raw         (N, 1 + 3K) density before its activation, then K coefficients for red, green and blue each
+    length      (N,) extent of each sample
+    first       (R + 1,) int64 offsets
+    harmonics   (R, K) basis at the rays' directions
+    background  (R, 3) what lies behind each ray
+    """
+    ray = ray_of_sample(first, len(raw))
+    k = harmonics.shape[1]
+    weight = sample_weights(activate(raw[:, 0], activation) * length, first)
+    sh = raw[:, 1:].reshape(len(raw), 3, k)
+    rgb = torch.sigmoid((sh * harmonics[ray][:, None]).sum(dim=-1))  # (N, 3)
+    rays = len(first) - 1
+    opacity = raw.new_zeros(rays).index_add(0, ray, weight)
+    colour = raw.new_zeros(rays, 3).index_add(0, ray, weight[:, None] * rgb)
+    return Composite(colour + (1 - opacity)[:, None] * background, opacity, weight, rgb)

@@ -1,0 +1,98 @@
+"""Momentum density voxels: the memory of the density over the scene (EfficientNeRF, section 3.3).
+
+Two readings of the paper, and two rules of update, are named settings, because the paper's own can't be taken literally:
+
+- "momentum" is equation 7 on the raw density, before its activation, with threshold 0. (A momentum average of densities >= 0 that starts at
+  10 never reaches 0, so nothing would ever be pruned.)
+- "maximum" keeps a decayed maximum of the activated density, v <- max(decay v, new), and calls a voxel valid whose density would absorb more
+  than about one percent of the light over an interval. It needs far fewer visits and heals itself.
+
+With both, pruned space can come back: `refresh` asks the field about random cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass
+class DensityVoxels:
+    """values (D, D, D) float32 over grid coordinates; x slowest."""
+
+    values: Tensor
+    rule: str
+    beta: float
+    decay: float
+    threshold: float
+
+    @property
+    def side(self) -> int:
+        return self.values.shape[0]
+
+    @property
+    def occupied(self) -> float:
+        """Share of valid voxels."""
+        return float((self.values > self.threshold).float().mean())
+
+
+def density_voxels(side: int, rule: str, *, initial: float = 10.0, beta: float = 0.1, decay: float = 0.95, threshold: float = 0.0, device: str = "cpu") -> DensityVoxels:
+    """Fresh voxels; all are valid."""
+    if rule not in ("momentum", "maximum"):
+        raise ValueError(f"density voxels updated by {rule!r}: expected 'momentum' or 'maximum'")
+    # A maximum that starts at twice the threshold is forgotten after some fourteen refreshes at the usual decay, and each cell has been asked by then.
+    start = initial if rule == "momentum" else 2 * threshold
+    return DensityVoxels(torch.full((side, side, side), start, device=device), rule, beta, decay, threshold)
+
+
+def cell_of(points: Tensor, side: int) -> Tensor:
+    """Flat index (N,) of the voxel that holds each point in grid coordinates (N, 3)."""
+    cell = (points * side).long().clamp(0, side - 1)
+    return (cell[:, 0] * side + cell[:, 1]) * side + cell[:, 2]
+
+
+def update(voxels: DensityVoxels, cell: Tensor, density: Tensor) -> None:
+    """Tell the voxels the density at some cells, in place.
+
+        momentum   V[i] <- (1 - beta) V[i] + beta mean(density in i)     equation 7; several samples in one voxel make one update
+        maximum    V[i] <- max(V[i], max(density in i))
+
+    cell (N,) flat indices, density (N,): raw for "momentum", activated for "maximum".
+    """
+    flat = voxels.values.view(-1)
+    density = density.to(flat.dtype)
+    if voxels.rule == "maximum":
+        flat.scatter_reduce_(0, cell, density, reduce="amax", include_self=True)
+        return
+    seen, index, counts = torch.unique(cell, return_inverse=True, return_counts=True)
+    mean = torch.zeros(len(seen), dtype=flat.dtype, device=flat.device).index_add_(0, index, density) / counts
+    flat[seen] = (1 - voxels.beta) * flat[seen] + voxels.beta * mean
+
+
+def fade(voxels: DensityVoxels) -> None:
+    """Forget a little, where the rule is "maximum": v <- decay v."""
+    if voxels.rule == "maximum":
+        voxels.values.mul_(voxels.decay)
+
+
+def sweep_cells(voxels: DensityVoxels, part: int, parts: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Every `parts`-th cell from the `part`-th on, and a random point in each: the warm-up asks about every cell this way."""
+    cell = torch.arange(part % parts, voxels.side**3, parts, device=voxels.values.device)
+    return cell, _point_in(cell, voxels.side, generator)
+
+
+def _point_in(cell: Tensor, side: int, generator: torch.Generator) -> Tensor:
+    corner = torch.stack([cell // (side * side), cell // side % side, cell % side], dim=1)
+    return (corner + torch.rand(len(cell), 3, generator=generator).to(cell.device)) / side
+
+
+def refresh_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Cells to ask about anew, half anywhere and half among the valid, and a random point in each: (count,), (count, 3) grid coordinates."""
+    flat = voxels.values.view(-1)
+    anywhere = torch.randint(len(flat), (count - count // 2,), generator=generator).to(flat.device)
+    valid = torch.nonzero(flat > voxels.threshold).squeeze(1)
+    pick = torch.randint(max(len(valid), 1), (count // 2,), generator=generator).to(flat.device)
+    cell = torch.cat([anywhere, valid[pick]]) if len(valid) else anywhere
+    return cell, _point_in(cell, voxels.side, generator)

@@ -1,0 +1,310 @@
+"""The training step's kernels on the CPU (numba, all cores): same results as the torch functions they stand for.
+
+Parallel without races: rays and samples are split into fixed blocks, and a hash table's gradient is summed level by level, each level by one
+thread. So the bytes depend neither on timing nor on the number of threads.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from efficientnerf.compositing import LARGEST_LOGIT
+from efficientnerf.sampling import FARTHEST
+
+BLOCK = 64  # rays per task
+PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Mueller et al. 2022, section 3
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=False)
+def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, write, start, extent, length, point):  # type: ignore[no-untyped-def]
+    """One ray: counts its valid samples, and writes them where `write` >= 0. Returns (valid, tried)."""
+    side = voxels.shape[0]
+    ux, uy, uz = (ox - centre[0]) / half[0], (oy - centre[1]) / half[1], (oz - centre[2]) / half[2]
+    vx, vy, vz = dx / half[0], dy / half[1], dz / half[2]
+    tiny = np.float32(1e-12)
+    one, two = np.float32(1), np.float32(2)
+    t, leave = near, far
+    if not contracted:
+        sx = vx if abs(vx) >= tiny else tiny
+        sy = vy if abs(vy) >= tiny else tiny
+        sz = vz if abs(vz) >= tiny else tiny
+        ax, bx = (-one - ux) / sx, (one - ux) / sx
+        ay, by = (-one - uy) / sy, (one - uy) / sy
+        az, bz = (-one - uz) / sz, (one - uz) / sz
+        t = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), near))
+        leave = min(min(max(ax, bx), max(ay, by)), min(max(az, bz), far))
+    reach = np.float32(1)
+    scale = np.float32(0.25) if contracted else np.float32(0.5)
+    shift = two if contracted else one
+    valid = tried = 0
+    for _ in range(slots):
+        stretch = one
+        if contracted:
+            reach = max(max(abs(ux + t * vx), abs(uy + t * vy)), max(abs(uz + t * vz), one))
+            stretch = reach * reach
+            if reach * np.float32(FARTHEST) > one:
+                break
+        if t >= leave:
+            break
+        tried += 1
+        size = step * stretch
+        at = t + offset * size
+        px, py, pz = ux + at * vx, uy + at * vy, uz + at * vz
+        if contracted:
+            m = max(max(abs(px), abs(py)), max(abs(pz), one))
+            f = (two - one / m) / m
+            px, py, pz = px * f, py * f, pz * f
+        gx, gy, gz = (px + shift) * scale, (py + shift) * scale, (pz + shift) * scale
+        i = min(max(int(gx * side), 0), side - 1)
+        j = min(max(int(gy * side), 0), side - 1)
+        k = min(max(int(gz * side), 0), side - 1)
+        if voxels[i, j, k] > threshold:
+            if write >= 0:
+                n = write + valid
+                start[n], extent[n], length[n] = t, size, size / stretch
+                point[n, 0], point[n, 1], point[n, 2] = gx, gy, gz
+            valid += 1
+        t = t + size
+    return valid, tried
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _count_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, counts, tried, start, extent, length, point):  # type: ignore[no-untyped-def]
+    for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
+            counts[r], tried[r] = _walk(
+                origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r], offset[r],
+                centre, half, contracted, step, slots, voxels, threshold, -1, start, extent, length, point,
+            )  # fmt: skip
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _write_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, first, start, extent, length, point):  # type: ignore[no-untyped-def]
+    for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
+            if first[r + 1] > first[r]:
+                _walk(
+                    origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r], offset[r],
+                    centre, half, contracted, step, slots, voxels, threshold, first[r], start, extent, length, point,
+                )  # fmt: skip
+
+
+def valid_samples(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold):  # type: ignore[no-untyped-def]
+    """`efficientnerf.sampling.valid_samples` on float32 arrays: (first, start, extent, length, point, tried)."""
+    rays = len(origins)
+    counts, tried = np.zeros(rays, np.int64), np.zeros(rays, np.int64)
+    empty, no_point = np.empty(0, np.float32), np.empty((0, 3), np.float32)
+    args = (origins, directions, near, far, offset, centre, half, contracted, np.float32(step), slots, voxels, np.float32(threshold))
+    _count_valid(*args, counts, tried, empty, empty, empty, no_point)
+    first = np.zeros(rays + 1, np.int64)
+    np.cumsum(counts, out=first[1:])
+    n = int(first[-1])
+    start, extent, length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
+    _write_valid(*args, first, start, extent, length, point)
+    return first, start, extent, length, point, int(tried.sum())
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _pivotal(origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point):  # type: ignore[no-untyped-def]
+    one, two = np.float32(1), np.float32(2)
+    scale = np.float32(0.25) if contracted else np.float32(0.5)
+    shift = two if contracted else one
+    for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
+            n = fine_first[r]
+            for i in range(first[r], first[r + 1]):
+                if not pivotal[i]:
+                    continue
+                size, part = extent[i] / np.float32(per_pivot), length[i] / np.float32(per_pivot)
+                for s in range(per_pivot):
+                    begin = start[i] + np.float32(s) * size
+                    at = begin + offset[r] * size
+                    px = (origins[r, 0] + at * directions[r, 0] - centre[0]) / half[0]
+                    py = (origins[r, 1] + at * directions[r, 1] - centre[1]) / half[1]
+                    pz = (origins[r, 2] + at * directions[r, 2] - centre[2]) / half[2]
+                    if contracted:
+                        m = max(max(abs(px), abs(py)), max(abs(pz), one))
+                        f = (two - one / m) / m
+                        px, py, pz = px * f, py * f, pz * f
+                    fine_start[n], fine_extent[n], fine_length[n] = begin, size, part
+                    point[n, 0], point[n, 1], point[n, 2] = (px + shift) * scale, (py + shift) * scale, (pz + shift) * scale
+                    n += 1
+
+
+def pivotal_samples(origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot):  # type: ignore[no-untyped-def]
+    """`efficientnerf.sampling.pivotal_samples` on arrays: (first, start, extent, length, point)."""
+    total = np.concatenate([np.zeros(1, np.int64), np.cumsum(pivotal, dtype=np.int64)])
+    fine_first = total[first] * per_pivot
+    n = int(fine_first[-1])
+    fine_start, fine_extent, fine_length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
+    _pivotal(origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point)
+    return fine_first, fine_start, fine_extent, fine_length, point
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _slot(x, y, z, side, dense, mask):  # type: ignore[no-untyped-def]
+    """Where a lattice point lies in its level's table: its own place where the level fits, else its hash."""
+    if dense:
+        return (x * side + y) * side + z
+    return np.int64((np.uint32(x) ^ (np.uint32(y) * PRIME_Y) ^ (np.uint32(z) * PRIME_Z)) & mask)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def encode(points, table, sides, dense, starts, mask, out):  # type: ignore[no-untyped-def]
+    """Multiresolution hash encoding with two features a level, forward: points (N, 3), table (T, 2), out (N, 2L)."""
+    samples, levels = points.shape[0], sides.shape[0]
+    one = np.float32(1)
+    for block in numba.prange((samples + 2047) // 2048):
+        lo, hi = block * 2048, min(samples, block * 2048 + 2048)
+        for level in range(levels):
+            side, begin, flat = sides[level], starts[level], dense[level]
+            cells = np.float32(side - 1)
+            for n in range(lo, hi):
+                x, y, z = points[n, 0] * cells, points[n, 1] * cells, points[n, 2] * cells
+                i = min(max(int(x), 0), side - 2)
+                j = min(max(int(y), 0), side - 2)
+                k = min(max(int(z), 0), side - 2)
+                fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+                a = b = np.float32(0)
+                for c in range(8):
+                    p, q, s = c >> 2, (c >> 1) & 1, c & 1
+                    w = (fx if p else one - fx) * (fy if q else one - fy) * (fz if s else one - fz)
+                    at = begin + _slot(i + p, j + q, k + s, side, flat, mask)
+                    a += w * table[at, 0]
+                    b += w * table[at, 1]
+                out[n, 2 * level] = a
+                out[n, 2 * level + 1] = b
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def encode_backward(points, grad, sides, dense, starts, mask, table_grad):  # type: ignore[no-untyped-def]
+    """Adds the gradient with respect to the table: grad (N, 2L), table_grad (T, 2). One thread owns a level."""
+    samples, levels = points.shape[0], sides.shape[0]
+    one = np.float32(1)
+    for level in numba.prange(levels):
+        side, begin, flat = sides[level], starts[level], dense[level]
+        cells = np.float32(side - 1)
+        for n in range(samples):
+            ga, gb = grad[n, 2 * level], grad[n, 2 * level + 1]
+            if ga == 0 and gb == 0:
+                continue
+            x, y, z = points[n, 0] * cells, points[n, 1] * cells, points[n, 2] * cells
+            i = min(max(int(x), 0), side - 2)
+            j = min(max(int(y), 0), side - 2)
+            k = min(max(int(z), 0), side - 2)
+            fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+            for c in range(8):
+                p, q, s = c >> 2, (c >> 1) & 1, c & 1
+                w = (fx if p else one - fx) * (fy if q else one - fy) * (fz if s else one - fz)
+                at = begin + _slot(i + p, j + q, k + s, side, flat, mask)
+                table_grad[at, 0] += w * ga
+                table_grad[at, 1] += w * gb
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _activate(x, exponential):  # type: ignore[no-untyped-def]
+    """Density and its derivative."""
+    one = np.float32(1)
+    if exponential:
+        if x > np.float32(LARGEST_LOGIT):
+            return np.exp(np.float32(LARGEST_LOGIT)), np.float32(0)
+        y = np.exp(x)
+        return y, y
+    z = x - one
+    e = np.exp(-abs(z))
+    return max(z, np.float32(0)) + np.log1p(e), (one if z >= 0 else e) / (one + e)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def composite(raw, length, first, harmonics, background, exponential, colour, opacity, weight, rgb):  # type: ignore[no-untyped-def]
+    """`efficientnerf.compositing.composite`, forward."""
+    terms = harmonics.shape[1]
+    one = np.float32(1)
+    rays = len(first) - 1
+    for block in numba.prange((rays + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
+            light = one
+            c0 = c1 = c2 = np.float32(0)
+            for n in range(first[r], first[r + 1]):
+                density, _ = _activate(raw[n, 0], exponential)
+                alpha = one - np.exp(-density * length[n])
+                w = light * alpha
+                light *= one - alpha
+                for channel in range(3):
+                    total = np.float32(0)
+                    for k in range(terms):
+                        total += harmonics[r, k] * raw[n, 1 + channel * terms + k]
+                    rgb[n, channel] = one / (one + np.exp(-total))
+                c0 += w * rgb[n, 0]
+                c1 += w * rgb[n, 1]
+                c2 += w * rgb[n, 2]
+                weight[n] = w
+            colour[r, 0] = c0 + light * background[r, 0]
+            colour[r, 1] = c1 + light * background[r, 1]
+            colour[r, 2] = c2 + light * background[r, 2]
+            opacity[r] = one - light
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def composite_backward(raw, length, first, harmonics, background, exponential, weight, rgb, grad_colour, grad_opacity, grad_raw, grad_background):  # type: ignore[no-untyped-def]
+    """Gradients of colour and opacity with respect to raw and background."""
+    terms = harmonics.shape[1]
+    one = np.float32(1)
+    rays = len(first) - 1
+    for block in numba.prange((rays + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
+            g0, g1, g2 = grad_colour[r, 0], grad_colour[r, 1], grad_colour[r, 2]
+            behind = g0 * background[r, 0] + g1 * background[r, 1] + g2 * background[r, 2] - grad_opacity[r]
+            # What lies behind sample n contributes `rest`: the background's share and the samples', front to back from the total.
+            light = one
+            rest = np.float32(0)
+            for n in range(first[r], first[r + 1]):
+                rest += weight[n] * (g0 * rgb[n, 0] + g1 * rgb[n, 1] + g2 * rgb[n, 2])
+                light -= weight[n]
+            light = max(light, np.float32(0))
+            rest += light * behind
+            grad_background[r, 0], grad_background[r, 1], grad_background[r, 2] = light * g0, light * g1, light * g2
+            before = one
+            for n in range(first[r], first[r + 1]):
+                density, slope = _activate(raw[n, 0], exponential)
+                w = weight[n]
+                own = g0 * rgb[n, 0] + g1 * rgb[n, 1] + g2 * rgb[n, 2]
+                rest -= w * own
+                after = before * np.exp(-density * length[n])
+                grad_raw[n, 0] = (after * own - rest) * length[n] * slope
+                before = after
+                for channel in range(3):
+                    g = g0 if channel == 0 else (g1 if channel == 1 else g2)
+                    c = rgb[n, channel]
+                    d = w * g * c * (one - c)
+                    for k in range(terms):
+                        grad_raw[n, 1 + channel * terms + k] = d * harmonics[r, k]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def adam(value, grad, first, second, rate, beta1, beta2, correction1, correction2, eps, skip_zeros):  # type: ignore[no-untyped-def]
+    """Kingma and Ba's Adam in place on flat arrays; with `skip_zeros`, entries without a gradient are left alone. Clears the gradient."""
+    one = np.float32(1)
+    count = len(value)
+    for block in numba.prange((count + 8191) // 8192):
+        for n in range(block * 8192, min(count, (block + 1) * 8192)):
+            g = grad[n]
+            if skip_zeros and g == 0:
+                continue
+            m = beta1 * first[n] + (one - beta1) * g
+            v = beta2 * second[n] + (one - beta2) * g * g
+            first[n], second[n] = m, v
+            value[n] -= rate * (m / correction1) / (np.sqrt(v / correction2) + eps)
+            grad[n] = 0
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def ray_directions(lookup, begin, pixel, rotation, view, out):  # type: ignore[no-untyped-def]
+    """Directions in the world of pixels of several views: rotation[view] @ lookup[begin + pixel]."""
+    for n in numba.prange(len(view)):
+        v = view[n]
+        at = begin[v] + pixel[n]
+        x, y, z = lookup[at, 0], lookup[at, 1], lookup[at, 2]
+        for row in range(3):
+            out[n, row] = rotation[v, row, 0] * x + rotation[v, row, 1] * y + rotation[v, row, 2] * z

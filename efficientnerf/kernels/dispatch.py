@@ -1,0 +1,87 @@
+"""The kernels under the signatures of the torch functions they replace: numba for float32 on the CPU, else the torch function itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from efficientnerf import compositing, sampling
+from efficientnerf.compositing import Composite
+from efficientnerf.grid import Space
+from efficientnerf.sampling import Samples
+
+
+def _fast(*tensors: Tensor) -> bool:
+    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+
+
+def _array(t: Tensor) -> np.ndarray:
+    return t.detach().contiguous().numpy()
+
+
+def _box(space: Space) -> tuple[np.ndarray, np.ndarray, bool]:
+    return space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted
+
+
+def valid_samples(
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float
+) -> Samples:
+    """See `efficientnerf.sampling.valid_samples`."""
+    if not _fast(origins, directions, near, far, offset, voxels):
+        return sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold)
+    from efficientnerf.kernels import cpu
+
+    arrays = [_array(t) for t in (origins, directions, near, far, offset)]
+    first, start, extent, length, point, tried = cpu.valid_samples(*arrays, *_box(space), step, slots, _array(voxels), threshold)
+    return Samples(*(torch.from_numpy(a) for a in (first, start, extent, length, point)), tried)
+
+
+def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
+    """See `efficientnerf.sampling.pivotal_samples`."""
+    if not _fast(origins, directions, offset, coarse.start):
+        return sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
+    from efficientnerf.kernels import cpu
+
+    arrays = [_array(t) for t in (coarse.first, coarse.start, coarse.extent, coarse.length, pivotal)]
+    fine = cpu.pivotal_samples(_array(origins), _array(directions), _array(offset), *_box(space), *arrays, per_pivot)
+    return Samples(*(torch.from_numpy(a) for a in fine), coarse.tried)
+
+
+def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
+    """See `efficientnerf.compositing.composite`; on the CPU only colour and opacity carry gradients."""
+    if not _fast(raw, length, harmonics, background):
+        return compositing.composite(raw, length, first, harmonics, background, activation)
+    return Composite(*_Composite.apply(raw, length, first, harmonics, background, activation == "exp"))
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, exponential: bool) -> tuple[Tensor, ...]:  # type: ignore[override]
+        from efficientnerf.kernels import cpu
+
+        rays = len(first) - 1
+        colour, opacity = torch.empty(rays, 3), torch.empty(rays)
+        weight, rgb = torch.empty(len(raw)), torch.empty(len(raw), 3)
+        cpu.composite(
+            _array(raw), _array(length), _array(first), _array(harmonics), _array(background), exponential,
+            colour.numpy(), opacity.numpy(), weight.numpy(), rgb.numpy(),
+        )  # fmt: skip
+        ctx.save_for_backward(raw, length, first, harmonics, background, weight, rgb)
+        ctx.exponential = exponential
+        ctx.mark_non_differentiable(weight, rgb)
+        return colour, opacity, weight, rgb
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        from efficientnerf.kernels import cpu
+
+        raw, length, first, harmonics, background, weight, rgb = ctx.saved_tensors
+        grad_raw, grad_background = torch.empty(raw.shape), torch.empty(background.shape)
+        cpu.composite_backward(
+            *(_array(t) for t in (raw, length, first, harmonics, background)), ctx.exponential, _array(weight), _array(rgb),
+            _array(grads[0]), _array(grads[1]), grad_raw.numpy(), grad_background.numpy(),
+        )  # fmt: skip
+        return grad_raw, None, None, None, grad_background, None

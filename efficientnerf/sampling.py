@@ -1,0 +1,108 @@
+"""Where rays are sampled: valid samples (EfficientNeRF, section 3.3) and pivotal ones (section 3.4), in plain torch.
+
+A ray is cut into intervals. In the box an interval is `step` long; beyond it, it grows with the square of the distance, which is the same
+length in contracted space. A random offset in [0, 1), one per ray and shared by both stages, says where in its interval a sample lies.
+Coarse sample i lies in interval i; a pivotal interval is cut into N_s slots, each with one fine sample, so that no point is evaluated twice
+and neighbouring pivots do not overlap (the paper's equation 11 read literally gives overlapping neighbourhoods; see the authors' release).
+
+R rays, N samples.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from efficientnerf.grid import Space
+
+FARTHEST = 1.0 / 64  # 1 / |u|_inf at which a ray in contracted space ends
+
+
+class Samples(NamedTuple):
+    """Packed samples of a bundle of rays.
+
+    first   (R + 1,) int64 offsets: ray r owns samples first[r] to first[r + 1]
+    start   (N,) where the sample's interval begins, distance along the ray
+    extent  (N,) its length, world units
+    length  (N,) its length in the field's units: the world's in the box, contracted beyond
+    point   (N, 3) grid coordinates of the sample
+    tried   how many samples there would have been without the density voxels
+    """
+
+    first: Tensor
+    start: Tensor
+    extent: Tensor
+    length: Tensor
+    point: Tensor
+    tried: int
+
+
+def clip_to_space(space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances (R,) at which rays enter and leave the space, within near and far; leave <= enter where they miss it."""
+    if space.contracted:
+        return near, far
+    u, du = space.unit(origins), directions / torch.as_tensor(space.half, dtype=directions.dtype, device=directions.device)
+    du = torch.where(du.abs() < 1e-12, torch.full_like(du, 1e-12), du)
+    one, other = (-1 - u) / du, (1 - u) / du
+    return torch.maximum(torch.minimum(one, other).amax(dim=-1), near), torch.minimum(torch.maximum(one, other).amin(dim=-1), far)
+
+
+def valid_samples(
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float
+) -> Samples:
+    """The coarse samples of rays that lie where the density voxels are above `threshold` (equation 9).
+
+    origins, directions  (R, 3) world frame, unit directions
+    near, far, offset    (R,) distances, and the offset in [0, 1)
+    step, slots          length of an interval in the box; at most so many intervals on a ray
+    voxels               (D, D, D) density voxels over the grid coordinates
+    """
+    t, leave = clip_to_space(space, origins, directions, near, far)
+    side = voxels.shape[0]
+    columns = []
+    tried = 0
+    for _ in range(slots):
+        stretch = torch.ones_like(t)
+        if space.contracted:
+            reach = space.unit(origins + t[:, None] * directions).abs().amax(dim=-1).clamp(min=1)
+            stretch = reach * reach
+            leave = torch.where(reach * FARTHEST > 1, t, leave)
+        alive = t < leave
+        if not alive.any():
+            break
+        extent = step * stretch
+        point = space.grid(origins + (t + offset * extent)[:, None] * directions)
+        cell = (point * side).long().clamp(0, side - 1)
+        valid = alive & (voxels[cell[:, 0], cell[:, 1], cell[:, 2]] > threshold)
+        tried += int(alive.sum())
+        columns.append((valid, t, extent, extent / stretch, point))
+        t = t + extent
+    if not columns:
+        empty = origins.new_zeros(0)
+        return Samples(torch.zeros(len(origins) + 1, dtype=torch.int64, device=origins.device), empty, empty, empty, empty.reshape(0, 3), 0)
+    valid = torch.stack([c[0] for c in columns], dim=1)  # (R, slots)
+    start, extent, length = (torch.stack([c[n] for c in columns], dim=1)[valid] for n in (1, 2, 3))
+    point = torch.stack([c[4] for c in columns], dim=1)[valid]
+    first = torch.cat([valid.new_zeros(1, dtype=torch.int64), valid.sum(dim=1).cumsum(dim=0)])
+    return Samples(first, start, extent, length, point, tried)
+
+
+def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
+    """The fine samples: `per_pivot` in each interval of a pivotal coarse sample.
+
+    pivotal  (N,) bool, which coarse samples are pivotal (their weight exceeds epsilon)
+    """
+    rays = len(origins)
+    counts = coarse.first[1:] - coarse.first[:-1]
+    ray = torch.repeat_interleave(torch.arange(rays, device=origins.device), counts, output_size=len(pivotal))[pivotal]
+    slot = torch.arange(per_pivot, device=origins.device)
+    extent = (coarse.extent[pivotal] / per_pivot)[:, None].expand(-1, per_pivot)
+    start = coarse.start[pivotal][:, None] + slot * extent
+    length = (coarse.length[pivotal] / per_pivot)[:, None].expand(-1, per_pivot)
+    at = start + offset[ray][:, None] * extent
+    point = space.grid(origins[ray][:, None] + at[..., None] * directions[ray][:, None])
+    per_ray = torch.zeros(rays, dtype=torch.int64, device=origins.device).index_add(0, ray, torch.full_like(ray, per_pivot))
+    first = torch.cat([per_ray.new_zeros(1), per_ray.cumsum(dim=0)])
+    return Samples(first, start.reshape(-1), extent.reshape(-1), length.reshape(-1), point.reshape(-1, 3), coarse.tried)

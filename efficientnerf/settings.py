@@ -1,0 +1,47 @@
+"""What can be set about training; imports nothing heavy, so that it can be listed in no time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+def _setting(default: Any, doc: str, **limits: Any) -> Any:
+    return field(default=default, metadata={"doc": doc, **limits})
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How a scene is learned. The defaults are for two CPU cores (`preview`)."""
+
+    iterations: int = _setting(2000, "optimisation steps", minimum=1)
+    samples: int = _setting(65536, "network evaluations aimed at in a step; the number of rays follows from it", minimum=64)
+    rays: int = _setting(8192, "rays in a step at most", minimum=1)
+    seed: int = _setting(0, "seed of every random choice", minimum=0)
+    field: str = _setting("hash", "hash: multiresolution hash grid; mlp: the paper's networks", choices=("hash", "mlp"))
+    degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
+    levels: int = _setting(12, "hash: levels", minimum=1, maximum=24)
+    log2_table: int = _setting(17, "hash: entries of a level's table, as a power of two", minimum=8, maximum=24)
+    finest: int = _setting(1024, "hash: lattice points a side of the finest level", minimum=16, maximum=16384)
+    hidden: int = _setting(64, "width of the fine network (the paper: 256, with field mlp)", minimum=8, maximum=1024)
+    layers: int = _setting(2, "hidden layers of the fine network (the paper: 8)", minimum=1, maximum=16)
+    coarse_hidden: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
+    coarse_layers: int = _setting(1, "hidden layers of the coarse network (the paper: 4)", minimum=1, maximum=16)
+    coarse_samples: int = _setting(128, "N_c: intervals over the diagonal of the box", minimum=8, maximum=1024)
+    fine_samples: int = _setting(4, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
+    pivotal_weight: float = _setting(1e-4, "epsilon: weight above which a coarse sample is pivotal", minimum=0.0, maximum=1.0)
+    voxels: int = _setting(0, "D: side of the density voxels; 0 chooses 128, or 192 where surroundings are learned too", minimum=0, maximum=512)
+    voxel_rule: str = _setting(
+        "maximum", "momentum: equation 7 on raw densities, threshold 0, as in the paper; maximum: decayed maximum of densities", choices=("momentum", "maximum")
+    )
+    voxel_beta: float = _setting(0.1, "beta of equation 7", minimum=0.0, maximum=1.0)
+    voxel_initial: float = _setting(10.0, "density that the voxels start with", minimum=0.0)
+    voxel_decay: float = _setting(0.95, "maximum: what a voxel keeps at each refresh", minimum=0.0, maximum=1.0)
+    voxel_absorption: float = _setting(0.01, "maximum: share of light that an interval of a valid voxel absorbs at least", minimum=0.0, maximum=1.0)
+    refresh_every: int = _setting(16, "steps between looks at random voxels, which let pruned space return", minimum=1)
+    refresh_share: float = _setting(0.03125, "share of the voxels looked at in a refresh", minimum=0.0, maximum=1.0)
+    warm_up: int = _setting(256, "steps in which no voxel is pruned", minimum=0)
+    learning_rate: float = _setting(1e-2, "Adam's rate after the first steps (the paper: 5e-4, with field mlp)", minimum=0.0)
+    final_rate: float = _setting(0.05, "what is left of the rate at the last step; it falls exponentially", minimum=0.0, maximum=1.0)
+    checkpoint_every: int = _setting(250, "steps between checkpoints", minimum=1)
+    preview_every: int = _setting(500, "steps between preview pictures of a held-back view; 0: none", minimum=0)

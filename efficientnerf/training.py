@@ -1,0 +1,233 @@
+"""Training: one flat loop.
+
+Every random choice of step n is drawn from a generator seeded by (seed, n), so a resumed run makes the choices of an uninterrupted one without
+any state to restore. What is restored: parameters, Adam's moments, density voxels, the running average that sets the number of rays.
+
+R rays, C views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from efficientnerf.cameras import Camera, rays
+from efficientnerf.compositing import activate
+from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
+from efficientnerf.model import Model, look
+
+RATE_WARM_UP = 100  # steps in which the rate rises
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15  # Mueller et al. 2022; epsilon this small because a table entry's gradient can be
+FEWEST_RAYS = 64
+SWEEP_PARTS = 8  # refreshes of the warm-up that together ask about every voxel
+
+
+class Pixels:
+    """All training pixels: bytes, and directions by lookup, one table for all views that share a lens.
+
+    images   (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha
+    usable   (P,) bool or None: pixels that masks leave in
+    """
+
+    def __init__(self, cameras: list[Camera], images: list[np.ndarray], masks: list[np.ndarray | None], near: np.ndarray, far: np.ndarray) -> None:
+        self.near, self.far = near.astype(np.float32), far.astype(np.float32)
+        channels = max(image.shape[-1] for image in images)
+        sizes = [camera.width * camera.height for camera in cameras]
+        self.offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        self.images = np.empty((int(self.offsets[-1]), channels), np.uint8)
+        for at, image in zip(self.offsets, images, strict=False):
+            flat = image.reshape(-1, image.shape[-1])
+            self.images[at : at + len(flat), : flat.shape[1]] = flat
+            if flat.shape[1] < channels:
+                self.images[at : at + len(flat), 3] = 255
+        self.usable = None
+        if any(mask is not None for mask in masks):
+            self.usable = np.concatenate([np.ones(n, bool) if mask is None else mask.reshape(-1) for n, mask in zip(sizes, masks, strict=True)])
+        self.rotation = np.stack([camera.world_from_camera[:3, :3] for camera in cameras]).astype(np.float32)
+        self.centre = np.stack([camera.centre for camera in cameras]).astype(np.float32)
+        lenses: dict[tuple, int] = {}
+        tables, self.lens = [], np.empty(len(cameras), np.int64)
+        at = 0
+        for n, camera in enumerate(cameras):
+            key = (camera.width, camera.height, camera.model, camera.params)
+            if key not in lenses:
+                lenses[key] = at
+                still = Camera(camera.name, camera.width, camera.height, camera.model, camera.params, np.eye(4))
+                tables.append(rays(still, None)[1].astype(np.float32))
+                at += sizes[n]
+            self.lens[n] = lenses[key]
+        self.lookup = np.concatenate(tables)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def choose(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Indices of `count` usable pixels, with replacement."""
+        if self.usable is None:
+            return rng.integers(len(self), size=count)
+        found = np.empty(0, np.int64)
+        while len(found) < count:
+            tried = rng.integers(len(self), size=2 * count)
+            found = np.concatenate([found, tried[self.usable[tried]]])
+        return found[:count]
+
+    def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""
+        from efficientnerf.kernels import cpu
+
+        view = np.searchsorted(self.offsets, index, side="right") - 1
+        directions = np.empty((len(index), 3), np.float32)
+        pixel = index - self.offsets[view]
+        cpu.ray_directions(self.lookup, self.lens, pixel, self.rotation, view, directions)
+        slant = np.einsum("ri,ri->r", directions, self.rotation[view, :, 2])
+        slant = np.maximum(slant, 1e-3)  # near and far are measured along the view axis
+        return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, self.images[index].astype(np.float32) / np.float32(255)
+
+
+class Adam:
+    """Kingma and Ba's Adam over named parameters. A hash table's entries without a gradient are left alone (as Mueller et al. do)."""
+
+    def __init__(self, parameters: list[tuple[str, torch.nn.Parameter]]) -> None:
+        self.parameters = parameters
+        self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters}
+
+    def step(self, number: int, rate: float) -> None:
+        """The `number`-th step, from 1; clears the gradients."""
+        correction1, correction2 = 1 - BETA1**number, 1 - BETA2**number
+        for name, p in self.parameters:
+            if p.grad is None:
+                continue
+            first, second = self.moments[name]
+            sparse = name.endswith("table")
+            if p.device.type == "cpu":
+                from efficientnerf.kernels import cpu
+
+                flat = [t.detach().view(-1).numpy() for t in (p, p.grad.contiguous(), first, second)]
+                cpu.adam(*flat, *(np.float32(x) for x in (rate, BETA1, BETA2, correction1, correction2, EPSILON)), sparse)
+            else:
+                with torch.no_grad():
+                    touched = (p.grad != 0) if sparse else torch.ones_like(p.grad, dtype=torch.bool)
+                    first.copy_(torch.where(touched, first.lerp(p.grad, 1 - BETA1), first))
+                    second.copy_(torch.where(touched, second.lerp(p.grad**2, 1 - BETA2), second))
+                    p.sub_(touched * rate * (first / correction1) / ((second / correction2).sqrt() + EPSILON))
+            p.grad = None
+
+
+@dataclass
+class Progress:
+    """What one step did.
+
+    step        from 1
+    loss        mean squared error of the fine colours
+    rays        in the step
+    tried       coarse intervals, valid or not
+    valid, pivotal, fine   how many samples of each kind
+    """
+
+    step: int
+    loss: float
+    rays: int
+    tried: int
+    valid: int
+    pivotal: int
+    fine: int
+
+    @property
+    def psnr(self) -> float:
+        return -10 * math.log10(max(self.loss, 1e-10))
+
+
+@dataclass
+class Trainer:
+    """The state of a training run; `samples_per_ray` is the running average that sets the number of rays."""
+
+    model: Model
+    adam: Adam
+    step: int = 0
+    samples_per_ray: float = 0.0
+
+
+def trainer(m: Model) -> Trainer:
+    # Until it is known better, every interval is sampled by both stages.
+    return Trainer(m, Adam(m.parameters()), 0, float(m.slots * (1 + m.settings.fine_samples)))
+
+
+def state_of(t: Trainer) -> dict[str, Tensor]:
+    """All that a resumed run needs, by name."""
+    from efficientnerf.model import state_of as model_state
+
+    moments = {f"adam.{k}.{name}": pair[k] for name, pair in t.adam.moments.items() for k in (0, 1)}
+    progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
+    return model_state(t.model) | moments | {"progress": progress}
+
+
+def restore(t: Trainer, state: dict[str, Tensor]) -> None:
+    """Put `state_of`'s tensors back."""
+    from efficientnerf.model import restore as restore_model
+
+    restore_model(t.model, state)
+    for name, pair in t.adam.moments.items():
+        for k in (0, 1):
+            pair[k].copy_(state[f"adam.{k}.{name}"])
+    t.step, t.samples_per_ray = int(state["progress"][0]), float(state["progress"][1])
+
+
+def learning_rate(step: int, settings_rate: float, final: float, iterations: int) -> float:
+    """Rises over the first steps, then falls exponentially to `final` of itself."""
+    return settings_rate * min(1.0, step / RATE_WARM_UP) * final ** (step / iterations)
+
+
+def train(t: Trainer, pixels: Pixels) -> Iterator[Progress]:
+    """Train until the settings' last step, yielding after each."""
+    m, settings = t.model, t.model.settings
+    device = m.device
+    transparent = pixels.images.shape[1] == 4
+    while t.step < settings.iterations:
+        number = t.step + 1
+        rng = np.random.Generator(np.random.Philox(key=settings.seed, counter=[0, 0, 0, number]))
+
+        # A bundle of rays of about as many samples as the settings ask for.
+        count = int(min(settings.rays, max(FEWEST_RAYS, settings.samples / t.samples_per_ray)))
+        origins, directions, near, far, colour = (torch.from_numpy(a).to(device) for a in pixels.bundle(pixels.choose(count, rng)))
+        offset = torch.from_numpy(rng.random(count, np.float32)).to(device)
+        behind = m.behind(directions)
+        if transparent:
+            # Behind an object cut out of its background anything may lie: a new colour for each ray keeps the field from learning one.
+            behind = torch.from_numpy(rng.random((count, 3), np.float32)).to(device)
+            colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
+
+        # Both stages, both losses (weighted equally, as in the authors' release).
+        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up)
+        fine_loss = ((seen.fine_colour - colour) ** 2).mean()
+        loss = fine_loss + ((seen.coarse_colour - colour) ** 2).mean()
+        loss.backward()
+        t.adam.step(number, learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations))
+
+        # The voxels remember what the coarse field said on the rays, and are refreshed at random.
+        with torch.no_grad():
+            remember(m, seen.coarse.point, seen.coarse_raw[:, 0].detach())
+            if number % settings.refresh_every == 0:
+                generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+                fade(m.voxels)
+                if number <= settings.warm_up:
+                    cell, point = sweep_cells(m.voxels, number // settings.refresh_every, SWEEP_PARTS, generator)
+                else:
+                    cell, point = refresh_cells(m.voxels, int(settings.refresh_share * m.voxels.side**3), generator)
+                for part in range(0, len(cell), 2**17):
+                    remember(m, point[part : part + 2**17], m.coarse.density(point[part : part + 2**17]), cell[part : part + 2**17])
+
+        fine, valid = len(seen.fine.start), len(seen.coarse.start)
+        t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((fine + valid) / count, 1.0)
+        t.step = number
+        yield Progress(number, float(fine_loss.detach()), count, seen.coarse.tried, valid, int(seen.pivotal.sum()), fine)
+
+
+def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None) -> None:
+    """Update the density voxels with what the coarse field said, before its activation, at points in grid coordinates."""
+    cell = cell_of(point, m.voxels.side) if cell is None else cell
+    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.coarse.activation))
