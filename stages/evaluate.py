@@ -1,0 +1,305 @@
+"""The evaluate stage: PSNR and SSIM of the network and of the baked asset on the views that training never saw.
+
+    metrics.json       network and asset: means over the views; views[]: the figures of each
+    contact_sheet.png  truth, network and asset with their errors
+
+The network is slow to draw, so that only some views are drawn with it, and of these every n-th pixel along each side, through its own centre.
+Its PSNR is then an unbiased estimate of that at full size; against photographs averaged down it would be held down by their soft edges. (Its SSIM
+is that of the thinned pictures.) The asset is measured on every held-back view at the full working size. On photographs the asset lies between
+what the network puts before and behind its box; in-box figures leave out the pixels where the network sees less than half of the light in the
+box. On a constant background, in-box figures are over the pixels that the photograph's alpha covers.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.cameras import MODELS, Camera
+from pipeline.stage import Job, Stage
+from stages.scene import Scene, View
+from stages.settings import setting
+
+FORMAT = 1
+NETWORK_SIDE = 400  # pixels: the longest side of what the network draws where evaluate.scale does not say
+PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal images get this
+SHEET_ROWS = 8
+SHEET_SIDE = 320
+
+
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """How much is measured."""
+
+    views: int = setting(4, "How many held-back views the network is drawn for, spread evenly; 0: all of them.", minimum=0)
+    scale: float | None = setting(
+        None, f"One over the thinning of the pixels the network draws; none: at most {NETWORK_SIDE} along the longest side.", minimum=0.01, maximum=1
+    )
+    background_pixels: int = setting(
+        500_000, "On photographs, pixels in all that the network draws as background for the asset on other views (then enlarged).", minimum=1
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """A photograph to compare with.
+
+    colour  (H, W, 3) float32, on the scene's background
+    mask    (H, W) bool, pixels that count, or None
+    inside  (H, W) bool, pixels that show the subject, where the photograph says so, or None
+    """
+
+    colour: np.ndarray
+    mask: np.ndarray | None
+    inside: np.ndarray | None
+
+
+def run(job: Job) -> None:
+    from efficientnerf.nerftree.tree import NerfTree
+
+    def load_field() -> Any:
+        from efficientnerf.render import FieldRenderer
+
+        return FieldRenderer.load(job.inputs["train"], job.device)
+
+    evaluate(NerfTree.load(job.inputs["bake"] / "asset.nerftree"), load_field, job)
+
+
+def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
+    """Measure each view once; figures and thumbnails are kept in job.work, so that a kill costs at most one view.
+
+    tree        with the interface of a NerfTree
+    load_field  gives a FieldRenderer; called only where one is needed
+    """
+    from stages.scene import load
+
+    settings: EvaluateSettings = job.settings
+    scene = load(job.inputs["poses"])
+    views, split = held_back(scene)
+    if split == "train":
+        job.warn("no view was held back from training: the figures below are of views that training saw")
+    drawn = set(spread(len(views), settings.views))
+    longest = max(max(view.camera.width, view.camera.height) for view in views)
+    stride = max(1, math.ceil(longest / NETWORK_SIDE if settings.scale is None else 1.0 / settings.scale - 1e-6))
+    rest = background_stride([view for k, view in enumerate(views) if k not in drawn], settings.background_pixels)
+    field: Any = None
+    figures = []
+    for k, view in enumerate(views):
+        job.safe_point()
+        job.progress(k, len(views), f"view {view.name}")
+        done = job.work / f"view_{k:05d}.json"
+        if not done.exists():
+            needs_field = k in drawn or scene.background is None
+            field = field or (load_field() if needs_field else None)
+            measured, pictures = measure(tree, field, scene, view, job, drawn=k in drawn, stride=stride if k in drawn else rest)
+            if k in drawn:
+                _keep_pictures(pictures, job.work, k)
+            _write_json(measured, done)
+        figures.append(json.loads(done.read_text(encoding="utf-8")))
+    job.progress(len(views), len(views))
+    metrics = summary(figures, split=split, stride=stride, background=rest if scene.background is None else None)
+    _write_json(metrics, job.out / "metrics.json")
+    _write_sheet(metrics, sorted(drawn), job)
+
+
+def held_back(scene: Scene) -> tuple[tuple[View, ...], str]:
+    """The views to report on and their split: test, else val, else train."""
+    from stages.scene import views_of
+
+    for split in ("test", "val", "train"):
+        views = views_of(scene, split)
+        if views:
+            return views, split
+    raise ValueError("the scene holds no views")
+
+
+def spread(count: int, wanted: int) -> list[int]:
+    """Indices of `wanted` of `count` things, evenly spread; 0: all."""
+    if wanted == 0 or wanted >= count:
+        return list(range(count))
+    return [int((k + 0.5) * count / wanted) for k in range(wanted)]
+
+
+def background_stride(views: Sequence[View], pixels: int) -> int:
+    """The thinning at which all of the views together have about so many pixels at most."""
+    total = sum(view.camera.width * view.camera.height for view in views)
+    return max(1, math.ceil(math.sqrt(total / pixels)))
+
+
+def truth_of(folder: Path, view: View, background: tuple[float, float, float] | None) -> Truth:
+    """The photograph of a view at working size."""
+    from stages.scene import read_image, read_mask
+
+    pixels = read_image(folder, view).astype(np.float32) / 255.0
+    mask = read_mask(folder, view)
+    if pixels.shape[2] == 3:
+        return Truth(pixels, mask, None)
+    alpha = pixels[..., 3]
+    if background is None:
+        covered = alpha >= 0.5
+        return Truth(pixels[..., :3], covered if mask is None else mask & covered, None)
+    colour = pixels[..., :3] * alpha[..., None] + (1.0 - alpha[..., None]) * np.asarray(background, np.float32)
+    return Truth(colour, mask, alpha > 0)
+
+
+def thinned_camera(camera: Camera, stride: int) -> Camera:
+    """The camera whose pixels look through the centres of every stride-th pixel of another, beginning at the offset of `thinned`."""
+    first = (stride - 1) // 2
+    params = []
+    for name, value in zip(MODELS[camera.model], camera.params, strict=True):
+        if name in ("cx", "cy"):
+            value = (value - first - 0.5) / stride + 0.5
+        elif name in ("f", "fx", "fy"):
+            value = value / stride
+        params.append(value)
+    width, height = (len(range(first, size, stride)) for size in (camera.width, camera.height))
+    return replace(camera, width=width, height=height, params=tuple(params))
+
+
+def thinned(values: np.ndarray, stride: int) -> np.ndarray:
+    """Every stride-th row and column, (H, W, ...) -> (H', W', ...); the first is the middle of its group."""
+    first = (stride - 1) // 2
+    return values[first::stride, first::stride]
+
+
+def thickened(values: np.ndarray, stride: int, width: int, height: int) -> np.ndarray:
+    """The inverse of `thinned`, bilinear between the pixels that are known; beyond the outermost they are repeated."""
+    import cv2
+
+    values = np.ascontiguousarray(values, np.float32)
+    if stride == 1:
+        return values
+    first = (stride - 1) // 2
+    x, y = np.meshgrid((np.arange(width, dtype=np.float32) - first) / stride, (np.arange(height, dtype=np.float32) - first) / stride)
+    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def measure(tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn: bool, stride: int) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """The figures of one view, and, where the network is drawn, its pictures: truth, network, its error, asset, its error.
+
+    drawn   whether the network is measured; else it is asked only for the background of the asset, and not at all on a constant one
+    stride  thinning of what the network draws
+    """
+    from stages.plots import eight_bits, error_picture
+
+    truth = truth_of(job.inputs["poses"], view, scene.background)
+    figures: dict[str, Any] = {"name": view.name, "network": None}
+    pictures: list[np.ndarray] = []
+    rendering = None
+    if drawn or scene.background is None:
+        rendering = field.render(thinned_camera(view.camera, stride), progress=lambda *_: job.safe_point())
+    if drawn and rendering is not None:
+        small = Truth(thinned(truth.colour, stride), *(None if m is None else thinned(m, stride) for m in (truth.mask, truth.inside)))
+        inside = small.inside if scene.background is not None else rendering.inside_opacity >= 0.5
+        network = _clean(rendering.colour, job, f"{view.name}: the network")
+        figures["network"] = {**compare(network, small, inside), "width": network.shape[1], "height": network.shape[0]}
+        pictures += [eight_bits(small.colour), eight_bits(network), error_picture(network, small.colour)]
+    asset, inside = asset_picture(tree, scene, view, rendering, stride)
+    asset = _clean(asset, job, f"{view.name}: the asset")
+    figures["asset"] = {**compare(asset, truth, truth.inside if inside is None else inside), "width": view.camera.width, "height": view.camera.height}
+    if scene.background is None:
+        figures["asset"]["background_scale"] = 1.0 / stride
+    if figures["asset"]["psnr"] is None:
+        job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
+    return figures, [*pictures, eight_bits(asset), error_picture(asset, truth.colour)]
+
+
+def asset_picture(tree: Any, scene: Scene, view: View, rendering: Any, stride: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """What the asset shows of a view (H, W, 3), and which pixels lie in its box (photographs only).
+
+    On photographs: before + (1 - before's alpha) (asset + (1 - asset's alpha) behind), with the network's before and behind.
+    """
+    if scene.background is not None:
+        return tree.render(view.camera, background=scene.background).colour, None
+    seen = tree.render(view.camera)
+    size = (stride, view.camera.width, view.camera.height)
+    before, behind = thickened(rendering.before, *size), thickened(rendering.behind, *size)
+    middle = seen.colour + (1.0 - seen.opacity[..., None]) * behind
+    return before[..., :3] + (1.0 - before[..., 3:]) * middle, thickened(rendering.inside_opacity, *size) >= 0.5
+
+
+def compare(image: np.ndarray, truth: Truth, inside: np.ndarray | None) -> dict[str, float | None]:
+    """psnr, ssim and psnr_in_box, None where nothing can be compared (no pixel, or fewer than an SSIM window)."""
+    from efficientnerf.metrics import psnr, ssim
+
+    used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
+    boxed = None if inside is None else used & inside
+    windows = used[5:-5, 5:-5]
+    return {
+        "psnr": min(PSNR_CAP, psnr(image, truth.colour, truth.mask)) if used.any() else None,
+        "ssim": ssim(image, truth.colour, truth.mask) if windows.any() else None,
+        "psnr_in_box": min(PSNR_CAP, psnr(image, truth.colour, boxed)) if boxed is not None and boxed.any() else None,
+    }
+
+
+def summary(figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None) -> dict[str, Any]:
+    """metrics.json: the means over the views (of PSNR in decibels, as published), how they were taken, and the figures of each."""
+    drawn = [view["network"] for view in figures if view["network"] is not None]
+    assets = [view["asset"] for view in figures]
+    same = [view["asset"] for view in figures if view["network"] is not None]
+    network: dict[str, Any] = {**_means(drawn), "views": len(drawn), "scale": 1.0 / stride}
+    asset: dict[str, Any] = {**_means(assets), "views": len(assets), "scale": 1.0, "on_network_views": _means(same)}
+    if background is not None:
+        asset["background_scale"] = {"network_views": 1.0 / stride, "other_views": 1.0 / background}
+    return {"format": FORMAT, "split": split, "network": network, "asset": asset, "views": list(figures)}
+
+
+def _means(figures: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    means: dict[str, float | None] = {}
+    for name in ("psnr", "ssim", "psnr_in_box"):
+        values = [view[name] for view in figures if view[name] is not None]
+        means[name] = math.fsum(values) / len(values) if values else None
+    return means
+
+
+def _clean(image: np.ndarray, job: Job, what: str) -> np.ndarray:
+    """Clipped to 0-1; what is not a number counts as black and is told."""
+    bad = int((~np.isfinite(image)).any(axis=-1).sum())
+    if bad:
+        job.warn(f"{what} is not a number at {bad} pixels; they count as black")
+    return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+
+
+def _write_json(document: dict[str, Any], path: Path) -> None:
+    aside = path.with_name(f".{path.name}.partial")
+    with aside.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def _keep_pictures(pictures: Sequence[np.ndarray], folder: Path, k: int) -> None:
+    from stages.exporters.frames import write_png
+    from stages.plots import thumbnail_of
+
+    for column, picture in enumerate(pictures):
+        write_png(np.asarray(thumbnail_of(picture, SHEET_SIDE)), folder / f"picture_{k:05d}_{column}.png")
+
+
+def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
+    from stages.exporters.frames import read_png
+    from stages.plots import contact_sheet
+
+    def figure(found: dict[str, Any]) -> str:
+        psnr = "no PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"
+        return psnr if found["ssim"] is None else f"{psnr}, SSIM {found['ssim']:.3f}"
+
+    shown = [drawn[k] for k in spread(len(drawn), SHEET_ROWS)]
+    rows = [[read_png(job.work / f"picture_{k:05d}_{column}.png") for column in range(5)] for k in shown]
+    labels = []
+    for k in shown:
+        view = metrics["views"][k]
+        labels.append([view["name"], f"network {figure(view['network'])}", "error of the network", f"asset {figure(view['asset'])}", "error of the asset"])
+    title = f"{metrics['split']} views: network {figure(metrics['network'])}; asset {figure(metrics['asset'])}; errors are white from 0.25"
+    contact_sheet(rows, labels, job.out / "contact_sheet.png", thumbnail=SHEET_SIDE, title=title)
+
+
+STAGE = Stage(name="evaluate", version=1, settings=EvaluateSettings, needs=("bake", "train", "poses"), run=run)
