@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -37,10 +37,21 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
             faces=settings.faces,
             min_component=settings.min_component,
             rounds=settings.smooth,
+            viewpoints=orbit_places(tree.metadata),
             progress=progress,
         )
     except NoSurface as error:
         raise StageFailed(f"mesh: {error}. {remedy('mesh', settings.threshold)}") from error
+
+
+def orbit_places(metadata: Mapping[str, Any]) -> np.ndarray:
+    """(N, 3) places on the orbit of the capture's cameras, training frame; none where the asset records no orbit."""
+    orbit = metadata.get("orbit")
+    if not orbit:
+        return np.zeros((0, 3))
+    turn, tilt = np.radians(float(orbit["heading"]) + np.arange(8) * 45.0), np.radians(float(orbit["elevation"]))
+    direction = np.stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.full(8, np.sin(tilt))], 1)
+    return np.asarray(orbit["centre"], np.float64) + float(orbit["radius"]) * direction[: 1 if orbit["forward_facing"] else 8]
 
 
 def remedy(stage: str, threshold: float | None) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
-from stages.mesh import remedy
+from stages.mesh import orbit_places, remedy
 from stages.settings import setting
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
             min_component=settings.min_component,
             rounds=settings.smooth,
             seed=settings.seed,
+            viewpoints=orbit_places(tree.metadata),
             progress=progress,
         )
     except NoSurface as error:

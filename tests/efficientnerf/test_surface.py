@@ -1,0 +1,209 @@
+"""Surfaces of analytic densities: areas and volumes in closed form, seams, closed boundaries, what is left out, even sampling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from efficientnerf import surface as surfaces
+from efficientnerf.mesh import decimate, face_areas, face_volumes, moved, sample, separate, smooth, tidy, topology
+from efficientnerf.surface import NoSurface, automatic_threshold, enclosed_cells, isosurface, points, surface
+
+LEVEL = 40.0
+NOBODY = np.zeros((0, 3))
+
+
+class Balls:
+    """A tree whose density passes LEVEL on spheres: LEVEL * 2^(-distance / softness), capped. Colour: position / 2 + 1/2."""
+
+    def __init__(self, *balls: tuple[tuple[float, float, float], float], cells: int = 16, softness: float = 0.03, hollow: float = 0.0) -> None:
+        self.shape, self.brick, self.voxel, self.bounds_min = (cells, cells, cells), 4, 2 / (4 * cells), np.full(3, -1.0)
+        self.balls, self.softness, self.hollow = balls, softness, hollow
+
+    def density(self, at: np.ndarray) -> np.ndarray:
+        distance = np.min([np.linalg.norm(at - np.array(centre), axis=-1) - radius for centre, radius in self.balls], 0)
+        if self.hollow:
+            distance = np.maximum(distance, -self.hollow - distance)
+        return np.minimum(LEVEL * np.exp2(np.clip(-distance / self.softness, -100, 10)), 2000).astype(np.float32)
+
+    def density_block(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high)), indexing="ij"), -1)
+        inside = ((index >= 0) & (index < np.array(self.shape) * self.brick)).all(-1)
+        return np.where(inside, self.density(self.bounds_min + (index + 0.5) * self.voxel), 0).astype(np.float32)
+
+    def colour(self, at: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
+        return (at / 2 + 0.5).astype(np.float32)
+
+
+class Noise(Balls):
+    """Saturated densities at random: every case of marching cubes, the ambiguous ones above all."""
+
+    def __init__(self) -> None:
+        super().__init__(((0, 0, 0), 1), cells=8)
+        self.values = np.where(np.random.default_rng(3).random((32, 32, 32)) < 0.35, 1e6, 0).astype(np.float32)
+
+    def density_block(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        padded = np.pad(self.values, 40)
+        return padded[tuple(slice(a + 40, b + 40) for a, b in zip(low, high))]
+
+
+def test_a_ball_has_the_area_and_volume_of_a_ball() -> None:
+    mesh = surface(Balls(((0.1, 0, -0.05), 0.6)), LEVEL)
+    assert topology(mesh.vertices, mesh.faces).watertight
+    assert face_areas(mesh.vertices, mesh.faces).sum() == pytest.approx(4 * np.pi * 0.6**2, rel=0.01)
+    assert face_volumes(mesh.vertices, mesh.faces).sum() == pytest.approx(4 / 3 * np.pi * 0.6**3, rel=0.01)
+    outward = (mesh.vertices - [0.1, 0, -0.05]) / np.linalg.norm(mesh.vertices - [0.1, 0, -0.05], axis=1, keepdims=True)
+    assert (mesh.normals * outward).sum(1).min() > 0.97
+    assert np.abs(mesh.colours - (mesh.vertices / 2 + 0.5)).max() < 0.02
+
+
+@pytest.mark.parametrize("block", [7, 16, 64])
+def test_blocks_leave_no_seams(block: int) -> None:
+    ball = Balls(((0, 0, 0), 0.7))
+    vertices, faces = isosurface(ball, LEVEL, block=block)
+    whole, _ = isosurface(ball, LEVEL, block=1000)
+    assert topology(vertices, faces).watertight
+    assert len(vertices) == len(whole)
+    np.testing.assert_allclose(np.sort(vertices, 0), np.sort(whole, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize("block", [5, 64])
+def test_saturated_noise_is_closed(block: int) -> None:
+    vertices, faces = isosurface(Noise(), 1.0, block=block)
+    assert topology(vertices, faces).watertight
+
+
+def test_the_surface_closes_at_the_boundary_and_stays_inside() -> None:
+    mesh = surface(Balls(((0.9, 0, 0), 0.5)), LEVEL, rounds=0)
+    assert topology(mesh.vertices, mesh.faces).watertight
+    assert mesh.vertices[:, 0].max() == pytest.approx(1.0)
+
+
+def test_small_pieces_go_and_large_ones_stay() -> None:
+    balls = Balls(((-0.4, 0, 0), 0.4), ((0.6, 0.6, 0.6), 0.06), ((0.6, -0.5, 0), 0.25))
+    assert topology(*_shape(surface(balls, LEVEL, min_component=0.05))).components == 2
+    assert topology(*_shape(surface(balls, LEVEL, min_component=0.0))).components == 3
+
+
+def test_hollows_are_filled_unless_somebody_stands_in_them() -> None:
+    shell = Balls(((0, 0, 0), 0.7), hollow=0.25)
+    assert enclosed_cells(shell, LEVEL, NOBODY).sum() > 100
+    filled = surface(shell, LEVEL)
+    assert face_volumes(filled.vertices, filled.faces).sum() == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=0.01)
+    room = surface(shell, LEVEL, viewpoints=np.zeros((1, 3)))
+    assert face_volumes(room.vertices, room.faces).sum() == pytest.approx(4 / 3 * np.pi * (0.7**3 - 0.45**3), rel=0.02)
+    assert topology(room.vertices, room.faces).components == 2
+
+
+def test_decimation_keeps_the_budget_and_the_surface() -> None:
+    mesh = surface(Balls(((0, 0, 0), 0.7)), LEVEL, faces=1500)
+    assert len(mesh.faces) <= 1500
+    assert topology(mesh.vertices, mesh.faces).watertight
+    assert face_volumes(mesh.vertices, mesh.faces).sum() == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=0.02)
+    assert (face_areas(mesh.vertices, mesh.faces) > 0).all()
+
+
+def test_decimated_noise_stays_closed() -> None:
+    vertices, faces = isosurface(Noise(), 1.0)
+    vertices, faces = separate(*tidy(*decimate(smooth(vertices, faces, 3), faces, len(faces) // 3)))
+    assert topology(vertices, faces).open_edges == 0
+    assert topology(vertices, faces).crowded_edges == 0
+
+
+def test_touching_sheets_are_separated() -> None:
+    first = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])  # tetrahedron; a second one shares the edge 0-1
+    second = np.array([[0, 1, 4], [0, 5, 1], [1, 5, 4], [4, 5, 0]])
+    vertices = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]], float)
+    faces = np.concatenate([first, second])
+    assert topology(vertices, faces).crowded_edges == 1
+    apart = topology(*separate(vertices, faces))
+    assert apart.watertight
+    assert apart.components in (1, 2)  # one end of the edge is enough
+
+
+def test_tidying_keeps_a_closed_mesh_closed() -> None:
+    vertices, faces = isosurface(Balls(((0, 0, 0), 0.5), cells=4), LEVEL)
+    broken = vertices.copy()
+    broken[faces[10, 0]] = broken[faces[10, 1]]  # every face on this edge is degenerate now
+    vertices, faces = tidy(broken, faces)
+    assert topology(vertices, faces).watertight
+    assert (face_areas(vertices, faces) > 0).all()
+
+
+def test_smoothing_keeps_the_volume() -> None:
+    vertices, faces = isosurface(Balls(((0, 0, 0), 0.5), softness=1e-4), LEVEL)
+    smoothed = smooth(vertices, faces, 10)
+    assert face_volumes(smoothed, faces).sum() == pytest.approx(face_volumes(vertices, faces).sum(), rel=0.01)
+    assert face_areas(smoothed, faces).sum() < 0.98 * face_areas(vertices, faces).sum()  # the terraces are gone
+
+
+@pytest.mark.parametrize("softness", [0.005, 0.05, 0.2])
+def test_the_automatic_threshold_draws_what_is_opaque(softness: float) -> None:
+    ball = Balls(((0, 0, 0), 0.5), softness=softness, cells=12)
+    level = automatic_threshold(ball)
+    assert 0 < level <= np.log(2) / ball.voxel + 1e-9
+    radius = 0.5 - softness * np.log2(level / LEVEL)
+    if radius < 0.95:
+        vertices, _ = isosurface(ball, level)
+        assert np.median(np.linalg.norm(vertices, axis=1)) == pytest.approx(radius, abs=ball.voxel)
+
+
+def test_no_surface_says_so() -> None:
+    ball = Balls(((0, 0, 0), 0.5), cells=4)
+    with pytest.raises(NoSurface, match="nowhere reaches 1e\\+05"):
+        surface(ball, 1e5)
+    with pytest.raises(NoSurface, match="above zero"):
+        surface(ball, -1.0)
+    ball.density_block = lambda low, high: np.full(np.asarray(high) - low, 1e-3, np.float32)  # type: ignore[method-assign]
+    with pytest.raises(NoSurface, match="half its light"):
+        surface(ball)
+
+
+def test_points_are_spread_evenly_and_repeatably() -> None:
+    ball = Balls(((0, 0, 0), 0.6))
+    cloud = points(ball, 20_000, LEVEL)
+    again = points(ball, 20_000, LEVEL)
+    np.testing.assert_array_equal(cloud.positions, again.positions)
+    np.testing.assert_array_equal(cloud.colours, again.colours)
+    np.testing.assert_allclose(np.linalg.norm(cloud.positions, axis=1), 0.6, atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-9)
+    # Archimedes: on a sphere every coordinate is uniform.
+    for axis in range(3):
+        share = np.histogram(cloud.positions[:, axis], 10, (-0.6, 0.6))[0] / 20_000
+        assert np.abs(share - 0.1).max() < 0.012
+
+
+def test_sampling_follows_the_area() -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 5], [3, 0, 5], [0, 1, 5]], float)
+    face, weight = sample(vertices, np.array([[0, 1, 2], [3, 4, 5]]), 1000, seed=1)
+    assert abs((face == 0).sum() - 250) <= 1
+    assert weight.min() >= 0
+    np.testing.assert_allclose(weight.sum(1), 1)
+    np.testing.assert_allclose(weight[face == 1].mean(0), 1 / 3, atol=0.03)
+
+
+def test_moving_rotates_normals() -> None:
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    mesh = surface(Balls(((0, 0, 0), 0.5), cells=4), LEVEL)
+    there = moved(mesh, 2.0, turn, np.array([1.0, 2, 3]))
+    np.testing.assert_allclose(there.vertices, 2 * mesh.vertices @ turn.T + [1, 2, 3])
+    np.testing.assert_allclose(there.normals, mesh.normals @ turn.T)
+
+
+def test_progress_stops_the_work() -> None:
+    def stop(done: int, total: int, text: str) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        surface(Balls(((0, 0, 0), 0.5), cells=4), LEVEL, progress=stop)
+
+
+def test_colours_are_looked_up_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = Balls(((0, 0, 0), 0.5), cells=4)
+    whole = surface(ball, LEVEL)
+    monkeypatch.setattr(surfaces, "_CHUNK", 17)
+    np.testing.assert_allclose(surface(ball, LEVEL).colours, whole.colours, atol=1e-6)
+
+
+def _shape(mesh: surfaces.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    return mesh.vertices, mesh.faces
