@@ -95,7 +95,7 @@ def outputs_of(folder: Path, stage: Stage, hashes: Hashes | None = None) -> dict
         if name == manifest.NAME:
             raise StageFailed(f"{stage.name}: left a file named {manifest.NAME}, which is the engine's own")
         is_volatile = any(fnmatch.fnmatchcase(name, pattern) for pattern in stage.volatile)
-        outputs[name] = Output(hashes.digest(f"{stage.name}/{name}", folder / name, trust=False), status.st_size, is_volatile)
+        outputs[name] = Output(hashes.digest(f"{stage.name}/{name}", folder / name, anew=True), status.st_size, is_volatile)
     if not outputs:
         raise StageFailed(f"{stage.name}: left no file behind")
     return outputs

@@ -36,7 +36,7 @@ def interruption_in(error: BaseException, signalled: int | None) -> Interrupted 
     return None
 
 
-def translated(error: Exception, stage: str, run: Path) -> PipelineError:
+def translated(error: BaseException, stage: str, run: Path) -> PipelineError:
     """A PipelineError stays as it is; a full disk, a lack of memory and everything else become one line about the stage."""
     full = _full_folder(error, run)
     if full is not None:
@@ -50,7 +50,7 @@ def translated(error: Exception, stage: str, run: Path) -> PipelineError:
     return StageFailed(f"{stage}: {text[:500]}")
 
 
-def _full_folder(error: Exception, run: Path) -> Path | None:
+def _full_folder(error: BaseException, run: Path) -> Path | None:
     """The folder whose disk is full, if that is what happened."""
     for cause in history(error):
         if is_disk_full(cause):

@@ -60,7 +60,7 @@ def is_safe_name(name: str) -> bool:
     if not name or "\0" in name or name != str(PurePosixPath(name)):
         return False
     path = PurePosixPath(name)
-    return not path.is_absolute() and all(part not in ("..", ".") for part in path.parts)
+    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -44,14 +44,17 @@ class Hashes:
         self._changed = False
         self._entries: dict[str, tuple[int, int, int, str]] = {} if path is None else _read(path)
 
-    def digest(self, key: str, path: Path, *, trust: bool = True) -> str:
-        """Of the file at `path`, which is or will be at the place `key`. Raises OSError if it cannot be read."""
+    def digest(self, key: str, path: Path, *, anew: bool = False) -> str:
+        """Of the file at `path`, which is or will be at the place `key`. Raises OSError if it cannot be read.
+
+        anew  read it whatever is remembered, and without a safe point: what a stage has just finished is not given up for a Ctrl-C
+        """
         before = os.stat(path)
         known = self._entries.get(key)
-        if trust and self.trust and known is not None and known[:3] == _identity(before):
+        if self.trust and not anew and known is not None and known[:3] == _identity(before):
             return known[3]
         started = time.time_ns()
-        digest = sha256_of(path, self.safe_point)
+        digest = sha256_of(path, None if anew else self.safe_point)
         after = os.stat(path)
         if _identity(after) == _identity(before) and after.st_mtime_ns < started - SETTLED_NS:
             self._entries[key] = (*_identity(after), digest)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from pipeline import artifact
+from pipeline import artifact, files, manifest
 from pipeline.artifact import Workplace
 from pipeline.decide import Decision, decide, survey
 from pipeline.errors import BadInput, CorruptArtifact, Interrupted, UsageError
@@ -20,7 +20,7 @@ from pipeline.executors.local import Usage
 from pipeline.failures import interruption_in, translated
 from pipeline.hashes import Hashes
 from pipeline.interrupt import Stop, stopping
-from pipeline.manifest import Manifest, Request, read_manifest
+from pipeline.manifest import Manifest, Request
 from pipeline.run import Run, disk_full, is_disk_full
 from pipeline.stage import Job, Report, Stage, settings_from
 
@@ -175,7 +175,7 @@ class _Runner:
         if decision.note is not None:
             raise BadInput(f"{stage.name} has to run ({reason}), but {decision.note.partition(';')[0]}. Put the source back, or undo the change.")
         for need in stage.needs:
-            made = read_manifest(self.run.folder(need))
+            made = manifest.read_manifest(self.run.folder(need))
             found = artifact.differences(self.run.folder(need), made.outputs, self.hashes)
             if found.damaged:
                 names = tuple(f"{need}/{name}" for name in found.damaged)
@@ -186,7 +186,10 @@ class _Runner:
         """Clear up after a stage that raised, and raise what the user is to see."""
         failure = interruption_in(error, self.stop()) or translated(error, stage.name, self.run.path)
         with contextlib.suppress(OSError):  # else the next start clears up; the error that brought us here is the one to tell
-            artifact.abandon(place, self.work)
+            if files.exists(place.out / manifest.NAME):
+                artifact.recover(self.run.path)  # it was being published
+            else:
+                artifact.abandon(place, self.work)
         if isinstance(failure, Interrupted):
             raise failure from error
         self.emit("stage_failed", stage.name, text=str(failure), exit_code=failure.exit_code)
@@ -223,7 +226,7 @@ def verify(run: Run, stages: Sequence[Stage], report: Report | None = None) -> l
         if not folder.exists():
             continue
         try:
-            made = read_manifest(folder)
+            made = manifest.read_manifest(folder)
         except CorruptArtifact as error:
             damaged.extend(error.files or (stage.name,))
             _emit(report, "warning", stage.name, text=str(error), state="corrupt")
@@ -240,8 +243,7 @@ def verify(run: Run, stages: Sequence[Stage], report: Report | None = None) -> l
         _emit(report, "message", stage.name, text=f"{stage.name}: {len(made.outputs)} files as they were written", size=made.size)
         outcomes.append(_outcome(stage, "verified", None, made))
     if damaged:
-        files = artifact.listed(damaged)
-        raise CorruptArtifact(f"{run.path}: {files} not as written. Make anew what is damaged: {run.command()}", tuple(damaged))
+        raise CorruptArtifact(f"{run.path}: {artifact.listed(damaged)} not as written. Make anew what is damaged: {run.command()}", tuple(damaged))
     return outcomes
 
 

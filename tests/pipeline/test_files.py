@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from pipeline import files
+
+
+@pytest.mark.parametrize("name", ["a", "a/b.txt", "images/0 1.jpg", "..a", "a..", ".hidden", "a\\b"])
+def test_names_that_stay(name: str) -> None:
+    assert files.is_safe_name(name)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "/a", "//a", "../a", "a/../b", "a/..", "a//b", "a/", "./a", "a/./b", "a\0b"])
+def test_names_that_leave_or_are_not_the_only_spelling(name: str) -> None:
+    assert not files.is_safe_name(name)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "empty"),
+        (b"{", "not JSON"),
+        (b"\xff\xfe", "not JSON"),
+        (b"[NaN]", "NaN"),
+        (b"[" * 100_000, "nested too deeply"),
+        (b"1" * 5000, "not JSON"),
+        (b" " * 30000, "larger than"),
+    ],
+)
+def test_json_from_anybody(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(data)
+    with pytest.raises(files.Unreadable, match=message) as caught:
+        files.read_json(path, limit=200_000 if data.startswith(b"[[") else 20_000)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_in_place_of_a_file_is_unreadable(tmp_path: Path) -> None:
+    with pytest.raises(files.Unreadable, match="directory"):
+        files.read_json(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        files.read_json(tmp_path / "none.json")
+
+
+def test_canonical_json_has_one_spelling() -> None:
+    assert files.canonical_json({"b": (1, 2.0), "a": "é"}) == b'{"a":"\\u00e9","b":[1,2.0]}'
+    with pytest.raises(ValueError, match="JSON"):
+        files.canonical_json(float("inf"))
+
+
+def test_write_atomically_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    files.write_atomically(path, b"1")
+    files.write_atomically(path, b"2")
+    assert path.read_bytes() == b"2"
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_walk_names_files_and_links_but_does_not_follow(tmp_path: Path) -> None:
+    (tmp_path / "in" / "sub").mkdir(parents=True)
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "secret").write_text("x")
+    (tmp_path / "in" / "a").write_text("x")
+    (tmp_path / "in" / "sub" / "b").write_text("x")
+    (tmp_path / "in" / "link").symlink_to(tmp_path / "outside")
+    assert sorted(name for name, _ in files.walk(tmp_path / "in")) == ["a", "link", "sub/b"]
+
+
+def test_remove_takes_a_link_and_leaves_its_target(tmp_path: Path) -> None:
+    target = tmp_path / "target"
+    target.mkdir()
+    (tmp_path / "link").symlink_to(target)
+    files.discard(tmp_path / "link", tmp_path)
+    assert os.listdir(tmp_path) == ["target"]
+    files.discard(tmp_path / "none", tmp_path)

@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import Interrupted
+from pipeline.hashes import Hashes
+
+
+def old_file(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    os.utime(path, ns=(10**18, 10**18))
+    return path
+
+
+def test_a_known_file_is_not_read_again(tmp_path: Path) -> None:
+    path = old_file(tmp_path / "a", b"one")
+    hashes = Hashes(tmp_path / "cache" / "h.json")
+    first = hashes.digest("k", path)
+    assert first == hashlib.sha256(b"one").hexdigest()
+    hashes.save()
+
+    with open(path, "r+b") as file:  # the same inode, size and, below, time
+        file.write(b"two")
+    os.utime(path, ns=(10**18, 10**18))
+    again = Hashes(tmp_path / "cache" / "h.json")
+    assert again.digest("k", path) == first
+    assert again.digest("k", path, anew=True) != first
+    assert Hashes(tmp_path / "cache" / "h.json", trust=False).digest("k", path) != first
+
+
+def test_another_size_time_or_inode_is_read(tmp_path: Path) -> None:
+    path = old_file(tmp_path / "a", b"one")
+    hashes = Hashes()
+    hashes.digest("k", path)
+    other = old_file(tmp_path / "b", b"two")
+    os.replace(other, path)
+    assert hashes.digest("k", path) == hashlib.sha256(b"two").hexdigest()
+    with open(path, "r+b") as file:
+        file.write(b"six")
+    assert hashes.digest("k", path) == hashlib.sha256(b"six").hexdigest()
+
+
+def test_a_file_that_has_just_changed_is_not_remembered(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    hashes = Hashes()
+    digests = set()
+    for round in range(50):  # of the same size, several within one tick of the file system's clock
+        with open(path, "r+b" if path.exists() else "wb") as file:
+            file.write(b"%03d" % round)
+        digests.add(hashes.digest("k", path))
+    assert len(digests) == 50
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "other", "files": {}}', '{"format": "enerf-hashes-1", "files": {"k": [1, 2, 3, "x"], "l": 5}}'])
+def test_a_damaged_memory_is_ignored(tmp_path: Path, text: str) -> None:
+    cache = tmp_path / "h.json"
+    cache.write_text(text)
+    path = old_file(tmp_path / "a", b"one")
+    assert Hashes(cache).digest("k", path) == hashlib.sha256(b"one").hexdigest()
+
+
+def test_forgetting(tmp_path: Path) -> None:
+    cache = tmp_path / "h.json"
+    path = old_file(tmp_path / "a", b"one")
+    hashes = Hashes(cache)
+    for key in ("train/a", "train/b", "bake/a"):
+        hashes.digest(key, path)
+    hashes.forget("train/", {"train/b"})
+    hashes.save()
+    assert '"bake/a"' in cache.read_text()
+    assert '"train/b"' in cache.read_text()
+    assert '"train/a"' not in cache.read_text()
+
+
+def test_a_memory_that_cannot_be_written_does_no_harm(tmp_path: Path) -> None:
+    path = old_file(tmp_path / "a", b"one")
+    hashes = Hashes(tmp_path / "a" / "h.json")
+    hashes.digest("k", path)
+    hashes.save()
+
+
+def test_hashing_can_be_interrupted(tmp_path: Path) -> None:
+    path = old_file(tmp_path / "a", b"one")
+
+    def stop() -> None:
+        raise Interrupted()
+
+    with pytest.raises(Interrupted):
+        Hashes(safe_point=stop).digest("k", path)
+    assert Hashes(safe_point=stop).digest("k", path, anew=True)

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from pipeline.errors import Interrupted, UnknownSetting, UsageError
+from pipeline.stage import Job, Stage, settings_dict, settings_from
+from tests.pipeline.toy import Events, NoSettings
+
+
+@dataclass(frozen=True)
+class Settings:
+    iterations: int = field(default=100, metadata={"minimum": 1, "maximum": 1000})
+    rate: float = 0.5
+    strict: bool = False
+    up: str = field(default="auto", metadata={"choices": ("auto", "x", "y", "z")})
+    colour: tuple[float, float, float] | None = None
+    sizes: tuple[int, ...] = field(default=(1, 2), metadata={"minimum": 0})
+    limit: int | float | None = None
+    mode: Literal["a", "b"] = "a"
+
+
+def test_values_as_json_gives_them_become_the_settings_own_types() -> None:
+    made = settings_from(Settings, {"rate": 2, "colour": [1, 0.5, 0], "sizes": [3], "mode": "b", "limit": 3})
+    assert made == Settings(rate=2.0, colour=(1.0, 0.5, 0.0), sizes=(3,), mode="b", limit=3)
+    assert type(made.rate) is float
+    assert type(made.limit) is int
+
+
+def test_plain_values_and_back() -> None:
+    made = Settings(colour=(1.0, 0.0, 0.0))
+    assert settings_dict(made)["colour"] == [1.0, 0.0, 0.0]
+    assert settings_from(Settings, settings_dict(made)) == made
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"iterations": 2.0}, "train.iterations: expected a whole number, found 2.0 (float)"),
+        ({"iterations": True}, "train.iterations: expected a whole number, found True (bool)"),
+        ({"iterations": "5"}, "found '5' (str)"),
+        ({"iterations": 0}, "expected at least 1"),
+        ({"iterations": 1001}, "expected at most 1000"),
+        ({"rate": float("nan")}, "expected a finite number"),
+        ({"rate": True}, "expected a finite number"),
+        ({"strict": 1}, "expected true or false"),
+        ({"up": "Z"}, "expected one of auto, x, y, z"),
+        ({"colour": [1, 2]}, "expected a list of 3"),
+        ({"colour": "red"}, "or none"),
+        ({"sizes": [1, -1]}, "expected at least 0"),
+        ({"sizes": 3}, "expected a list"),
+        ({"mode": "c"}, "one of 'a', 'b'"),
+        ({"strict": None}, "found none"),
+    ],
+)
+def test_a_wrong_value_is_refused_and_named(values: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        settings_from(Settings, values, where="train")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_an_unknown_setting_names_the_nearest() -> None:
+    with pytest.raises(UnknownSetting, match=r"train\.iteration: no such setting\. Did you mean train\.iterations\?"):
+        settings_from(Settings, {"iteration": 5}, where="train")
+    with pytest.raises(UnknownSetting, match="There are: iterations, rate"):
+        settings_from(Settings, {"qqq": 5})
+    with pytest.raises(UsageError, match="expected a table"):
+        settings_from(Settings, [1], where="train")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", ".work", "A", "1st", "old-train"])
+def test_a_stage_name_is_a_folder_name(name: str) -> None:
+    with pytest.raises(ValueError, match="stage name"):
+        Stage(name, 1, NoSettings, (), lambda job: None)
+
+
+def test_a_job_made_by_hand(tmp_path: Path) -> None:
+    job = Job(settings=Settings(), inputs={}, out=tmp_path / "out", work=tmp_path / "work")
+    job.say("hello")
+    job.warn("careful", file="a")
+    job.progress(1, 2)
+    job.safe_point()
+    assert job.out.is_dir()
+    assert job.work.is_dir()
+    assert job.device == "cpu"
+
+
+def test_progress_is_thinned_but_the_first_and_the_last_arrive(tmp_path: Path) -> None:
+    events = Events()
+    job = Job(settings=None, out=tmp_path / "o", work=tmp_path / "w", stage="train", report=events)
+    for step in range(1, 5001):
+        job.progress(step, 5000, psnr=20.0)
+    assert 2 <= len(events) < 100
+    assert events[0]["done"] == 1
+    assert events[-1]["done"] == 5000
+    assert {"event", "stage", "time", "total", "text", "psnr"} <= events[-1].keys()
+
+
+def test_a_safe_point_raises_once_a_signal_has_arrived(tmp_path: Path) -> None:
+    job = Job(settings=None, out=tmp_path / "o", work=tmp_path / "w", stop=lambda: 15)
+    with pytest.raises(Interrupted) as caught:
+        job.safe_point()
+    assert caught.value.exit_code == 143
