@@ -75,7 +75,7 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
 def _best(source: Source) -> Path:
     found = model_folders(source.root)
     if not found:
-        raise BadInput(f"{source.root}: no COLMAP model: expected cameras and images (.bin or .txt) here, in sparse/ or in sparse/0 ... Choose another format with --as?")
+        raise BadInput(f"{source.root}: no COLMAP model: expected cameras and images (.bin or .txt) here, in sparse/ or sparse/0. Choose a format with --as.")
     source.check_inside(found[0])
     return found[0]
 
@@ -92,7 +92,8 @@ def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], 
     counts = Counter({folder: sum((folder / name).is_file() for name in names.values()) for folder in shown})
     best = max(shown, key=lambda folder: counts[folder])  # the first of equals
     found: dict[int, Path | None] = {}
-    places, extensions = [], []
+    places: list[tuple[str, str]] = []
+    extensions: list[tuple[str, str]] = []
     for number, name in names.items():
         result = source.find(name, best)
         found[number] = result.path

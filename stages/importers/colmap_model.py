@@ -169,7 +169,8 @@ def _lens(path: Path, number: int, model: str, width: int, height: int, params: 
 def _posed(path: Path, name: str, camera: int, numbers: tuple[float, ...]) -> PosedImage:
     quaternion, translation = numbers[:4], numbers[4:]
     if not all(map(math.isfinite, numbers)) or abs(math.hypot(*quaternion) - 1) > 1e-2:
-        raise BadInput(f"{path}: image {name}: quaternion {list(quaternion)}, translation {list(translation)}; expected a unit quaternion and finite numbers. {_AGAIN}")
+        found = f"quaternion {list(quaternion)}, translation {list(translation)}"
+        raise BadInput(f"{path}: image {name}: {found}; expected a unit quaternion and finite numbers. {_AGAIN}")
     if not name:
         raise BadInput(f"{path}: an image without a name. {_AGAIN}")
     return PosedImage(name, camera, quaternion, translation)  # type: ignore[arg-type]
@@ -283,7 +284,8 @@ def _images_txt(path: Path) -> dict[int, PosedImage]:
     for line, text, points in _image_lines(path):
         words = text.split(maxsplit=9)
         if len(words) < 10:
-            raise BadInput(f"{path}: line {line}: {len(words)} words, expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME (then a line of points, or an empty one).")
+            expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME (then a line of points, or an empty one)"
+            raise BadInput(f"{path}: line {line}: {len(words)} words, expected {expected}. {_AGAIN}")
         if points is not None and len(points.split()) % 3:
             raise BadInput(f"{path}: line {line + 1}: truncated: points come as X Y POINT3D_ID, found {len(points.split())} words. {_AGAIN}")
         if len(images) >= MOST_IMAGES:
@@ -301,7 +303,8 @@ def _points_txt(path: Path) -> Points:
         if not words or words[0].startswith("#"):
             continue
         if len(words) < 8 or len(words) % 2:
-            raise BadInput(f"{path}: line {line}: truncated: {len(words)} words, expected POINT3D_ID X Y Z R G B ERROR and pairs IMAGE_ID POINT2D_IDX. {_AGAIN}")
+            expected = "POINT3D_ID X Y Z R G B ERROR and pairs IMAGE_ID POINT2D_IDX"
+            raise BadInput(f"{path}: line {line}: truncated: {len(words)} words, expected {expected}. {_AGAIN}")
         numbers = _numbers(path, line, words[1:8])
         colour = numbers[3:6]
         if not all(0 <= channel <= 255 for channel in colour):
@@ -311,4 +314,5 @@ def _points_txt(path: Path) -> Points:
         error.append(numbers[6])
         observers.append(tuple(sorted({_integer(path, line, word) for word in words[8::2]})))
     _check_count(path, "points", len(xyz))
-    return _finite(path, Points(np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3), np.array(error, np.float64), tuple(observers)))
+    points = Points(np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3), np.array(error, np.float64), tuple(observers))
+    return _finite(path, points)

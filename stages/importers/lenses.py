@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from efficientnerf.cameras import Camera, quarter_turned, resized
 from pipeline.errors import BadInput
+from stages.importers.source import listed
 
 _EXIF_ORIENTATION = 0x0112
 _QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}  # clockwise, from the stored pixels to the upright image; the others are mirrored
@@ -99,7 +100,7 @@ def rotation(columns: np.ndarray, where: str) -> np.ndarray:
     if np.abs(columns.T @ columns - np.eye(3)).max() > 2e-3:
         raise BadInput(f"{where}: the matrix is no rotation: its axes have lengths {', '.join(f'{n:.4g}' for n in lengths)} or are not at right angles.")
     if np.linalg.det(columns) < 0:
-        raise BadInput(f"{where}: the matrix is left-handed (a mirror image). Negate one axis where the data set was written; the project's axes are right-handed.")
+        raise BadInput(f"{where}: the matrix is left-handed (a mirror image). Negate one axis where the data set was written.")
     left, _, right = np.linalg.svd(columns)
     return np.asarray(left @ right)
 
@@ -124,17 +125,17 @@ def fitted(camera: Camera, header: Header, where: str) -> tuple[Camera, str | No
     Raises BadInput where the aspect does not agree (1 %, or a pixel of rounding).
     """
     width, height = header.size
-    if header.orientation >= 5 and not same_aspect((camera.width, camera.height), (width, height)):
-        if same_aspect((camera.width, camera.height), (height, width)):
-            if header.orientation not in _QUARTER_TURNS:
-                raise BadInput(f"{where}: the image is mirrored by its EXIF orientation ({header.orientation}) and the camera is not. Write the image upright.")
-            camera = resized(camera, height, width)
-            for _ in range(_QUARTER_TURNS[header.orientation]):
-                camera = quarter_turned(camera)
-            return camera, "turned"
-    if (camera.width, camera.height) == (width, height):
+    stated = camera.width, camera.height
+    if header.orientation >= 5 and not same_aspect(stated, (width, height)) and same_aspect(stated, (height, width)):
+        if header.orientation not in _QUARTER_TURNS:
+            raise BadInput(f"{where}: the image is mirrored by its EXIF orientation ({header.orientation}) and the camera is not. Write the image upright.")
+        camera = resized(camera, height, width)
+        for _ in range(_QUARTER_TURNS[header.orientation]):
+            camera = quarter_turned(camera)
+        return camera, "turned"
+    if stated == (width, height):
         return camera, "upright?" if header.orientation != 1 and (header.orientation < 5 or width == height) else None
-    if not same_aspect((camera.width, camera.height), (width, height)):
+    if not same_aspect(stated, (width, height)):
         raise BadInput(
             f"{where}: the camera is stated for {camera.width}x{camera.height}, the image is {width}x{height}, of another aspect. "
             "Use the images that the cameras were made for (not cropped ones), or correct w and h."
@@ -150,17 +151,11 @@ def same_aspect(stated: tuple[int, int], actual: tuple[int, int]) -> bool:
     return abs(width * h / (w * height) - 1) <= 0.01 or abs(height - h * width / w) <= 1 or abs(width - w * height / h) <= 1
 
 
-def with_name(camera: Camera, name: str) -> Camera:
-    return replace(camera, name=name)
-
-
 def fit_warnings(where: str, odd: dict[str, list[str]]) -> list[str]:
     """Sentences about what `fitted` found odd: kind -> names of the images."""
-    sentences = []
-    if odd.get("resized"):
-        sentences.append(f"{where}: {len(odd['resized'])} images are not of the stated size ({odd['resized'][0]}, ...); the intrinsics were scaled to them.")
-    if odd.get("turned"):
-        sentences.append(f"{where}: {len(odd['turned'])} images are turned by EXIF ({odd['turned'][0]}, ...) and stated as stored; the cameras were turned with them.")
-    if odd.get("upright?"):
-        sentences.append(f"{where}: {len(odd['upright?'])} images are turned by EXIF ({odd['upright?'][0]}, ...); the cameras are taken to be those of the upright images.")
-    return sentences
+    said = {
+        "resized": "are not of the stated size; the intrinsics were scaled to them",
+        "turned": "are turned by EXIF and their cameras stated for the pixels as stored; the cameras were turned too",
+        "upright?": "are turned by EXIF; their cameras are taken to be those of the upright images",
+    }
+    return [f"{where}: {len(names)} images ({listed(names)}) {said[kind]}." for kind, names in odd.items()]

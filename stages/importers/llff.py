@@ -15,8 +15,8 @@ from efficientnerf.cameras import Camera, pose_from_llff
 from pipeline.errors import BadInput
 from stages.capture import Capture, Photo
 from stages.importers import lenses
-from stages.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, images_in
 from stages.importers.photographs import masks_of
+from stages.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, images_in
 
 POSES = "poses_bounds.npy"
 
@@ -97,7 +97,7 @@ def _rows(path: Path) -> np.ndarray:
             raise BadInput(f"{path}: {size} bytes; more than {MOST_FRAMES} poses are not read.")
         array = np.load(path, allow_pickle=False, mmap_mode=None)
     except OSError as error:
-        raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. It is expected in an LLFF folder; name that folder, or choose a format with --as.") from error
+        raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error
     except (ValueError, EOFError, MemoryError) as error:
         raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({str(error).splitlines()[0] if str(error) else type(error).__name__}).") from error
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 17 or array.dtype.kind not in "fiu":
@@ -117,14 +117,15 @@ def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[
     counts = {factor: len(images_in(folder)) for factor, folder in folders.items()}
     if settings.llff_factor is not None:
         if settings.llff_factor not in folders:
-            raise BadInput(f"{source.root}: no images reduced by {settings.llff_factor} (poses.llff_factor); there are {', '.join(f.name for f in folders.values())}.")
+            there = ", ".join(folder.name for folder in folders.values())
+            raise BadInput(f"{source.root}: no images reduced by {settings.llff_factor} (poses.llff_factor); there are {there}.")
         usable = [settings.llff_factor]
     else:
         usable = list(folders)
     fitting = [factor for factor in usable if counts[factor] == count]
     if not fitting:
         found = ", ".join(f"{folders[factor].name} holds {counts[factor]}" for factor in usable)
-        raise BadInput(f"{source.root / POSES}: {count} poses, but {found} images; rows belong to the sorted names one to one. Restore the images that were used.")
+        raise BadInput(f"{source.root / POSES}: {count} poses, but {found} images; rows belong to the sorted names. Restore the images it was made from.")
     warnings = []
     if fitting[0] != usable[0]:
         warnings.append(f"{folders[usable[0]].name} holds {counts[usable[0]]} images for {count} poses; {folders[fitting[0]].name} is used instead.")

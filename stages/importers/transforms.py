@@ -28,8 +28,10 @@ from stages.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source,
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 LARGEST_PLY = 1 << 30  # bytes
 _REMEDY = "Copy them into the source folder, or take their frames out of the JSON."
-_NERFSTUDIO_KEYS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path", "orientation_override", "train_filenames", "val_filenames", "test_filenames")
-_NGP_KEYS = ("aabb_scale", "scale", "offset", "is_fisheye", "from_na", "n_extra_learnable_dims", "enable_depth_loading", "integer_depth_scale", "render_aabb")
+_NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path")
+_NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
+_NGP_FACTS = ("aabb_scale", "scale", "offset")
+_NGP_KEYS = (*_NGP_FACTS, "is_fisheye", "from_na", "n_extra_learnable_dims", "enable_depth_loading", "integer_depth_scale", "render_aabb")
 _UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")
 _NGP_SCALE = 0.33  # of instant-ngp, where the file states none
 
@@ -127,14 +129,14 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
         rejected=tuple(rejected),
         warnings=tuple(warnings + point_warnings),
         metric=any("depth_file_path" in frame.entry for frame in listing.frames) and "applied_scale" not in document,
-        facts={key: document[key] for key in (*_NERFSTUDIO_KEYS[:4], *_NGP_KEYS[:3]) if key in document},
+        facts={key: document[key] for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
     )
 
 
 def _document(file: Path) -> dict[str, Any]:
     document = read_json(file)
     if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
-        raise BadInput(f"{file}: no data set: expected an object with a list `frames`. Name the folder of a transforms.json data set, or choose a format with --as.")
+        raise BadInput(f"{file}: no data set: expected an object with a list `frames`. Name the folder of a data set, or choose a format with --as.")
     if not document["frames"]:
         raise BadInput(f"{file}: its list of frames is empty. At least {FEWEST} are needed.")
     if len(document["frames"]) > MOST_FRAMES:

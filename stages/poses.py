@@ -1,0 +1,237 @@
+"""The poses stage: a source in any format becomes a scene that needs the source no more.
+
+    detect the format -> read the cameras, or find them -> working images -> training frame -> split -> write
+
+Undistortion is not needed: every later stage traces the distorted rays of the working images.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from efficientnerf.cameras import resized
+from pipeline.errors import BadInput
+from pipeline.stage import Job, Stage
+from stages import importers
+from stages.capture import Capture, Photo, SparsePoints
+from stages.importers.source import FEWEST, Source, listed
+from stages.scene import SPLITS, Scene, View, save, save_points
+from stages.settings import setting
+
+WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
+
+
+@dataclass(frozen=True)
+class PosesSettings:
+    """How a source is read and framed."""
+
+    format: str = setting("auto", "Format of the source; auto looks at what is there.", choices=importers.FORMATS)
+    max_side: int = setting(1024, "Longest side of the images that later stages read; larger ones are reduced.", minimum=32, maximum=16384, unit="pixels")
+    up: str = setting("auto", "Axis of the capture's frame that points up; auto estimates it.", choices=("auto", "x", "y", "z", "-x", "-y", "-z"))
+    box: tuple[float, float, float, float, float, float] | None = setting(
+        None, "Crop box in the capture's frame: x y z of one corner, then of the opposite one; none estimates it."
+    )
+    margin: float = setting(0.05, "Room left on each side of an estimated box, as a fraction of its size.", minimum=0.0, maximum=2.0)
+    alpha: str = setting(
+        "auto",
+        "What alpha means: composite (an object on a constant background, white) or mask (transparent pixels are left out).",
+        choices=("auto", "composite", "mask"),
+    )
+    test_every: int = setting(8, "Every n-th image in sorted order is held back for testing where the source states no split.", minimum=2)
+    llff_factor: int | None = setting(None, "Reduction of the LLFF images to use (images_N); none takes the largest there are.", minimum=1)
+    strict: bool = setting(False, "Refuse a source of which images are missing or cannot be read, instead of warning.")
+    allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.")
+    matching: str = setting(
+        "auto",
+        "Which photographs are compared: all pairs, or each with those that follow; auto goes by their number.",
+        choices=("auto", "exhaustive", "sequential"),
+    )
+    features: int = setting(4096, "Most features found in a photograph.", minimum=256, maximum=65536)
+    feature_side: int = setting(1600, "Longest side of the photographs at which features are found.", minimum=320, maximum=8192, unit="pixels")
+    seed: int = setting(0, "Seed of every random choice in finding cameras.", minimum=0, maximum=2**31 - 1)
+
+
+def run(job: Job) -> None:
+    """Write scene.json, images/, masks/, points.safetensors, contact_sheet.png and report.json. Raises BadInput."""
+    from stages import framing, working_images
+    from stages.contact_sheet import write_contact_sheet
+
+    settings: PosesSettings = job.settings
+    if job.source is None:
+        raise BadInput("the poses stage needs a source: name a folder of photographs or of a posed data set.")
+    notes: list[str] = []
+
+    def warn(text: str, **facts: Any) -> None:
+        notes.append(text)
+        job.warn(text, **facts)
+
+    capture = read(job, settings, warn)
+    job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
+    keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].module == "transforms")
+    capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
+    framed = framing.frame(capture, up=settings.up, box=settings.box, margin=settings.margin)
+    splits = assign_splits(capture.photos, settings.test_every, warn)
+    world = framed.world_from_capture
+    views = tuple(
+        View(
+            image=files.image,
+            mask=files.mask,
+            split=split,
+            camera=world.camera(resized(photo.camera, files.width, files.height)),
+            source_camera=photo.camera,
+            near=float(near),
+            far=float(far),
+        )
+        for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far, strict=True)
+    )
+    if capture.points is not None:
+        save_points(replace(capture.points, xyz=world.points(capture.points.xyz)), job.out)
+    scene = Scene(
+        kind=capture.kind,
+        views=views,
+        bounds=framed.bounds,
+        background=capture.background,
+        world_from_capture=world,
+        orbit=framed.orbit,
+        points=capture.points is not None,
+        metric=capture.metric,
+    )
+    save(scene, job.out)
+    _write_report(job.out / "report.json", capture, scene, framed.facts, notes)
+    job.safe_point()
+    write_contact_sheet(scene, job.out, capture.rejected, job.source)
+
+
+STAGE = Stage(name="poses", version=1, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
+
+
+def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
+    """The capture of the job's source, its cameras found first where the format states none."""
+    assert job.source is not None
+    possible = importers.candidates(job.source) if settings.format == "auto" else [settings.format]
+    name = possible[0]
+    if len(possible) > 1 and possible[1:] != ["photographs"]:
+        warn(f"{job.source} is read as {name}; it could also be {', '.join(possible[1:])}. Choose with --as.")
+    if importers.IMPORTERS[name].posed:
+        capture = importers.IMPORTERS[name].read(job.source, settings)
+        for sentence in capture.warnings:
+            warn(sentence)
+    else:
+        capture = _find_cameras(job, settings, warn)
+    if settings.strict and capture.rejected:
+        which = listed([f"{image} ({why})" for image, why in capture.rejected])
+        raise BadInput(f"{job.source}: {len(capture.rejected)} images cannot be used: {which}. Refused by --strict.")
+    return capture
+
+
+def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
+    from stages.importers.photographs import masks_of, photographs
+    from stages.photographs import find_cameras
+
+    assert job.source is not None
+    source = Source(job.source, settings.allow_outside)
+    images = [source.check_inside(path) for path in photographs(source.root)]
+    return find_cameras(
+        source.root,
+        [source.name_of(path) for path in images],
+        max_side=settings.feature_side,
+        features=settings.features,
+        matching=settings.matching,
+        seed=settings.seed,
+        masks={source.name_of(image): mask for image, mask in masks_of(source, images).items()},
+        work=job.work / "cameras",
+        progress=job.progress,
+        safe_point=job.safe_point,
+        warn=warn,
+    )
+
+
+def _format_of(capture: Capture) -> str:
+    return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
+
+
+def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tuple[Capture, list[Any]]:
+    """Write every working image; the capture without the images that cannot be decoded, and what was written for the others."""
+    from stages import working_images
+    from stages.upright import UnreadableImage
+
+    relative = working_images.relative_paths([photo.camera for photo in capture.photos])
+    kept: list[int] = []
+    written = []
+    failed: list[tuple[str, str]] = []
+    odd: list[str] = []
+    for index, photo in enumerate(capture.photos):
+        job.safe_point()
+        job.progress(index, len(capture.photos), "preparing images")
+        try:
+            written.append(working_images.write(photo, job.out, relative[index], max_side=job.settings.max_side, keep_alpha=keep_alpha))
+            odd += written[-1].warnings
+            kept.append(index)
+        except UnreadableImage as error:
+            failed.append((photo.camera.name, str(error)))
+    job.progress(len(capture.photos), len(capture.photos), "preparing images")
+    if failed:
+        sentence = f"{len(failed)} of {len(capture.photos)} images cannot be used: {listed([f'{name} {reason}' for name, reason in failed])}."
+        if len(kept) < FEWEST or job.settings.strict:
+            why = "Refused by --strict." if len(kept) >= FEWEST else f"{len(kept)} remain; at least {FEWEST} are needed."
+            raise BadInput(f"{job.source}: {sentence} {why} Copy or convert them again, or take them out.")
+        warn(f"{sentence} They are left out.")
+    for sentence in [*odd[:3], *([f"... and {len(odd) - 3} more remarks like these."] if len(odd) > 3 else [])]:
+        warn(sentence)
+    return without(capture, kept, failed), written
+
+
+def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, str]]) -> Capture:
+    """The capture with only the photos `kept`; the others are rejected, and points forget them."""
+    if not failed:
+        return capture
+    place = {index: new for new, index in enumerate(kept)}
+    points = capture.points
+    if points is not None:
+        observers = tuple(tuple(place[photo] for photo in seen if photo in place) for seen in points.observers)
+        points = SparsePoints(points.xyz, points.rgb, points.error, observers)
+    return replace(capture, photos=tuple(capture.photos[index] for index in kept), points=points, rejected=(*capture.rejected, *failed))
+
+
+def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: None) -> list[str]:
+    """The split of each photo: the source's where it states any images to hold back, else every n-th in sorted order is for testing.
+
+    At least 2 are left for training, whatever the source says.
+    """
+    given = [photo.split for photo in photos]
+    if any(split in ("val", "test") for split in given):
+        splits = [split or "train" for split in given]
+        if splits.count("train") >= 2:
+            unlisted = given.count(None)
+            if unlisted:
+                warn(f"{unlisted} images are in none of the splits that the source states; they are used for training.")
+            return splits
+        warn(f"The source states {splits.count('train')} images for training; at least 2 are needed, and its split is not used.")
+    order = sorted(range(len(photos)), key=lambda index: photos[index].camera.name)
+    test = set(order[::every][: max(0, len(photos) - 2)])
+    return ["test" if index in test else "train" for index in range(len(photos))]
+
+
+def _write_report(path: Path, capture: Capture, scene: Scene, framing_facts: dict[str, object], notes: Sequence[str]) -> None:
+    """What was used, what was not and why, and what was odd."""
+    report = {
+        "kind": capture.kind,
+        "registered": [
+            {"name": view.name, "split": view.split, "image": view.image, "mask": view.mask, "size": [view.camera.width, view.camera.height]}
+            for view in scene.views
+        ],
+        "rejected": [{"name": name, "reason": reason} for name, reason in capture.rejected],
+        "splits": {split: count for split, count in Counter(view.split for view in scene.views).items() if split in SPLITS},
+        "reprojection_error": capture.reprojection_error,
+        "points": 0 if capture.points is None else len(capture.points.xyz),
+        "background": capture.background,
+        "framing": framing_facts,
+        "facts": capture.facts,
+        "warnings": list(notes),
+    }
+    path.write_text(json.dumps(report, indent=1, allow_nan=False, default=str) + "\n", encoding="utf-8")
