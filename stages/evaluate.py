@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -268,12 +267,10 @@ def _clean(image: np.ndarray, job: Job, what: str) -> np.ndarray:
 
 
 def _write_json(document: dict[str, Any], path: Path) -> None:
-    aside = path.with_name(f".{path.name}.partial")
-    with aside.open("w", encoding="utf-8") as file:
-        file.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    from stages.exporters.aside import written_aside
+
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _keep_pictures(pictures: Sequence[np.ndarray], folder: Path, k: int) -> None:

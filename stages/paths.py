@@ -18,8 +18,10 @@ from stages.scene import Orbit
 if TYPE_CHECKING:
     from efficientnerf.nerftree.tree import NerfTree
 
-WIDEST_FIT = 50.0  # degrees: beyond it the picture of a box is all perspective, so the camera steps back instead
-ROOM = 1.05  # air around the box
+WIDEST_FIT = 50.0  # degrees: beyond it a picture is all perspective, so the camera steps back instead
+ROOM = 1.1  # air around what is shown
+STRAYS = 0.005  # share of the occupied cells that may leave the picture: specks at the edge of the box do not decide how large the subject is
+FIT_POINTS = 4000
 LARGEST_FILE = 64 << 20
 LARGEST_SIDE = 16384
 LARGEST_COUNT = 100_000
@@ -94,14 +96,25 @@ def turntable_poses(orbit: Orbit, frames: int, *, sway: float) -> list[np.ndarra
     return [pose_on_sphere(orbit.centre, orbit.radius, azimuth, elevation) for azimuth, elevation in angles]
 
 
-def half_extents_seen(poses: Sequence[np.ndarray], box: np.ndarray) -> tuple[float, float] | None:
-    """Tangents of the half angles, horizontal and vertical, under which all poses see a box (2, 3); None where one stands in it or too near."""
-    corners = np.stack(np.meshgrid(*np.asarray(box).T, indexing="ij"), -1).reshape(-1, 3)
-    local = np.stack([(corners - pose[:3, 3]) @ pose[:3, :3] for pose in poses])  # (C, 8, 3)
-    depth = local[..., 2]
-    if depth.min() <= 0.05 * np.abs(local).max():
-        return None
-    return float((np.abs(local[..., 0]) / depth).max()), float((np.abs(local[..., 1]) / depth).max())
+def occupied_points(tree: NerfTree) -> np.ndarray:
+    """(N, 3) centres of the coarse cells that hold something, some thousands of them at most; of an empty asset the corners of its box."""
+    cells = np.argwhere(tree.brick_index >= 0)
+    if not len(cells):
+        return np.stack(np.meshgrid(*np.stack([tree.bounds_min, tree.bounds_max]).T, indexing="ij"), -1).reshape(-1, 3)
+    cells = cells[:: max(1, len(cells) // FIT_POINTS)]
+    return np.asarray(tree.bounds_min) + (cells + 0.5) * (tree.brick * tree.voxel)
+
+
+def half_extent_seen(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> float:
+    """Tangent of half the vertical field of view in which all poses see the points (N, 3), but for a few strays; infinite where they stand among them.
+
+    aspect  width over height of the picture
+    """
+    local = np.stack([(points - pose[:3, 3]) @ pose[:3, :3] for pose in poses])  # (C, N, 3)
+    across, depth = np.maximum(np.abs(local[..., 0]) / aspect, np.abs(local[..., 1])), local[..., 2]
+    near = depth <= 0.02 * np.abs(local).max()
+    tangents = np.divide(across, depth, out=np.full_like(depth, np.inf), where=~near).max(axis=0)  # (N,)
+    return float(np.sort(tangents)[math.ceil((1.0 - STRAYS) * len(tangents)) - 1])
 
 
 def turntable_cameras(
@@ -118,23 +131,21 @@ def turntable_cameras(
     """The cameras of a turntable, pinholes in the training frame.
 
     elevation  degrees; None: as the capture's cameras stood
-    radius     distance from the centre in the capture's units; None: as the capture's cameras stood, or further where the box would not fit
-    fov        vertical, degrees; None: so that the box fits from everywhere
+    radius     distance from the centre in the capture's units; None: as the capture's cameras stood, or further where the asset would not fit
+    fov        vertical, degrees; None: so that the asset fits from everywhere
     sway       degrees; see turntable_poses
     """
     orbit = orbit_of(tree)
     distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
     orbit = Orbit(orbit.centre, distance, orbit.elevation if elevation is None else elevation, orbit.forward_facing, orbit.heading)
-    box = np.stack([tree.bounds_min, tree.bounds_max])
+    points = occupied_points(tree)
     widest = math.tan(math.radians(WIDEST_FIT / 2))
 
     def needed(poses: list[np.ndarray]) -> float:
-        """Tangent of half the vertical field of view that shows the box."""
-        seen = half_extents_seen(poses, box)
-        return math.inf if seen is None else ROOM * max(seen[1], seen[0] * height / width)
+        return ROOM * half_extent_seen(poses, points, width / height)
 
     poses = turntable_poses(orbit, frames, sway=sway)
-    # Captures from one side show nothing of what lies beyond their pictures, so there the camera stays and the box may leave the picture.
+    # Captures from one side show nothing of what lies beyond their pictures, so there the camera stays and the asset may leave the picture.
     if radius is None and fov is None and not orbit.forward_facing:
         for _ in range(60):
             if needed(poses) <= widest:

@@ -48,6 +48,15 @@ class BallTree:
         return -self.bounds_min
 
     @property
+    def brick_index(self) -> np.ndarray:
+        """Numbers the coarse cells that the ball may touch; -1 elsewhere."""
+        side = self.brick * self.voxel
+        axes = [self.bounds_min[k] + (np.arange(self.shape[k]) + 0.5) * side for k in range(3)]
+        away = np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij"), -1) - self.centre, axis=-1)
+        occupied = away < self.radius + 0.5 * np.sqrt(3.0) * side
+        return np.where(occupied, np.cumsum(occupied).reshape(self.shape) - 1, -1).astype(np.int32)
+
+    @property
     def metadata(self) -> dict[str, Any]:
         s = self.similarity
         return {

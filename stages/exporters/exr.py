@@ -6,12 +6,14 @@ normal.X normal.Y normal.Z (unit, in the capture's frame; zero where nothing is 
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
 import numpy as np
 
 from efficientnerf.cameras import Similarity
+from stages.exporters.aside import written_aside
 
 
 def write_exr(
@@ -25,7 +27,7 @@ def write_exr(
     normal   (H, W, 3)  unit, world frame
     world_from_capture  what takes depth and normals back to the capture's frame; None: they are in it
 
-    Written aside, synced and renamed.
+    The file appears whole or not at all.
     """
     import OpenEXR
 
@@ -38,11 +40,15 @@ def write_exr(
     channels = {"RGBA": _plane(rgba), "depth.Z": _plane(depth / scale)}
     channels |= {f"normal.{axis}": _plane(in_capture[..., k]) for k, axis in enumerate("XYZ")}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    aside = path.with_name(f".{path.name}.partial")
-    OpenEXR.File(header, channels).write(str(aside))
-    with aside.open("rb") as file:
-        os.fsync(file.fileno())
-    aside.replace(path)
+    with written_aside(path) as aside:
+        try:
+            OpenEXR.File(header, channels).write(str(aside))
+        except RuntimeError as error:
+            # The library has one exception for everything; a full disk has to be told from the rest.
+            for number in (errno.ENOSPC, errno.EDQUOT):
+                if os.strerror(number) in str(error):
+                    raise OSError(number, os.strerror(number), str(path)) from error
+            raise
 
 
 def _plane(values: np.ndarray) -> np.ndarray:

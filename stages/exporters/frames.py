@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.errors import UsageError
+from stages.exporters.aside import written_aside
 
 NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -53,15 +53,11 @@ def over_background(frame: np.ndarray, background: tuple[float, float, float]) -
 
 
 def write_png(frame: np.ndarray, path: Path) -> None:
-    """Write (H, W, 3) or (H, W, 4) uint8; written aside, synced and renamed, so that a kill leaves no half of a file."""
+    """Write (H, W, 3) or (H, W, 4) uint8; a kill leaves no half of a file."""
     from PIL import Image
 
-    aside = path.with_name(f".{path.name}.partial")
-    with aside.open("wb") as file:
-        Image.fromarray(np.ascontiguousarray(frame)).save(file, "PNG", compress_level=6)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    with written_aside(path) as aside:
+        Image.fromarray(np.ascontiguousarray(frame)).save(aside, "PNG", compress_level=6)
 
 
 def read_png(path: Path) -> np.ndarray:

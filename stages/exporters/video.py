@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+
+from stages.exporters.aside import written_aside
 
 
 def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 18, each: Callable[[], None] | None = None) -> int:
@@ -18,15 +19,14 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
     crf     x264's quality, 0 lossless to 51 worst
     each    called before each frame; may raise to stop
 
-    Written aside, synced and renamed. Raises ValueError where there is no frame or their sizes differ.
+    The file appears whole or not at all. Raises ValueError where there is no frame or their sizes differ.
     """
     import av
 
-    aside = path.with_name(f".{path.name}.partial")
     count, size = 0, None
     # bitexact: no names or versions of libraries, no dates. One thread: x264's decisions depend on their number.
     options = {"movflags": "+faststart", "fflags": "+bitexact"}
-    with av.open(str(aside), "w", format="mp4", container_options=options) as container:
+    with written_aside(path) as aside, av.open(str(aside), "w", format="mp4", container_options=options) as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": str(crf), "preset": "medium", "flags": "+bitexact"})
         stream.thread_count = 1
         stream.pix_fmt = "yuv420p"
@@ -48,9 +48,6 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
         if not count:
             raise ValueError(f"{path}: a video of no frames")
         container.mux(stream.encode())
-    with aside.open("rb") as file:
-        os.fsync(file.fileno())
-    aside.replace(path)
     return count
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import av
@@ -137,3 +138,14 @@ def test_mp4_of_nothing_or_of_mixed_sizes_is_refused_and_leaves_no_file(tmp_path
     with pytest.raises(ValueError, match="frame 1 has shape"):
         write_mp4(moving_frames(1, 32, 32) + moving_frames(1, 32, 34), tmp_path / "a.mp4", fps=30)
     assert not (tmp_path / "a.mp4").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_told_as_one_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = BallTree().render(CAMERA)
+    write = OpenEXR.File.write
+    monkeypatch.setattr(OpenEXR.File, "write", lambda file, path: write(file, "/dev/full"))
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_exr(tmp_path / "a.exr", colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal)
+    assert caught.value.errno == errno.ENOSPC
+    assert not list(tmp_path.iterdir())

@@ -77,7 +77,7 @@ def test_half_written_frames_are_drawn_again(tmp_path: Path) -> None:
     draw_turntable(BallTree(), whole)
     frames = tmp_path / "work" / "frames"
     frames.mkdir(parents=True)
-    (frames / ".frame_0000.png.partial").write_bytes(b"half")
+    (frames / ".frame_0000.png.123.part").write_bytes(b"half")
     (frames / "frame_0000.exr").write_bytes(b"half")
     job = job_in(tmp_path)
     draw_turntable(BallTree(), job)
