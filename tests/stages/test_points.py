@@ -1,0 +1,46 @@
+"""The stage `points` on a real asset file that holds a ball."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import StageFailed
+from pipeline.stage import Job
+from stages import points as stage
+from stages.points import PointsSettings
+
+from .test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball
+
+
+@pytest.fixture(scope="module")
+def bake(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bake_ball(tmp_path_factory.mktemp("ball") / "bake")
+
+
+def test_points_lie_on_the_ball_in_the_captures_frame(bake: Path, tmp_path: Path) -> None:
+    stage.run(Job(settings=PointsSettings(count=5000), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
+    header, body = (tmp_path / "out" / "points.ply").read_bytes().split(b"end_header\n", 1)
+    assert b"element vertex 5000\n" in header
+    assert b"element face" not in header
+    rows = np.frombuffer(body, [("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
+    outward = rows["position"] - WORLD_FROM_CAPTURE.inverse().points(np.zeros(3))
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), RADIUS * 4, atol=0.2)
+    assert ((rows["normal"] * outward).sum(1) / np.linalg.norm(outward, axis=1)).min() > 0.7
+    assert np.abs(np.median(rows["colour"][outward[:, 1] < -0.5], 0) - [230, 128, 26]).max() <= 3
+    assert np.abs(outward.mean(0)).max() < 0.05
+
+
+def test_the_same_seed_gives_the_same_points(bake: Path, tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        stage.run(Job(settings=PointsSettings(count=500, seed=seed), inputs={"bake": bake}, out=tmp_path / name, work=tmp_path / "work"))
+    a, b, c = ((tmp_path / name / "points.ply").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+def test_a_threshold_out_of_reach_names_the_remedy(bake: Path, tmp_path: Path) -> None:
+    with pytest.raises(StageFailed, match=r"Lower points.threshold"):
+        stage.run(Job(settings=PointsSettings(threshold=1e4), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
