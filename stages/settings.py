@@ -27,10 +27,10 @@ def setting(
     default            an immutable value: number, text, true or false, None or a tuple of these
     doc                one sentence: what the setting does
     choices            the values it may take
-    minimum, maximum   inclusive limits of a number
+    minimum, maximum   inclusive limits of a number; of a tuple, of each of its numbers
     unit               of the number, as printed in the documentation
     """
-    about = {"doc": doc, "choices": None if choices is None else tuple(choices), "min": minimum, "max": maximum, "unit": unit}
+    about = {"doc": doc, "choices": None if choices is None else tuple(choices), "minimum": minimum, "maximum": maximum, "unit": unit}
     return dataclasses.field(default=default, metadata={name: value for name, value in about.items() if value is not None})
 
 
@@ -65,8 +65,8 @@ def describe_settings(settings_type: type) -> list[SettingInfo]:
                 default=entry.default,
                 doc=about.get("doc", ""),
                 choices=about.get("choices"),
-                minimum=about.get("min"),
-                maximum=about.get("max"),
+                minimum=about.get("minimum"),
+                maximum=about.get("maximum"),
                 unit=about.get("unit"),
             )
         )

@@ -113,7 +113,7 @@ def _source(given: Path | None, standing: Run | None) -> Path | None:
         return recorded
     if not given.exists():
         raise BadInput(f"{given}: no such file or folder. Give the folder of the photographs or of the data set.")
-    if given.is_dir() and not any(os.scandir(given)):
+    if given.is_dir() and not os.listdir(given):
         raise BadInput(f"{given}: the folder is empty; expected photographs or a data set.")
     source = Path(os.path.abspath(given))
     unchanged = recorded is None or os.path.realpath(source) == os.path.realpath(recorded)

@@ -1,0 +1,122 @@
+"""A workflow of toy stages for testing the command line in a blink, and a way to call it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import BadInput
+from pipeline.stage import Job, Stage
+from stages.settings import setting
+from workflows import asset
+from workflows.cli import main
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a call of the command line gave."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def objects(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.out.splitlines()]
+
+    @property
+    def object(self) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(self.out)
+        return found
+
+
+@pytest.fixture
+def enerf(capfd: pytest.CaptureFixture[str]) -> Callable[..., Result]:
+    """enerf("run", ...) in this process."""
+
+    def call(*arguments: object) -> Result:
+        capfd.readouterr()
+        code = main([str(argument) for argument in arguments])
+        out, err = capfd.readouterr()
+        return Result(code, out, err)
+
+    return call
+
+
+@dataclass(frozen=True)
+class PosesSettings:
+    format: str = setting("auto", "What the source is.", choices=("auto", "photographs"))
+    strict: bool = setting(False, "Whether to refuse.")
+    allow_outside: bool = setting(False, "Whether to allow.")
+    repeat: int = setting(1, "How often the text is repeated.", minimum=1, maximum=9)
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    iterations: int = setting(4, "Steps.", minimum=1)
+    rate: float = setting(0.5, "Speed.")
+    seed: int = setting(0, "Of the random numbers.")
+    fail: str = setting("", "How to fail.", choices=("", "bad", "error", "disk", "memory"))
+
+
+@dataclass(frozen=True)
+class PointsSettings:
+    seed: int = setting(0, "Of the random numbers.")
+
+
+def _poses(job: Job) -> None:
+    assert job.source is not None
+    text = "".join(path.read_text(encoding="utf-8") for path in sorted(job.source.glob("*.txt")))
+    (job.out / "text.txt").write_text(text * job.settings.repeat, encoding="utf-8")
+    if "odd" in text:
+        job.warn("something is odd")
+
+
+def _train(job: Job) -> None:
+    match job.settings.fail:
+        case "bad":
+            raise BadInput(f"{job.inputs['poses']}: found nothing, expected something. Do something.")
+        case "error":
+            raise ValueError("first line\nsecond line")
+        case "disk":
+            raise OSError(28, "No space left on device", str(job.out / "field"))
+        case "memory":
+            raise MemoryError
+    for step in range(job.settings.iterations):
+        job.progress(step + 1, job.settings.iterations, "training", loss=1.0 / (step + 1))
+        job.safe_point()
+    text = (job.inputs["poses"] / "text.txt").read_text(encoding="utf-8")
+    (job.out / "field.txt").write_text(f"{text} {job.settings.iterations} {job.settings.rate} {job.settings.seed}", encoding="utf-8")
+
+
+def _points(job: Job) -> None:
+    job.say("some points", points=3)
+    (job.out / "points.ply").write_text((job.inputs["train"] / "field.txt").read_text(encoding="utf-8"), encoding="utf-8")
+
+
+TOYS = (
+    Stage("poses", 1, PosesSettings, (), _poses, reads_source=True),
+    Stage("train", 1, TrainSettings, ("poses",), _train),
+    Stage("points", 1, PointsSettings, ("train",), _points),
+)
+
+
+@pytest.fixture
+def toys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The toy workflow in place of the real one, with presets of its own; returns its source."""
+    presets = tmp_path / "presets"
+    presets.mkdir()
+    (presets / "preview.toml").write_text('description = "Toy."\n[train]\niterations = 3\n', encoding="utf-8")
+    (presets / "tiny.toml").write_text('description = "Smaller toy."\n[train]\niterations = 1\nrate = 2\n', encoding="utf-8")
+    monkeypatch.setattr("workflows.resolve.PRESETS_FOLDER", presets)
+    monkeypatch.setattr("workflows.device.cuda_device_count", lambda: 0)
+    monkeypatch.setattr(asset, "STAGES", TOYS)
+    source = tmp_path / "source"
+    source.mkdir()
+    (source / "a.txt").write_text("words", encoding="utf-8")
+    return source
