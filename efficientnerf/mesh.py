@@ -177,7 +177,9 @@ def separate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
     crowded = np.unique(pairs[uses > 2])
     if not len(crowded):
         return vertices, faces
-    faces, added, moves, count = faces.copy(), [], {}, len(vertices)
+    faces, count = faces.copy(), len(vertices)
+    added: list[np.ndarray] = []
+    moves: dict[int, np.ndarray] = {}
     around: dict[int, list[int]] = {int(vertex): [] for vertex in crowded}
     touched = np.isin(faces, crowded)
     for row, column in zip(*np.nonzero(touched)):

@@ -15,7 +15,6 @@ import numpy as np
 from .mesh import Mesh, PointCloud, compact, decimate, face_areas, face_components, face_volumes, sample, separate, smooth, tidy, vertex_normals
 
 Progress = Callable[[int, int, str], None]
-POOL = 2  # voxels along a side of the cells in which enclosed space is looked for
 BLOCK = 64  # voxels a side that are in memory at a time
 _CHUNK = 1 << 16  # points whose colours are looked up at a time
 
@@ -30,6 +29,11 @@ def _silent(done: int, total: int, text: str) -> None:
 
 def _grid(tree: Any) -> np.ndarray:
     return np.asarray(tree.shape, np.int64) * int(tree.brick)  # (3,) voxels per axis
+
+
+def _pool(tree: Any) -> int:
+    """Voxels along a side of the cells in which enclosed space is looked for: two; more where that were over 256 cells a side, for the memory."""
+    return 2 * max(1, -(-int(_grid(tree).max()) // 512))
 
 
 def automatic_threshold(tree: Any, lines: int = 24) -> float:
@@ -78,7 +82,7 @@ def _met_on_the_way(sigma: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def enclosed_cells(tree: Any, threshold: float, viewpoints: np.ndarray) -> np.ndarray:
-    """Empty space that nobody outside can see, because everything around it is dense: bool, one value per cell of POOL^3 voxels.
+    """Empty space that nobody outside can see, because everything around it is dense: bool, one value per cell of `_pool`^3 voxels.
 
     viewpoints  (N, 3) places that are outside by definition, besides the boundary of the volume: a camera may stand in a closed room
 
@@ -86,19 +90,20 @@ def enclosed_cells(tree: Any, threshold: float, viewpoints: np.ndarray) -> np.nd
     """
     from scipy.ndimage import label
 
-    grid = _grid(tree)
-    cells = -(-grid // POOL)
+    grid, pool = _grid(tree), _pool(tree)
+    cells = -(-grid // pool)
     dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
-    step = POOL * 16
+    step = pool * 16
     for start in range(0, int(grid[0]), step):
-        sigma = np.asarray(tree.density_block((start, 0, 0), (start + step, *(cells[1:] * POOL).tolist())))
-        pooled = (sigma >= threshold).reshape(step // POOL, POOL, cells[1], POOL, cells[2], POOL).any((1, 3, 5))
-        first = start // POOL
+        sigma = np.asarray(tree.density_block((start, 0, 0), (start + step, *(cells[1:] * pool).tolist())))
+        pooled = np.any((sigma >= threshold).reshape(step // pool, pool, cells[1], pool, cells[2], pool), axis=(1, 3, 5))
+        first = start // pool
         last = min(first + len(pooled), int(cells[0]))
         dense[1 + first : 1 + last, 1:-1, 1:-1] = pooled[: last - first]
-    region, _ = label(~dense)
+    region = np.empty(dense.shape, np.int32)
+    label(~dense, output=region)
     outside = {int(region[0, 0, 0])}
-    at = np.floor((viewpoints - np.asarray(tree.bounds_min)) / (float(tree.voxel) * POOL)).astype(np.int64)  # (N, 3)
+    at = np.floor((viewpoints - np.asarray(tree.bounds_min)) / (float(tree.voxel) * pool)).astype(np.int64)  # (N, 3)
     at = at[((at >= 0) & (at < cells)).all(1)] + 1
     outside |= set(region[tuple(at.T)].tolist())
     return (~dense & ~np.isin(region, list(outside)))[1:-1, 1:-1, 1:-1]
@@ -114,8 +119,8 @@ def _filled_block(tree: Any, low: np.ndarray, high: np.ndarray, threshold: float
 
     if enclosed is None:
         return np.asarray(tree.density_block(low, high))
-    margin = POOL + 1
-    axes = [np.arange(a - margin, b + margin) // POOL for a, b in zip(low, high)]
+    margin = _pool(tree) + 1
+    axes = [np.arange(a - margin, b + margin) // _pool(tree) for a, b in zip(low, high)]
     known = [(axis >= 0) & (axis < count) for axis, count in zip(axes, enclosed.shape)]
     seed = enclosed[np.ix_(*(np.clip(axis, 0, count - 1) for axis, count in zip(axes, enclosed.shape)))]
     seed &= known[0][:, None, None] & known[1][:, None] & known[2]

@@ -7,7 +7,7 @@ import numpy as np
 from efficientnerf.mesh import Mesh, sample
 
 _PAPER = np.array([0.93, 0.93, 0.93])
-_SAMPLES = 1_500_000
+_SAMPLES = 600_000
 
 
 def draw_sides(mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, size: int = 420) -> np.ndarray:
@@ -30,7 +30,10 @@ def draw_sides(mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, siz
     for turn in range(4):
         right, up, back = _axes(heading + 90 * turn, elevation)
         local = (positions - centre) / reach
-        picked = _front_samples(local @ right, local @ up, local @ back, size)  # (size, size), -1 where nothing is
+        facing = np.flatnonzero(normals @ back > -0.2)
+        seen = local[facing]
+        picked = _front_samples(seen @ right, seen @ up, seen @ back, size)  # (size, size), -1 where nothing is
+        picked = np.where(picked >= 0, facing[picked], -1)
         light = back + 0.5 * up - 0.4 * right
         shade = np.clip(normals @ (light / np.linalg.norm(light)), 0, 1) * 0.7 + 0.2
         hit = picked[..., None] >= 0
