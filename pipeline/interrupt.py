@@ -93,9 +93,28 @@ def _watching() -> Iterator[None]:
         os.close(reading)
 
 
-# Worker processes that a stage forks must die of SIGTERM as usual, and the Ctrl-C that a terminal sends to all of them is still one.
+# Worker processes that a stage forks must die of SIGTERM as usual, and the Ctrl-C that a terminal sends to all of them counts once. Signals
+# wait while a process is forked: one that came before the child has its own handlers back would be lost.
 _in_children: list[Callable[[], object]] = []
-os.register_at_fork(after_in_child=lambda: [undo() for undo in reversed(_in_children)])
+_masks: list[set[int]] = []
+
+
+def _before_fork() -> None:
+    _masks.append({int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM} if _in_children else set())})
+
+
+def _after_fork() -> None:
+    signal.pthread_sigmask(signal.SIG_SETMASK, _masks.pop())
+
+
+def _in_child() -> None:
+    for undo in reversed(_in_children):
+        undo()
+    _in_children.clear()
+    _after_fork()
+
+
+os.register_at_fork(before=_before_fork, after_in_parent=_after_fork, after_in_child=_in_child)
 
 
 @contextmanager
@@ -104,4 +123,5 @@ def _undone_in_children(undo: Callable[[], object]) -> Iterator[None]:
     try:
         yield
     finally:
-        _in_children.remove(undo)
+        if undo in _in_children:
+            _in_children.remove(undo)

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from pipeline.run import Run
 from pipeline.stage import Job, Stage, settings_dict
 
@@ -99,7 +97,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.is_file() and not name.endswith(("manifest.json", "log.jsonl")):
+        if path.is_file() and not name.endswith(("manifest.json", "log.jsonl", "hashes.json")):
             found[name] = path.read_bytes()
     return found
 
@@ -127,6 +125,3 @@ def raising(error: BaseException) -> Callable[[Job], None]:
         raise error
 
     return run
-
-
-needs_posix = pytest.mark.skipif(not hasattr(__import__("os"), "fork"), reason="needs fork")

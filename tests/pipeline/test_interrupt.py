@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.interrupt import stopping
+from pipeline.run import Run
+from pipeline.runner import run_stages, verify
+from tests.pipeline.toy import STAGES, make_run, set_one
+
+# Runs the toy workflow, slowed down so that signals meet it at work, as a command line would.
+SCRIPT = """
+import ctypes, sys, time
+from dataclasses import replace
+from pathlib import Path
+from pipeline.errors import PipelineError
+from pipeline.run import Run
+from pipeline.runner import run_stages
+from tests.pipeline.toy import STAGES
+
+def slow(stage):
+    def run(job):
+        point = job.safe_point
+        def safe_point():
+            time.sleep(0.02)
+            point()
+        job.safe_point = safe_point
+        print(stage.name, flush=True)
+        time.sleep(0.02)
+        stage.run(job)
+        time.sleep(0.02)
+    return replace(stage, run=run)
+
+def deaf(job):
+    print("deaf", flush=True)
+    if sys.argv[2] == "foreign":
+        ctypes.CDLL(None).sleep(20)
+    end = time.monotonic() + 20
+    while time.monotonic() < end:
+        time.sleep(0.01)
+
+stages = [replace(s, run=deaf) if s.name == "count" and sys.argv[2] != "slow" else slow(s) for s in STAGES]
+try:
+    run_stages(Run.open(Path(sys.argv[1])), stages)
+except PipelineError as error:
+    print(error, flush=True)
+    sys.exit(error.exit_code)
+print("done", flush=True)
+"""
+
+
+def start(run: Run, how: str) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, str(run.path), how], stdout=subprocess.PIPE, text=True)
+
+
+def await_line(process: subprocess.Popen[str], line: str) -> None:
+    assert process.stdout is not None
+    while (found := process.stdout.readline().strip()) != line:
+        assert found, f"ended before it said {line!r}"
+
+
+def test_the_first_signal_sets_the_flag_and_the_handlers_are_restored() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with stopping() as stop:
+        assert stop() is None
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop() == signal.SIGTERM
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop() == signal.SIGTERM
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+    assert not [thread for thread in threading.enumerate() if thread.name == "second Ctrl-C"]
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    former = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stopping() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stop() is None
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
+def test_outside_of_the_main_thread_nothing_is_touched(tmp_path: Path) -> None:
+    run = make_run(tmp_path)
+    failures: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            run_stages(run, STAGES)
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert failures == []
+
+
+def test_a_worker_that_was_forked_dies_of_sigterm() -> None:
+    """At once after the fork, too; and the Ctrl-C that a terminal sends to workers as well is not counted for the parent."""
+    with stopping() as stop:
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT) * 3:
+            pid = os.fork()
+            if pid == 0:
+                try:
+                    time.sleep(30)
+                finally:
+                    os._exit(9)
+            os.kill(pid, number)
+            _, status = os.waitpid(pid, 0)
+            ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
+            assert ended_by == (signal.SIGTERM if number == signal.SIGTERM else 9)  # 9: by KeyboardInterrupt
+        time.sleep(0.5)  # longer than it takes for a second Ctrl-C to end this process
+        assert stop() is None
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_stops_at_the_next_safe_point_and_the_next_run_goes_on(tmp_path: Path, number: int, code: int) -> None:
+    run = make_run(tmp_path, count={"steps": 100})
+    with start(run, "slow") as process:
+        await_line(process, "count")
+        time.sleep(0.15)
+        process.send_signal(number)
+        assert process.stdout is not None
+        assert f"Go on with: enerf run --out {run.path}" in process.stdout.read()
+        assert process.wait(10) == code
+    assert not (run.path / ".lock.json").exists()
+    (checkpoint,) = (run.path / ".work" / "count").glob("*/scratch/state.txt")
+    assert 1 <= len(checkpoint.read_text().splitlines()) < 100
+    set_one(run, "list", upper=False)
+    assert run_stages(run, STAGES)[1].reason == "incomplete: cut short; it goes on where it stopped"
+
+
+@pytest.mark.parametrize("how", ["deaf", "foreign"])
+def test_a_second_ctrl_c_ends_at_once_even_within_a_foreign_call(tmp_path: Path, how: str) -> None:
+    run = make_run(tmp_path)
+    with start(run, how) as process:
+        await_line(process, "deaf")
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.3)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) in (-signal.SIGINT, 130)
+    assert [outcome.action for outcome in run_stages(run, STAGES)] == ["skipped", "ran", "ran", "ran"]
+
+
+def test_killed_at_random_moments_the_end_is_the_same(tmp_path: Path) -> None:
+    undisturbed = run_stages(make_run(tmp_path / "undisturbed", count={"steps": 12}), STAGES)
+    run = make_run(tmp_path / "killed", count={"steps": 12})
+    chance = random.Random(4)
+    for _ in range(6):
+        with start(run, "slow") as process:
+            try:
+                process.wait(chance.uniform(0.15, 0.6))
+            except subprocess.TimeoutExpired:
+                process.kill()
+    outcomes = run_stages(run, STAGES)
+    assert [outcome.digest for outcome in outcomes] == [outcome.digest for outcome in undisturbed]
+    verify(run, STAGES)

@@ -1,0 +1,424 @@
+from __future__ import annotations
+
+import contextlib
+import errno
+import itertools
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline import artifact, files
+from pipeline.decide import decide, survey
+from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, StageFailed, UsageError
+from pipeline.executors import local
+from pipeline.executors.local import Usage
+from pipeline.manifest import read_manifest
+from pipeline.run import Run
+from pipeline.runner import run_stages, verify
+from pipeline.stage import Job, Stage
+from tests.pipeline.kills import run_and_kill
+from tests.pipeline.toy import COUNT, LIST, STAGES, Events, actions, contents, make_run, raising, set_one
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return make_run(tmp_path)
+
+
+def replaced(name: str, **changes: object) -> list[Stage]:
+    return [replace(stage, **changes) if stage.name == name else stage for stage in STAGES]  # type: ignore[arg-type]
+
+
+def test_all_run_once_and_then_nothing(run: Run) -> None:
+    events = Events()
+    outcomes = run_stages(run, STAGES, report=events)
+    assert actions(outcomes) == {"list": "ran", "count": "ran", "double": "ran", "report": "ran"}
+    assert {outcome.reason for outcome in outcomes} == {"never run"}
+    assert [event["stage"] for event in events.named("stage_done")] == ["list", "count", "double", "report"]
+    assert all({"event", "stage", "time"} <= event.keys() for event in events)
+    assert os.listdir(run.path / artifact.WORK) == []
+    before = {path: path.lstat().st_mtime_ns for path in run.path.rglob("*")}
+
+    events = Events()
+    again = run_stages(run, STAGES, report=events)
+    assert [outcome.digest for outcome in again] == [outcome.digest for outcome in outcomes]
+    assert set(actions(again).values()) == {"skipped"}
+    assert [event["event"] for event in events] == ["stage_skipped"] * 4
+    after = {path: path.lstat().st_mtime_ns for path in run.path.rglob("*")}
+    assert {path for path in before | after if before.get(path) != after.get(path)} <= {run.path, run.path / ".cache", run.cache}
+
+
+def test_the_manifest_says_what_made_it(run: Run) -> None:
+    run_stages(run, STAGES, until="count")
+    made = read_manifest(run.folder("count"))
+    assert made.request.settings == {"steps": 6, "rate": 0.5, "name": None}
+    assert made.request.inputs == {"list": read_manifest(run.folder("list")).digest}
+    assert made.outputs["log.jsonl"].volatile
+    assert made.peak_memory > 2**20
+    assert not made.resumed
+    assert sorted(read_manifest(run.folder("list")).request.source or {}) == ["0.jpg", "1.jpg", "2.jpg"]
+
+
+def test_only_what_changed_runs_again(run: Run) -> None:
+    run_stages(run, STAGES)
+    set_one(run, "count", steps=9)
+    assert actions(run_stages(run, STAGES)) == {"list": "skipped", "count": "ran", "double": "ran", "report": "ran"}
+
+
+def test_a_stage_that_gives_the_same_again_leaves_the_rest_fresh(run: Run) -> None:
+    run_stages(run, STAGES)
+    before = read_manifest(run.folder("count"))
+    assert actions(run_stages(run, replaced("count", version=2))) == {"list": "skipped", "count": "ran", "double": "skipped", "report": "skipped"}
+    after = read_manifest(run.folder("count"))
+    assert before.outputs["log.jsonl"] != after.outputs["log.jsonl"]
+    assert before.digest == after.digest
+
+
+def test_until_from_and_force(run: Run) -> None:
+    assert actions(run_stages(run, STAGES, until="double")) == {"list": "ran", "count": "ran", "double": "ran"}
+    assert actions(run_stages(run, STAGES, start="count", until="count")) == {"list": "skipped", "count": "ran"}
+    assert actions(run_stages(run, STAGES, start="double")) == {"list": "skipped", "count": "skipped", "double": "ran", "report": "ran"}
+    assert set(actions(run_stages(run, STAGES, force=True)).values()) == {"ran"}
+    with pytest.raises(UsageError, match="comes first"):
+        run_stages(run, STAGES, start="double", until="list")
+    with pytest.raises(UsageError, match="single stage"):
+        run_stages(run, STAGES, only="double", until="list")
+    with pytest.raises(UsageError, match=r"cuont: no such stage\. Did you mean count\?"):
+        run_stages(run, STAGES, until="cuont")
+
+
+def test_a_workflow_in_the_wrong_order_is_a_mistake_of_ours(run: Run) -> None:
+    with pytest.raises(ValueError, match="count stands before list"):
+        run_stages(run, [COUNT, LIST])
+    with pytest.raises(ValueError, match="two stages are named list"):
+        run_stages(run, [LIST, LIST])
+
+
+def test_one_stage_alone(run: Run) -> None:
+    run_stages(run, STAGES)
+    assert actions(run_stages(run, STAGES, only="double")) == {"double": "skipped"}
+    assert actions(run_stages(run, STAGES, only="double", force=True)) == {"double": "ran"}
+
+
+def test_one_stage_alone_says_that_those_before_it_are_stale_and_uses_what_there_is(run: Run) -> None:
+    run_stages(run, STAGES)
+    set_one(run, "count", steps=9)
+    events = Events()
+    assert actions(run_stages(run, STAGES, only="report", force=True, report=events)) == {"report": "ran"}
+    warnings = events.named("warning")
+    assert [(warning["about"], warning["state"]) for warning in warnings] == [("count", "stale"), ("double", "stale")]
+    assert "steps 6 -> 9" in warnings[0]["text"]
+    assert read_manifest(run.folder("count")).request.settings["steps"] == 6
+
+
+def test_one_stage_alone_without_what_it_needs(run: Run) -> None:
+    with pytest.raises(BadInput, match=r"count needs list, which this run does not have\. Make it first: enerf run --out .* --until count"):
+        run_stages(run, STAGES, only="count")
+    run_stages(run, STAGES)
+    (run.folder("count") / "count.txt").write_text("altered")
+    with pytest.raises(CorruptArtifact, match=r"double needs count, which is corrupt: count\.txt altered") as caught:
+        run_stages(run, STAGES, only="double", force=True)
+    assert caught.value.files == ("count/count.txt",)
+    (run.folder("count") / "manifest.json").write_text("{")
+    with pytest.raises(CorruptArtifact, match="double needs count, which is corrupt"):
+        run_stages(run, STAGES, only="double", force=True)
+
+
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(run: Run, tmp_path: Path) -> None:
+    events = Events()
+    assert set(actions(run_stages(run, STAGES, dry_run=True, report=events)).values()) == {"would run"}
+    assert sorted(os.listdir(run.path)) == [".lock", "run.json"]
+    assert "list: would run (never run)" in events.text()
+    run_stages(run, STAGES)
+    set_one(run, "count", steps=9)
+    planned = {"list": "skipped", "count": "would run", "double": "may run", "report": "may run"}
+    assert actions(run_stages(run, STAGES, dry_run=True)) == planned
+    assert actions(run_stages(run, STAGES, dry_run=True, start="report"))["report"] == "would run"
+    assert actions(run_stages(run, STAGES, dry_run=True, only="double")) == {"double": "skipped"}
+    assert actions(run_stages(Run(tmp_path / "new", run.source), STAGES, dry_run=True, until="list")) == {"list": "would run"}
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_altered_output_is_made_anew(run: Run) -> None:
+    run_stages(run, STAGES)
+    (run.folder("count") / "count.txt").write_text("altered")
+    outcomes = run_stages(run, STAGES)
+    assert actions(outcomes) == {"list": "skipped", "count": "ran", "double": "skipped", "report": "skipped"}
+    assert outcomes[1].reason == "output altered on disk: count.txt altered"
+    assert outcomes[2].action == "skipped"
+
+
+def test_a_vanished_source(run: Run) -> None:
+    run_stages(run, STAGES)
+    assert run.source is not None
+    shutil.rmtree(run.source)
+    events = Events()
+    set_one(run, "count", steps=9)
+    assert actions(run_stages(run, STAGES, report=events))["report"] == "ran"
+    assert "is not there" in events.text()
+    set_one(run, "list", upper=True)
+    with pytest.raises(BadInput, match=r"list has to run \(settings changed: upper false -> true\), but .* is not there"):
+        run_stages(run, STAGES)
+    assert contents(run.folder("list"))
+
+
+def test_no_source_at_all(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "run", tmp_path / "none")
+    with pytest.raises(BadInput, match="none is not there, or empty"):
+        run_stages(run, STAGES)
+    with pytest.raises(BadInput, match="the run names no source"):
+        run_stages(Run.create(tmp_path / "other"), STAGES)
+
+
+def test_a_stage_sees_the_source_only_if_it_reads_it(run: Run) -> None:
+    seen = {}
+
+    def look(job: Job) -> None:
+        seen.update(source=job.source, device=job.device, inputs=job.inputs)
+        (job.out / "a").write_text("a")
+
+    run_stages(run, [LIST, Stage("look", 1, COUNT.settings, ("list",), look)], device="cuda")
+    assert seen == {"source": None, "device": "cuda", "inputs": {"list": run.folder("list")}}
+
+
+def test_a_stage_that_raises(run: Run) -> None:
+    run_stages(run, STAGES)
+    before = contents(run.path)
+    set_one(run, "count", steps=9)
+    original = ValueError("bad thing\nwith details")
+    events = Events()
+    with pytest.raises(StageFailed, match=r"^count: ValueError: bad thing$") as caught:
+        run_stages(run, replaced("count", run=raising(original)), report=events)
+    assert caught.value.__cause__ is original
+    assert events.named("stage_failed")[0]["exit_code"] == 3
+    assert {**contents(run.path), "run.json": b""} == {**before, "run.json": b""}
+    assert os.listdir(run.path / artifact.WORK) == []
+    assert actions(run_stages(run, STAGES))["count"] == "ran"
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (BadInput("photos: none"), BadInput, "^photos: none$"),
+        (MemoryError(), StageFailed, "count: out of memory"),
+        (KeyError("x"), StageFailed, "count: KeyError: 'x'"),
+        (RuntimeError(), StageFailed, "count: RuntimeError$"),
+        (OSError(errno.ENOSPC, "No space left on device"), DiskFull, r"count: no space .* left in .*run \(\d+\.\d MiB free\)"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), DiskFull, "no space"),
+        (RuntimeError("database or disk is full"), DiskFull, "no space"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "x.bin"), StageFailed, "FileNotFoundError"),
+    ],
+)
+def test_what_the_user_sees_of_an_error(run: Run, error: Exception, kind: type[Exception], message: str) -> None:
+    with pytest.raises(kind, match=message) as caught:
+        run_stages(run, replaced("count", run=raising(error)))
+    assert type(caught.value) is kind
+    assert "\n" not in str(caught.value)
+
+
+def test_a_full_disk_that_a_library_wrapped(run: Run) -> None:
+    def wrapped(job: Job) -> None:
+        try:
+            raise OSError(errno.ENOSPC, "No space left on device", str(job.out / "field.bin"))
+        except OSError as error:
+            raise RuntimeError("could not save") from error
+
+    with pytest.raises(DiskFull, match="out "):
+        run_stages(run, replaced("count", run=wrapped))
+
+
+def test_a_disk_that_fills_up_while_publishing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At whichever step: the former artifact, or the new one, stands; and the next run goes on."""
+    run_stages(run, STAGES)
+    set_one(run, "count", steps=9)
+    for moment in itertools.count(1):
+        left = [moment]
+        for name in ("rename", "sync_folder", "sync_file"):
+            monkeypatch.setattr(files, name, _failing(getattr(files, name), left))
+        with contextlib.suppress(DiskFull):
+            run_stages(run, STAGES, only="count", force=True)
+        monkeypatch.undo()
+        made = read_manifest(run.folder("count"))
+        assert not artifact.differences(run.folder("count"), made.outputs).damaged
+        if left[0] > 0:
+            break
+    assert moment > 10
+    assert actions(run_stages(run, STAGES))["double"] == "ran"
+
+
+def _failing(step: object, left: list[int]) -> object:
+    def call(*arguments: object) -> object:
+        left[0] -= 1
+        if left[0] == 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return step(*arguments)  # type: ignore[operator]
+
+    return call
+
+
+def test_a_failed_stage_keeps_its_checkpoint_and_goes_on(run: Run) -> None:
+    steps: list[int] = []
+
+    def stumble(job: Job) -> None:
+        done = job.work / "done"
+        start = int(done.read_text()) if done.exists() else 0
+        for step in range(start, 5):
+            steps.append(step)
+            done.write_text(str(step + 1))
+            if step == 2 and start == 0:
+                raise RuntimeError("stumbled")
+        (job.out / "count.txt").write_text("5")
+
+    stages = replaced("count", run=stumble)
+    with pytest.raises(StageFailed):
+        run_stages(run, stages)
+    assert decide(stages[1], run).state == "partial"
+    events = Events()
+    run_stages(run, stages, report=events)
+    assert steps == [0, 1, 2, 3, 4]
+    assert [event["resumed"] for event in events.named("stage_started")] == [True, False, False]
+    assert read_manifest(run.folder("count")).resumed
+    assert os.listdir(run.path / artifact.WORK) == []
+
+
+def test_changed_settings_start_anew(run: Run) -> None:
+    with pytest.raises(Interrupted):
+        run_stages(run, replaced("count", run=_count_until(3)))
+    set_one(run, "count", rate=2.0)
+    events = Events()
+    run_stages(run, STAGES, report=events)
+    assert not events.named("stage_started")[0]["resumed"]
+    assert b"0.5" not in contents(run.folder("count"))["count.txt"]
+
+
+def _count_until(step: int) -> object:
+    def count(job: Job) -> None:
+        job._stop = lambda: 2 if (job.work / "state.txt").read_text().count("\n") >= step - 1 else None
+        COUNT.run(job)
+
+    return count
+
+
+def test_interrupted_and_resumed_gives_the_same_bytes(run: Run, tmp_path: Path) -> None:
+    events = Events()
+    with pytest.raises(Interrupted, match="Go on with: enerf run --out ") as caught:
+        run_stages(run, replaced("count", run=_count_until(3)), report=events)
+    assert caught.value.exit_code == 130
+    assert events.named("interrupted")[0]["resume"] == run.command()
+    assert decide(COUNT, run).reason == "incomplete: cut short; it goes on where it stopped"
+    resumed = run_stages(run, STAGES)
+    undisturbed = run_stages(make_run(tmp_path / "other"), STAGES)
+    assert [outcome.digest for outcome in resumed] == [outcome.digest for outcome in undisturbed]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), Interrupted(15)])
+def test_an_interruption_that_a_library_wrapped(run: Run, error: BaseException) -> None:
+    def wrapped(job: Job) -> None:
+        try:
+            raise error
+        except BaseException as caught:
+            raise RuntimeError("callback failed") from caught
+
+    with pytest.raises(Interrupted) as caught:
+        run_stages(run, replaced("count", run=wrapped))
+    assert caught.value.exit_code == (143 if isinstance(error, Interrupted) else 130)
+    with pytest.raises(Interrupted, match="enerf stage count "):
+        run_stages(run, replaced("count", run=raising(error)), only="count")
+
+
+def test_an_interrupted_forced_run_goes_on_when_forced_again(run: Run) -> None:
+    run_stages(run, STAGES)
+    before = contents(run.path)
+    with pytest.raises(Interrupted):
+        run_stages(run, replaced("count", run=_count_until(3)), only="count", force=True)
+    assert decide(COUNT, run).fresh
+    events = Events()
+    run_stages(run, STAGES, only="count", force=True, report=events)
+    assert events.named("stage_started")[0]["resumed"]
+    assert contents(run.path) == before
+
+
+def test_a_stage_that_was_done_but_not_published_is_not_run_again(run: Run) -> None:
+    run_stages(run, STAGES, until="list")
+    for moment in itertools.count(1):
+        run_and_kill(lambda: run_stages(run, STAGES, until="count"), moment)
+        if (decide(COUNT, run).reason or "").startswith("incomplete: done"):
+            break
+        assert moment < 50
+    events = Events()
+    outcomes = run_stages(run, replaced("count", run=raising(AssertionError("ran again"))), until="count", report=events)
+    assert actions(outcomes)["count"] == "ran"
+    assert "only its publication had been cut short" in events.text()
+
+
+def test_killed_before_every_durable_step_of_a_run(tmp_path: Path) -> None:
+    """All four stages over older artifacts: whatever the moment, the next run ends with what an undisturbed one gives."""
+    first = make_run(tmp_path)
+    run_stages(first, STAGES)
+    set_one(first, "list", upper=True)
+    set_one(first, "count", steps=4)
+    shutil.copytree(first.path, tmp_path / "undisturbed")
+    expected = [outcome.digest for outcome in run_stages(Run.open(tmp_path / "undisturbed"), STAGES)]
+    for moment in itertools.count(1, 5):  # every fifth: all of them stand in test_artifact, for one stage
+        shutil.copytree(first.path, tmp_path / f"run{moment}")
+        run = Run.open(tmp_path / f"run{moment}")
+        killed = run_and_kill(lambda run=run: run_stages(run, STAGES), moment)  # type: ignore[misc]
+        survey(STAGES, run)
+        assert [outcome.digest for outcome in run_stages(run, STAGES)] == expected
+        assert os.listdir(run.path / artifact.WORK) == []
+        verify(run, STAGES)
+        if not killed:
+            break
+    assert moment > 50
+
+
+def test_another_executor(run: Run) -> None:
+    asked = []
+
+    def execute(stage: Stage, job: Job) -> Usage:
+        asked.append(stage.name)
+        local.execute(stage, job)
+        return Usage(12.5, 99)
+
+    run_stages(run, STAGES, execute=execute)
+    assert asked == ["list", "count", "double", "report"]
+    assert read_manifest(run.folder("count")).seconds == 12.5
+
+
+def test_verify_reads_everything_and_lists_what_is_damaged(run: Run) -> None:
+    run_stages(run, STAGES)
+    assert actions(verify(run, STAGES)) == {"list": "verified", "count": "verified", "double": "verified", "report": "verified"}
+    run_stages(run, STAGES)  # all files are now known by size, time and inode
+    path = run.folder("double") / "double.txt"
+    status = path.stat()
+    with open(path, "r+b") as file:
+        file.write(b"X")
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    (run.folder("list") / "images" / "0.jpg").unlink()
+    (run.folder("report") / "extra.txt").write_text("")
+    (run.folder("count") / "manifest.json").write_text("")
+    events = Events()
+    with pytest.raises(CorruptArtifact) as caught:
+        verify(run, STAGES, events)
+    assert caught.value.files == ("list/images/0.jpg", "count/manifest.json", "double/double.txt")
+    assert caught.value.exit_code == 4
+    assert "report: extra.txt not written by it" in events.text()
+    assert run.command() in str(caught.value)
+    assert actions(run_stages(run, STAGES))["count"] == "ran"
+    run_stages(run, STAGES, only="double", force=True)
+    verify(run, STAGES)
+
+
+def test_a_file_too_many_is_a_warning(run: Run) -> None:
+    run_stages(run, STAGES)
+    (run.folder("report") / "extra.txt").write_text("")
+    events = Events()
+    verify(run, STAGES, events)
+    assert [event["extra"] for event in events.named("warning")] == [["extra.txt"]]
+
+
+def test_verify_of_what_is_not_there_yet(run: Run) -> None:
+    assert verify(run, STAGES) == []
