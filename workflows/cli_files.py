@@ -62,17 +62,16 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, set
 
 def _export_cameras(what: Path, path: Path) -> int:
     from pipeline.errors import BadInput
-    from pipeline.run import Run
     from stages import scene
-    from stages.exporters.transforms import write_cameras
+    from stages.exporters import cameras
     from workflows.target import is_run
 
-    run = Run.open(what) if is_run(what) else None
-    folder = what / "poses" if run is not None else what
+    folder = what / "poses" if is_run(what) else what
     if not (folder / "scene.json").is_file():
         raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
-    source = run.source if run is not None and run.source is not None and run.source.is_dir() else None
-    return write_cameras(scene.load(folder), path.absolute(), source)
+    found = scene.load(folder)
+    cameras.write(found, path)
+    return len(found.views)
 
 
 def _export_surface(what: Path, files: list[Path], as_points: bool, sets: tuple[str, ...], show: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:

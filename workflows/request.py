@@ -113,7 +113,9 @@ def _source(given: Path | None, standing: Run | None) -> Path | None:
         return recorded
     if not given.exists():
         raise BadInput(f"{given}: no such file or folder. Give the folder of the photographs or of the data set.")
-    if given.is_dir() and not os.listdir(given):
+    if not given.is_dir():
+        raise BadInput(f"{given}: is a file; expected the folder of the photographs or of the data set. Give {given.absolute().parent}")
+    if not os.listdir(given):
         raise BadInput(f"{given}: the folder is empty; expected photographs or a data set.")
     source = Path(os.path.abspath(given))
     unchanged = recorded is None or os.path.realpath(source) == os.path.realpath(recorded)

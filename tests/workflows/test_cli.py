@@ -252,8 +252,8 @@ def test_what_has_nothing_to_do_imports_nothing_heavy(tmp_path: Path, arguments:
     program = (
         "import sys; from pathlib import Path; from pipeline.run import Run; from workflows.cli import main\n"
         f"Run.create(Path({str(tmp_path / 'run')!r}), Path({str(tmp_path)!r}))\n"
-        f"main({[str(tmp_path / 'run') if each == 'RUN' else each for each in arguments]!r} + (['--dry-run'] if {'--out' in arguments} else []))\n"
-        f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
+        f"code = main({[str(tmp_path / 'run') if each == 'RUN' else each for each in arguments]!r} + (['--dry-run'] if {'--out' in arguments} else []))\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr); sys.exit(code)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.splitlines()[-1] == "[]"

@@ -1,0 +1,44 @@
+"""Which device is taken, and that asking does not import torch."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from pipeline.errors import UsageError
+from workflows import device
+
+
+@pytest.mark.parametrize(("devices", "built", "wanted", "taken"), [(1, True, "auto", "cuda"), (1, False, "auto", "cpu"), (0, True, "auto", "cpu"), (1, True, "cpu", "cpu")])
+def test_the_device_that_is_taken(monkeypatch: pytest.MonkeyPatch, devices: int, built: bool, wanted: str, taken: str) -> None:
+    monkeypatch.setattr(device, "cuda_device_count", lambda: devices)
+    monkeypatch.setattr(device, "torch_has_cuda", lambda: built)
+    assert device.resolve_device(wanted) == taken
+
+
+@pytest.mark.parametrize(("devices", "built", "words"), [(1, False, "torch was built without CUDA"), (0, True, "no CUDA device")])
+def test_cuda_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, devices: int, built: bool, words: str) -> None:
+    monkeypatch.setattr(device, "cuda_device_count", lambda: devices)
+    monkeypatch.setattr(device, "torch_has_cuda", lambda: built)
+    with pytest.raises(UsageError, match=words):
+        device.resolve_device("cuda")
+
+
+@pytest.mark.parametrize("hidden", ["", "-1"])
+def test_hidden_devices_do_not_count(monkeypatch: pytest.MonkeyPatch, hidden: str) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)
+    assert device.cuda_device_count() == 0
+
+
+def test_it_agrees_with_torch() -> None:
+    import torch
+
+    assert device.torch_has_cuda() == (torch.version.cuda is not None)
+    assert device.has_cuda() == torch.cuda.is_available()
+
+
+def test_asking_does_not_import_torch() -> None:
+    program = "import sys; from workflows.device import has_cuda; has_cuda(); sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program], check=True)

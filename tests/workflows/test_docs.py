@@ -1,0 +1,34 @@
+"""The pages made from the code are up to date, and what the README names exists."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_pages_are_up_to_date() -> None:
+    done = subprocess.run([sys.executable, str(ROOT / "docs/make_pages.py"), "--check"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
+    assert links
+    for link in links:
+        assert (ROOT / link).exists(), link
+
+
+def test_commands_of_the_readme_exist() -> None:
+    from workflows.cli import enerf
+
+    text = (ROOT / "README.md").read_text(encoding="utf-8") + (ROOT / "examples/README.md").read_text(encoding="utf-8")
+    calls = re.findall(r"^    enerf (\w+)(.*)$", text, flags=re.MULTILINE)
+    assert len(calls) > 10
+    for name, arguments in calls:
+        options = {option for parameter in enerf.commands[name].params for option in parameter.opts}
+        assert set(re.findall(r"(?<= )--[a-z-]+", arguments.partition("#")[0])) <= options
