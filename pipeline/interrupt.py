@@ -52,7 +52,13 @@ def stopping() -> Iterator[Stop]:
         for number in handled:
             signal.signal(number, former[number])
 
-    with _watching(), _undone_in_children(restore):
+    def restore_in_child() -> None:
+        restore()
+        if former[signal.SIGINT] is signal.default_int_handler:
+            # A KeyboardInterrupt that comes while the process is still being forked would be swallowed: a worker simply ends.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    with _watching(), _undone_in_children(restore_in_child):
         for number in handled:
             signal.signal(number, arrived)
         try:
@@ -96,15 +102,16 @@ def _watching() -> Iterator[None]:
 # Worker processes that a stage forks must die of SIGTERM as usual, and the Ctrl-C that a terminal sends to all of them counts once. Signals
 # wait while a process is forked: one that came before the child has its own handlers back would be lost.
 _in_children: list[Callable[[], object]] = []
-_masks: list[set[int]] = []
+_masks = threading.local()
 
 
 def _before_fork() -> None:
-    _masks.append({int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM} if _in_children else set())})
+    waiting = {signal.SIGINT, signal.SIGTERM} if _in_children else set()
+    _masks.former = signal.pthread_sigmask(signal.SIG_BLOCK, waiting)
 
 
 def _after_fork() -> None:
-    signal.pthread_sigmask(signal.SIG_SETMASK, _masks.pop())
+    signal.pthread_sigmask(signal.SIG_SETMASK, _masks.former)
 
 
 def _in_child() -> None:

@@ -107,7 +107,7 @@ def test_outside_of_the_main_thread_nothing_is_touched(tmp_path: Path) -> None:
     assert failures == []
 
 
-def test_a_worker_that_was_forked_dies_of_sigterm() -> None:
+def test_a_worker_that_was_forked_ends_as_usual() -> None:
     """At once after the fork, too; and the Ctrl-C that a terminal sends to workers as well is not counted for the parent."""
     with stopping() as stop:
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT) * 3:
@@ -119,8 +119,8 @@ def test_a_worker_that_was_forked_dies_of_sigterm() -> None:
                     os._exit(9)
             os.kill(pid, number)
             _, status = os.waitpid(pid, 0)
-            ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else os.WEXITSTATUS(status)
-            assert ended_by == (signal.SIGTERM if number == signal.SIGTERM else 9)  # 9: by KeyboardInterrupt
+            assert os.WIFSIGNALED(status)
+            assert os.WTERMSIG(status) == number
         time.sleep(0.5)  # longer than it takes for a second Ctrl-C to end this process
         assert stop() is None
 
