@@ -12,9 +12,9 @@ from stages.capture import Capture, Photo, SparsePoints
 
 FEWEST_POINTS = 50  # sparse points that make a box
 IN_VIEW = 0.75  # of the best seen points' share of cameras: what fewer than this see is surroundings
-MOST_CAMERAS = 64  # that are asked; more, spread evenly over the capture, would change nothing
+MOST_CAMERAS = 48  # that are asked; more, spread evenly over the capture, would change nothing
 SILHOUETTE = 160  # px, longest side at which alpha is read
-GRID = 48  # voxels to a side of the region searched
+GRID = 32  # voxels to a side of the region searched
 
 
 def box_of_interest(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool) -> tuple[np.ndarray, np.ndarray, str]:
@@ -131,12 +131,13 @@ def box_of_silhouettes(photos: Sequence[Photo], cameras: Sequence[Camera], low: 
     views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in masks if mask is not None]
     if len(views) < 3:
         return None
-    for _ in range(2):
-        xyz, step = grid(low, high)
-        against = np.zeros(len(xyz), int)
+    for _ in range(3):  # each pass looks closer at what the one before has left
+        kept, step = grid(low, high)
+        against = np.zeros(len(kept), int)
         for camera, mask in views:
-            against += _transparent(camera, mask, xyz, float(np.linalg.norm(step)) / 2)
-        kept = xyz[against <= len(views) // 50]
+            against += _transparent(camera, mask, kept, float(np.linalg.norm(step)) / 2)
+            left = against <= len(views) // 50
+            kept, against = kept[left], against[left]
         if not len(kept):
             return None
         low, high = kept.min(0) - step / 2, kept.max(0) + step / 2

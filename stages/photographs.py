@@ -5,28 +5,20 @@ The frame is COLMAP's own: neither its scale nor its up axis means anything.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from efficientnerf.cameras import Camera, rays, resized
+from efficientnerf.cameras import resized
 from pipeline.errors import BadInput
-from stages import matches
+from stages import mapping, matches
 from stages.capture import Capture, Photo, SparsePoints
 from stages.matches import WorkImage
 
 EXHAUSTIVE_UP_TO = 100  # photographs; beyond it, every pair would take longer than everything else together
-FEWEST = 3  # photographs that make a model
 NAMED = 8  # photographs that an error lists by name
-
-# The starting pair must see the scene from angles that differ by 16 degrees or more and agree in 100 points; where that leaves less
-# than half of the photographs (little parallax, little texture), a second attempt asks for less.
-STRICT = {"init_min_tri_angle": 16.0, "init_min_num_inliers": 100, "abs_pose_min_num_inliers": 30}
-RELAXED = {"init_min_tri_angle": 4.0, "init_min_num_inliers": 40, "abs_pose_min_num_inliers": 15}
-
 
 def find_cameras(
     folder: Path,
@@ -59,9 +51,9 @@ def find_cameras(
     images, unreadable = matches.prepare(
         folder, names, max_side=max_side, features=features, seed=seed, masks=masks, work=work, progress=progress, safe_point=safe_point, warn=warn
     )
-    if len(images) < FEWEST:
+    if len(images) < mapping.FEWEST:
         raise BadInput(
-            f"{folder}: {len(images)} readable photographs; at least {FEWEST} are needed, and 20 or more all round a subject are better."
+            f"{folder}: {len(images)} readable photographs; at least {mapping.FEWEST} are needed, and 20 or more all round a subject are better."
             + (f" Unreadable: {_listed([name for name, _ in unreadable])}." if unreadable else "")
         )
     if matching == "auto":
@@ -69,49 +61,14 @@ def find_cameras(
     matches.open_database(work, images)
     matches.extract(work, images, features=features, progress=progress, safe_point=safe_point)
     matches.match(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
-    models = _map(work, len(images), seed, STRICT, progress, safe_point)
-    if _registered(models) < max(FEWEST, len(images) / 2):
-        models = max((models, _map(work, len(images), seed, RELAXED, progress, safe_point)), key=_registered)
+    models = mapping.models_of(work, images, seed, progress, safe_point)
     rejected = [*unreadable, *_left_out(work, images, models)]
-    if _registered(models) < max(FEWEST, len(images) / 2):
+    if mapping.registered(models) < max(mapping.FEWEST, len(images) / 2):
         raise BadInput(_failure(folder, images, models, rejected, matching))
-    capture = _capture(folder, work, images, models[0], masks, rejected)
+    capture = _capture(folder, work, images, mapping.refined(models[0], images, safe_point), masks, rejected)
     for sentence in capture.warnings:
         warn(sentence)
     return capture
-
-
-def _map(work: Path, count: int, seed: int, demands: Mapping[str, float], progress: matches.Progress, safe_point: matches.SafePoint) -> list[Any]:
-    """Every model that the mapper finds, the one with most photographs (then points) first; on one thread, as two are not repeatable."""
-    with matches.quiet_pycolmap() as pycolmap:
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = 1
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-        options.min_model_size = FEWEST
-        options.mapper.mergedict(dict(demands))
-        placed = 0
-
-        def registered() -> None:
-            nonlocal placed
-            safe_point()
-            placed = min(placed + 1, count)
-            progress(placed, count, "placing cameras")
-
-        output = work / "models"
-        shutil.rmtree(output, ignore_errors=True)
-        output.mkdir()
-        pycolmap.set_random_seed(seed)
-        safe_point()
-        models = pycolmap.incremental_mapping(
-            matches.database_path(work), work / "images", output, options, initial_image_pair_callback=registered, next_image_callback=registered
-        )
-        shutil.rmtree(output)
-    safe_point()
-    return [model for _, model in sorted(models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))]
-
-
-def _registered(models: Sequence[Any]) -> int:
-    return int(models[0].num_reg_images()) if models else 0
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -154,8 +111,9 @@ def _failure(folder: Path, images: Sequence[WorkImage], models: Sequence[Any], r
         hints.append("--set poses.matching=exhaustive if the names do not follow the path of the camera")
     hints.append("--set poses.features=8192")
     worst = dict(rejected)
+    fewest = max(mapping.FEWEST, -(-len(images) // 2))
     return (
-        f"{folder}: cameras found for {_registered(models)} of {len(images)} photographs; at least {max(FEWEST, -(-len(images) // 2))} are needed. "
+        f"{folder}: cameras found for {mapping.registered(models)} of {len(images)} photographs; at least {fewest} are needed. "
         f"Not placed: {_listed(list(worst))} ({next(iter(worst.values()), 'no model')}).\nTry {'; '.join(hints)}."
     )
 
@@ -165,14 +123,14 @@ def _capture(
 ) -> Capture:
     by_file = {image.file: image for image in images}
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
-    at_work = [_camera(model, image, by_file[image.name]) for image in registered]  # at working size
+    at_work = [mapping.camera_of(model, image, by_file[image.name]) for image in registered]  # at working size
     photos = tuple(
         Photo(camera=resized(camera, by_file[image.name].width, by_file[image.name].height), image=folder / camera.name, mask=masks.get(camera.name))
         for camera, image in zip(at_work, registered, strict=True)
     )
     index = {image.image_id: i for i, image in enumerate(registered)}
     points = _points(model, index)
-    agreement = pair_agreement(work, {image.image_id: camera for image, camera in zip(registered, at_work, strict=True)})
+    agreement = mapping.agreement_of(work, images, model)
     facts: dict[str, object] = {
         "photographs": len(images),
         "registered": len(photos),
@@ -193,15 +151,6 @@ def _capture(
         reprojection_error=float(model.compute_mean_reprojection_error()),
         facts=facts,
     )
-
-
-def _camera(model: Any, image: Any, source: WorkImage) -> Camera:
-    pose = np.eye(4)
-    camera_from_world = np.asarray(image.cam_from_world().matrix())
-    pose[:3, :3] = camera_from_world[:, :3].T
-    pose[:3, 3] = -camera_from_world[:, :3].T @ camera_from_world[:, 3]
-    lens = model.cameras[image.camera_id]
-    return Camera(source.name, source.work_width, source.work_height, lens.model_name, tuple(float(p) for p in lens.params), pose)
 
 
 def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
@@ -229,34 +178,6 @@ def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
     return float(np.median(widest))
 
 
-def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: float = 4.0) -> float:
-    """How much of what the photographs say in pairs the cameras confirm: the share of matches, verified by two photographs alone, whose
-    rays pass each other within `tolerance` pixels of the working size. COLMAP drops what does not fit, so that its own reprojection error
-    is small even where a facade with equal windows was folded onto itself; this share is not.
-
-    cameras  by COLMAP's image id, at working size
-    """
-    agreeing = total = 0
-    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
-        directions = {
-            image_id: rays(camera, np.asarray(database.read_keypoints(image_id), np.float64)[:, :2])[1] for image_id, camera in cameras.items()
-        }  # (N, 3) each
-        for first, second in matches.verified_pairs(matches.database_path(work)):
-            if first not in cameras or second not in cameras:
-                continue
-            inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
-            if len(inliers) < 30:
-                continue
-            a, b = directions[first][inliers[:, 0]], directions[second][inliers[:, 1]]
-            baseline = cameras[second].centre - cameras[first].centre
-            plane = np.cross(baseline, b)  # the epipolar plane of the second ray
-            sine = np.abs((plane * a).sum(1)) / np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
-            focal = cameras[first].intrinsics["fx"]
-            agreeing += int((sine * focal < tolerance).sum())
-            total += len(inliers)
-    return agreeing / total if total else 1.0
-
-
 def _doubts(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:
     """What is odd about a model whose counts and reprojection error are fine."""
     doubts = []
@@ -271,7 +192,7 @@ def _doubts(photos: Sequence[Photo], points: SparsePoints, agreement: float, pri
     lenses = {photo.camera.params: (photo.camera, prior) for photo, prior in zip(photos, priors, strict=True)}
     for camera, prior in lenses.values():
         focal, longest = camera.intrinsics["fx"], max(camera.width, camera.height)
-        if prior and not 0.75 < focal / prior < 1.33:
+        if prior and mapping.far_off(focal, prior):
             doubts.append(f"{camera.name}: focal length {focal:.0f} px, but {prior:.0f} px by its EXIF data; cropped or edited photographs may explain it.")
         elif not 0.35 < focal / longest < 6.0:
             doubts.append(f"{camera.name}: an unlikely focal length, {focal:.0f} px at {longest} px wide.")
