@@ -11,7 +11,7 @@ from efficientnerf.cameras import Camera, Similarity, project, resized
 from stages.capture import Capture, Photo, SparsePoints
 
 FEWEST_POINTS = 50  # sparse points that make a box
-IN_VIEW = 0.75  # of the best seen points' share of cameras: what fewer than this see is surroundings
+IN_VIEW = 0.65  # of the best seen points' share of cameras: what fewer than this see is surroundings
 MOST_CAMERAS = 48  # that are asked; more, spread evenly over the capture, would change nothing
 SILHOUETTE = 160  # px, longest side at which alpha is read
 GRID = 32  # voxels to a side of the region searched
@@ -44,8 +44,12 @@ def box_of_points(points: SparsePoints, cameras: Sequence[Camera], focus: np.nda
     """A box round the points that most cameras have in view; None if too few remain.
 
     What lies behind a subject is seen from one side only, and what is seen by few is not what the photographs are of. Where the cameras look the
-    same way they all see the background: there, depth is limited instead, as far as the parallax still carries.
+    same way they all see the background: there, depth is limited instead, as far as the parallax still carries. Where they pass
+    through the scene, as along a street, no part of it is seen by most, and the box holds all of it that is near their path.
     """
+    centres = np.array([camera.centre for camera in cameras])
+    if not converging and _passes_through(points.xyz, cameras, centres):
+        return _box_of_path(points.xyz, centres)
     share = in_view(points.xyz, cameras).mean(0)
     keep = share >= IN_VIEW * np.quantile(share, 0.95)
     count = np.array([len(observers) for observers in points.observers]) if points.observers else np.full(len(points.xyz), 3)
@@ -63,6 +67,23 @@ def box_of_points(points: SparsePoints, cameras: Sequence[Camera], focus: np.nda
     if len(kept) < FEWEST_POINTS:
         return None
     return np.quantile(kept, 0.002, axis=0), np.quantile(kept, 0.998, axis=0)
+
+
+def _passes_through(xyz: np.ndarray, cameras: Sequence[Camera], centres: np.ndarray) -> bool:
+    """Whether cameras come nearer to what others see than they come to each other: usual depth below the extent of the path."""
+    depths = [depth[inside] for inside, depth in ((in_view(xyz, [camera])[0], project(camera, xyz)[1]) for camera in cameras) if inside.any()]
+    extent = np.linalg.norm(np.quantile(centres, 0.9, axis=0) - np.quantile(centres, 0.1, axis=0))
+    return bool(depths) and float(np.median([np.quantile(depth, 0.25) for depth in depths])) < float(extent)
+
+
+def _box_of_path(xyz: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A box round the path and the points that lie to its side, as far from it as half of the points do, times two."""
+    from scipy.spatial import cKDTree
+
+    distance = cKDTree(centres).query(xyz)[0]
+    near = xyz[distance <= 2 * np.median(distance)]
+    both = np.concatenate([np.quantile(near, [0.02, 0.98], axis=0), centres])
+    return both.min(0), both.max(0)
 
 
 def isolated(xyz: np.ndarray, *, neighbours: int = 5, factor: float = 4.0) -> np.ndarray:

@@ -1,0 +1,86 @@
+"""How exactly, and how fast, cameras are found from the sample photographs.
+
+    python benchmarks/poses.py [--photographs FOLDER] [--truth FILE.json] [--out RESULT.json]
+
+Prints and saves: photographs registered, RMS and largest error of the camera centres after a similarity alignment, in per cent of
+their mean distance to the centroid, the lens, seconds, processor seconds and the load of the machine before and after.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import resource
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.cameras import pose_from_opengl
+from stages.photographs import find_cameras
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def aligned_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(C,) distances after the best similarity (Umeyama 1991) from (C, 3) found to true centres, over the mean distance of the true ones
+    to their centroid."""
+    a, b = found - found.mean(0), true - true.mean(0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    scale = (s * sign).sum() / (a**2).sum()
+    return np.asarray(np.linalg.norm(b - scale * a @ (u * sign @ vt).T, axis=1) / np.linalg.norm(b, axis=1).mean())
+
+
+def true_centres(path: Path) -> dict[str, np.ndarray]:
+    frames = json.loads(path.read_text())["frames"]
+    return {frame["file_path"]: pose_from_opengl(np.array(frame["transform_matrix"]))[:3, 3] for frame in frames}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--photographs", type=Path, default=ROOT / "examples" / "still_life")
+    parser.add_argument("--truth", type=Path, default=ROOT / "tests" / "data" / "still_life_cameras.json")
+    parser.add_argument("--out", type=Path, default=None)
+    arguments = parser.parse_args()
+    truth = true_centres(arguments.truth)
+    names = sorted(path.name for path in arguments.photographs.iterdir() if path.name in truth)
+    load_before, started, used = os.getloadavg()[0], time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF)
+    phases: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as work:
+        capture = find_cameras(
+            arguments.photographs,
+            names,
+            work=Path(work),
+            progress=lambda done, total, text="", **facts: phases.update({text: round(time.perf_counter() - started, 2)}),
+            safe_point=lambda: None,
+            warn=lambda text, **facts: print(text),
+        )
+    seconds, after = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_SELF)
+    errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))
+    result = {
+        "photographs": len(names),
+        "registered": len(capture.photos),
+        "centre_rms_percent": round(100 * float(np.sqrt((errors**2).mean())), 4),
+        "centre_max_percent": round(100 * float(errors.max()), 4),
+        "reprojection_error_px": round(float(capture.reprojection_error or 0), 4),
+        "lens": {capture.photos[0].camera.model: capture.photos[0].camera.params},
+        "seconds": round(seconds, 2),
+        "processor_seconds": round(after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime, 2),
+        "phase_ends_at": phases,
+        "load_before": load_before,
+        "load_after": os.getloadavg()[0],
+        "machine": {"cores": len(os.sched_getaffinity(0)), "processor": platform.machine(), "pycolmap": version("pycolmap")},
+    }
+    text = json.dumps(result, indent=1)
+    print(text)
+    if arguments.out:
+        arguments.out.write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()
