@@ -95,6 +95,6 @@ def files(folder: Path, settings: Any) -> list[Path]:
 
 def describe(source: Path, format: str = "auto") -> dict[str, Any]:
     """What `enerf inspect SOURCE` prints of a data set as it stands; raises BadInput."""
-    from stages.importers.describe import describe_source
+    from stages.importers.description import describe_source
 
     return describe_source(source, format)

@@ -6,7 +6,7 @@ a small reprojection error is no sign of a good one.
 
 from __future__ import annotations
 
-from collections import Counter
+import os
 from pathlib import Path
 
 import numpy as np
@@ -86,11 +86,10 @@ def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], 
     The folder of images is the one in which most of the model's names are found.
     """
     names = {number: image.name for number, image in sorted(model.images.items(), key=lambda item: item[1].name)}
-    candidates = [base / place for place in _IMAGE_PLACES for base in (source.root, model.folder, model.folder.parent)]
-    candidates = [path for path in dict.fromkeys(path.resolve() for path in candidates) if path.is_dir() and path.is_relative_to(source.root.resolve())]
-    shown = [source.root / path.relative_to(source.root.resolve()) for path in candidates]
-    counts = Counter({folder: sum((folder / name).is_file() for name in names.values()) for folder in shown})
-    best = max(shown, key=lambda folder: counts[folder])  # the first of equals
+    places_to_look = [Path(os.path.normpath(base / place)) for place in _IMAGE_PLACES for base in (source.root, model.folder, model.folder.parent)]
+    candidates = [path for path in dict.fromkeys(places_to_look) if path.is_dir() and path.is_relative_to(source.root)]
+    counts = {folder: sum((folder / name).is_file() for name in names.values()) for folder in candidates}
+    best = max(candidates, key=lambda folder: counts[folder])  # the first of equals
     found: dict[int, Path | None] = {}
     places: list[tuple[str, str]] = []
     extensions: list[tuple[str, str]] = []

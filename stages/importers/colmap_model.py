@@ -93,7 +93,8 @@ def count_images(folder: Path) -> int:
         return 0
     path = found[1]
     if path.suffix == ".bin":
-        head = path.open("rb").read(8)
+        with path.open("rb") as file:
+            head = file.read(8)
         return struct.unpack("<Q", head)[0] if len(head) == 8 else 0
     return sum(1 for _ in _image_lines(path))
 
