@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import artifact, files, manifest
-from pipeline.errors import BadInput, CorruptArtifact, PipelineError
+from pipeline.errors import BadInput, CorruptArtifact, Interrupted, PipelineError
 from pipeline.hashes import Hashes
 from pipeline.manifest import ABSENT, Manifest, Request
 from pipeline.run import Run
@@ -147,6 +147,8 @@ def _request(stage: Stage, run: Run, recorded: Manifest | None, hashes: Hashes) 
         former = None if recorded is None else recorded.request.source
         try:
             source, note = _source(stage, run, settings, former, hashes)
+        except Interrupted:
+            raise
         except PipelineError as error:
             return None, error, None
     return Request(stage.name, stage.version, settings_dict(settings), inputs, source), None, note

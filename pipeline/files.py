@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+SafePoint = Callable[[], None]
+
 MAX_JSON = 64 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
 
 
@@ -144,6 +146,3 @@ def exists(path: Path) -> bool:
 def is_empty(folder: Path) -> bool:
     with os.scandir(folder) as entries:
         return next(entries, None) is None
-
-
-SafePoint = Callable[[], None]

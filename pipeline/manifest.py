@@ -140,7 +140,7 @@ def read_manifest(folder: Path) -> Manifest:
         return _parsed(files.read_json(path))
     except (FileNotFoundError, NotADirectoryError):
         raise CorruptArtifact(f"{where}: is not there", (where,)) from None
-    except (files.Unreadable, _Bad) as error:
+    except (ValueError, OverflowError, RecursionError) as error:  # Unreadable and _Bad are ValueErrors; the others come of absurd numbers
         raise CorruptArtifact(f"{where}: {error}", (where,)) from None
 
 

@@ -100,13 +100,17 @@ class Run:
         unknown = sorted(changes.keys() - set(_CHANGEABLE))
         if unknown:
             raise TypeError(f"a run has no {unknown[0]!r} to change")
+        former = {name: getattr(self, name) for name in changes}
         before = self.plain()
-        for name, value in changes.items():
-            setattr(self, name, value)
-        self.__post_init__()
-        if self.plain() != before:
+        self._set(changes)
+        if self.plain() == before:
+            return
+        try:
             with self.locked():
                 self._save()
+        except BaseException:
+            self._set(former)
+            raise
 
     def folder(self, stage: str) -> Path:
         return self.path / stage
@@ -154,6 +158,11 @@ class Run:
             "created": self.created,
         }
 
+    def _set(self, values: dict[str, Any]) -> None:
+        for name, value in values.items():
+            setattr(self, name, value)
+        self.__post_init__()
+
     def _save(self) -> None:
         try:
             files.write_atomically(self.path / NAME, files.pretty_json(self.plain()))
@@ -197,7 +206,7 @@ def _checked(path: Path, value: Any) -> dict[str, Any]:
         "preset": isinstance(value.get("preset"), str | None),
         "seed": type(value.get("seed")) in (int, type(None)),
         "device": isinstance(value.get("device"), str | None),
-        "created": type(value.get("created", 0.0)) in (int, float),
+        "created": type(value.get("created", 0.0)) in (int, float) and abs(value.get("created", 0.0)) < 1e15,
     }
     for name, is_good in good.items():
         if not is_good:

@@ -9,7 +9,8 @@ import pytest
 
 from pipeline import artifact
 from pipeline.decide import decide, survey, why_run
-from pipeline.errors import BadInput, UnknownSetting
+from pipeline.errors import BadInput, Interrupted, UnknownSetting
+from pipeline.hashes import Hashes
 from pipeline.run import Run
 from pipeline.runner import run_stages
 from tests.pipeline.toy import COUNT, DOUBLE, LIST, REPORT, STAGES, make_run, set_one
@@ -42,7 +43,7 @@ def test_nothing_to_do(done: Run) -> None:
 
 
 def test_looking_changes_nothing(done: Run) -> None:
-    shutil.rmtree(done.path / ".cache")
+    shutil.rmtree(done.path / ".cache", ignore_errors=True)  # what was written a moment ago may not be remembered
     set_one(done, "count", steps=9)
     before = tree(done.path.parent)
     survey(STAGES, done)
@@ -126,6 +127,14 @@ def test_a_source_that_can_no_longer_be_read_is_a_change(done: Run) -> None:
 
     decision = decide(replace(LIST, source_files=refuse), done)
     assert (decision.state, decision.reason) == ("stale", "inputs changed: transforms.json: has no frames")
+
+
+def test_hashing_the_source_can_be_interrupted(done: Run) -> None:
+    def stop() -> None:
+        raise Interrupted()
+
+    with pytest.raises(Interrupted):
+        decide(LIST, done, Hashes(safe_point=stop))
 
 
 def test_an_altered_output_is_corrupt(done: Run) -> None:

@@ -78,6 +78,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "format": (lambda v: v.update(format="other"), "format 'other'"),
     "newer": (lambda v: v.update(format_version=2), "format version 2; this build reads 1"),
     "versions": (lambda v: v.update(versions={"a": 1}), "versions"),
+    "huge number": (lambda v: v.update(seconds=10**400), "too large"),
     "seconds": (lambda v: v.update(seconds="fast"), "seconds"),
 }
 
@@ -108,7 +109,13 @@ def test_a_cut_manifest_is_refused_wherever_it_is_cut(tmp_path: Path) -> None:
             read_manifest(tmp_path)
 
 
-def test_a_missing_or_huge_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_infinity_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_bytes(example().to_bytes().replace(b"1.5", b"1e999"))
+    with pytest.raises(CorruptArtifact):
+        read_manifest(tmp_path)
+
+
+def test_a_missing_or_huge_manifest(tmp_path: Path) -> None:
     with pytest.raises(CorruptArtifact, match="is not there"):
         read_manifest(tmp_path)
     with open(tmp_path / "manifest.json", "wb") as file:

@@ -82,6 +82,7 @@ def test_open_says_what_it_found(tmp_path: Path) -> None:
         ({"preset": 1}, CorruptArtifact, "preset"),
         ({"device": 1}, CorruptArtifact, "device"),
         ({"created": "x"}, CorruptArtifact, "created"),
+        ({"created": 10**400}, CorruptArtifact, "created"),
     ],
 )
 def test_a_hostile_run_json(tmp_path: Path, change: dict[str, Any], error: type[Exception], message: str) -> None:
@@ -121,4 +122,5 @@ def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(DiskFull, match="MiB free"):
         run.update(preset="high")
     monkeypatch.undo()
-    assert Run.open(run.path).preset is None
+    assert run.preset is None
+    assert Run.open(run.path) == run
