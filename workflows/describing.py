@@ -26,7 +26,7 @@ def describe(path: Path) -> dict[str, Any]:
         return scene.describe(path)
     if (path / ASSET).is_file():
         return {"what": "asset", "path": str(path / ASSET), **describe_asset(path / ASSET)}
-    from stages.importers.describe import describe_source
+    from stages.importers.description import describe_source
 
     return describe_source(path)
 
@@ -42,7 +42,7 @@ def _describe_file(path: Path) -> dict[str, Any]:
 
         return scene.describe(path.parent)
     if suffix in (".json", ".npy", ".bin", ".txt"):
-        from stages.importers.describe import describe_source
+        from stages.importers.description import describe_source
 
         return describe_source(path.parent)
     raise BadInput(f"{path}: of no kind that can be described; expected an asset (.nerftree), a mesh ({', '.join(MESHES)}), a run or the folder of a data set.")
@@ -103,7 +103,7 @@ def _lines(found: dict[str, Any], indent: str) -> list[str]:
     lines = []
     for name, value in found.items():
         label = f"{indent}{name.replace('_', ' ')}"
-        if name == "cameras" and isinstance(value, list):
+        if name == "cameras" and isinstance(value, list) and all(isinstance(camera, dict) for camera in value):
             if value:
                 first = value[0]
                 lines.append(f"{label:<24} {len(value)}, listed with --json; the first: {first['name']}, {first['model']} {_shown(first['params'])}")

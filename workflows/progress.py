@@ -15,9 +15,9 @@ from typing import Any, TextIO
 
 Event = Mapping[str, Any]
 
-# In a log, one line per ten seconds or per tenth of the way, whichever comes first, but no more than one a second.
+# In a log, one line per ten seconds or per tenth of the way, whichever comes first, but no more than one in two seconds.
 SECONDS_BETWEEN_LINES = 10.0
-SECONDS_BETWEEN_TENTHS = 1.0
+SECONDS_BETWEEN_TENTHS = 2.0
 
 
 def duration(seconds: float) -> str:

@@ -11,7 +11,10 @@ from pipeline.errors import UsageError
 from workflows import device
 
 
-@pytest.mark.parametrize(("devices", "built", "wanted", "taken"), [(1, True, "auto", "cuda"), (1, False, "auto", "cpu"), (0, True, "auto", "cpu"), (1, True, "cpu", "cpu")])
+@pytest.mark.parametrize(
+    ("devices", "built", "wanted", "taken"),
+    [(1, True, "auto", "cuda"), (1, False, "auto", "cpu"), (0, True, "auto", "cpu"), (1, True, "cpu", "cpu")],
+)
 def test_the_device_that_is_taken(monkeypatch: pytest.MonkeyPatch, devices: int, built: bool, wanted: str, taken: str) -> None:
     monkeypatch.setattr(device, "cuda_device_count", lambda: devices)
     monkeypatch.setattr(device, "torch_has_cuda", lambda: built)
