@@ -29,7 +29,7 @@ gpu: $(INSTALLED)
 	fi
 
 docs: $(INSTALLED)
-	$(BIN)/python docs/make_settings.py
+	$(BIN)/python docs/make_pages.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
