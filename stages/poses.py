@@ -44,7 +44,7 @@ class PosesSettings:
     )
     test_every: int = setting(8, "Every n-th image in sorted order is held back for testing where the source states no split.", minimum=2)
     llff_factor: int | None = setting(None, "Reduction of the LLFF images to use (images_N); none takes the largest there are.", minimum=1)
-    strict: bool = setting(False, "Refuse a source of which images are missing or cannot be read, instead of warning.")
+    strict: bool = setting(False, "Refuse a source of which images are missing, cannot be read or find no place, instead of warning.")
     allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.")
     matching: str = setting(
         "auto",

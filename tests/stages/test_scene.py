@@ -1,0 +1,192 @@
+"""scene.json: written and read back the same, refused in words where it has been damaged; cameras handed on to nerfstudio."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.cameras import Similarity, rays, resized
+from pipeline.errors import BadInput
+from stages import importers, scene
+from stages.capture import SparsePoints
+from stages.exporters import cameras as camera_exporter
+from stages.scene import Orbit, Scene, View
+from tests.stages import captures
+from tests.stages.test_importers import LENSES, assert_same_rays
+
+
+def scene_of(model: str = "SIMPLE_PINHOLE") -> Scene:
+    made = captures.cameras() if model == "SIMPLE_PINHOLE" else captures.cameras(model=model, params=LENSES[model])
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    world = Similarity(0.5, turn, np.array([0.1, 0.2, 0.3]))
+    views = tuple(
+        View(
+            image=f"images/{camera.name}",
+            mask=f"masks/{camera.name}" if index == 0 else None,
+            split="test" if index == 0 else "train",
+            camera=world.camera(resized(camera, 16, 12)),
+            source_camera=camera,
+            near=0.1,
+            far=3.0,
+        )
+        for index, camera in enumerate(made)
+    )
+    return Scene(
+        kind="colmap",
+        views=views,
+        bounds=np.array([[-1, -0.5, -0.5], [1, 0.5, 0.5]]),
+        background=(1.0, 1.0, 1.0),
+        world_from_capture=world,
+        orbit=Orbit((0.0, 0.0, 0.1), 2.0, 20.0, False, -90.0),
+        metric=True,
+    )
+
+
+def test_a_scene_comes_back_as_it_was(tmp_path: Path) -> None:
+    whole = scene_of("OPENCV")
+    scene.save(whole, tmp_path)
+    again = scene.load(tmp_path)
+    for view, same in zip(whole.views, again.views, strict=True):
+        assert (view.image, view.mask, view.split, view.near, view.far) == (same.image, same.mask, same.split, same.near, same.far)
+        for camera, other in ((view.camera, same.camera), (view.source_camera, same.source_camera)):
+            assert (camera.name, camera.width, camera.height, camera.model, camera.params) == (other.name, other.width, other.height, other.model, other.params)
+            np.testing.assert_array_equal(camera.world_from_camera, other.world_from_camera)
+    assert (again.kind, again.background, again.orbit, again.points, again.metric) == (whole.kind, whole.background, whole.orbit, False, True)
+    np.testing.assert_array_equal(again.bounds, whole.bounds)
+    np.testing.assert_array_equal(again.world_from_capture.matrix(), whole.world_from_capture.matrix())
+    assert again.up == (0, 0, 1)
+    assert [len(scene.views_of(again, split)) for split in ("train", "val", "test", "report")] == [5, 0, 1, 1]
+    (tmp_path / "again").mkdir()
+    scene.save(again, tmp_path / "again")
+    assert (tmp_path / "again/scene.json").read_bytes() == (tmp_path / "scene.json").read_bytes()
+
+
+def set_in(*path: Any) -> Callable[[Any], None]:
+    """A change of a document: all but the last of the arguments lead to the value, the last replaces it."""
+    *way, last, value = path
+
+    def change(document: Any) -> None:
+        for step in way:
+            document = document[step]
+        document[last] = value
+
+    return change
+
+
+DAMAGE: dict[str, tuple[Callable[[Any], None], str]] = {
+    "newer": (set_in("format", 2), "format version 2; this build reads 1"),
+    "no views": (set_in("views", None), "views: expected a list"),
+    "split": (set_in("views", 0, "split", "all"), r"views\[0\]: split 'all'"),
+    "near": (set_in("views", 0, "near", 4.0), "near 4.0, far 3.0"),
+    "pose": (set_in("views", 1, "camera", "world_from_camera", 0, 0, 7.0), "not a rigid motion"),
+    "pose shape": (set_in("views", 1, "camera", "world_from_camera", [[1]]), r"shape \(4, 4\)"),
+    "model": (set_in("views", 1, "camera", "model", "FOV"), "FOV"),
+    "size": (set_in("views", 1, "camera", "width", 0), "size 0x12"),
+    "truth for a number": (set_in("views", 1, "near", True), "near: expected numbers"),
+    "outside": (set_in("views", 1, "image", "../x.png"), "lies outside"),
+    "absolute": (set_in("views", 0, "mask", "/etc/x.png"), "lies outside"),
+    "bounds": (set_in("bounds", [[1, 1, 1], [0, 0, 0]]), "bounds are empty"),
+    "scale": (set_in("world_from_capture", "scale", -1.0), "not a similarity"),
+    "background": (set_in("background", [1, 1]), r"background: expected finite numbers of shape \(3,\)"),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_a_damaged_scene_is_refused(what: str, tmp_path: Path) -> None:
+    scene.save(scene_of(), tmp_path)
+    document = json.loads((tmp_path / "scene.json").read_text())
+    change, word = DAMAGE[what]
+    change(document)
+    (tmp_path / "scene.json").write_text(json.dumps(document))
+    with pytest.raises(BadInput, match=word):
+        scene.load(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "7", '{"format": NaN}', "[" * 100_000])
+def test_what_is_no_scene_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.json").write_text(text)
+    with pytest.raises(BadInput, match=r"scene\.json"):
+        scene.load(tmp_path)
+
+
+def test_no_scene(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="Run the poses stage first"):
+        scene.load(tmp_path)
+
+
+def test_images_and_masks_are_read_as_written(tmp_path: Path) -> None:
+    view = scene_of().views[0]
+    for channels in (3, 4):
+        pixels = captures.picture(1, 16, 12, channels)
+        captures.write_picture(tmp_path / view.image, pixels)
+        np.testing.assert_array_equal(scene.read_image(tmp_path, view), pixels)
+    mask = np.where(captures.picture(2, 16, 12)[..., 0] > 100, np.uint8(255), np.uint8(0))
+    captures.write_picture(tmp_path / "masks/img_0.png", mask)
+    np.testing.assert_array_equal(scene.read_mask(tmp_path, view), mask == 255)
+    assert scene.read_mask(tmp_path, scene_of().views[1]) is None
+
+
+def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
+    view = scene_of().views[0]
+    for read in (scene.read_image, scene.read_mask):
+        with pytest.raises(BadInput, match="missing"):
+            read(tmp_path, view)
+    captures.write_picture(tmp_path / view.image, captures.picture(1, 12, 12))
+    with pytest.raises(BadInput, match="uint8 12x12; expected an 8-bit image of 16x12"):
+        scene.read_image(tmp_path, view)
+
+
+def test_points_come_back_as_they_were(tmp_path: Path) -> None:
+    for observers in [((0, 2), (), (5,)), ()]:
+        count = len(observers)
+        points = SparsePoints(np.ones((count, 3)), np.full((count, 3), 7, np.uint8), np.full(count, np.nan), observers)
+        scene.save_points(points, tmp_path)
+        again = scene.read_points(tmp_path)
+        np.testing.assert_array_equal(again.xyz, points.xyz)
+        np.testing.assert_array_equal(again.rgb, points.rgb)
+        assert again.observers == observers
+    (tmp_path / "points.safetensors").write_bytes(b"nothing")
+    with pytest.raises(BadInput, match=r"points\.safetensors"):
+        scene.read_points(tmp_path)
+
+
+def test_description(tmp_path: Path) -> None:
+    scene.save(scene_of(), tmp_path)
+    (tmp_path / "report.json").write_text('{"warnings": ["odd"]}')
+    described = json.loads(json.dumps(scene.describe(tmp_path), allow_nan=False))
+    camera = described["cameras"][0]
+    assert {"name", "width", "height", "model", "params", "split", "capture_from_camera"} <= set(camera)
+    assert (camera["width"], camera["height"], camera["params"], camera["split"]) == (32, 24, [40.0, 16.0, 12.0], "test")
+    np.testing.assert_array_equal(camera["capture_from_camera"], captures.cameras()[0].world_from_camera)
+    assert described["count"] == 6
+    assert described["odd"] == ["odd"]
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", *LENSES])
+def test_exported_cameras_are_those_of_the_source(model: str, tmp_path: Path) -> None:
+    whole = scene_of(model)
+    named = replace(whole, views=tuple(replace(view, source_camera=replace(view.source_camera, name=view.image)) for view in whole.views))
+    named = replace(named, views=tuple(replace(view, camera=replace(view.camera, name=view.image)) for view in named.views))
+    captures.write_pictures(tmp_path, [view.image for view in named.views])
+    camera_exporter.write(named, tmp_path / "transforms.json")
+    capture = importers.IMPORTERS["nerfstudio"].read(tmp_path, captures.Settings())
+    truth = captures.cameras() if model == "SIMPLE_PINHOLE" else captures.cameras(model=model, params=LENSES[model])
+    assert_same_rays(capture, truth)
+    assert [photo.split for photo in capture.photos].count("test") == 1
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    assert document["fl_x"] == 40.0 or model == "OPENCV_FISHEYE"
+    assert rays(capture.photos[0].camera)[1].shape == (768, 3)
+
+
+def test_exported_cameras_that_differ_state_their_own_lens() -> None:
+    whole = scene_of()
+    other = replace(whole.views[0], source_camera=resized(whole.views[0].source_camera, 64, 48))
+    document = camera_exporter.transforms_from_scene(replace(whole, views=(other, *whole.views[1:])))
+    assert "fl_x" not in document
+    assert [frame["w"] for frame in document["frames"]] == [64, 32, 32, 32, 32, 32]
