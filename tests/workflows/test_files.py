@@ -1,0 +1,138 @@
+"""export, render and inspect with a bare asset file: a ball."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from efficientnerf.nerftree import format as nerftree
+from efficientnerf.nerftree.tree import NerfTree
+from tests.workflows.conftest import Result
+
+Enerf = Callable[..., Result]
+SCALE = 0.5
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A red ball of radius 0.6 about the origin of the training frame, which is the capture's times 0.5."""
+    cells, brick, voxel = 6, 4, 2 / 24
+    centres = (np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1) + 0.5) * voxel - 1  # (24, 24, 24, 3)
+    density = np.where(np.linalg.norm(centres, axis=-1) < 0.6, 200.0, 0.0)
+    blocks = density.reshape(cells, brick, cells, brick, cells, brick).transpose(0, 2, 4, 1, 3, 5).reshape(-1, brick**3)
+    sh = np.zeros((cells**3 * brick**3, 1, 3), np.float32)
+    sh[:, 0] = (8.0, -8.0, -8.0)
+    tree = NerfTree(
+        shape=(cells,) * 3,
+        brick=brick,
+        voxel=voxel,
+        bounds_min=np.full(3, -1.0),
+        brick_index=np.arange(cells**3, dtype=np.int32).reshape((cells,) * 3),
+        voxel_index=np.arange(cells**3 * brick**3, dtype=np.int32).reshape(cells**3, brick**3),
+        density_values=blocks.reshape(-1).astype(np.float32),
+        sh=sh,
+        metadata={"world_from_capture": {"scale": SCALE, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}},
+    )
+    path = tmp_path_factory.mktemp("asset") / "ball.nerftree"
+    nerftree.save(tree, path)
+    return path
+
+
+def test_meshes_lie_in_the_frame_of_the_capture(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    files = [tmp_path / f"ball{extension}" for extension in (".ply", ".glb", ".obj")]
+    result = enerf("export", ball, "--to", *files, "--set", "mesh.faces=500", "--json")
+    assert result.code == 0, result.err
+    assert [entry["path"] for entry in result.objects[-1]["written"]] == [str(path) for path in files]
+    for path in files:
+        found = enerf("inspect", path, "--json").object
+        assert 100 < found["faces"] <= 500
+        np.testing.assert_allclose(found["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 0.6 / SCALE, atol=0.1)
+
+
+def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    result = enerf("export", ball, "--points", "--to", tmp_path / "ball.ply", tmp_path / "ball.xyz", "--set", "points.count=300")
+    assert result.code == 0, result.err
+    assert "300 points" in result.out
+    assert len((tmp_path / "ball.xyz").read_text(encoding="utf-8").splitlines()) == 300
+    assert enerf("inspect", tmp_path / "ball.ply", "--json").object["vertices"] == 300
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--to", "ball.stl"], 2, ".ply, .glb, .obj"),
+        (["--to", "ball.obj", "--points"], 2, ".ply, .xyz"),
+        (["--to", "no/where/ball.ply"], 2, "does not exist"),
+        (["--to", "cameras.json"], 2, "has no cameras"),
+        (["--to", "ball.ply", "--set", "mesh.facs=3"], 2, "Nearest: mesh.faces."),
+        (["--to", "ball.ply", "--set", "mesh.threshold=1e9"], 3, "Lower mesh.threshold"),
+        ([], 2, "--to"),
+    ],
+)
+def test_exports_that_are_refused(
+    enerf: Enerf, ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = enerf("export", ball, *arguments)
+    assert result.code == code
+    assert words in result.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_turntable_with_its_video(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    out, video = tmp_path / "frames", tmp_path / "ball.mp4"
+    result = enerf("render", ball, "--out", out, "--frames", 3, "--width", 32, "--height", 24, "--background", "#0000ff", "--video", video)
+    assert result.code == 0, result.err
+    assert sorted(path.name for path in out.glob("*.png")) == ["frame_0000.png", "frame_0001.png", "frame_0002.png"]
+    pixels = np.asarray(Image.open(out / "frame_0001.png"))
+    assert pixels.shape == (24, 32, 3)
+    assert pixels[0, 0].tolist() == [0, 0, 255]
+    assert pixels[12, 16, 0] > 200
+    assert video.read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_camera_path(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    matrix = [1, 0, 0, 0, 0, 0, -1, -4, 0, 1, 0, 0, 0, 0, 0, 1]  # at y = -4 in the capture's frame, looking along +y
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"render_width": 40, "render_height": 30, "fps": 10, "camera_path": [{"camera_to_world": matrix, "fov": 60}]}), encoding="utf-8")
+    result = enerf("render", ball, "--out", tmp_path / "frames", "--path", path, "--json")
+    assert result.code == 0, result.err
+    assert result.objects[-1]["written"][0].endswith("frame_0000.png")
+    assert np.asarray(Image.open(tmp_path / "frames/frame_0000.png")).shape == (30, 40, 3)
+    path.write_text('{"frames": []}', encoding="utf-8")
+    assert enerf("render", ball, "--out", tmp_path / "frames", "--path", path).code == 2
+
+
+def test_what_cannot_be_rendered(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    assert enerf("render", tmp_path, "--out", tmp_path / "frames").code == 2
+    assert enerf("render", ball, "--out", tmp_path / "frames", "--background", "pink").code == 2
+    assert enerf("render", ball, "--out", tmp_path / "frames", "--video", tmp_path / "ball.avi").code == 2
+    assert not (tmp_path / "frames").exists()
+
+
+def test_describing_an_asset(enerf: Enerf, ball: Path) -> None:
+    found = enerf("inspect", ball, "--json").object
+    assert (found["what"], found["resolution"], found["sh_degree"]) == ("asset", [24, 24, 24], 0)
+    assert "resolution               [24, 24, 24]" in enerf("inspect", ball).out
+
+
+def test_broken_assets(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    cut, altered, other = tmp_path / "cut.nerftree", tmp_path / "altered.nerftree", tmp_path / "other.nerftree"
+    content = ball.read_bytes()
+    cut.write_bytes(content[:-100])
+    altered.write_bytes(content[:-1] + b"x")
+    other.write_text("no asset", encoding="utf-8")
+    for path in (cut, altered, other):
+        result = enerf("render", path, "--out", tmp_path / "frames")
+        assert result.code == 4
+        assert str(path) in result.err
+        assert len(result.err.splitlines()) <= 2
+    assert enerf("inspect", cut).code == 4
+    assert enerf("inspect", ball.parent / "nothing.nerftree").code == 2
+    (tmp_path / "mesh.ply").write_text("ply\nbroken", encoding="utf-8")
+    assert enerf("inspect", tmp_path / "mesh.ply").code == 2
