@@ -250,8 +250,13 @@ def smooth(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
 
 
 def decimate(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh with at most about `budget` faces, by quadric edge collapse; as it was where it has no more."""
+    """The mesh with at most about `budget` faces, by quadric edge collapse; as it was where it has no more.
+
+    Where the quadrics of a collapse are nearly singular its best place may lie far off the surface, a spike: a vertex that is further than
+    a mean edge from all former vertices goes to the nearest of them.
+    """
     import fast_simplification
+    from scipy.spatial import cKDTree
 
     if len(faces) <= budget:
         return vertices, faces
@@ -260,7 +265,11 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[np.n
     points, triangles = fast_simplification.simplify(
         np.ascontiguousarray((vertices - centre) / size, np.float64), np.ascontiguousarray(faces, np.int64), target_count=budget
     )
-    return tidy(np.asarray(points, np.float64) * size + centre, np.asarray(triangles, np.int64))
+    places = np.asarray(points, np.float64) * size + centre
+    edge = float(np.linalg.norm(vertices[faces[:, 1]] - vertices[faces[:, 0]], axis=1).mean())
+    distance, nearest = cKDTree(vertices).query(places)
+    places = np.where((distance > edge)[:, None], vertices[nearest], places)
+    return tidy(places, np.asarray(triangles, np.int64))
 
 
 def sample(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -299,7 +299,8 @@ def _shape(
     if not len(faces):
         raise NoSurface(f"the density nowhere reaches {level:.4g} per unit")
     vertices, faces, facts = visible_parts(vertices, faces, min_component, viewpoints)
-    return smooth(vertices, faces, rounds), faces, {"threshold": level, "threshold_chosen": "automatic" if threshold is None else "given", **facts}
+    vertices = np.clip(smooth(vertices, faces, rounds), vertices.min(0), vertices.max(0))  # flat sides must not bulge out of the box
+    return vertices, faces, {"threshold": level, "threshold_chosen": "automatic" if threshold is None else "given", **facts}
 
 
 _NOBODY = np.zeros((0, 3))
@@ -311,7 +312,7 @@ def surface(
     *,
     faces: int = 200_000,
     min_component: float = 0.01,
-    rounds: int = 5,
+    rounds: int = 10,
     viewpoints: np.ndarray = _NOBODY,
     progress: Progress = _silent,
 ) -> Mesh:
@@ -340,7 +341,7 @@ def points(
     threshold: float | None = None,
     *,
     min_component: float = 0.01,
-    rounds: int = 5,
+    rounds: int = 10,
     viewpoints: np.ndarray = _NOBODY,
     seed: int = 0,
     progress: Progress = _silent,

@@ -23,7 +23,7 @@ class MeshSettings:
     faces: int = setting(200_000, "most faces of the mesh; it is decimated to this many", minimum=100)
     threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
     min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area are removed", minimum=0.0, maximum=1.0)
-    smooth: int = setting(5, "rounds of smoothing (Taubin's, which keeps the volume); 0: none", minimum=0, maximum=200)
+    smooth: int = setting(10, "rounds of smoothing (Taubin's, which keeps the volume); 0: none", minimum=0, maximum=200)
 
 
 def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:

@@ -21,7 +21,7 @@ class PointsSettings:
     count: int = setting(200_000, "points", minimum=1)
     threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
     min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area get no points", minimum=0.0, maximum=1.0)
-    smooth: int = setting(5, "rounds of smoothing of the surface that the points lie on; 0: none", minimum=0, maximum=200)
+    smooth: int = setting(10, "rounds of smoothing of the surface that the points lie on; 0: none", minimum=0, maximum=200)
     seed: int = setting(0, "where on the surface the points fall", minimum=0)
 
 
