@@ -6,19 +6,24 @@ kernels do not reach.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from efficientnerf.cameras import Camera, rays
+from efficientnerf.compositing import ray_of_sample
 from efficientnerf.harmonics import basis
+from efficientnerf.model import Look, Model, look
 
 if TYPE_CHECKING:
     from efficientnerf.nerftree.tree import NerfTree, Rendering
 
-ROWS_PER_BLOCK = 2**18
+RAYS_PER_BLOCK = 2**18
+FIELD_RAYS_PER_BLOCK = 8192
 
 
 def subpixels(camera: Camera, rows: range, supersample: int) -> np.ndarray:
@@ -37,7 +42,7 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
     height, width = camera.height, camera.width
     colour, opacity = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
     depth, normal = np.empty((height, width), np.float32), np.empty((height, width, 3), np.float32)
-    step = max(1, ROWS_PER_BLOCK // (width * supersample**2))
+    step = max(1, RAYS_PER_BLOCK // (width * supersample**2))
     for top in range(0, height, step):
         span = range(top, min(height, top + step))
         origins, directions = rays(camera, subpixels(camera, span, supersample))
@@ -55,6 +60,91 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
     if background is not None:
         colour += (1 - opacity[..., None]) * np.asarray(background, np.float32)
     return Rendering(colour, opacity, depth, normal)
+
+
+@dataclass(frozen=True)
+class FieldRendering:
+    """What a camera sees of a field, and how much of it lies in the box.
+
+    colour          (H, W, 3) sRGB with all that lies behind
+    opacity         (H, W) of all samples
+    depth           (H, W) along the view axis, world units; infinity where less than half of the light is absorbed
+    before          (H, W, 4) premultiplied colour and opacity of what lies between the camera and the box
+    behind          (H, W, 3) colour of what lies beyond the box, as if the box were empty
+    inside_opacity  (H, W) of what lies in the box
+    """
+
+    colour: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    before: np.ndarray
+    behind: np.ndarray
+    inside_opacity: np.ndarray
+
+
+@dataclass(frozen=True)
+class FieldRenderer:
+    """Draws a trained model; near and far along the view axis, world units."""
+
+    model: Model
+    near: float
+    far: float
+
+    @torch.no_grad()
+    def render(self, camera: Camera, progress: Callable[..., Any] | None = None) -> FieldRendering:
+        """The picture that a camera in the training frame takes of the field."""
+        m = self.model
+        count = camera.width * camera.height
+        parts = []
+        for begin in range(0, count, FIELD_RAYS_PER_BLOCK):
+            index = np.arange(begin, min(count, begin + FIELD_RAYS_PER_BLOCK))
+            pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)
+            origins, directions = (torch.as_tensor(a, dtype=torch.float32, device=m.device) for a in rays(camera, pixels))
+            slant = (directions @ torch.as_tensor(camera.forward, dtype=torch.float32, device=m.device)).clamp(min=1e-3)
+            behind = m.behind(directions)
+            seen = look(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), behind)
+            parts.append([part.cpu().numpy() for part in split_by_box(m, origins, directions, slant, seen, behind)])
+            if progress is not None:
+                progress(begin + len(index), count)
+        shape = (camera.height, camera.width)
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return FieldRendering(*(column.reshape(*shape, *column.shape[1:]) for column in columns))
+
+
+def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, seen: Look, behind: Tensor) -> tuple[Tensor, ...]:
+    """The fields of a FieldRendering for rays (R, ...): each fine sample belongs in front of the box, in it or beyond it."""
+    count = len(origins)
+    ray = ray_of_sample(seen.fine.first, len(seen.fine.start))
+    middle = seen.fine.start + seen.fine.extent / 2
+    u = m.space.unit(origins)
+    du = directions / torch.as_tensor(m.space.half, dtype=directions.dtype, device=directions.device)
+    du = torch.where(du.abs() < 1e-12, torch.full_like(du, 1e-12), du)
+    one, other = (-1 - u) / du, (1 - u) / du
+    enter, leave = torch.minimum(one, other).amax(dim=-1), torch.maximum(one, other).amin(dim=-1)
+    misses = leave <= torch.clamp(enter, min=0)  # such a ray sees nothing but what lies beyond
+    enter = torch.where(misses, -torch.inf, enter)
+    leave = torch.where(misses, -torch.inf, leave)
+
+    def gathered(chosen: Tensor) -> tuple[Tensor, Tensor]:
+        weight = seen.fine_weight * chosen
+        colour = weight.new_zeros(count, 3).index_add(0, ray, weight[:, None] * seen.fine_rgb)
+        return colour, weight.new_zeros(count).index_add(0, ray, weight)
+
+    in_front, beyond = middle < enter[ray], middle > leave[ray]
+    before, before_opacity = gathered(in_front)
+    _, inside_opacity = gathered(~in_front & ~beyond)
+    after, after_opacity = gathered(beyond)
+    reaching_box = (1 - before_opacity).clamp(min=0)
+    passing_box = (reaching_box - inside_opacity).clamp(min=0)
+    rest = (passing_box - after_opacity).clamp(min=0)
+    # Where next to no light passes the box nothing is known of what lies beyond it, and nothing depends on it.
+    beyond_colour = torch.where((passing_box > 1e-4)[:, None], (after + rest[:, None] * behind) / passing_box.clamp(min=1e-4)[:, None], behind)
+    inside = torch.where(reaching_box > 1e-4, inside_opacity / reaching_box.clamp(min=1e-4), torch.zeros_like(inside_opacity))
+    # Depth: the first sample at which half of the light is gone.
+    gone = torch.cumsum(seen.fine_weight.double(), dim=0)
+    gone = gone - torch.cat([gone.new_zeros(1), gone])[seen.fine.first[:-1]][ray]
+    depth = torch.full_like(slant, torch.inf).scatter_reduce(0, ray, torch.where(gone >= 0.5, middle, torch.inf), reduce="amin")
+    return seen.fine_colour, seen.fine_opacity, depth * slant, torch.cat([before, before_opacity[:, None]], dim=1), beyond_colour, inside.clamp(max=1)
 
 
 def tree_density(tree: NerfTree, points: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -86,7 +176,9 @@ def tree_density(tree: NerfTree, points: Tensor, values: Tensor) -> tuple[Tensor
     return sigma, index, weight
 
 
-def render_tree_reference(tree: NerfTree, origins: Tensor, directions: Tensor, density: Tensor | None = None, sh: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def render_tree_reference(
+    tree: NerfTree, origins: Tensor, directions: Tensor, density: Tensor | None = None, sh: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Colour (R, 3), premultiplied, and opacity (R,) of rays by plain sums over every step; differentiable in `density` and `sh`.
 
     origins, directions  (R, 3) world frame, unit directions

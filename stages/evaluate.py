@@ -64,9 +64,9 @@ def run(job: Job) -> None:
     from efficientnerf.nerftree.tree import NerfTree
 
     def load_field() -> Any:
-        from efficientnerf.render import FieldRenderer
+        from stages.field import load_renderer
 
-        return FieldRenderer.load(job.inputs["train"], job.device)
+        return load_renderer(job.inputs["train"], job.device)
 
     evaluate(NerfTree.load(job.inputs["bake"] / "asset.nerftree"), load_field, job)
 

@@ -42,7 +42,8 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
             if frame.shape != size:
                 raise ValueError(f"{path}: frame {count} has shape {frame.shape}, the first has {size}")
             picture = _yuv(frame)
-            picture.pts, picture.time_base = count, stream.time_base
+            # Not the stream's time base: the container changes that when it writes its header.
+            picture.pts, picture.time_base = count, Fraction(1, fps)
             container.mux(stream.encode(picture))
             count += 1
         if not count:

@@ -1,0 +1,166 @@
+"""The bake stage: a trained field in, the asset out.
+
+    asset.nerftree  see efficientnerf/nerftree/FORMAT.md
+    report.json     resolution, voxels, bytes
+
+What takes long is kept in the scratch folder: the voxels' greatest weights, and each block of baked values.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.stage import Job, Stage
+from stages.settings import setting
+
+if TYPE_CHECKING:
+    from stages.scene import Scene
+
+ASSET = "asset.nerftree"
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """How finely the field is baked."""
+
+    resolution: int = setting(0, "voxels along the longest side of the box; 0 chooses from what a pixel covers, up to max_resolution", minimum=0, maximum=4096)
+    max_resolution: int = setting(384, "the most voxels along the longest side that are chosen by themselves", minimum=8, maximum=4096)
+    brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
+    pixels: int = setting(2_000_000, "training pixels that are looked at to see which voxels matter", minimum=1000)
+    weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
+    dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
+    points: int = setting(8, "jittered points averaged in a voxel", minimum=1, maximum=256)
+    seed: int = setting(0, "seed of the jitter", minimum=0)
+    licence: str = setting("", "licence text to write into the asset")
+
+
+def run(job: Job) -> None:
+    from efficientnerf.nerftree import baking, format
+    from efficientnerf.nerftree.tree import tree_from_voxels
+    from stages import scene
+    from stages.field import load_renderer
+    from stages.train import use_all_cores
+
+    settings: BakeSettings = job.settings
+    use_all_cores()
+    m = load_renderer(job.inputs["train"], job.device).model
+    s = scene.load(job.inputs["poses"])
+    resolution = settings.resolution or chosen_resolution(s, settings.max_resolution)
+    shape, voxel = baking.grid_of(s.bounds, resolution, settings.brick)
+    low = np.asarray(s.bounds[0], np.float64)
+
+    indices = _kept(job, s, m, shape, voxel, low)
+    if not len(indices):
+        from pipeline.errors import StageFailed
+
+        raise StageFailed("bake: the trained field is empty: no voxel of the box contributes to any training image. Train longer, or check the box (poses.box).")
+    density, sh = _values(job, m, indices, voxel, low)
+    tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=metadata_of(s, settings, m))
+    format.save(tree, job.out / ASSET)
+    report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": (job.out / ASSET).stat().st_size}
+    (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def chosen_resolution(s: Scene, most: int) -> int:
+    """Voxels along the longest side of the box, so that a voxel covers about three quarters of a pixel at the box's centre, for the median camera."""
+    centre = np.asarray(s.bounds, np.float64).mean(axis=0)
+    footprints = []
+    for view in s.views:
+        focal = view.camera.intrinsics["fx"]
+        footprints.append(np.linalg.norm(view.camera.centre - centre) / focal)
+    side = float((s.bounds[1] - s.bounds[0]).max())
+    return int(np.clip(round(side / (0.75 * float(np.median(footprints)))), 32, most))
+
+
+def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
+    """What the bare asset must know to be used without its run."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        tool = version("efficientnerf")
+    except PackageNotFoundError:
+        tool = "unknown"
+    similarity, orbit = s.world_from_capture, s.orbit
+    return {
+        "world_from_capture": {
+            "scale": float(similarity.scale),
+            "rotation": np.asarray(similarity.rotation, np.float64).tolist(),
+            "translation": np.asarray(similarity.translation, np.float64).tolist(),
+        },
+        "orbit": {
+            "centre": [float(x) for x in orbit.centre],
+            "radius": float(orbit.radius),
+            "elevation": float(orbit.elevation),
+            "forward_facing": bool(orbit.forward_facing),
+            "heading": float(orbit.heading),
+        },
+        "metric": bool(s.metric),
+        "licence": settings.licence,
+        "provenance": {"tool": f"efficientnerf {tool}", "kind": s.kind, "training_views": sum(v.split == "train" for v in s.views), "iterations": m.settings.iterations},
+    }
+
+
+def _kept(job: Job, s: Scene, m: Any, shape: tuple[int, int, int], voxel: float, low: np.ndarray) -> np.ndarray:
+    """Coordinates of the voxels to store, from scratch or from an earlier attempt."""
+    from efficientnerf.nerftree import baking
+    from stages import scene
+    from stages.train import pixels_of
+
+    settings: BakeSettings = job.settings
+    stored = job.work / "voxels.npy"
+    if (found := _read_npy(stored)) is not None:
+        return found
+
+    def looked(done: int, total: int) -> None:
+        job.progress(done, total, "finding the voxels that matter")
+        job.safe_point()
+
+    pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
+    greatest = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked)
+    indices = baking.chosen_voxels(greatest, shape, settings.brick, settings.weight, settings.dilate)
+    _write_npy(indices, stored)
+    return indices
+
+
+def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Baked values of all voxels; blocks of an earlier attempt are taken as they are."""
+    from efficientnerf.nerftree import baking
+
+    settings: BakeSettings = job.settings
+    blocks = baking.blocks_of(len(indices), settings.points)
+    parts: list[np.ndarray] = []
+    while len(parts) < blocks and (part := _read_npy(job.work / f"block_{len(parts):06d}.npy")) is not None:
+        parts.append(part)
+    for density, sh in baking.voxel_values(m, indices, voxel, low, settings.points, settings.seed, first=len(parts)):
+        part = np.concatenate([density[:, None], sh.reshape(len(density), -1)], axis=1)
+        _write_npy(part, job.work / f"block_{len(parts):06d}.npy")
+        parts.append(part)
+        job.progress(len(parts), blocks, "baking voxels")
+        job.safe_point()
+    values = np.concatenate(parts)
+    return values[:, 0], values[:, 1:].reshape(len(values), -1, 3)
+
+
+def _write_npy(values: np.ndarray, path: Path) -> None:
+    """Whole or not at all; it need not be on the disk yet, for a lost block is baked again."""
+    import os
+
+    aside = path.with_suffix(".part")
+    with open(aside, "wb") as file:
+        np.save(file, values, allow_pickle=False)
+    os.replace(aside, path)
+
+
+def _read_npy(path: Path) -> np.ndarray | None:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+
+
+STAGE = Stage(name="bake", version=1, settings=BakeSettings, needs=("poses", "train"), run=run)

@@ -1,0 +1,88 @@
+"""The trained field on disk: field.safetensors, read strictly and written whole or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.settings import TrainSettings
+from pipeline.errors import CorruptArtifact
+from pipeline.stage import settings_from
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from efficientnerf.model import Model
+    from efficientnerf.render import FieldRenderer
+
+FILE = "field.safetensors"
+FORMAT = 1
+
+
+def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path) -> None:
+    """A safetensors file with one metadata entry, "field", a JSON text: the same input gives the same bytes."""
+    from safetensors.torch import save
+
+    text = json.dumps({"format": FORMAT, **about}, sort_keys=True)
+    data = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata={"field": text})
+    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with open(aside, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors and the metadata of a file of `write_tensors`; CorruptArtifact where it is damaged."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            about = json.loads((file.metadata() or {}).get("field", "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, ValueError, OSError) as error:
+        raise CorruptArtifact(f"{path}: not a readable field file ({str(error)[:80]}). Train again.") from None
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise CorruptArtifact(f"{path}: field file of format {about.get('format') if isinstance(about, dict) else None}; this build reads {FORMAT}.")
+    return tensors, about
+
+
+def save_model(m: Model, near: float, far: float, path: Path) -> None:
+    from efficientnerf.model import state_of
+
+    about = {
+        "settings": dataclasses.asdict(m.settings),
+        "bounds": m.space.bounds.tolist(),
+        "contracted": m.space.contracted,
+        "background": m.background,
+        "near": near,
+        "far": far,
+    }
+    write_tensors(state_of(m), about, path)
+
+
+def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
+    """The trained model in the folder of the train stage, ready to draw."""
+    from efficientnerf.grid import Space
+    from efficientnerf.model import model, restore
+    from efficientnerf.render import FieldRenderer
+
+    path = folder / FILE
+    tensors, about = read_tensors(path)
+    try:
+        background = about["background"]
+        space = Space(np.asarray(about["bounds"], np.float64).reshape(2, 3), bool(about["contracted"]))
+        m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device)
+        restore(m, tensors)
+        return FieldRenderer(m, float(about["near"]), float(about["far"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise CorruptArtifact(f"{path}: {error}. Train again.") from None

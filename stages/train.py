@@ -1,0 +1,220 @@
+"""The train stage: a scene in, a trained field out.
+
+    field.safetensors  both fields, the density voxels, what they mean
+    log.jsonl          a line every few steps
+    curve.png          PSNR over steps
+    previews/          a held-back view every so often
+
+Checkpoints lie in the scratch folder that belongs to the request; the last two are kept. A run that goes on from one ends with the bytes of a run
+that was never disturbed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.settings import TrainSettings
+from pipeline.stage import Job, Stage
+
+if TYPE_CHECKING:
+    from efficientnerf.training import Pixels, Progress, Trainer
+    from stages.scene import Scene, View
+
+LOG_EVERY = 10
+CHECKPOINTS_KEPT = 2
+
+
+def run(job: Job) -> None:
+    from efficientnerf import training
+    from efficientnerf.grid import Space
+    from efficientnerf.model import model
+    from efficientnerf.render import FieldRenderer
+    from stages import field, scene
+
+    settings: TrainSettings = job.settings
+    use_all_cores()
+    folder = job.inputs["poses"]
+    s = scene.load(folder)
+    views = scene.views_of(s, "train")
+    job.progress(0, settings.iterations, "reading images")
+    pixels = pixels_of(folder, views)
+    m = model(Space(s.bounds, contracted=s.background is None), settings, s.background, job.device)
+    near, far = min(view.near for view in s.views), max(view.far for view in s.views)
+    t = training.trainer(m)
+    log = job.work / "log.jsonl"
+    _resume(t, job, log)
+
+    renderer = FieldRenderer(m, near, far)
+    watched = _watched(s)
+    _preview(renderer, watched, folder, job, t.step, settings)
+    lines: list[str] = []
+    started, first, loss = time.monotonic(), t.step, 0.0
+    held_back: float | None = None
+    for done in training.train(t, pixels):
+        loss = done.loss if done.step == first + 1 else 0.95 * loss + 0.05 * done.loss
+        if done.step % LOG_EVERY == 0 or done.step == settings.iterations:
+            lines.append(json.dumps(_line(done, loss, m.voxels.occupied, time.monotonic() - started), sort_keys=True))
+        facts = {"psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), "rays": done.rays}
+        job.progress(done.step, settings.iterations, "training", **facts, **({} if held_back is None else {"held_back_psnr": held_back}))
+        if done.step % settings.checkpoint_every == 0 and done.step < settings.iterations:
+            _checkpoint(t, job, log, lines)
+        held_back = _preview(renderer, watched, folder, job, done.step, settings) or held_back
+        try:
+            job.safe_point()
+        except BaseException:
+            if done.step < settings.iterations:
+                _checkpoint(t, job, log, lines)
+            raise
+    _append(log, lines)
+    field.save_model(m, near, far, job.out / field.FILE)
+    _publish_log(log, job)
+
+
+def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
+    """All pixels of some views of a scene, as bytes."""
+    from efficientnerf.training import Pixels
+    from stages import scene
+
+    images = [scene.read_image(folder, view) for view in views]
+    masks = [scene.read_mask(folder, view) for view in views]
+    near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
+    return Pixels([view.camera for view in views], images, masks, near, far)
+
+
+def use_all_cores() -> None:
+    """Let torch compute on all the cores this process may use: the number is part of what makes results repeat."""
+    import os
+
+    import torch
+
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 0)) or len(os.sched_getaffinity(0)))
+
+
+def _checkpoints(job: Job) -> list[Path]:
+    return sorted(job.work.glob("checkpoint_*.safetensors"))
+
+
+def _checkpoint(t: Trainer, job: Job, log: Path, lines: list[str]) -> None:
+    from efficientnerf.training import state_of
+    from stages.field import write_tensors
+
+    _append(log, lines)
+    lines.clear()
+    write_tensors(state_of(t), {"step": t.step}, job.work / f"checkpoint_{t.step:08d}.safetensors")
+    for old in _checkpoints(job)[:-CHECKPOINTS_KEPT]:
+        old.unlink()
+
+
+def _resume(t: Trainer, job: Job, log: Path) -> None:
+    """Go on from the newest checkpoint that can be read, if there is one."""
+    from efficientnerf.training import restore
+    from pipeline.errors import CorruptArtifact
+    from stages.field import read_tensors
+
+    for path in reversed(_checkpoints(job)):
+        try:
+            restore(t, read_tensors(path)[0])
+        except (CorruptArtifact, KeyError, ValueError) as error:
+            job.warn(f"{path.name} can't be used ({error}); going on from the one before it")
+            path.unlink()
+            continue
+        job.say(f"training goes on from step {t.step}")
+        break
+    # What was logged after the checkpoint will be logged again.
+    if log.exists():
+        kept = [line for line in _lines(log) if line["step"] <= t.step]
+        log.write_text("".join(json.dumps(line, sort_keys=True) + "\n" for line in kept), encoding="utf-8")
+
+
+def _lines(log: Path) -> list[dict[str, Any]]:
+    out = []
+    for text in log.read_text(encoding="utf-8").splitlines():
+        try:
+            out.append(json.loads(text))
+        except ValueError:  # a line cut short by a kill
+            break
+    return out
+
+
+def _append(log: Path, lines: list[str]) -> None:
+    with open(log, "a", encoding="utf-8") as file:
+        file.writelines(line + "\n" for line in lines)
+
+
+def _line(done: Progress, loss: float, occupied: float, seconds: float) -> dict[str, Any]:
+    return {
+        "step": done.step,
+        "loss": loss,
+        "psnr": -10 * math.log10(max(loss, 1e-10)),
+        "rays": done.rays,
+        "tried": done.tried,
+        "valid": done.valid,
+        "pivotal": done.pivotal,
+        "fine": done.fine,
+        "occupied": occupied,
+        "seconds": round(seconds, 3),
+    }
+
+
+def _watched(s: Scene) -> View | None:
+    """The held-back view that previews show: one of val if there is any, so that the test views stay unseen until the end."""
+    from stages.scene import views_of
+
+    views = views_of(s, "val") or views_of(s, "test")
+    return views[len(views) // 2] if views else None
+
+
+PREVIEW_SIDE = 200
+
+
+def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int, settings: TrainSettings) -> float | None:
+    """Draw the watched view small, keep the picture, return its PSNR."""
+    if view is None or settings.preview_every == 0 or step == 0 or step % settings.preview_every:
+        return None
+    from efficientnerf.metrics import psnr
+    from stages.evaluate import thinned, thinned_camera, truth_of
+    from stages.exporters.frames import write_png
+    from stages.plots import eight_bits
+
+    target = job.work / f"preview_{step:06d}.png"
+    stride = max(1, math.ceil(max(view.camera.width, view.camera.height) / PREVIEW_SIDE))
+    truth = thinned(truth_of(folder, view, renderer.model.background).colour, stride)
+    picture = np.clip(renderer.render(thinned_camera(view.camera, stride)).colour, 0, 1)
+    write_png(eight_bits(np.concatenate([truth, picture], axis=1)), target)
+    return round(float(psnr(picture, truth)), 2)
+
+
+def _publish_log(log: Path, job: Job) -> None:
+    import shutil
+
+    from stages.plots import curve
+
+    lines = _lines(log)
+    shutil.copyfile(log, job.out / "log.jsonl")
+    curve(
+        job.out / "curve.png",
+        {"training PSNR": (np.array([x["step"] for x in lines]), np.array([x["psnr"] for x in lines]))},
+        x_label="step",
+        y_label="PSNR / dB",
+    )
+    previews = sorted(job.work.glob("preview_*.png"))
+    if previews:
+        (job.out / "previews").mkdir()
+        for path in previews:
+            shutil.copyfile(path, job.out / "previews" / path.name)
+
+
+STAGE = Stage(
+    name="train",
+    version=1,
+    settings=TrainSettings,
+    needs=("poses",),
+    run=run,
+    volatile=("log.jsonl", "curve.png", "previews/*"),
+)
