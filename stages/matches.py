@@ -246,7 +246,10 @@ def extract(work: Path, images: Sequence[WorkImage], *, features: int, progress:
         with pycolmap.Database.open(database_path(work)) as database:
             known = {image.name for image in database.read_all_images() if database.exists_descriptors(image.image_id)}
         reader = pycolmap.ImageReaderOptions()
-        if any((work / "masks").iterdir()):
+        if any((work / "masks").glob("*.png")):
+            for image in images:  # COLMAP skips an image whose mask is missing
+                if not (work / "masks" / f"{image.file}.png").exists():
+                    write_png(work / "masks" / f"{image.file}.png", np.full((image.work_height, image.work_width), 255, np.uint8))
             reader.mask_path = work / "masks"
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False

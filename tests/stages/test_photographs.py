@@ -1,0 +1,312 @@
+"""Cameras from photographs: reading them upright, features and matches that survive a kill, and the cameras that come out."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.poses import aligned_errors, true_centres
+from pipeline.errors import BadInput
+from stages import matches, upright
+from stages.capture import Capture
+from stages.photographs import find_cameras
+
+ROOT = Path(__file__).resolve().parents[2]
+STILL_LIFE = ROOT / "examples" / "still_life"
+TRUTH = ROOT / "tests" / "data" / "still_life_cameras.json"
+SIDE = 360  # px: enough for exact cameras, quick enough for a test
+
+
+def chosen() -> list[str]:
+    """Ten photographs along a third of the circle."""
+    names = sorted(path.name for path in STILL_LIFE.glob("*.jpg")) if STILL_LIFE.is_dir() else []
+    if len(names) < 10:
+        pytest.skip("examples/still_life is not there")
+    centres = true_centres(TRUTH)
+    return sorted(sorted(names, key=lambda name: -centres[name][0])[:10])
+
+
+def find(folder: Path, names: list[str], work: Path, **changes: object) -> Capture:
+    keywords: dict[str, object] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None, "max_side": SIDE}
+    return find_cameras(folder, names, work=work, **(keywords | changes))  # type: ignore[arg-type]
+
+
+def numbers(capture: Capture) -> tuple[bytes, ...]:
+    """Every figure of a capture, bit for bit."""
+    assert capture.points is not None
+    cameras = [(p.camera.name, p.camera.model, np.array(p.camera.params).tobytes(), p.camera.world_from_camera.tobytes()) for p in capture.photos]
+    return (repr(cameras).encode(), capture.points.xyz.tobytes(), capture.points.rgb.tobytes(), repr(capture.points.observers).encode())
+
+
+@pytest.fixture(scope="module")
+def ten(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path, Capture]:
+    names = chosen()
+    work = tmp_path_factory.mktemp("work")
+    return names, work, find(STILL_LIFE, names, work)
+
+
+# ---------------------------------------------------------------------------------------------------------- reading upright
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_undone(tmp_path: Path, orientation: int) -> None:
+    seen = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)
+    undo = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}  # Pillow's Transpose that turns the upright picture into the stored one
+    stored = Image.fromarray(seen)
+    if orientation > 1:
+        stored = stored.transpose(Image.Transpose(undo[orientation]))
+    exif = Image.Exif()
+    exif[274] = orientation
+    stored.save(tmp_path / "a.png", exif=exif)
+    photo = upright.upright_photo(tmp_path / "a.png", 1600)
+    assert (photo.width, photo.height) == (30, 20)
+    np.testing.assert_array_equal(photo.rgb, seen)
+
+
+def test_focal_length_from_exif() -> None:
+    assert upright.focal_from_exif({41989: 50}, 3600, 2400) == pytest.approx(5000)
+    # 36 mm sensor, 3600 px across, 50 mm lens, the image scaled to a half since
+    assert upright.focal_from_exif({37386: 50.0, 41486: 100.0, 41488: 4, 40962: 3600}, 1800, 1200) == pytest.approx(2500)
+    assert upright.focal_from_exif({37386: 50.0, 41486: 1.0, 41488: 4}, 1800, 1200) is None  # a density that cannot be
+    assert upright.focal_from_exif({}, 1800, 1200) is None
+
+
+@pytest.mark.parametrize("size", [(4000, 3000), (4032, 3024), (3001, 1999), (1999, 3001), (5184, 3456), (1601, 37)])
+def test_working_size_keeps_the_aspect(size: tuple[int, int]) -> None:
+    w, h = upright.working_size(*size, 1600)
+    assert 1560 <= max(w, h) <= 1600
+    assert abs(w / h * size[1] / size[0] - 1) < (0.02 if min(size) < 100 else 2e-4)
+    assert upright.working_size(*size, 5184) == size
+
+
+def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
+    Image.fromarray(np.full((8, 8), 65535 // 2, np.uint16)).save(tmp_path / "deep.png")
+    assert abs(int(upright.upright_photo(tmp_path / "deep.png", 100).rgb[0, 0, 0]) - 127) <= 1
+    rgba = np.full((8, 8, 4), 255, np.uint8)
+    rgba[:, :4, 3] = 0
+    Image.fromarray(rgba).save(tmp_path / "alpha.png")
+    opaque = upright.upright_photo(tmp_path / "alpha.png", 100).opaque
+    assert opaque is not None
+    assert opaque[:, 4:].all()
+    assert not opaque[:, :4].any()
+
+
+def test_mask_must_fit(tmp_path: Path) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    photo = upright.upright_photo(tmp_path / "a.png", 20)
+    mask = np.zeros((60, 80), np.uint8)
+    mask[:, 40:] = 255
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(upright.mask_of(tmp_path / "m.png", photo), np.broadcast_to(np.arange(20) >= 10, (15, 20)))
+    Image.fromarray(mask[:, :50]).save(tmp_path / "m.png")
+    with pytest.raises(upright.UnreadableImage, match="50x60, the photograph 40x30"):
+        upright.mask_of(tmp_path / "m.png", photo)
+
+
+# ------------------------------------------------------------------------------------------------------------------- pairs
+
+
+def test_exhaustive_pairs_are_all_pairs_once() -> None:
+    blocks = matches.pairs_to_match(23, "exhaustive")
+    pairs = [pair for block in blocks for pair in block]
+    assert len(pairs) == len(set(pairs)) == 23 * 22 // 2
+    assert max(map(len, blocks)) <= matches.BLOCK**2
+
+
+def test_sequential_pairs_reach_neighbours_and_close_loops() -> None:
+    pairs = {pair for block in matches.pairs_to_match(400, "sequential") for pair in block}
+    assert all((i, i + 1) in pairs for i in range(399))
+    assert any(i < 10 and j > 385 for i, j in pairs)
+    assert len(pairs) < 400 * 20
+    with pytest.raises(ValueError, match="matching"):
+        matches.pairs_to_match(3, "vocabulary")
+
+
+# ----------------------------------------------------------------------------------------------------------------- cameras
+
+
+def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path, Capture]) -> None:
+    names, _, capture = ten
+    truth = true_centres(TRUTH)
+    assert [photo.camera.name for photo in capture.photos] == names
+    assert not capture.rejected
+    errors = aligned_errors(np.array([p.camera.centre for p in capture.photos]), np.array([truth[n] for n in names]))
+    assert np.sqrt((errors**2).mean()) < 0.005
+    camera = capture.photos[0].camera
+    assert (camera.width, camera.height) == (480, 360)  # of the source, not of the working copies
+    assert camera.intrinsics["fx"] == pytest.approx(400, rel=0.01)
+    assert camera.intrinsics["k1"] == pytest.approx(-0.04, abs=0.02)
+    assert capture.kind == "photographs"
+    assert capture.up is None
+    assert not capture.metric
+    assert capture.facts["pairs_agreeing"] > 0.9  # type: ignore[operator]
+    assert capture.points is not None
+    assert max(max(seen) for seen in capture.points.observers) < len(names)
+
+
+def test_again_in_another_order_gives_the_same_bits(ten: tuple[list[str], Path, Capture], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    names, _, capture = ten
+    assert numbers(find(STILL_LIFE, names[::-1], tmp_path)) == numbers(capture)
+    assert capfd.readouterr() == ("", "")  # COLMAP keeps silent
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from stages.photographs import find_cameras
+folder, work, phase, moment, side = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
+def progress(done, total, text="", **facts):
+    if text == phase and done >= moment:
+        os.kill(os.getpid(), signal.SIGKILL)
+find_cameras(folder, sys.argv[6:], work=work, progress=progress, safe_point=lambda: None, warn=print, max_side=side)
+"""
+
+
+@pytest.mark.parametrize(("phase", "moment"), [("finding features", 6), ("matching pairs", 20)])
+def test_killed_and_resumed_gives_the_same_bits(ten: tuple[list[str], Path, Capture], tmp_path: Path, phase: str, moment: int) -> None:
+    names, _, capture = ten
+    command = [sys.executable, "-c", KILLED, str(STILL_LIFE), str(tmp_path), phase, str(moment), str(SIDE), *names]
+    assert subprocess.run(command, cwd=ROOT, check=False, timeout=200).returncode == -signal.SIGKILL
+    first_seen: dict[str, int] = {}
+
+    def progress(done: int, total: int, text: str = "", **facts: object) -> None:
+        first_seen.setdefault(text, done)
+
+    assert numbers(find(STILL_LIFE, names, tmp_path, progress=progress)) == numbers(capture)
+    assert first_seen["finding features"] >= 6  # what was found before the kill is used
+
+
+def test_damaged_database_is_made_anew(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+    names, work, capture = ten
+    shutil.copytree(work, tmp_path / "work")
+    path = matches.database_path(tmp_path / "work")
+    size = path.stat().st_size
+    with open(path, "r+b") as file:
+        file.truncate(size * 2 // 3)
+    assert numbers(find(STILL_LIFE, names, tmp_path / "work")) == numbers(capture)
+
+
+def test_half_written_database_is_not_trusted(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+    names, work, _ = ten
+    shutil.copytree(work, tmp_path / "work")
+    images, _ = matches.prepare(
+        STILL_LIFE, names, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
+        progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
+    )  # fmt: skip
+    assert matches.open_database(tmp_path / "work", images)
+    with sqlite3.connect(matches.database_path(tmp_path / "work")) as connection:
+        connection.execute("DELETE FROM descriptors WHERE image_id = 3")
+    connection.close()
+    assert not matches.open_database(tmp_path / "work", images)
+    assert matches.open_database(tmp_path / "work", images)  # the new one lists the images
+    assert not matches.open_database(tmp_path / "work", images[:-1])  # and is not taken for another set
+
+
+def test_interrupted_while_placing_cameras(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+    names, work, capture = ten
+    shutil.copytree(work, tmp_path / "work")
+
+    class Stop(Exception):
+        pass
+
+    phase = ""
+
+    def progress(done: int, total: int, text: str = "", **facts: object) -> None:
+        nonlocal phase
+        phase = text if done >= 3 else ""
+
+    def safe_point() -> None:
+        if phase == "placing cameras":
+            raise Stop
+
+    with pytest.raises(Stop):
+        find(STILL_LIFE, names, tmp_path / "work", progress=progress, safe_point=safe_point)
+    assert numbers(find(STILL_LIFE, names, tmp_path / "work")) == numbers(capture)
+
+
+def test_mixed_sizes_rotation_and_a_truncated_file(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+    names, _, _ = ten
+    folder = tmp_path / "photos"
+    (folder / "more").mkdir(parents=True)
+    placed = []
+    for index, name in enumerate(names):
+        image: Image.Image = Image.open(STILL_LIFE / name)
+        exif = Image.Exif()
+        exif.get_ifd(34665)[41989] = 29  # 35 mm equivalent, as in the originals
+        target = name
+        if index < 3:  # held upright, stored lying
+            exif[274] = 6
+            image = image.transpose(Image.Transpose.ROTATE_90)
+        elif index < 6:
+            image = image.resize((400, 300), Image.Resampling.LANCZOS)
+            target = f"more/{name}"
+        image.save(folder / target, quality=95, exif=exif)
+        placed.append(target)
+    whole = (folder / placed[9]).read_bytes()
+    (folder / placed[9]).write_bytes(whole[: len(whole) // 2])
+    said: list[str] = []
+    capture = find(folder, placed, tmp_path / "work", warn=lambda text, **facts: said.append(text))
+    assert [name for name, _ in capture.rejected] == [placed[9]]
+    assert any(placed[9] in text for text in said)
+    by_name = {photo.camera.name: photo.camera for photo in capture.photos}
+    assert len(by_name) == 9
+    assert {(c.width, c.height) for c in by_name.values()} == {(480, 360), (400, 300)}
+    for camera in by_name.values():
+        assert camera.intrinsics["fx"] == pytest.approx(400 * camera.width / 480, rel=0.02)
+    truth = true_centres(TRUTH)
+    errors = aligned_errors(np.array([c.centre for c in by_name.values()]), np.array([truth[Path(n).name] for n in by_name]))
+    assert errors.max() < 0.02
+
+
+def test_masked_parts_give_no_features(tmp_path: Path) -> None:
+    names = chosen()[:3]
+    mask = np.zeros((360, 480), np.uint8)
+    mask[:, 240:] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
+    images, _ = matches.prepare(
+        STILL_LIFE, names, max_side=240, features=500, seed=0, masks={names[1]: tmp_path / "mask.png"}, work=tmp_path / "w", warn=print, **quiet
+    )
+    matches.open_database(tmp_path / "w", images)
+    matches.extract(tmp_path / "w", images, features=500, **quiet)
+    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(tmp_path / "w")) as database:
+        columns = [database.read_keypoints(i)[:, 0] for i in (1, 2, 3)]
+    assert columns[0].min() < 100
+    assert len(columns[1]) > 10
+    assert columns[1].min() >= 119
+
+
+def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg")
+    (tmp_path / "b.jpg").write_bytes(b"no picture")
+    Image.new("RGB", (64, 48)).save(tmp_path / "c.jpg")
+    with pytest.raises(BadInput, match=r"2 readable photographs.*Unreadable: b\.jpg"):
+        find(tmp_path, ["a.jpg", "b.jpg", "c.jpg"], tmp_path / "w")
+
+
+def test_photographs_that_show_nothing_in_common_are_named(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    names = []
+    for index in range(5):
+        coarse = Image.fromarray(rng.integers(0, 255, (24, 32, 3), np.uint8))
+        coarse.resize((320, 240), Image.Resampling.BICUBIC).save(tmp_path / f"{index}.png")
+        names.append(f"{index}.png")
+    with pytest.raises(BadInput) as caught:
+        find(tmp_path, names, tmp_path / "w")
+    assert "cameras found for 0 of 5 photographs; at least 3 are needed" in str(caught.value)
+    assert "0.png, 1.png, 2.png" in str(caught.value)
+    assert "overlaps no other photograph" in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 2
+
+
+def test_threads_are_those_allowed() -> None:
+    assert 1 <= matches.threads() <= (os.cpu_count() or 1)
