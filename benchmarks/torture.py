@@ -38,6 +38,9 @@ HERE = Path(__file__).resolve().parent
 PHOTOGRAPHS = HERE.parent / "examples" / "still_life"
 STAGES = ("poses", "train", "bake", "evaluate", "turntable", "mesh", "points")
 
+# The tiny preset, with a video that takes long enough to be hit.
+OPTIONS = ("--preset", "tiny", "--device", "cpu", "--set", "turntable.frames=16", "--set", "turntable.width=320", "--set", "turntable.height=240")
+
 # argv: rename to die after, its number, what follows is for enerf. Renames are the steps by which artifacts are published.
 SELF_KILLER = """
 import os, signal, sys
@@ -154,12 +157,16 @@ def digests(run: Path) -> dict[str, str | None]:
 
 
 def at_share(stage: str, share: float, seconds: float) -> Callable[[Child], bool]:
-    """So far into a stage, by time; also once a later stage has begun, so that no moment is waited for in vain."""
+    """So far into a stage, by time or by what it says of itself; also once a later stage has begun, so that no moment is waited for in vain."""
     place = STAGES.index(stage)
 
     def moment(child: Child) -> bool:
         begun = child.started.get(stage)
         if begun is not None and time.monotonic() - begun >= share * seconds:
+            return True
+        last = child.events[-1] if child.events else {}
+        # The progress of training is that of the stage; elsewhere it begins anew with each part.
+        if stage == "train" and last.get("stage") == stage and last["event"] == "progress" and last["done"] >= max(1, share * last["total"]):
             return True
         return any(STAGES.index(other) > place for other in list(child.started))
 
@@ -220,7 +227,7 @@ class Torture:
                 encoding = while_encoding(run)
                 moment = lambda child, late=late, encoding=encoding: encoding(child) or late(child)  # type: ignore[misc]  # noqa: E731
             else:
-                moment = at_share(stage, self.random.uniform(0.0, 0.9), self.seconds[stage])
+                moment = at_share(stage, self.random.uniform(0.0, 0.8), self.seconds[stage])
             if kill_when(self.arguments(run), moment, kill, run):
                 self.note(kill)
         self.end(run, f"round with kills at {', '.join(aims)}")
@@ -304,7 +311,7 @@ def main() -> int:
     with contextlib.ExitStack() as stack:
         folder = given.folder or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="torture-")))
         folder.mkdir(parents=True, exist_ok=True)
-        torture = Torture(folder, source_of(given.images, folder), ["--preset", "tiny", "--device", "cpu"], given.seed)
+        torture = Torture(folder, source_of(given.images, folder), OPTIONS, given.seed)
         begun = time.monotonic()
         torture.undisturbed()
         seconds = ", ".join(f"{stage} {took:.1f} s" for stage, took in torture.seconds.items())
