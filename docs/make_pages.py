@@ -9,8 +9,8 @@ import click
 
 from stages.settings import SettingInfo, describe_settings
 from workflows.asset import STAGES
-from workflows.cli import main as enerf
-from workflows.resolve import preset_names, read_preset, shown
+from workflows.cli import enerf
+from workflows.resolve import meaning, preset_names, read_preset, shown
 
 FOLDER = Path(__file__).parent
 NOTE = "<!-- Made from the code by `make docs`; changes belong there. -->"
@@ -20,8 +20,8 @@ def limits(info: SettingInfo) -> str:
     """What a setting may be, for the third column."""
     if info.choices is not None:
         return ", ".join(f"`{shown(choice)}`" for choice in info.choices)
-    bounds = [f"at least {info.minimum:g}"] if info.minimum is not None else []
-    bounds += [f"at most {info.maximum:g}"] if info.maximum is not None else []
+    bounds = [f"at least {info.minimum}"] if info.minimum is not None else []
+    bounds += [f"at most {info.maximum}"] if info.maximum is not None else []
     return ", ".join([info.type_name, *bounds])
 
 
@@ -52,9 +52,8 @@ def settings_page() -> str:
         lines.append("| setting | default | may be | meaning |" + "".join(f" {preset.name} |" for preset in changing))
         lines.append("|---|---|---|---|" + "---|" * len(changing))
         for info in described:
-            meaning = info.doc + (f" ({info.unit})" if info.unit else "")
             values = [preset.table[stage.name].get(info.name) for preset in changing]
-            columns = [f"`{info.name}`", f"`{shown(info.default)}`", limits(info), meaning]
+            columns = [f"`{info.name}`", f"`{shown(info.default)}`", limits(info), meaning(info)]
             columns += ["" if value is None else f"`{shown(value)}`" for value in values]
             lines.append("| " + " | ".join(cell(column) for column in columns) + " |")
     return "\n".join(lines) + "\n"

@@ -20,7 +20,7 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
     from stages.settings import describe_settings
     from workflows import asset
     from workflows.progress import write_json
-    from workflows.resolve import Settings, nearest, preset_names, read_preset, shown, table_of
+    from workflows.resolve import Settings, meaning, nearest, preset_names, read_preset, shown, table_of
 
     types = {stage.name: stage.settings for stage in asset.STAGES}
     for name in stages:
@@ -48,6 +48,5 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
         click.echo(f"\n[{stage}]")
         for info in describe_settings(types[stage]):
             value = shown(values[stage][info.name])
-            unit = f" ({info.unit})" if info.unit else ""
             choices = f" One of: {', '.join(shown(choice) for choice in info.choices)}." if info.choices else ""
-            click.echo(f"{info.name + ' = ' + value:<36} {info.doc}{unit}{choices}")
+            click.echo(f"{info.name + ' = ' + value:<36} {meaning(info)}{choices}")

@@ -177,3 +177,10 @@ def shown(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(shown(item) for item in value) + "]"
     return f"{value}"
+
+
+def meaning(info: SettingInfo) -> str:
+    """What a setting means, as a sentence with its unit."""
+    text = info.doc if ":" in info.doc.split(" ")[0] else info.doc[:1].upper() + info.doc[1:]
+    unit = f" ({info.unit})" if info.unit else ""
+    return f"{text.rstrip('.')}{unit}."
