@@ -27,20 +27,22 @@ def box_of_interest(capture: Capture, turned: Similarity, focus: np.ndarray, con
     photos = [photo for photo in capture.photos if photo.split in (None, "train")] or list(capture.photos)
     photos = photos[:: -(-len(photos) // MOST_CAMERAS)]
     cameras = [turned.camera(photo.camera) for photo in photos]
-    if capture.points is not None and len(capture.points.xyz) >= FEWEST_POINTS:
-        found = box_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, focus, converging)
-        if found is not None:
-            return *found, "sparse points"
     ranges = [(photo.near, photo.far) for photo in photos]
-    low, high = box_seen_together(cameras, ranges, focus, converging)
-    if capture.background is not None:
-        hull = box_of_silhouettes(photos, cameras, low, high)
-        if hull is not None:
-            return *hull, "silhouettes"
-    return low, high, "volume seen together"
+    cut_out = capture.background is not None  # without surroundings, the silhouettes say more than any points
+    for way in ("silhouettes", "sparse points") if cut_out else ("sparse points", "silhouettes"):
+        if way == "silhouettes":
+            # A wide region to start from: parts of the subject that leave the picture in close views are cut by the other views.
+            found = box_of_silhouettes(photos, cameras, *box_seen_together(cameras, ranges, focus, converging, least=0.5))
+        elif capture.points is not None and len(capture.points.xyz) >= FEWEST_POINTS:
+            found = box_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, converging)
+        else:
+            found = None
+        if found is not None:
+            return *found, way
+    return *box_seen_together(cameras, ranges, focus, converging), "volume seen together"
 
 
-def box_of_points(points: SparsePoints, cameras: Sequence[Camera], focus: np.ndarray, converging: bool) -> tuple[np.ndarray, np.ndarray] | None:
+def box_of_points(points: SparsePoints, cameras: Sequence[Camera], converging: bool) -> tuple[np.ndarray, np.ndarray] | None:
     """A box round the points that most cameras have in view; None if too few remain.
 
     What lies behind a subject is seen from one side only, and what is seen by few is not what the photographs are of. Where the cameras look the
@@ -109,10 +111,15 @@ def in_view(xyz: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def box_seen_together(
-    cameras: Sequence[Camera], ranges: Sequence[tuple[float | None, float | None]], focus: np.ndarray, converging: bool
+    cameras: Sequence[Camera],
+    ranges: Sequence[tuple[float | None, float | None]],
+    focus: np.ndarray,
+    converging: bool,
+    least: float = 0.9,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A box round the volume that nine tenths of the cameras (or as many as agree anywhere) have in view.
+    """A box round the volume that most cameras have in view.
 
+    least   the share of the cameras, or of as many as agree anywhere
     ranges  near and far of each camera where the source states them: nothing nearer or farther counts. Far surroundings would fill the
             box; it ends where four fifths of the range in 1 / depth, that is of the parallax, are inside.
     """
@@ -129,7 +136,7 @@ def box_seen_together(
             depth = (xyz - camera.centre) @ camera.forward
             row &= (depth >= near) & (depth <= far)
         share = seen.mean(0)
-        kept = xyz[share >= min(0.9, 0.9 * float(share.max()))]
+        kept = xyz[share >= least * min(1.0, float(share.max()))]
         if not len(kept) or share.max() == 0:
             break
         low, high = kept.min(0) - step / 2, kept.max(0) + step / 2
@@ -143,14 +150,15 @@ def _depth_limits(near: float | None, far: float | None) -> tuple[float, float]:
 
 
 def box_of_silhouettes(photos: Sequence[Photo], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """A box round the visual hull: what no photograph shows as transparent; None where there is no alpha.
+    """A box round the visual hull: what no photograph shows as transparent; None unless half of the photos have an
+    alpha channel that leaves something out.
 
     A voxel is left out where its whole projection is transparent in more than a few photographs (one in fifty may have a damaged alpha
     channel), so that thin parts stay.
     """
     masks = [(camera, alpha_of(photo)) for camera, photo in zip(cameras, photos, strict=True)]
     views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in masks if mask is not None]
-    if len(views) < 3:
+    if len(views) < max(3, len(photos) / 2):
         return None
     for _ in range(3):  # each pass looks closer at what the one before has left
         kept, step = grid(low, high)

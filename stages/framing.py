@@ -40,13 +40,13 @@ class Framing:
     facts: dict[str, object]
 
 
-def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.03) -> Framing:
+def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05) -> Framing:
     """Choose the training frame and the box of interest.
 
     up      "auto", or an axis of the capture's frame ("z", "-y", ...) that points up
     box     six numbers in the capture's frame, x y z of one corner and of the opposite one; None: estimated
-    margin  room left on every side of what was found, as a fraction of its longest side: what sparse points miss (bare rims) does not
-            depend on the direction; a given box gets none
+    margin  room left on every side of the sparse points, as a fraction of their longest side: what they miss (bare rims) does not depend on
+            the direction. Other boxes get none: silhouettes bound the subject from outside
 
     Raises BadInput for an empty box or an unknown axis.
     """
@@ -65,7 +65,7 @@ def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = N
     else:
         turned = Similarity(1.0, turn, np.zeros(3))
         low, high, how = extent.box_of_interest(capture, turned, turned.points(focus), converging)
-        room = margin * (high - low).max()
+        room = margin * (high - low).max() if how == "sparse points" else 0.0
         low, high = low - room, high + room
     centre, half = (low + high) / 2, (high - low) / 2
     half = np.maximum(half, 0.02 * half.max())  # a flat subject gets some thickness

@@ -153,6 +153,30 @@ def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path
     assert max(max(seen) for seen in capture.points.observers) < len(names)
 
 
+def test_still_life_lies_in_the_box(ten: tuple[list[str], Path, Capture]) -> None:
+    """The things on the table, by the true mesh brought into the frame of the cameras found."""
+    import trimesh
+
+    from stages.framing import frame
+
+    names, _, capture = ten
+    truth = true_centres(TRUTH)
+    framing = frame(capture)
+    found = np.array([framing.world_from_capture.camera(photo.camera).centre for photo in capture.photos])
+    true = np.array([truth[name] for name in names])
+    u, s, vt = np.linalg.svd((found - found.mean(0)).T @ (true - true.mean(0)))
+    sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
+    rotation, scale = u * sign @ vt, (s * sign).sum() / ((true - true.mean(0)) ** 2).sum()
+    mesh = trimesh.load(TRUTH.with_name("still_life_mesh.ply"), process=False)
+    vertices = np.asarray(mesh.vertices)
+    things = vertices[vertices[:, 2] > 0.02]
+    placed = scale * (things - true.mean(0)) @ rotation.T + found.mean(0)
+    assert (np.abs(placed) <= framing.bounds[1]).all(1).mean() > 0.99
+    volume = np.prod(framing.bounds[1] / scale * 2)
+    assert volume < 10 * np.prod(np.ptp(vertices, axis=0))
+    assert rotation[2, 2] > np.cos(np.radians(3.0))  # up
+
+
 def test_again_in_another_order_gives_the_same_bits(ten: tuple[list[str], Path, Capture], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     names, _, capture = ten
     assert numbers(find(STILL_LIFE, names[::-1], tmp_path)) == numbers(capture)

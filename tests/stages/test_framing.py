@@ -1,0 +1,308 @@
+"""Up, focus, box, near and far: on rigs whose answers are known, and on real captures where they are there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from efficientnerf.cameras import Camera, Similarity, project
+from pipeline.errors import BadInput
+from stages import extent
+from stages.capture import Capture, Photo, SparsePoints
+from stages.framing import Framing, estimated_up, frame, heading_of, rotation_to_z
+
+PLAIN = Path("a.png")
+
+
+def looking(centre: np.ndarray, target: np.ndarray, *, roll: float = 0.0, focal: float = 1.2, name: str = "a") -> Camera:
+    """A camera of 100 x 75 pixels at `centre` that looks at `target`, level in a world with z up but for `roll` radians."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    turned = np.cos(roll) * right + np.sin(roll) * down
+    pose = np.eye(4)
+    pose[:3] = np.stack([turned, np.cross(forward, turned), forward, centre], -1)
+    return Camera(name, 100, 75, "SIMPLE_PINHOLE", (100 * focal, 50.0, 37.5), pose)
+
+
+def ring(count: int, radius: float, height: float, target: np.ndarray, *, arc: float = 360.0, start: float = 0.0, roll: float = 0.0) -> list[Camera]:
+    rng = np.random.default_rng(1)
+    cameras = []
+    for i in range(count):
+        angle = np.radians(start + arc * i / (count if arc >= 360 else max(count - 1, 1)))
+        centre = target + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        aim = target + rng.normal(0, 0.02 * radius, 3)
+        cameras.append(looking(centre, aim, roll=roll * rng.normal(), name=f"{i:03d}"))
+    return cameras
+
+
+def capture_of(cameras: list[Camera], xyz: np.ndarray | None = None, *, moved: Similarity | None = None, **more: object) -> Capture:
+    """A capture in a frame of its own: `moved` takes the rig there; every camera observes the points it has in view."""
+    moved = moved or Similarity.identity()
+    points = None
+    if xyz is not None:
+        seen = extent.in_view(xyz, cameras)
+        count = len(xyz)
+        observers = tuple(tuple(int(i) for i in np.flatnonzero(seen[:, k])) for k in range(count))
+        points = SparsePoints(moved.points(xyz), np.zeros((count, 3), np.uint8), np.ones(count), observers)
+    photos = tuple(Photo(moved.camera(camera), PLAIN) for camera in cameras)
+    return Capture("photographs", photos, None, points=points, **more)  # type: ignore[arg-type]
+
+
+def some_rotation(seed: int) -> np.ndarray:
+    q = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return q * np.sign(np.linalg.det(q))
+
+
+def scene_points(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A subject (a block 0.6 x 0.4 x 0.5 on z = 0), and a wall all round at eight times its size."""
+    rng = np.random.default_rng(seed)
+    subject = rng.uniform([-0.3, -0.2, 0.0], [0.3, 0.2, 0.5], (600, 3))
+    angle = rng.uniform(0, 2 * np.pi, 600)
+    wall = np.stack([5 * np.cos(angle), 5 * np.sin(angle), rng.uniform(-0.5, 2.5, 600)], -1)
+    return subject, wall
+
+
+def check_laws(capture: Capture, framing: Framing) -> None:
+    """What holds for every framing."""
+    np.testing.assert_allclose(framing.bounds[0], -framing.bounds[1], atol=1e-12)
+    assert framing.bounds[1].max() == pytest.approx(1.0)
+    assert (framing.bounds[1] > 0).all()
+    rotation = framing.world_from_capture.rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    assert framing.near_far.shape == (len(capture.photos), 2)
+    assert (framing.near_far[:, 0] > 0).all()
+    assert (framing.near_far[:, 1] > framing.near_far[:, 0]).all()
+    centre = np.array(framing.orbit.centre)
+    assert (centre >= framing.bounds[0] - 1e-12).all()
+    assert (centre <= framing.bounds[1] + 1e-12).all()
+
+
+# -------------------------------------------------------------------------------------------------------------------- up
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("arc", [360.0, 150.0, 40.0])
+def test_up_is_found_from_level_cameras(seed: int, arc: float) -> None:
+    cameras = ring(24, 2.0, 1.0, np.zeros(3), arc=arc, roll=0.01)
+    rotation = some_rotation(seed)
+    moved = Similarity(3.0, rotation, np.array([1.0, 2.0, 3.0]))
+    found = estimated_up([moved.camera(camera) for camera in cameras])
+    assert np.degrees(np.arccos(found @ rotation[:, 2])) < (1.0 if arc > 100 else 10.0)
+
+
+def test_up_ignores_a_few_tilted_photographs() -> None:
+    cameras = ring(24, 2.0, 1.0, np.zeros(3))
+    cameras[::8] = [looking(camera.centre, np.zeros(3), roll=1.2) for camera in cameras[::8]]
+    assert estimated_up(cameras)[2] > np.cos(np.radians(1.5))
+
+
+def test_parallel_cameras_hold_up_to_the_top_of_the_image() -> None:
+    cameras = [looking(np.array([x, -4.0, z]), np.array([x, 0.0, z])) for x in (-0.3, 0, 0.3) for z in (0, 0.3)]
+    np.testing.assert_allclose(estimated_up(cameras), [0, 0, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [0, 1, 0], [-1, 0, 0], [0.6, 0.0, -0.8], [0.1, -0.9, 0.2]])
+def test_rotation_to_z(up: list[float]) -> None:
+    unit = np.array(up) / np.linalg.norm(up)
+    rotation = rotation_to_z(unit)
+    np.testing.assert_allclose(rotation @ unit, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+def test_stated_up_keeps_the_axes() -> None:
+    subject, _ = scene_points()
+    capture = capture_of(ring(12, 2, 1, np.zeros(3), arc=100), subject, up=np.array([0.0, 0.0, 1.0]))
+    framing = frame(capture)
+    np.testing.assert_array_equal(framing.world_from_capture.rotation, np.eye(3))
+    assert frame(capture, up="-y").facts["up"] == [0.0, -1.0, 0.0]
+    np.testing.assert_allclose(frame(capture, up="-y").world_from_capture.rotation @ [0, -1, 0], [0, 0, 1], atol=1e-12)
+    with pytest.raises(BadInput, match="up axis 'w'"):
+        frame(capture, up="w")
+
+
+# ------------------------------------------------------------------------------------------------------------------- box
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("arc", [360.0, 170.0])
+def test_box_holds_the_subject_and_not_the_room(seed: int, arc: float) -> None:
+    subject, wall = scene_points(seed)
+    cameras = ring(30, 1.6, 0.8, np.array([0, 0, 0.2]), arc=arc)
+    moved = Similarity(2.5, some_rotation(seed), np.array([4.0, -1.0, 2.0]))
+    capture = capture_of(cameras, np.concatenate([subject, wall]), moved=moved)
+    framing = frame(capture)
+    check_laws(capture, framing)
+    inside = framing.world_from_capture.points(moved.points(subject))
+    assert (np.abs(inside) <= framing.bounds[1] * 1.01).mean() > 0.99
+    half = framing.bounds[1] / framing.world_from_capture.scale / 2.5
+    assert half.max() < 0.5  # the block's half diagonal is 0.36, the room's radius 5
+    assert framing.orbit.forward_facing == (arc < 180)
+    assert framing.orbit.elevation == pytest.approx(26, abs=8)
+    upward = framing.world_from_capture.rotation @ moved.rotation[:, 2]
+    assert upward[2] > np.cos(np.radians(2.0))
+
+
+def test_a_few_stray_points_change_little() -> None:
+    subject, _ = scene_points()
+    cameras = ring(30, 1.6, 0.8, np.array([0, 0, 0.2]))
+    stray = np.array([[0.0, 0.0, 0.8], [0.5, 0.5, -0.5], [-0.6, 0.1, 0.2]])
+    clean, dirty = (frame(capture_of(cameras, xyz)) for xyz in (subject, np.concatenate([subject, stray])))
+    assert dirty.world_from_capture.scale == pytest.approx(clean.world_from_capture.scale, rel=0.05)
+
+
+def test_forward_facing_capture_turns_its_cameras_to_the_front() -> None:
+    rng = np.random.default_rng(0)
+    wall = rng.uniform([3, -1.5, -1], [4, 1.5, 1], (500, 3))
+    far = rng.uniform([60, -20, -15], [90, 20, 15], (40, 3))
+    cameras = [looking(np.array([0.0, y, z]), np.array([3.5, y, z])) for y in np.linspace(-0.4, 0.4, 5) for z in (-0.2, 0.2)]
+    capture = capture_of(cameras, np.concatenate([wall, far]))
+    framing = frame(capture)
+    check_laws(capture, framing)
+    assert framing.orbit.forward_facing
+    assert framing.orbit.heading == pytest.approx(-90, abs=2)
+    placed = framing.world_from_capture.camera(cameras[0])
+    np.testing.assert_allclose(placed.forward, [0, 1, 0], atol=0.03)
+    assert (framing.bounds[1] / framing.world_from_capture.scale).max() < 3  # the far points are not in it
+    depths = [3.0 * framing.world_from_capture.scale, 90 * framing.world_from_capture.scale]
+    assert framing.near_far[0, 0] < depths[0]
+    assert framing.near_far[0, 1] > depths[1]
+
+
+def test_path_through_a_street_is_boxed_as_a_whole() -> None:
+    rng = np.random.default_rng(0)
+    side = rng.choice([-1.0, 1.0], 1500)
+    facades = np.stack([rng.uniform(0, 30, 1500), 2 * side, rng.uniform(0, 3, 1500)], -1)
+    cameras = [looking(np.array([x, 0.0, 1.5]), np.array([x + 5, 0.0, 1.5])) for x in np.arange(0, 20, 1.0)]
+    capture = capture_of(cameras, facades)
+    framing = frame(capture)
+    check_laws(capture, framing)
+    centres = np.array([framing.world_from_capture.camera(camera).centre for camera in cameras])
+    assert (np.abs(centres) <= framing.bounds[1]).all()
+
+
+def test_given_box_wins_and_is_kept_exactly() -> None:
+    subject, wall = scene_points()
+    capture = capture_of(ring(20, 1.6, 0.8, np.zeros(3)), np.concatenate([subject, wall]), up=np.array([0.0, 0.0, 1.0]))
+    framing = frame(capture, box=(-1.0, -0.5, 0.0, 1.0, 0.5, 0.25))
+    check_laws(capture, framing)
+    np.testing.assert_allclose(framing.world_from_capture.inverse().points(framing.bounds), [[-1, -0.5, 0], [1, 0.5, 0.25]], atol=1e-12)
+    stated = frame(Capture(capture.kind, capture.photos, None, up=capture.up, bounds=np.array([[-1.0, -1, -1], [1, 1, 1]])))
+    np.testing.assert_allclose(stated.bounds, [[-1, -1, -1], [1, 1, 1]], atol=1e-12)
+    for wrong in ((0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, np.nan)):
+        with pytest.raises(BadInput, match="crop box"):
+            frame(capture, box=wrong)
+
+
+@pytest.mark.parametrize("with_alpha", [True, False])
+def test_box_without_points(tmp_path: Path, with_alpha: bool) -> None:
+    """A ball of radius 0.4 off the centre, drawn as alpha; without alpha the box is what the cameras see together."""
+    ball = np.array([0.2, -0.1, 0.3])
+    cameras = ring(24, 3.0, 1.5, np.array([0.0, 0.0, 0.2])) + ring(12, 2.0, 2.6, np.array([0.0, 0.0, 0.2]))
+    photos = []
+    for index, camera in enumerate(cameras):
+        pixels, depth = project(camera, ball[None])
+        y, x = np.mgrid[:75, :100] + 0.5
+        # the outline of a ball is an ellipse; a disc a little larger than it serves
+        opaque = np.hypot(x - pixels[0, 0], y - pixels[0, 1]) <= 1.05 * camera.params[0] * 0.4 / np.sqrt(depth[0] ** 2 - 0.4**2)
+        rgba = np.full((75, 100, 4), 200, np.uint8)
+        rgba[..., 3] = np.where(opaque, 255, 0) if with_alpha else 255
+        Image.fromarray(rgba).save(tmp_path / f"{index}.png")
+        photos.append(Photo(camera, tmp_path / f"{index}.png", split="train"))
+    capture = Capture("blender", tuple(photos), (1.0, 1.0, 1.0), up=np.array([0.0, 0.0, 1.0]))
+    framing = frame(capture)
+    check_laws(capture, framing)
+    corners = framing.world_from_capture.inverse().points(framing.bounds)
+    assert (corners[0] <= ball - 0.4).all()
+    assert (corners[1] >= ball + 0.4).all()
+    half = framing.bounds[1] / framing.world_from_capture.scale
+    assert half.max() < (0.65 if with_alpha else 2.0)
+    # depths: the whole box, nothing else
+    for camera, (near, far) in zip(cameras, framing.near_far, strict=True):
+        corner_depth = (framing.bounds[1] - framing.world_from_capture.camera(camera).centre) @ framing.world_from_capture.camera(camera).forward
+        assert near - 1e-9 <= corner_depth <= far + 1e-9
+
+
+def test_heading() -> None:
+    angles = np.radians([170, 180, -170, -160])
+    heading, one_side = heading_of(np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1))
+    assert abs(heading) == pytest.approx(175)
+    assert one_side
+    around = np.radians(np.arange(10, 370, 30))
+    heading, one_side = heading_of(np.stack([np.cos(around), np.sin(around), 0 * around], -1))
+    assert heading == pytest.approx(10)
+    assert not one_side
+
+
+def test_one_camera_and_cameras_in_one_place_are_framed() -> None:
+    one = looking(np.array([0.0, -2.0, 1.0]), np.zeros(3))
+    for cameras in ([one], [one, one, one]):
+        capture = capture_of(cameras)
+        check_laws(capture, frame(capture))
+
+
+def test_cameras_that_look_outwards_are_framed() -> None:
+    cameras = [looking(np.array([0.1 * np.cos(a), 0.1 * np.sin(a), 0.0]), np.array([np.cos(a), np.sin(a), 0.0])) for a in np.arange(0, 6.2, 0.3)]
+    room = np.random.default_rng(0).uniform([-3, -3, -1], [3, 3, 1], (800, 3))
+    for xyz in (None, room):
+        capture = capture_of(cameras, xyz)
+        check_laws(capture, frame(capture))
+
+
+# ------------------------------------------------------------------------------------------------------------- real captures
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def real(name: str, form: str) -> Capture:
+    from stages.importers import IMPORTERS
+    from stages.poses import PosesSettings
+
+    if not (DATA / name).is_dir():
+        pytest.skip(f"shared/data/{name} is not there")
+    return IMPORTERS[form].read(DATA / name, PosesSettings())
+
+
+def entry(origins: np.ndarray, directions: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """(R,) bool: rays that pass through the box."""
+    with np.errstate(divide="ignore"):
+        a, b = (bounds[0] - origins) / directions, (bounds[1] - origins) / directions
+    return np.asarray(np.minimum(a, b).max(1) < np.maximum(a, b).min(1))
+
+
+def test_chair_lies_in_its_box() -> None:
+    from efficientnerf.cameras import rays
+
+    capture = replace(real("chair_200", "blender"), background=(1.0, 1.0, 1.0))
+    framing = frame(capture)
+    check_laws(capture, framing)
+    np.testing.assert_array_equal(framing.world_from_capture.rotation, np.eye(3))
+    assert not framing.orbit.forward_facing
+    assert (framing.bounds[1] / framing.world_from_capture.scale).max() < 1.5
+    for photo in capture.photos[::9]:
+        with Image.open(photo.image) as image:
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+        origins, directions = rays(framing.world_from_capture.camera(photo.camera))
+        opaque = alpha.ravel() > 127
+        assert entry(origins, directions, framing.bounds)[opaque].all()
+
+
+def test_fern_and_door_are_framed() -> None:
+    fern = real("fern_8", "llff")
+    framing = frame(fern)
+    check_laws(fern, framing)
+    assert framing.orbit.forward_facing
+    door = real("lund_door_colmap", "colmap")
+    framing = frame(door)
+    check_laws(door, framing)
+    assert framing.facts["bounds_from"] == "sparse points"
+    assert door.points is not None
+    inside = np.abs(framing.world_from_capture.points(door.points.xyz)) <= framing.bounds[1]
+    assert inside.all(1).mean() > 0.9
