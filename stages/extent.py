@@ -154,7 +154,7 @@ def box_of_silhouettes(photos: Sequence[Photo], cameras: Sequence[Camera], low: 
     alpha channel that leaves something out.
 
     A voxel is left out where its whole projection is transparent in more than a few photographs (one in fifty may have a damaged alpha
-    channel), so that thin parts stay.
+    channel), so that thin parts stay, or where less than half of the photographs have it in view.
     """
     masks = [(camera, alpha_of(photo)) for camera, photo in zip(cameras, photos, strict=True)]
     views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in masks if mask is not None]
@@ -162,19 +162,21 @@ def box_of_silhouettes(photos: Sequence[Photo], cameras: Sequence[Camera], low: 
         return None
     for _ in range(3):  # each pass looks closer at what the one before has left
         kept, step = grid(low, high)
-        against = np.zeros(len(kept), int)
+        against, seen = np.zeros(len(kept), int), np.zeros(len(kept), int)
         for camera, mask in views:
-            against += _transparent(camera, mask, kept, float(np.linalg.norm(step)) / 2)
+            inside, transparent = _transparent(camera, mask, kept, float(np.linalg.norm(step)) / 2)
+            against, seen = against + transparent, seen + inside
             left = against <= len(views) // 50
-            kept, against = kept[left], against[left]
+            kept, against, seen = kept[left], against[left], seen[left]
+        kept = kept[seen >= len(views) / 2]
         if not len(kept):
             return None
         low, high = kept.min(0) - step / 2, kept.max(0) + step / 2
     return low, high
 
 
-def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: float) -> np.ndarray:
-    """(N,) bool: balls of this radius whose image, as far as it lies in the picture, has no opaque pixel; balls out of the picture are not."""
+def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) bool twice: balls of this radius whose centre lies in the picture, and those of them whose image has no opaque pixel."""
     import cv2
 
     pixels, depth = project(camera, xyz)
@@ -186,7 +188,7 @@ def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: floa
     away = cv2.distanceTransform(np.where(mask, np.uint8(0), np.uint8(1)), cv2.DIST_C, 3) if mask.any() else np.full(mask.shape, np.inf)
     out = np.zeros(len(xyz), bool)
     out[inside] = away[row[inside].astype(int), column[inside].astype(int)] > reach[inside]
-    return out
+    return inside, out
 
 
 def alpha_of(photo: Photo) -> np.ndarray | None:
