@@ -1,0 +1,57 @@
+"""World to grid: inverses, the contraction's closed form, and what it leaves alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.grid import Space, contract, uncontract
+from tests import reference
+
+BOUNDS = np.array([[-1.0, -0.4, 0.2], [0.5, 0.9, 0.8]])
+
+
+@pytest.fixture
+def points() -> torch.Tensor:
+    rng = np.random.default_rng(0)
+    return torch.from_numpy(rng.normal(size=(500, 3)) * 10.0 ** rng.uniform(-2, 2, (500, 1)))
+
+
+def test_contraction_is_the_papers(points: torch.Tensor) -> None:
+    expected = [reference.contract(u) for u in points.tolist()]
+    torch.testing.assert_close(contract(points), torch.tensor(expected, dtype=torch.float64))
+
+
+def test_contraction_leaves_the_box_alone_and_stays_short_of_two(points: torch.Tensor) -> None:
+    inside = points / points.abs().amax(dim=1, keepdim=True) * 0.999
+    assert torch.equal(contract(inside), inside)
+    assert contract(points).abs().max() < 2
+
+
+def test_uncontract_is_the_inverse(points: torch.Tensor) -> None:
+    torch.testing.assert_close(uncontract(contract(points)), points)
+
+
+def test_contraction_is_continuous_and_monotonic_along_a_ray() -> None:
+    t = torch.linspace(0, 50, 5001, dtype=torch.float64)
+    along = contract(t[:, None] * torch.tensor([0.8, -0.5, 0.2], dtype=torch.float64))
+    assert (along[:, 0].diff() > 0).all()
+    assert along[:, 0].diff().max() <= 0.8 * 0.01 + 1e-12
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_world_is_the_inverse_of_grid(points: torch.Tensor, contracted: bool) -> None:
+    space = Space(BOUNDS, contracted)
+    world = torch.as_tensor(space.world(torch.from_numpy(np.random.default_rng(1).uniform(0.02, 0.98, (500, 3)))))
+    torch.testing.assert_close(space.world(space.grid(world)), world)
+    if contracted:
+        torch.testing.assert_close(space.world(space.grid(points)), points)
+        assert space.grid(points).min() >= 0
+        assert space.grid(points).max() <= 1
+
+
+@pytest.mark.parametrize(("contracted", "low", "high"), [(False, 0.0, 1.0), (True, 0.25, 0.75)])
+def test_the_box_lies_where_it_should(contracted: bool, low: float, high: float) -> None:
+    corners = Space(BOUNDS, contracted).grid(torch.from_numpy(BOUNDS))
+    torch.testing.assert_close(corners, torch.tensor([[low] * 3, [high] * 3], dtype=torch.float64))
