@@ -5,7 +5,12 @@ The frame is COLMAP's own: neither its scale nor its up axis means anything.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import errno
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,10 +63,11 @@ def find_cameras(
         )
     if matching == "auto":
         matching = "exhaustive" if len(images) <= EXHAUSTIVE_UP_TO else "sequential"
-    matches.open_database(work, images)
-    matches.extract(work, images, features=features, progress=progress, safe_point=safe_point)
-    matches.match(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
-    models = mapping.models_of(work, images, seed, progress, safe_point)
+    with _full_disk_named(work):
+        matches.open_database(work, images)
+        matches.extract(work, images, features=features, progress=progress, safe_point=safe_point)
+        matches.match(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
+        models = mapping.models_of(work, images, seed, progress, safe_point)
     rejected = [*unreadable, *_left_out(work, images, models)]
     if mapping.registered(models) < max(mapping.FEWEST, len(images) / 2):
         raise BadInput(_failure(folder, images, models, rejected, matching))
@@ -69,6 +75,17 @@ def find_cameras(
     for sentence in capture.warnings:
         warn(sentence)
     return capture
+
+
+@contextlib.contextmanager
+def _full_disk_named(work: Path) -> Iterator[None]:
+    """COLMAP reports a full disk as one of many RuntimeErrors."""
+    try:
+        yield
+    except (RuntimeError, sqlite3.OperationalError) as error:
+        if shutil.disk_usage(work).free < 1 << 20:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work)) from error
+        raise
 
 
 def _listed(names: Sequence[str]) -> str:
