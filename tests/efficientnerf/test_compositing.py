@@ -1,0 +1,179 @@
+"""Volume rendering: laws, a closed form, and loop, torch and kernel against each other, values and gradients."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf import compositing
+from efficientnerf.compositing import activate, sample_weights
+from efficientnerf.harmonics import basis
+from efficientnerf.kernels import dispatch
+from tests import reference
+
+
+class Bundle(NamedTuple):
+    """What `composite` is handed, float64; ray 2 has no samples and ray 4 begins with an opaque one."""
+
+    raw: torch.Tensor
+    length: torch.Tensor
+    first: torch.Tensor
+    harmonics: torch.Tensor
+    background: torch.Tensor
+
+
+def bundle(degree: int, counts: tuple[int, ...] = (5, 1, 0, 9, 7, 3)) -> Bundle:
+    rng = np.random.default_rng(degree)
+    n, k = sum(counts), (degree + 1) ** 2
+    first = torch.tensor([0, *np.cumsum(counts)])
+    raw = torch.from_numpy(rng.normal(size=(n, 1 + 3 * k)) * 1.5)
+    if len(counts) > 4:
+        raw[first[4], 0] = 9.0
+    directions = rng.normal(size=(len(counts), 3))
+    directions = torch.from_numpy(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    return Bundle(raw, torch.from_numpy(rng.uniform(0.02, 0.3, n)), first, basis(directions, degree), torch.from_numpy(rng.random((len(counts), 3))))
+
+
+def in_float32(b: Bundle) -> Bundle:
+    return Bundle(*(t.float() if t.dtype == torch.float64 else t for t in b))
+
+
+def test_weights_sum_to_one_at_most() -> None:
+    rng = np.random.default_rng(0)
+    for scale in (0.01, 1.0, 100.0, 1e4):
+        depth = torch.from_numpy((scale * rng.random(400)).astype(np.float32))
+        first = torch.arange(0, 401, 20)
+        weight = sample_weights(depth, first)
+        assert weight.min() >= 0
+        assert weight.reshape(20, 20).sum(1).max() <= 1 + 1e-6
+
+
+def test_weights_of_a_ray_do_not_feel_the_rays_before_it() -> None:
+    depth = torch.rand(1000, generator=torch.Generator().manual_seed(0))
+    many = sample_weights(torch.cat([torch.full((100_000,), 50.0), depth]), torch.tensor([0, 100_000, 101_000]))
+    torch.testing.assert_close(many[100_000:], sample_weights(depth, torch.tensor([0, 1000])), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("activation", ["exp", "softplus"])
+def test_activations(activation: str) -> None:
+    raw = torch.tensor([-80.0, -3.0, 0.0, 1.0, 2.5, 14.9], dtype=torch.float64)
+    torch.testing.assert_close(activate(raw, activation), torch.tensor([reference.activate(x, activation) for x in raw.tolist()], dtype=torch.float64))
+    assert math.isfinite(float(activate(torch.tensor(1e6), activation)))
+
+
+def test_an_unknown_activation_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected 'exp' or 'softplus'"):
+        activate(torch.zeros(1), "relu")
+
+
+@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("activation", ["exp", "softplus"])
+def test_pixels_are_those_of_the_loop(composite: object, degree: int, activation: str) -> None:
+    b = bundle(degree)
+    out = composite(*in_float32(b), activation)  # type: ignore[operator]
+    k = (degree + 1) ** 2
+    for r in range(len(b.first) - 1):
+        own = range(int(b.first[r]), int(b.first[r + 1]))
+        density = [reference.activate(float(b.raw[n, 0]), activation) for n in own]
+        rgb = [[reference.sigmoid(float(b.raw[n, 1 + c * k : 1 + (c + 1) * k] @ b.harmonics[r])) for c in range(3)] for n in own]
+        pixel = reference.composite(density, [float(b.length[n]) for n in own], rgb, b.background[r].tolist())
+        np.testing.assert_allclose(out.colour[r], pixel.colour, atol=2e-6)
+        assert float(out.opacity[r]) == pytest.approx(pixel.opacity, abs=2e-6)
+        np.testing.assert_allclose(out.weight[list(own)], pixel.weights, atol=2e-6)
+        np.testing.assert_allclose(out.sample_colour[list(own)], np.array(rgb).reshape(-1, 3), atol=2e-6)
+
+
+@pytest.mark.parametrize("activation", ["exp", "softplus"])
+def test_gradients_of_the_torch_function_are_finite_differences(activation: str) -> None:
+    b = bundle(1, (2, 0, 3))
+    raw, background = b.raw.requires_grad_(), b.background.requires_grad_()
+
+    def outputs(raw: torch.Tensor, background: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(compositing.composite(raw, b.length, b.first, b.harmonics, background, activation))
+
+    assert torch.autograd.gradcheck(outputs, (raw, background))
+
+
+@pytest.mark.parametrize("degree", [0, 2, 4])
+@pytest.mark.parametrize("activation", ["exp", "softplus"])
+def test_gradients_of_the_kernel_are_those_of_the_torch_function(degree: int, activation: str) -> None:
+    b = bundle(degree)
+    towards = torch.from_numpy(np.random.default_rng(9).normal(size=(len(b.first) - 1, 4)))
+    grads = []
+    for composite, of in ((compositing.composite, b), (dispatch.composite, in_float32(b))):
+        raw, background = of.raw.clone().requires_grad_(), of.background.clone().requires_grad_()
+        out = composite(raw, of.length, of.first, of.harmonics, background, activation)
+        ((out.colour * towards[:, :3].to(raw.dtype)).sum() + (out.opacity * towards[:, 3].to(raw.dtype)).sum()).backward()
+        grads.append((raw.grad, background.grad))
+    for slow, fast in zip(*grads, strict=True):
+        assert slow is not None
+        torch.testing.assert_close(fast.double(), slow, rtol=1e-4, atol=2e-6)
+
+
+@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
+def test_beyond_the_cap_the_density_has_no_gradient_and_stays_finite(composite: object) -> None:
+    raw = torch.tensor([[40.0, 0.3, 0.1, -0.2], [0.5, 0.0, 0.0, 0.0]], requires_grad=True)
+    out = composite(raw, torch.full((2,), 0.1), torch.tensor([0, 2]), torch.full((1, 1), 0.28), torch.ones(1, 3), "exp")  # type: ignore[operator]
+    out.colour.sum().backward()
+    assert raw.grad is not None
+    assert torch.isfinite(raw.grad).all()
+    assert raw.grad[0, 0] == 0
+    assert float(out.opacity.detach()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
+def test_splitting_a_sample_in_two_leaves_the_pixel_unchanged(composite: object) -> None:
+    b = in_float32(bundle(2))
+    whole = composite(*b, "softplus")  # type: ignore[operator]
+    twice = b._replace(raw=b.raw.repeat_interleave(2, 0), length=(b.length / 2).repeat_interleave(2), first=b.first * 2)
+    halves = composite(*twice, "softplus")  # type: ignore[operator]
+    torch.testing.assert_close(halves.colour, whole.colour, rtol=0, atol=1e-6)
+    torch.testing.assert_close(halves.opacity, whole.opacity, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
+def test_one_colour_everywhere_gives_that_colour(composite: object) -> None:
+    b = in_float32(bundle(0))
+    raw = b.raw.clone()
+    raw[:, 1:] = 0  # sigmoid(0)
+    out = composite(raw, b.length, b.first, b.harmonics, torch.full_like(b.background, 0.5), "exp")  # type: ignore[operator]
+    torch.testing.assert_close(out.colour, torch.full_like(out.colour, 0.5))
+
+
+@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
+def test_a_uniform_ball_has_its_closed_form(composite: object) -> None:
+    """Opacity 1 - exp(-sigma chord) whatever the number of samples; the rest is background."""
+    radius, sigma = 0.8, 1.7
+    height = np.linspace(0, 1.0, 23)
+    chord = 2 * np.sqrt(np.maximum(radius**2 - height**2, 0))
+    samples = 1 + np.arange(23) % 6
+    first = torch.tensor([0, *np.cumsum(samples)])
+    length = torch.from_numpy(np.repeat(chord / samples, samples).astype(np.float32))
+    raw = torch.zeros(int(first[-1]), 4)
+    raw[:, 0] = math.log(sigma)
+    out = composite(raw, length, first, torch.ones(23, 1), torch.ones(23, 3), "exp")  # type: ignore[operator]
+    expected = 1 - np.exp(-sigma * chord)
+    np.testing.assert_allclose(out.opacity, expected, atol=1e-6)
+    np.testing.assert_allclose(out.colour[:, 0], 0.5 * expected + 1 - expected, atol=1e-6)
+
+
+def test_the_kernel_gives_the_same_bytes_whatever_the_number_of_threads() -> None:
+    import numba
+
+    b = in_float32(bundle(3, (40,) * 500))
+    usual = numba.get_num_threads()
+    pictures = []
+    for threads in (1, usual):
+        numba.set_num_threads(threads)
+        raw = b.raw.clone().requires_grad_()
+        out = dispatch.composite(raw, *b[1:], "exp")
+        out.colour.sum().backward()
+        assert raw.grad is not None
+        pictures.append((out.colour.detach().numpy().tobytes(), raw.grad.numpy().tobytes()))
+    numba.set_num_threads(usual)
+    assert pictures[0] == pictures[1]

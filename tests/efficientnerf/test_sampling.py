@@ -1,0 +1,185 @@
+"""Valid and pivotal samples: loop, torch and kernel agree; pivotal slots tile their intervals; nothing is evaluated twice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf import sampling
+from efficientnerf.compositing import ray_of_sample
+from efficientnerf.grid import Space
+from efficientnerf.kernels import dispatch
+from efficientnerf.sampling import Samples
+from tests import reference
+
+BOUNDS = np.array([[-1.0, -0.5, -0.25], [1.0, 0.5, 0.75]])
+STEP, SIDE = 0.11, 6
+FINDERS = {"torch": sampling.valid_samples, "kernel": dispatch.valid_samples}
+DIVIDERS = {"torch": sampling.pivotal_samples, "kernel": dispatch.pivotal_samples}
+
+
+class Rays(NamedTuple):
+    origins: torch.Tensor
+    directions: torch.Tensor
+    near: torch.Tensor
+    far: torch.Tensor
+    offset: torch.Tensor
+
+
+def make_rays(kind: str, count: int = 60) -> Rays:
+    rng = np.random.default_rng(len(kind))
+    target = rng.uniform(BOUNDS[0], BOUNDS[1], (count, 3))
+    away = rng.normal(size=(count, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    origins, directions = target + 3 * away, -away
+    if kind == "inside":
+        origins = target
+    elif kind == "missing":
+        directions = away
+    elif kind == "parallel":  # to an axis, some through the box and some beside it
+        directions = np.eye(3)[np.arange(count) % 3] * rng.choice([-1.0, 1.0], (count, 1))
+        origins = np.where(directions == 0, target * rng.choice([1.0, 3.0], (count, 1)), -2 * directions)
+    near, far = np.full(count, 0.05), rng.uniform(2.5, 6.0, count)
+    return Rays(*(torch.from_numpy(a.astype(np.float32)) for a in (origins, directions, near, far, rng.random(count))))
+
+
+def double(rays: Rays) -> Rays:
+    return Rays(*(t.double() for t in rays))
+
+
+def voxels_of(seed: int = 0) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).random((SIDE, SIDE, SIDE)).astype(np.float32))
+
+
+@pytest.mark.parametrize("kind", ["outside", "inside", "missing", "parallel"])
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("threshold", [0.4, -math.inf])
+@pytest.mark.parametrize("finder", FINDERS)
+def test_valid_samples_are_those_of_the_loop(kind: str, contracted: bool, threshold: float, finder: str) -> None:
+    rays, voxels = make_rays(kind), voxels_of()
+    found = FINDERS[finder](Space(BOUNDS, contracted), *rays, STEP, 60, voxels, threshold)
+    compared = 0
+    for r in range(len(rays.origins)):
+        o, d, near, far, offset = (t[r].double().numpy() for t in rays)
+        wanted = reference.march(BOUNDS, contracted, o, d, float(near), float(far), float(offset), STEP, 60, voxels.numpy(), threshold)
+        if wanted.margin < 1e-4:  # a decision that rounding may turn
+            continue
+        compared += 1
+        begin, end = found.first[r : r + 2].tolist()
+        assert end - begin == len(wanted.samples)
+        if wanted.samples:
+            start, extent, length, point = (np.array(column) for column in zip(*wanted.samples, strict=True))
+            np.testing.assert_allclose(found.start[begin:end], start, rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(found.extent[begin:end], extent, rtol=1e-4)
+            np.testing.assert_allclose(found.length[begin:end], length, rtol=1e-4)
+            np.testing.assert_allclose(found.point[begin:end], point, atol=1e-5)
+    assert compared > 40
+    if kind == "missing" and not contracted:
+        assert found.first[-1] == 0
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_both_try_the_same_number(contracted: bool) -> None:
+    rays, space = make_rays("outside"), Space(BOUNDS, contracted)
+    fast, slow = (find(space, *rays, STEP, 60, voxels_of(), 0.4) for find in (dispatch.valid_samples, sampling.valid_samples))
+    assert fast.tried == pytest.approx(slow.tried, abs=2)
+    assert len(fast.start) < fast.tried
+
+
+@pytest.mark.parametrize("finder", FINDERS)
+def test_a_voxel_at_the_threshold_is_not_valid(finder: str) -> None:
+    rays = make_rays("outside")
+    space, voxels = Space(BOUNDS, False), torch.full((SIDE, SIDE, SIDE), 0.5)
+    find = FINDERS[finder]
+    assert len(find(space, *rays, STEP, 60, voxels, 0.5).start) == 0
+    above = find(space, *rays, STEP, 60, voxels, 0.5 - 1e-6)
+    assert len(above.start) == above.tried > 0
+
+
+@pytest.mark.parametrize("finder", FINDERS)
+@pytest.mark.parametrize("contracted", [False, True])
+def test_intervals_lie_end_to_end_and_samples_in_them(finder: str, contracted: bool) -> None:
+    rays, space = make_rays("outside"), Space(BOUNDS, contracted)
+    rays = rays._replace(far=torch.full_like(rays.far, 1e6))
+    found = FINDERS[finder](space, *rays, STEP, 200, voxels_of(), -math.inf)
+    ray = ray_of_sample(found.first, len(found.start))
+    same = ray[1:] == ray[:-1]
+    torch.testing.assert_close((found.start + found.extent)[:-1][same], found.start[1:][same], rtol=1e-5, atol=1e-5)
+    at = found.start + rays.offset[ray] * found.extent
+    torch.testing.assert_close(found.point, space.grid(rays.origins[ray] + at[:, None] * rays.directions[ray]), rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.length, torch.full_like(found.length, STEP))
+
+
+@pytest.mark.parametrize("coarse_samples", [16, 128])
+@pytest.mark.parametrize("half", [(1, 1, 1), (1, 0.3, 0.1), (0.1, 1, 1)])
+def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: int, half: tuple[float, float, float]) -> None:
+    from efficientnerf.model import model
+    from efficientnerf.settings import TrainSettings
+
+    space = Space(np.array([np.negative(half), half]), True)
+    m = model(space, TrainSettings(coarse_samples=coarse_samples, voxels=8, levels=2, log2_table=8), None)
+    rng = np.random.default_rng(5)
+    directions = rng.normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = torch.from_numpy((rng.uniform(-1.5, 1.5, (300, 3)) - 3 * directions).astype(np.float32))
+    along = torch.from_numpy(directions.astype(np.float32))
+    ones = torch.ones(300)
+    found = dispatch.valid_samples(space, origins, along, 0.01 * ones, 1e9 * ones, 0.5 * ones, m.step, m.slots, m.voxels.values, -math.inf)
+    last = found.first[1:] - 1
+    reach = space.unit(origins + (found.start + found.extent)[last][:, None] * along).abs().amax(dim=1)
+    assert reach.min() > reference.FARTHEST
+
+
+def coarse_samples_of(rays: Rays, contracted: bool) -> tuple[Space, Samples, torch.Tensor]:
+    space = Space(BOUNDS, contracted)
+    coarse = sampling.valid_samples(space, *rays, STEP, 60, voxels_of().to(rays.origins.dtype), 0.4)
+    return space, coarse, torch.rand(len(coarse.start), generator=torch.Generator().manual_seed(0)) < 0.5
+
+
+@pytest.mark.parametrize("divider", DIVIDERS)
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("per_pivot", [1, 4, 5])
+def test_pivotal_slots_tile_their_intervals(divider: str, contracted: bool, per_pivot: int) -> None:
+    rays = make_rays("outside")
+    space, coarse, pivotal = coarse_samples_of(rays, contracted)
+    fine = DIVIDERS[divider](space, rays.origins, rays.directions, rays.offset, coarse, pivotal, per_pivot)
+    pivots, ray = int(pivotal.sum()), ray_of_sample(coarse.first, len(pivotal))[pivotal]
+    assert fine.first.tolist() == [0, *(per_pivot * torch.bincount(ray, minlength=len(rays.origins))).cumsum(0).tolist()]
+    start, extent = fine.start.reshape(pivots, per_pivot), fine.extent.reshape(pivots, per_pivot)
+    torch.testing.assert_close(start[:, 0], coarse.start[pivotal])
+    torch.testing.assert_close((start + extent)[:, :-1], start[:, 1:])
+    torch.testing.assert_close(extent.sum(1), coarse.extent[pivotal])
+    torch.testing.assert_close(fine.length.reshape(pivots, per_pivot).sum(1), coarse.length[pivotal])
+    of = ray_of_sample(fine.first, len(fine.start))
+    at = fine.start + rays.offset[of] * fine.extent
+    torch.testing.assert_close(fine.point, space.grid(rays.origins[of] + at[:, None] * rays.directions[of]), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_the_pivotal_kernel_is_the_torch_function(contracted: bool) -> None:
+    rays = make_rays("inside")
+    space, coarse, pivotal = coarse_samples_of(rays, contracted)
+    args = (space, rays.origins, rays.directions, rays.offset, coarse, pivotal, 4)
+    for fast, slow in zip(dispatch.pivotal_samples(*args), sampling.pivotal_samples(*args), strict=True):
+        torch.testing.assert_close(torch.as_tensor(fast), torch.as_tensor(slow), rtol=1e-4, atol=1e-5)
+
+
+def test_no_point_is_evaluated_twice() -> None:
+    rays = double(make_rays("outside"))
+    space, coarse, _ = coarse_samples_of(rays, False)
+    fine = sampling.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, torch.ones(len(coarse.start), dtype=torch.bool), 4)
+    assert len(torch.unique(coarse.point, dim=0)) == len(coarse.point)
+    assert len(torch.unique(fine.point, dim=0)) == len(fine.point)
+
+
+@pytest.mark.parametrize("find", FINDERS.values(), ids=FINDERS.keys())
+def test_no_rays_and_no_slots_are_fine(find: Callable[..., Samples]) -> None:
+    none = Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), torch.zeros(0))
+    found = find(Space(BOUNDS, False), *none, STEP, 60, voxels_of(), 0.4)
+    assert found.first.tolist() == [0]
+    assert found.point.shape == (0, 3)
