@@ -291,6 +291,31 @@ def test_mixed_sizes_rotation_and_a_truncated_file(ten: tuple[list[str], Path, C
     assert errors.max() < 0.02
 
 
+def test_lens_with_more_than_one_term_of_distortion(tmp_path: Path) -> None:
+    """Fourteen photographs drawn again as a lens with two radial and two tangential terms would have taken them."""
+    import cv2
+
+    from efficientnerf.cameras import Camera, project, rays
+
+    chosen()
+    names = sorted(path.name for path in STILL_LIFE.glob("*.jpg"))[:14]
+    old = Camera("old", 480, 360, "SIMPLE_RADIAL", (400.0, 240.0, 180.0, -0.04), np.eye(4))
+    new = Camera("new", 480, 360, "OPENCV", (440.0, 440.0, 240.0, 180.0, -0.28, 0.22, 0.002, -0.001), np.eye(4))
+    from_pixel = project(old, rays(new)[1])[0].reshape(360, 480, 2).astype(np.float32) - 0.5  # cv2's pixel centres are integers
+    for name in names:
+        with Image.open(STILL_LIFE / name) as image:
+            drawn = cv2.remap(np.asarray(image), from_pixel[..., 0], from_pixel[..., 1], cv2.INTER_CUBIC)
+        Image.fromarray(drawn).save(tmp_path / name, quality=96)
+    capture = find(tmp_path, names, tmp_path / "work")
+    truth = true_centres(TRUTH)
+    errors = aligned_errors(np.array([p.camera.centre for p in capture.photos]), np.array([truth[p.camera.name] for p in capture.photos]))
+    camera = capture.photos[0].camera
+    assert camera.model == "OPENCV"
+    assert camera.intrinsics["fx"] == pytest.approx(440, rel=0.01)
+    assert camera.intrinsics["k1"] == pytest.approx(-0.28, abs=0.04)
+    assert np.sqrt((errors**2).mean()) < 0.002
+
+
 def test_masked_parts_give_no_features(tmp_path: Path) -> None:
     names = chosen()[:3]
     mask = np.zeros((360, 480), np.uint8)
