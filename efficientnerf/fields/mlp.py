@@ -18,7 +18,7 @@ FREQUENCIES = 10
 def positional_encoding(points: Tensor, frequencies: int = FREQUENCIES) -> Tensor:
     """(N, 3) in [-1, 1] to (N, 3 + 6 frequencies): the point itself, then sines and cosines of 2^l x (Mildenhall et al. 2020, equation 4)."""
     scales = 2.0 ** torch.arange(frequencies, device=points.device, dtype=points.dtype)
-    angles = (points[:, None] * scales[:, None]).reshape(len(points), -1)
+    angles = (points[:, None] * scales[:, None]).reshape(len(points), 3 * frequencies)
     return torch.cat([points, torch.sin(angles), torch.cos(angles)], dim=-1)
 
 
