@@ -48,6 +48,8 @@ class Pixels:
         self.usable = None
         if any(mask is not None for mask in masks):
             self.usable = np.concatenate([np.ones(n, bool) if mask is None else mask.reshape(-1) for n, mask in zip(sizes, masks, strict=True)])
+            if not self.usable.any():
+                raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
         self.rotation = np.stack([camera.world_from_camera[:3, :3] for camera in cameras]).astype(np.float32)
         self.centre = np.stack([camera.centre for camera in cameras]).astype(np.float32)
         lenses: dict[tuple, int] = {}
