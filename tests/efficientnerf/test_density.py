@@ -1,0 +1,107 @@
+"""Momentum density voxels: equation 7 against the loop, the other rule, the threshold, and how pruned space returns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.density import cell_of, density_voxels, fade, refresh_cells, sweep_cells, update
+from tests import reference
+
+SIDE = 3
+
+
+def samples(count: int = 80) -> tuple[torch.Tensor, torch.Tensor]:
+    rng = np.random.default_rng(count)
+    return torch.from_numpy(rng.integers(0, SIDE**3 - 4, count)), torch.from_numpy(rng.normal(size=count).astype(np.float32) * 20)
+
+
+def test_momentum_is_equation_seven_with_one_update_to_a_voxel() -> None:
+    voxels = density_voxels(SIDE, "momentum", initial=10.0, beta=0.1)
+    expected = [10.0] * SIDE**3
+    for count in (80, 1, 200):
+        cell, density = samples(count)
+        update(voxels, cell, density)
+        expected = reference.momentum(expected, cell.tolist(), density.tolist(), 0.1)
+    np.testing.assert_allclose(voxels.values.reshape(-1), expected, rtol=1e-5)
+    assert voxels.values.reshape(-1)[-1] == 10.0  # never asked about
+
+
+def test_a_voxel_of_raw_density_minus_five_is_pruned_at_its_eleventh_visit() -> None:
+    voxels = density_voxels(1, "momentum", initial=10.0, beta=0.1)
+    visits = 0
+    while voxels.occupied:
+        update(voxels, torch.zeros(1, dtype=torch.int64), torch.tensor([-5.0]))
+        visits += 1
+    assert visits == 11
+
+
+def test_momentum_does_not_fade() -> None:
+    voxels = density_voxels(SIDE, "momentum")
+    fade(voxels)
+    assert (voxels.values == 10).all()
+
+
+def test_maximum_keeps_the_largest_and_forgets() -> None:
+    voxels = density_voxels(SIDE, "maximum", decay=0.5, threshold=1.0)
+    assert (voxels.values == 2).all()
+    cell, density = samples()
+    update(voxels, cell, density)
+    fade(voxels)
+    expected = [max([2.0, *density[cell == n].tolist()]) / 2 for n in range(SIDE**3)]
+    np.testing.assert_allclose(voxels.values.reshape(-1), expected, rtol=1e-6)
+
+
+def test_fresh_voxels_are_all_valid_and_those_at_the_threshold_are_not() -> None:
+    for rule, threshold in (("momentum", 0.0), ("maximum", 0.7)):
+        voxels = density_voxels(SIDE, rule, threshold=threshold)
+        assert voxels.occupied == 1.0
+        voxels.values[0] = threshold
+        assert voxels.occupied == pytest.approx(2 / 3)
+
+
+def test_an_unknown_rule_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected 'momentum' or 'maximum'"):
+        density_voxels(SIDE, "average")
+
+
+def test_cells_hold_their_points_and_the_borders_belong_to_the_grid() -> None:
+    point = torch.tensor([[0.0, 0.0, 0.0], [0.99, 0.0, 0.34], [1.0, 1.0, 1.0], [-0.1, 0.5, 1.2]])
+    assert cell_of(point, SIDE).tolist() == [0, 19, 26, 5]
+
+
+def test_refreshed_points_lie_in_their_cells_half_of_them_valid() -> None:
+    voxels = density_voxels(8, "maximum", threshold=1.0)
+    voxels.values.zero_()
+    voxels.values[2, 3, 4] = 5.0
+    cell, point = refresh_cells(voxels, 101, torch.Generator().manual_seed(1))
+    assert torch.equal(cell_of(point, 8), cell)
+    assert len(cell) == 101
+    assert (cell[51:] == (2 * 8 + 3) * 8 + 4).all()
+    voxels.values.zero_()
+    cell, point = refresh_cells(voxels, 100, torch.Generator().manual_seed(1))
+    assert torch.equal(cell_of(point, 8), cell)
+
+
+def test_a_sweep_asks_about_every_cell_once() -> None:
+    voxels = density_voxels(5, "momentum")
+    parts = [sweep_cells(voxels, part, 8, torch.Generator().manual_seed(part)) for part in range(3, 11)]
+    assert sorted(torch.cat([cell for cell, _ in parts]).tolist()) == list(range(125))
+    assert all(torch.equal(cell_of(point, 5), cell) for cell, point in parts)
+
+
+@pytest.mark.parametrize(("rule", "empty", "full", "threshold"), [("momentum", -40.0, 40.0, 0.0), ("maximum", 0.0, 40.0, 1.0)])
+def test_refreshing_lets_pruned_space_return(rule: str, empty: float, full: float, threshold: float) -> None:
+    """A field says empty until all is pruned, then full: no ray asks any more, and yet the voxels learn of it."""
+    voxels = density_voxels(6, rule, threshold=threshold)
+    generator = torch.Generator().manual_seed(0)
+    shares = []
+    for density in (empty, full):
+        for _ in range(300):
+            fade(voxels)
+            cell, _ = refresh_cells(voxels, 20, generator)
+            update(voxels, cell, torch.full((len(cell),), density))
+        shares.append(voxels.occupied)
+    assert shares[0] == 0.0
+    assert shares[1] > 0.9

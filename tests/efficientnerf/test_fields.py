@@ -1,0 +1,135 @@
+"""Fields: the hash grid against the loop, the paper's networks by their sizes, one contract for both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from efficientnerf.fields.hash import HashField, encode, encode_reference
+from efficientnerf.fields.mlp import MlpField, positional_encoding
+from tests import reference
+
+
+def hash_field(degree: int = 2, seed: int = 0) -> HashField:
+    """Levels of 4, 8 and 16 points a side: the first two stored whole, the last hashed into 1024 entries."""
+    generator = torch.Generator().manual_seed(seed)
+    field = HashField(levels=3, log2_table=10, coarsest=4, finest=16, hidden=16, layers=2, degree=degree, generator=generator)
+    field.table.data.normal_(generator=generator)
+    return field
+
+
+def mlp_field(degree: int = 2, seed: int = 0) -> MlpField:
+    return MlpField(hidden=16, layers=4, degree=degree, generator=torch.Generator().manual_seed(seed))
+
+
+def points(count: int = 200) -> torch.Tensor:
+    corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, 0.5]])
+    return torch.cat([torch.rand(count, 3, generator=torch.Generator().manual_seed(4)), corners])
+
+
+def of_reference(field: HashField, at: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
+    return encode_reference(at, table, field.sides, field.dense, field.starts, int(field.mask))
+
+
+def test_the_test_field_has_levels_of_both_kinds() -> None:
+    field = hash_field()
+    assert field.sides.tolist() == [4, 8, 16]
+    assert field.dense.tolist() == [True, True, False]
+    assert len(field.table) == 4**3 + 8**3 + 1024
+
+
+def test_encoding_is_that_of_the_loop() -> None:
+    field, at = hash_field(), points()
+    table = field.table.detach().double()
+    levels = (field.sides.tolist(), field.dense.tolist(), field.starts.tolist(), 1024)
+    expected = np.array([reference.encode(p, table.numpy(), *levels) for p in at.double().tolist()])
+    np.testing.assert_allclose(of_reference(field, at.double(), table), expected, atol=1e-12)
+    np.testing.assert_allclose(encode(at, field).detach(), expected, atol=2e-5)
+
+
+def test_gradient_of_the_table_is_that_of_the_torch_function() -> None:
+    field, at = hash_field(), points()
+    towards = torch.from_numpy(np.random.default_rng(1).normal(size=(len(at), 6)))
+    table = field.table.detach().double().requires_grad_()
+    (of_reference(field, at.double(), table) * towards).sum().backward()
+    (encode(at, field) * towards.float()).sum().backward()
+    assert table.grad is not None
+    assert field.table.grad is not None
+    torch.testing.assert_close(field.table.grad.double(), table.grad, rtol=1e-4, atol=2e-5)
+    assert torch.autograd.gradcheck(lambda t: of_reference(field, at[-6:].double(), t), (table.detach().requires_grad_(),), fast_mode=True)
+
+
+def test_encoding_is_continuous_and_hits_the_lattice() -> None:
+    field = hash_field()
+    lattice = torch.tensor([[1 / 3, 2 / 3, 0.0]])
+    torch.testing.assert_close(encode(lattice, field)[0, :2], field.table[(1 * 4 + 2) * 4 + 0], rtol=1e-5, atol=1e-5)
+    for shift in (1e-6, -1e-6):
+        torch.testing.assert_close(encode(lattice + shift, field), encode(lattice, field), rtol=0, atol=1e-3)
+
+
+def test_encoding_runs_in_float64_too() -> None:
+    field = hash_field().double()
+    assert field(points(5).double()).dtype == torch.float64
+
+
+@pytest.mark.parametrize("make", [hash_field, mlp_field], ids=["hash", "mlp"])
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_the_contract(make: Callable[..., nn.Module], degree: int) -> None:
+    field = make(degree)
+    at = points()
+    out = field(at)
+    assert out.shape == (len(at), 1 + 3 * (degree + 1) ** 2)
+    torch.testing.assert_close(field.density(at), out[:, 0])
+    assert field.degree == degree
+    assert field.activation in ("exp", "softplus")
+    assert field(at[:0]).shape == (0, out.shape[1])
+    assert torch.equal(make(degree)(at), out)  # the same generator gives the same field
+    assert not torch.equal(make(degree, seed=1)(at), out)
+
+
+@pytest.mark.parametrize("make", [hash_field, mlp_field], ids=["hash", "mlp"])
+def test_every_parameter_has_a_gradient(make: Callable[..., nn.Module]) -> None:
+    field = make()
+    field(points()).square().sum().backward()
+    for name, p in field.named_parameters():
+        assert p.grad is not None, name
+        assert p.grad.abs().sum() > 0, name
+
+
+def test_an_untrained_hash_field_is_thin_and_grey() -> None:
+    field = HashField(levels=4, log2_table=10, coarsest=4, finest=64, hidden=16, layers=1, degree=2, generator=torch.Generator().manual_seed(0))
+    out = field(points()).detach()
+    assert out.abs().max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("hidden", "layers", "expected"),
+    [
+        # (inputs + 1) * outputs, layer by layer: 63 in, the skip adds 63 to the layer in the middle, 49 out
+        (256, 8, 64 * 256 + 6 * 257 * 256 + (256 + 64) * 256 + 257 * 49),
+        (128, 4, 64 * 128 + 2 * 129 * 128 + (128 + 64) * 128 + 129 * 49),
+    ],
+)
+def test_the_papers_networks_have_the_papers_sizes(hidden: int, layers: int, expected: int) -> None:
+    field = MlpField(hidden=hidden, layers=layers, degree=3, generator=torch.Generator().manual_seed(0))
+    assert sum(p.numel() for p in field.parameters()) == expected
+    assert field(torch.rand(2, 3)).shape == (2, 49)
+
+
+def test_positional_encoding_has_63_numbers_and_its_closed_form() -> None:
+    at = torch.tensor([[0.3, -0.7, 1.0]], dtype=torch.float64)
+    x = at[0].tolist()
+    angles = [2**l * v for l in range(10) for v in x]
+    expected = [*x, *np.sin(angles), *np.cos(angles)]
+    np.testing.assert_allclose(positional_encoding(at)[0], expected, atol=1e-12)
+    assert positional_encoding(at).shape == (1, 63)
+
+
+@pytest.mark.parametrize("layers", [1, 2, 3])
+def test_shallow_networks_work(layers: int) -> None:
+    field = MlpField(hidden=8, layers=layers, degree=0, generator=torch.Generator().manual_seed(0))
+    assert field(torch.rand(3, 3)).shape == (3, 4)

@@ -1,0 +1,133 @@
+"""Adam and the directions of training pixels against what they stand for; the kernels' other pairs are with what they replace."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from efficientnerf.cameras import Camera, rays
+from efficientnerf.training import BETA1, BETA2, EPSILON, Adam, Pixels
+from tests import reference
+
+RATES = [0.01, 0.02, 0.015, 0.01]
+
+
+def gradients(shape: tuple[int, ...] = (50, 2)) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    return [torch.randn(shape, generator=generator) * 10.0 ** -(2 * n) for n in range(len(RATES))]
+
+
+def stepped(name: str, grads: list[torch.Tensor]) -> nn.Parameter:
+    p = nn.Parameter(torch.ones_like(grads[0]))
+    adam = Adam([(name, p)])
+    for number, (grad, rate) in enumerate(zip(grads, RATES, strict=True), 1):
+        p.grad = grad.clone()
+        adam.step(number, rate)
+        assert p.grad is None
+    return p
+
+
+def test_adam_is_torchs() -> None:
+    theirs = nn.Parameter(torch.ones(50, 2))
+    optimiser = torch.optim.Adam([theirs], betas=(BETA1, BETA2), eps=EPSILON)
+    for grad, rate in zip(gradients(), RATES, strict=True):
+        theirs.grad = grad.clone()
+        optimiser.param_groups[0]["lr"] = rate
+        optimiser.step()
+    torch.testing.assert_close(stepped("fine.weights.0", gradients()), theirs, rtol=2e-5, atol=1e-6)
+
+
+def test_adam_is_the_papers() -> None:
+    ours = stepped("fine.weights.0", gradients())
+    for entry in (0, 7, 49):
+        expected = reference.adam(1.0, [float(g[entry, 1]) for g in gradients()], RATES, BETA1, BETA2, EPSILON)
+        assert float(ours[entry, 1].detach()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_table_entries_without_a_gradient_are_left_alone() -> None:
+    grads = gradients()
+    for grad in grads[1:]:
+        grad[10:20] = 0
+    sparse, dense = stepped("fine.table", grads).detach(), stepped("fine.weights.0", grads).detach()
+    once = stepped("fine.table", [grads[0], *[torch.zeros(50, 2)] * 3]).detach()
+    assert torch.equal(sparse[10:20], once[10:20])
+    assert (dense[10:20] != once[10:20]).all()
+    assert torch.equal(sparse[20:], dense[20:])
+
+
+def test_a_parameter_that_was_not_used_is_left_alone() -> None:
+    p = nn.Parameter(torch.ones(3))
+    Adam([("sky.sh", p)]).step(1, 0.1)
+    assert torch.equal(p.detach(), torch.ones(3))
+
+
+@pytest.mark.gpu
+def test_adam_on_the_device_is_that_of_the_kernel() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    for name in ("fine.table", "fine.weights.0"):
+        grads = gradients()
+        grads[1][:30] = 0
+        there = stepped(name, [grad.cuda() for grad in grads])
+        torch.testing.assert_close(there.detach().cpu(), stepped(name, grads).detach(), rtol=2e-5, atol=1e-6)
+
+
+def rotation(seed: int) -> np.ndarray:
+    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.sign(np.linalg.det(q))
+
+
+def camera(n: int, model: str, params: tuple[float, ...], width: int = 9, height: int = 7) -> Camera:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation(n), (n, -n, 0.5)
+    return Camera(f"v{n}", width, height, model, params, pose)
+
+
+def test_bundles_hold_the_rays_of_their_cameras() -> None:
+    cameras = [
+        camera(0, "OPENCV", (8.0, 8.5, 4.4, 3.6, 0.05, -0.01, 0.002, 0.001)),
+        camera(1, "SIMPLE_PINHOLE", (9.0, 5.0, 4.0), 10, 8),
+        camera(2, "OPENCV", (8.0, 8.5, 4.4, 3.6, 0.05, -0.01, 0.002, 0.001)),  # shares the first one's lens
+    ]
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (c.height, c.width, 3), dtype=np.uint8) for c in cameras]
+    near, far = np.array([0.1, 0.2, 0.3]), np.array([4.0, 5.0, 6.0])
+    pixels = Pixels(cameras, images, [None, None, None], near, far)
+    assert len(pixels.lookup) == 9 * 7 + 10 * 8
+    order = rng.permutation(len(pixels))
+    origins, directions, enter, leave, colour = pixels.bundle(order)
+    expected = [rays(c) for c in cameras]
+    slant = np.concatenate([d @ c.forward for c, (_, d) in zip(cameras, expected, strict=True)])
+    view = np.repeat(np.arange(3), [63, 80, 63])
+    np.testing.assert_allclose(origins, np.concatenate([o for o, _ in expected])[order], atol=1e-6)
+    np.testing.assert_allclose(directions, np.concatenate([d for _, d in expected])[order], atol=1e-6)
+    np.testing.assert_allclose(enter, (near[view] / slant)[order], rtol=1e-5)
+    np.testing.assert_allclose(leave, (far[view] / slant)[order], rtol=1e-5)
+    np.testing.assert_allclose(colour, np.concatenate([i.reshape(-1, 3) for i in images])[order] / 255, rtol=1e-6)
+
+
+def test_an_image_without_alpha_among_others_is_opaque() -> None:
+    cameras = [camera(n, "SIMPLE_PINHOLE", (9.0, 4.5, 3.5)) for n in range(2)]
+    images = [np.full((7, 9, 3), 10, np.uint8), np.full((7, 9, 4), 20, np.uint8)]
+    colour = Pixels(cameras, images, [None, None], np.ones(2), np.full(2, 2.0)).bundle(np.array([0, 63]))[4]
+    np.testing.assert_allclose(colour * 255, [[10, 10, 10, 255], [20] * 4], rtol=1e-6)
+
+
+def test_masks_leave_pixels_out() -> None:
+    cameras = [camera(n, "SIMPLE_PINHOLE", (9.0, 4.5, 3.5)) for n in range(2)]
+    images = [np.zeros((7, 9, 3), np.uint8)] * 2
+    mask = np.zeros((7, 9), bool)
+    mask[3, 4] = True
+    pixels = Pixels(cameras, images, [mask, None], np.ones(2), np.full(2, 2.0))
+    chosen = pixels.choose(5000, np.random.default_rng(0))
+    assert len(chosen) == 5000
+    assert set(chosen.tolist()) == {3 * 9 + 4, *range(63, 126)}
+
+
+def test_masks_that_leave_nothing_are_refused() -> None:
+    cameras, image = [camera(0, "SIMPLE_PINHOLE", (9.0, 4.5, 3.5))], np.zeros((7, 9, 3), np.uint8)
+    with pytest.raises(ValueError, match="masks leave no pixel"):
+        Pixels(cameras, [image], [np.zeros((7, 9), bool)], np.ones(1), np.full(1, 2.0))
