@@ -116,13 +116,15 @@ def _map(
     return [model for _, model in sorted(models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))]
 
 
-def refined(model: Any, images: Sequence[WorkImage], safe_point: matches.SafePoint) -> Any:
+def refined(work: Path, images: Sequence[WorkImage], model: Any, safe_point: matches.SafePoint) -> Any:
     """The model after a last bundle adjustment with Cauchy's loss at the scale of its own reprojection error.
 
     The mapper's squared loss lets the matches that are wrong by a few pixels pull at everything; on the sample photographs the robust
     one leaves a third of the error of the camera centres. Lenses that SIMPLE_RADIAL does not describe get OPENCV's eight parameters,
     where these lower the mean reprojection error by 1 %; with thousands of observations, what no lens explains does not. (All must be
-    adjusted for the comparison: points and poses hide most of what a lens does wrong.) A lens held at its EXIF data stays.
+    adjusted for the comparison: points and poses hide most of what a lens does wrong.) Where the motion does not determine a lens, the
+    parameters drift to what no lens has, and the matches that the mapper dropped agree less: then they are not taken. A lens held at its
+    EXIF data stays.
     """
     with matches.quiet_pycolmap() as pycolmap:
         held = {camera.camera_id for camera, prior in _lenses(images, model) if camera.focal_length == prior}
@@ -140,7 +142,8 @@ def refined(model: Any, images: Sequence[WorkImage], safe_point: matches.SafePoi
         safe_point()
         _adjust(pycolmap, richer, held)
         better = richer.compute_mean_reprojection_error() < 0.99 * model.compute_mean_reprojection_error()
-    return richer if better else model
+    square = all(abs(richer.cameras[i].focal_length_x / richer.cameras[i].focal_length_y - 1) < 0.02 for i in bendable)
+    return richer if better and square and agreement_of(work, images, richer) >= agreement_of(work, images, model) - 0.001 else model
 
 
 def _lens_counts(model: Any) -> dict[int, int]:

@@ -71,7 +71,7 @@ def find_cameras(
     rejected = [*unreadable, *_left_out(work, images, models)]
     if mapping.registered(models) < max(mapping.FEWEST, len(images) / 2):
         raise BadInput(_failure(folder, images, models, rejected, matching))
-    capture = _capture(folder, work, images, mapping.refined(models[0], images, safe_point), masks, rejected)
+    capture = _capture(folder, work, images, mapping.refined(work, images, models[0], safe_point), masks, rejected)
     for sentence in capture.warnings:
         warn(sentence)
     return capture
