@@ -52,7 +52,10 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
         opacity[span.start : span.stop] = part.opacity.reshape(shape).mean(axis=2)
         along = (part.depth * (directions @ camera.forward)).astype(np.float32).reshape(shape)
         # The nearest half of the samples decides; the mean of a near and a far surface would lie on neither.
-        depth[span.start : span.stop] = np.sort(along, axis=2)[:, :, (supersample**2 - 1) // 2]
+        along.sort(axis=2)
+        hits = np.isfinite(along).sum(axis=2, keepdims=True)  # less than half may do, where the others are half transparent
+        middle = np.clip(hits - 1, 0, (supersample**2 - 1) // 2)
+        depth[span.start : span.stop] = np.take_along_axis(along, middle, axis=2)[:, :, 0]
         facing = part.normal.reshape(*shape, 3).sum(axis=2)
         normal[span.start : span.stop] = facing / np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-12)
     depth[opacity < 0.5] = np.inf

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 STEP = 0.5  # of a voxel
 STOP = 1e-3  # transmittance at which a ray ends
-FAINT = 1e-4  # weight under which a sample's colour is not looked up (its weight still counts)
+FAINT = 1e-4  # weight under which a sample's colour is not looked up; the next one that is looked up stands for it
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -65,10 +65,10 @@ def _corners(u, v, w, brick, brick_index, voxel_index, index, weight):  # type: 
 @numba.njit(cache=True, error_model="numpy")
 def _density(u, v, w, brick, brick_index, voxel_index, density, index, weight):  # type: ignore[no-untyped-def]
     """Density at a point in voxel coordinates; zero in an empty coarse cell. Leaves the corners in `index` and `weight`."""
-    if u < 0 or v < 0 or w < 0:
+    # Compared before they become integers: what is no number, or too large for one, must not become an index.
+    if not (0 <= u < brick_index.shape[0] * brick and 0 <= v < brick_index.shape[1] * brick and 0 <= w < brick_index.shape[2] * brick):
         return np.float32(0)
-    a, b, c = int(u) // brick, int(v) // brick, int(w) // brick
-    if a >= brick_index.shape[0] or b >= brick_index.shape[1] or c >= brick_index.shape[2] or brick_index[a, b, c] < 0:
+    if brick_index[int(u) // brick, int(v) // brick, int(w) // brick] < 0:
         return np.float32(0)
     _corners(u, v, w, brick, brick_index, voxel_index, index, weight)
     total = np.float32(0)
@@ -142,7 +142,7 @@ def _render(origins, directions, bases, brick, brick_index, voxel_index, density
                 t1 = -1.0
             light = np.float32(1)
             hit = np.inf
-            r = g = b = np.float32(0)
+            r = g = b = owed = np.float32(0)
             k = 0
             last = int(np.floor((t1 - t0) / step)) + 1 if t1 > t0 else 0
             while k < last:
@@ -171,12 +171,13 @@ def _render(origins, directions, bases, brick, brick_index, voxel_index, density
                 if sigma > 0:
                     reach = sigma * np.float32(step * units)
                     alpha = np.float32(1) - np.exp(-reach)
-                    share = light * alpha
-                    if share > faint:
+                    owed += light * alpha
+                    if owed > faint:
                         _colour(index, weight, sh, bases[ray], rgb)
-                        r += share * rgb[0]
-                        g += share * rgb[1]
-                        b += share * rgb[2]
+                        r += owed * rgb[0]
+                        g += owed * rgb[1]
+                        b += owed * rgb[2]
+                        owed = np.float32(0)
                     left = light * (np.float32(1) - alpha)
                     if hit == np.inf and left <= 0.5:
                         hit = t - 0.5 * step + np.log(2 * light) / (sigma * units)

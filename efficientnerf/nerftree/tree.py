@@ -151,7 +151,7 @@ class NerfTree:
         inside = [(a >= 0) & (a < n) for a, n in zip(axes, self.resolution, strict=True)]
         out = np.zeros(tuple(high_a - low_a), np.float32)
         i, j, k = (a[m] for a, m in zip(axes, inside, strict=True))
-        if not (len(i) and len(j) and len(k)):
+        if not (len(i) and len(j) and len(k) and len(self.voxel_index)):
             return out
         d = self.brick
         brick = self.brick_index[np.ix_(i // d, j // d, k // d)]
