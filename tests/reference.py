@@ -154,15 +154,15 @@ def march(
             stretch = reach**2
         if t >= leave:
             break
-        extent = step * stretch
+        extent = min(step * stretch, leave - t)
         u = unit(t + offset * extent)
         point = [(x + reach_of_grid) / (2 * reach_of_grid) for x in (contract(u) if contracted else u)]
         tried += 1
         cell = tuple(min(max(math.floor(x * side), 0), side - 1) for x in point)
         margin = min(margin, *(abs(x * side - round(x * side)) if 0 < round(x * side) < side else math.inf for x in point))
         if voxels[cell] > threshold:
-            samples.append((t, extent, step, point))
-        t += extent
+            samples.append((t, extent, extent / stretch, point))
+        t += step * stretch
     return March(samples, tried, margin)
 
 

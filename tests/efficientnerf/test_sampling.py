@@ -112,7 +112,15 @@ def test_intervals_lie_end_to_end_and_samples_in_them(finder: str, contracted: b
     torch.testing.assert_close((found.start + found.extent)[:-1][same], found.start[1:][same], rtol=1e-5, atol=1e-5)
     at = found.start + rays.offset[ray] * found.extent
     torch.testing.assert_close(found.point, space.grid(rays.origins[ray] + at[:, None] * rays.directions[ray]), rtol=0, atol=1e-5)
-    torch.testing.assert_close(found.length, torch.full_like(found.length, STEP))
+    last = torch.zeros_like(found.start, dtype=torch.bool)
+    last[found.first[1:][found.first[1:] > found.first[:-1]] - 1] = True
+    torch.testing.assert_close(found.length[~last], torch.full_like(found.length[~last], STEP))
+    assert (found.length[last] <= STEP * 1.0001).all()
+    if not contracted:
+        assert found.point.min() >= -1e-5  # nothing beyond the box is asked for
+        assert found.point.max() <= 1 + 1e-5
+        chord = (found.start + found.extent)[last] - found.start[found.first[:-1][found.first[1:] > found.first[:-1]]]
+        torch.testing.assert_close(torch.zeros(len(rays.far)).index_add(0, ray, found.extent)[ray[last]], chord, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("coarse_samples", [16, 128])

@@ -1,0 +1,123 @@
+"""The model: both stages along rays, the counts of what is evaluated, sizes and states."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from efficientnerf.grid import Space
+from efficientnerf.model import Model, look, model, restore, state_of
+from efficientnerf.settings import TrainSettings
+from tests.efficientnerf.balls import BOUNDS, pixels, untrained
+
+
+class Counting(nn.Module):
+    """A field that remembers where it was asked: a ball of density e^6 round the grid's centre, e^-6 elsewhere."""
+
+    activation, degree = "exp", 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[Tensor] = []
+
+    def forward(self, points: Tensor) -> Tensor:
+        self.asked.append(points)
+        inside = (points - 0.5).norm(dim=1) < 0.25
+        return torch.cat([torch.where(inside, 6.0, -6.0)[:, None], torch.zeros(len(points), 3)], dim=1)
+
+
+def bundle(count: int = 64) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    some = pixels()
+    origins, directions, near, far, _ = some.bundle(some.choose(count, np.random.default_rng(0)))
+    return *(torch.from_numpy(a) for a in (origins, directions, near, far)), torch.full((count,), 0.3)
+
+
+def seen_by(m: Model, *, prune: bool = True, rays: tuple[Tensor, ...] | None = None):  # type: ignore[no-untyped-def]
+    rays = rays or bundle()
+    return look(m, *rays, torch.ones(len(rays[0]), 3), prune=prune)  # type: ignore[misc]
+
+
+def test_nothing_is_evaluated_twice_and_nothing_that_need_not_be() -> None:
+    m = untrained()
+    m.coarse, m.fine = Counting(), Counting()
+    inside = m.voxels.values
+    axis = (torch.arange(24) + 0.5) / 24 - 0.5
+    away = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
+    inside.copy_(torch.where(away < 0.3, 1e3, 0.0))
+    seen = seen_by(m)
+    (coarse,), (fine,) = m.coarse.asked, m.fine.asked
+    assert len(torch.unique(coarse, dim=0)) == len(coarse) == len(seen.coarse.start)
+    assert len(torch.unique(fine, dim=0)) == len(fine) == len(seen.fine.start)
+    assert (coarse - 0.5).norm(dim=1).max() < 0.3 + math.sqrt(3) / 24  # valid voxels only
+    assert len(coarse) < seen.coarse.tried / 2
+    assert len(fine) == m.settings.fine_samples * int(seen.pivotal.sum())
+    assert torch.equal(seen.pivotal, seen.coarse_weight > m.settings.pivotal_weight)
+    assert 0 < int(seen.pivotal.sum()) < 0.7 * len(coarse)  # what lies behind the surface is not
+    everything = seen_by(m, prune=False)
+    assert len(everything.coarse.start) == everything.coarse.tried == seen.coarse.tried
+    torch.testing.assert_close(everything.fine_opacity, seen.fine_opacity, rtol=0, atol=2e-2)
+
+
+def test_rays_that_meet_nothing_show_the_background() -> None:
+    for field in ("hash", "mlp"):
+        m = untrained(field=field)
+        m.voxels.values.fill_(-1.0)
+        seen = seen_by(m)
+        assert len(seen.coarse.start) == len(seen.fine.start) == 0
+        assert (seen.fine_colour == 1).all()
+        assert (seen.fine_opacity == 0).all()
+        origins, directions, *rest = bundle()
+        assert (seen_by(m, prune=False, rays=(origins, -directions, *rest)).fine_colour == 1).all()
+
+
+@pytest.mark.parametrize("field", ["hash", "mlp"])
+def test_the_same_settings_give_the_same_numbers(field: str) -> None:
+    first, again, other = untrained(field=field), untrained(field=field), untrained(field=field, seed=1)
+    assert all(torch.equal(a, b) for a, b in zip(state_of(first).values(), state_of(again).values(), strict=True))
+    assert not torch.equal(dict(first.parameters())["fine.weights.0"], dict(other.parameters())["fine.weights.0"])
+
+
+def test_the_papers_model_has_the_papers_sizes() -> None:
+    paper = TrainSettings(
+        field="mlp", degree=3, hidden=256, layers=8, coarse_hidden=128, coarse_layers=4, coarse_samples=64, fine_samples=2, voxels=384, voxel_rule="momentum"
+    )
+    m = model(Space(BOUNDS, False), paper, (1.0, 1.0, 1.0))
+    assert m.fine(torch.rand(2, 3)).shape == (2, 49)
+    assert m.coarse(torch.rand(2, 3)).shape == (2, 49)
+    assert m.voxels.values.shape == (384, 384, 384)
+    assert m.voxels.threshold == 0
+    assert float(m.voxels.values.max()) == 10
+    assert m.step == pytest.approx(2 * math.sqrt(3) / 64)
+
+
+def test_the_maximum_rules_threshold_is_an_absorption_over_an_interval() -> None:
+    m = untrained(voxel_rule="maximum", voxel_absorption=0.01)
+    assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.01)
+    assert m.voxels.occupied == 1.0
+
+
+def test_states_are_restored_and_what_does_not_fit_is_named() -> None:
+    m, other = untrained(seed=0), untrained(seed=5)
+    other.voxels.values.uniform_(generator=torch.Generator().manual_seed(0))
+    restore(m, state_of(other))
+    assert all(torch.equal(a, b) for a, b in zip(state_of(m).values(), state_of(other).values(), strict=True))
+    state = state_of(other)
+    with pytest.raises(ValueError, match="tensor 'voxels' is missing"):
+        restore(m, {name: t for name, t in state.items() if name != "voxels"})
+    with pytest.raises(ValueError, match=r"tensor 'voxels' is torch.float32 \(2, 2, 2\); expected torch.float32 \(24, 24, 24\)"):
+        restore(m, state | {"voxels": torch.zeros(2, 2, 2)})
+    with pytest.raises(ValueError, match="float64"):
+        restore(m, state | {"voxels": state["voxels"].double()})
+
+
+def test_surroundings_have_a_colour_of_their_own_behind_all_samples() -> None:
+    m = untrained(contracted=True)
+    directions = torch.nn.functional.normalize(torch.randn(10, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    assert (m.behind(directions) == 0.5).all()
+    with torch.no_grad():
+        m.sky.sh[0] = torch.tensor([9.0, -9.0, 0.0])
+    assert m.behind(directions)[:, 0].min() > 0.9 > 0.1 > m.behind(directions)[:, 1].max()

@@ -1,0 +1,221 @@
+"""Pictures of trees and fields: loop, torch and kernel against each other, closed forms, and what skipping may not change."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.cameras import Camera
+from efficientnerf.nerftree.tree import NerfTree, Rendering
+from efficientnerf.render import FieldRenderer, render_tree_reference
+from tests import reference
+from tests.efficientnerf.balls import pose, untrained
+from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+
+TREES = [(1, 0), (3, 1), (4, 2), (5, 3), (2, 4)]
+
+
+def looking(tree: NerfTree, side: int = 20) -> Camera:
+    at = pose(0.7, 0.4)
+    at[:3, 3] += (tree.bounds_min + tree.bounds_max) / 2
+    return Camera("view", side, side + 3, "SIMPLE_PINHOLE", (1.5 * side, side / 2, side / 2), at)
+
+
+def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
+    return [torch.from_numpy(a) for a in arrays]
+
+
+@pytest.mark.parametrize(("brick", "degree"), TREES)
+def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree)
+    origins, directions = rays_at(tree, 400)
+    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
+    seen = tree.render_rays(origins, directions)
+    # The kernel stops at 1e-3 of the light and is in float32.
+    np.testing.assert_allclose(seen.opacity, opacity, atol=1.2e-3)
+    np.testing.assert_allclose(seen.colour, colour, atol=1.2e-3)
+    assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
+    assert seen.opacity.max() > 0.8
+
+
+@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
+def test_the_torch_function_is_the_loop(brick: int, degree: int) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree)
+    origins, directions = rays_at(tree, 24)
+    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
+    depth = tree.render_rays(origins, directions).depth
+    for r in range(24):
+        wanted_colour, wanted_opacity, wanted_depth = reference.tree_ray(tree, origins[r], directions[r])
+        np.testing.assert_allclose(colour[r], wanted_colour, atol=1e-6)
+        assert float(opacity[r]) == pytest.approx(wanted_opacity, abs=1e-6)
+        if abs(wanted_opacity - 0.5) > 1e-3:
+            assert depth[r] == pytest.approx(wanted_depth, abs=1e-3)
+
+
+def test_gradients_of_the_torch_function_are_finite_differences() -> None:
+    tree = random_tree(1, shape=(2, 1, 2), brick=2, degree=1, share=0.8, sigma=8.0)
+    origins, directions = tensors(*rays_at(tree, 5))
+    density = torch.from_numpy(tree.density_values).double().requires_grad_()
+    sh = torch.from_numpy(tree.sh).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda d, s: render_tree_reference(tree, origins, directions, d, s), (density, sh), fast_mode=True)
+    render_tree_reference(tree, origins, directions, density, sh)[0].sum().backward()
+    assert density.grad is not None
+    assert density.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.5])
+def test_leaping_changes_no_value(share: float) -> None:
+    tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
+    origins, directions = rays_at(tree, 600)
+    usual = tree.render_rays(origins, directions)
+    for most in (0, 1, 2):
+        timid = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
+        timid.__dict__["leap"] = np.minimum(tree.leap, most)
+        other = timid.render_rays(origins, directions)
+        for name in ("colour", "opacity", "depth", "normal"):
+            assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
+def test_a_uniform_box_has_its_closed_form() -> None:
+    """Away from the faces, where interpolation thins it, the density is sigma: opacity and depth follow."""
+    tree = uniform_tree(sigma=2.0)
+    middle = (tree.bounds_min + tree.bounds_max) / 2
+    origin = np.array([middle[0] - 0.5, middle[1], middle[2]])  # inside
+    seen = tree.render_rays(origin[None], np.array([[1.0, 0, 0]]))
+    # The last half voxel before the face is at half of the density on average and better: three quarters of sigma over it.
+    chord = (tree.bounds_max[0] - origin[0]) - 0.125 * tree.voxel
+    assert float(seen.opacity[0]) == pytest.approx(1 - math.exp(-2 * chord), abs=2e-3)
+    assert float(seen.depth[0]) == pytest.approx(math.log(2) / 2, abs=1e-3)
+    np.testing.assert_allclose(seen.colour[0], seen.opacity[0] * reference.sigmoid(0.7), atol=1e-3)
+
+
+@pytest.mark.parametrize("sigma", [0.002, 0.02, 0.2, 2.0])
+def test_one_colour_everywhere_gives_that_colour_however_thin(sigma: float) -> None:
+    tree = uniform_tree((24, 24, 24), brick=2, sigma=sigma, logit=0.7)
+    origins, directions = rays_at(tree, 80)
+    seen = tree.render_rays(origins, directions)
+    np.testing.assert_allclose(seen.colour, seen.opacity[:, None] * reference.sigmoid(0.7) * np.ones(3), atol=2e-4)
+
+
+def test_normals_face_the_ray() -> None:
+    tree = uniform_tree(sigma=60.0)
+    middle = (tree.bounds_min + tree.bounds_max) / 2
+    directions = np.concatenate([np.eye(3), -np.eye(3)])
+    seen = tree.render_rays(middle - 3 * directions, directions)
+    np.testing.assert_allclose(seen.normal, -directions, atol=1e-3)
+    np.testing.assert_allclose(seen.depth, 3 - 0.8, atol=0.05)
+
+
+def test_pictures_are_their_rays() -> None:
+    from efficientnerf.cameras import rays
+
+    tree = random_tree(0, share=0.7)
+    camera = looking(tree)
+    picture = tree.render(camera)
+    flat = tree.render_rays(*rays(camera))
+    shape = (camera.height, camera.width)
+    assert np.array_equal(picture.colour.reshape(-1, 3), flat.colour)
+    assert np.array_equal(picture.opacity.reshape(-1), flat.opacity)
+    slant = (rays(camera)[1] @ camera.forward).reshape(shape)
+    np.testing.assert_allclose(picture.depth, flat.depth.reshape(shape) * slant, rtol=1e-5)
+    assert np.array_equal(np.isinf(picture.depth), picture.opacity < 0.5)
+    assert [getattr(picture, name).dtype for name in ("colour", "opacity", "depth", "normal")] == [np.float32] * 4
+
+
+def test_a_background_lies_behind() -> None:
+    tree = random_tree(0, share=0.7)
+    camera = looking(tree)
+    plain, over = tree.render(camera), tree.render(camera, background=(1.0, 0.5, 0.0))
+    np.testing.assert_allclose(over.colour, plain.colour + (1 - plain.opacity[..., None]) * [1.0, 0.5, 0.0], atol=1e-6)
+    assert np.array_equal(over.opacity, plain.opacity)
+
+
+def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
+    from efficientnerf.cameras import resized
+
+    tree = random_tree(0, share=0.7)
+    camera = looking(tree)
+    fine = tree.render(resized(camera, camera.width * 3, camera.height * 3))
+    coarse = tree.render(camera, supersample=3)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return values.reshape(camera.height, 3, camera.width, 3, -1).mean((1, 3))
+
+    np.testing.assert_allclose(coarse.colour, mean(fine.colour), atol=1e-5)
+    np.testing.assert_allclose(coarse.opacity, mean(fine.opacity)[..., 0], atol=1e-5)
+    with pytest.raises(ValueError, match="expected at least 1"):
+        tree.render(camera, supersample=0)
+
+
+@pytest.mark.parametrize("supersample", [1, 2, 3])
+def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: int) -> None:
+    tree = random_tree(4, share=0.7, sigma=20.0)
+    picture = tree.render(looking(tree, 40), supersample=supersample)
+    assert np.array_equal(np.isfinite(picture.depth), picture.opacity >= 0.5)
+    length = np.linalg.norm(picture.normal, axis=-1)
+    assert ((np.abs(length - 1) < 1e-3) | (length == 0)).all()
+
+
+def test_pictures_do_not_depend_on_how_they_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    from efficientnerf import render
+
+    tree = random_tree(0, share=0.7)
+    whole = tree.render(looking(tree), supersample=2)
+    monkeypatch.setattr(render, "RAYS_PER_BLOCK", 100)
+    cut = tree.render(looking(tree), supersample=2)
+    for name in ("colour", "opacity", "depth", "normal"):
+        assert np.array_equal(getattr(whole, name), getattr(cut, name)), name
+
+
+def test_a_rendering_of_no_rays() -> None:
+    seen = random_tree(0).render_rays(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert isinstance(seen, Rendering)
+    assert seen.colour.shape == (0, 3)
+
+
+@pytest.mark.gpu
+def test_the_torch_function_runs_on_the_device() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    tree = random_tree(0, share=0.7)
+    origins, directions = rays_at(tree, 200)
+    there = render_tree_reference(tree, *(t.float().cuda() for t in tensors(origins, directions)))
+    seen = tree.render_rays(origins, directions)
+    np.testing.assert_allclose(there[0].cpu(), seen.colour, atol=2e-3)
+
+
+# Fields.
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_a_fields_picture_is_what_lies_before_in_and_behind_the_box(contracted: bool) -> None:
+    m = untrained(contracted=contracted)
+    m.fine.weights[-1].data.mul_(30)  # no longer thin: something lies everywhere
+    m.fine.table.data.mul_(3e3)
+    camera = Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
+    seen = FieldRenderer(m, 0.5, 30.0).render(camera)
+    assert np.array_equal(seen.colour, FieldRenderer(m, 0.5, 30.0).render(camera).colour)  # no noise
+    assert seen.inside_opacity.mean() > 0.01
+    assert seen.inside_opacity.max() <= 1
+    if not contracted:
+        assert not seen.before.any()
+        np.testing.assert_allclose(seen.behind, 1, atol=1e-5)
+        np.testing.assert_allclose(seen.inside_opacity, seen.opacity, atol=1e-5)
+    assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
+
+
+def test_a_fields_picture_does_not_depend_on_how_it_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    from efficientnerf import render
+
+    m = untrained()
+    camera = Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
+    whole = FieldRenderer(m, 0.5, 30.0).render(camera)
+    monkeypatch.setattr(render, "FIELD_RAYS_PER_BLOCK", 11)
+    calls: list[tuple[int, int]] = []
+    cut = FieldRenderer(m, 0.5, 30.0).render(camera, lambda done, total: calls.append((done, total)))
+    np.testing.assert_allclose(cut.colour, whole.colour, atol=1e-6)
+    np.testing.assert_allclose(cut.opacity, whole.opacity, atol=1e-6)
+    assert calls[-1] == (63, 63)

@@ -1,0 +1,138 @@
+"""Training on an analytic ball: it learns, does not collapse, repeats, and goes on where it was."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf import training
+from efficientnerf.model import Model, look
+from efficientnerf.training import Pixels, Progress, learning_rate, restore, state_of, train, trainer
+from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
+
+MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_rate": 1e-2}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> object:
+    """The rate rises in a few steps; and one thread: sums are repeatable for a fixed number, and one keeps other work from slowing these small ones."""
+    monkeypatch.setattr(training, "RATE_WARM_UP", 10)
+    usual = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(usual)
+
+
+def run(m: Model, which: Pixels | None = None) -> list[Progress]:
+    return list(train(trainer(m), which or pixels()))
+
+
+def psnr_of(steps: list[Progress]) -> float:
+    return -10 * math.log10(np.mean([step.loss for step in steps]))
+
+
+@pytest.mark.parametrize("rule", ["momentum", "maximum"])
+@pytest.mark.parametrize("field", ["hash", "mlp"])
+def test_it_learns(field: str, rule: str) -> None:
+    m = untrained(voxel_rule=rule, **(dict(MLP, iterations=40) if field == "mlp" else {}))
+    steps = run(m)
+    assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + (2 if field == "hash" else 1)
+    assert [step.step for step in steps] == list(range(1, m.settings.iterations + 1))
+    assert all(step.fine == m.settings.fine_samples * step.pivotal and step.pivotal <= step.valid <= step.tried for step in steps)
+    for step in steps[: m.settings.warm_up]:
+        assert step.valid == step.tried  # nothing is pruned in the warm-up
+
+
+def test_surroundings_are_learned_too() -> None:
+    made = cameras()
+    photographs = Pixels(made, [photograph(camera) for camera in made], [None] * len(made), np.full(len(made), 1.0), np.full(len(made), 50.0))
+    steps = run(untrained(contracted=True), photographs)
+    assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 2
+
+
+@pytest.mark.parametrize("field", ["hash", "mlp"])
+def test_a_thin_white_scene_does_not_collapse_to_its_background(field: str) -> None:
+    """A ball of a few pixels on white: seeing nothing at all is a good guess, and the wrong one."""
+    m = untrained(iterations=80, **(MLP if field == "mlp" else {}))
+    thin = pixels(8, 20, 0.25)
+    run(m, thin)
+    origins, directions, near, far = (torch.from_numpy(a) for a in thin.bundle(np.arange(len(thin)))[:4])
+    with torch.no_grad():
+        opacity = look(m, origins, directions, near, far, torch.full_like(near, 0.5), torch.ones(len(thin), 3)).fine_opacity.numpy()
+    on_ball = thin.images[:, 3] > 200
+    assert 0 < on_ball.mean() < 0.06
+    if field == "hash":
+        assert opacity[on_ball].mean() > opacity[~on_ball].mean() + 0.2
+    else:  # a network needs longer, but is on its way
+        assert opacity[on_ball].mean() > 2 * opacity[~on_ball].mean()
+    assert m.voxels.occupied > 0
+
+
+def test_two_runs_give_the_same_bytes_and_another_seed_others() -> None:
+    states = []
+    for seed in (3, 3, 4):
+        t = trainer(untrained(iterations=12, warm_up=4, seed=seed))
+        list(train(t, pixels()))
+        states.append({name: tensor.numpy().tobytes() for name, tensor in state_of(t).items()})
+    assert states[0] == states[1]
+    assert states[0] != states[2]
+
+
+@pytest.mark.parametrize("field", ["hash", "mlp"])
+@pytest.mark.parametrize("at", [1, 4, 7])
+def test_a_restored_trainer_goes_on_to_the_same_bytes(field: str, at: int) -> None:
+    changes = dict(MLP if field == "mlp" else {}, iterations=10, warm_up=5, samples=2048)
+    whole = trainer(untrained(**changes))
+    kept = {}
+    for done in train(whole, pixels()):
+        if done.step == at:
+            kept = {name: tensor.clone() for name, tensor in state_of(whole).items()}
+    resumed = trainer(untrained(**changes))
+    restore(resumed, kept)
+    assert resumed.step == at
+    rest = list(train(resumed, pixels()))
+    assert len(rest) == 10 - at
+    for name, tensor in state_of(whole).items():
+        assert torch.equal(tensor, state_of(resumed)[name]), name
+
+
+def test_a_finished_run_has_nothing_left_to_do() -> None:
+    t = trainer(untrained(iterations=2))
+    assert len(list(train(t, pixels()))) == 2
+    assert list(train(t, pixels())) == []
+
+
+def test_the_number_of_rays_follows_the_samples_they_need() -> None:
+    steps = run(untrained(iterations=30, warm_up=5, samples=8192))
+    used = [step.valid + step.fine for step in steps[-10:]]
+    assert 0.7 * 8192 < np.mean(used) < 1.3 * 8192
+    assert steps[-1].rays > steps[0].rays  # at first, all intervals were expected to be sampled
+    assert run(untrained(iterations=1, rays=70))[0].rays <= 70
+
+
+def test_the_rate_rises_and_falls() -> None:
+    rates = [learning_rate(step, 1e-2, 0.05, 2000) for step in range(1, 2001)]
+    assert rates[0] < rates[4] < rates[9]
+    assert all(a >= b for a, b in itertools.pairwise(rates[9:]))
+    assert rates[-1] == pytest.approx(5e-4)
+
+
+def test_transparent_pixels_teach_no_colour() -> None:
+    """The colour under alpha 0 is anything; it must not be seen."""
+    some = pixels()
+    other = pixels()
+    hidden = other.images[:, 3] == 0
+    other.images[hidden, :3] = 77
+    assert hidden.any()
+    losses = [[step.loss for step in train(trainer(untrained(iterations=5)), p)] for p in (some, other)]
+    assert losses[0] == losses[1]
+
+
+def test_settings_say_what_they_mean() -> None:
+    for f in dataclasses.fields(settings()):
+        assert f.metadata["doc"], f.name

@@ -1,0 +1,44 @@
+"""Random sparse trees, and rays through and beside them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+
+LOW = np.array([-0.7, 0.2, -1.1])
+
+
+def random_tree(
+    seed: int = 0, *, shape: tuple[int, int, int] = (4, 3, 5), brick: int = 3, degree: int = 1, share: float = 0.3, sigma: float = 30.0, **more: Any
+) -> NerfTree:
+    """About `share` of the cells own a brick, of which two thirds of the voxels are stored. Values are halves, as in a file."""
+    rng = np.random.default_rng(seed)
+    size = np.array(shape) * brick
+    cells = rng.random(shape) < share
+    stored = cells.repeat(brick, 0).repeat(brick, 1).repeat(brick, 2) & (rng.random(size) < 0.67)
+    indices = rng.permutation(np.argwhere(stored))
+    density = (sigma * rng.random(len(indices)) ** 2).astype(np.float16).astype(np.float32)
+    sh = rng.normal(size=(len(indices), (degree + 1) ** 2, 3)).astype(np.float16).astype(np.float32)
+    return tree_from_voxels(shape, 0.1, LOW, indices, density, sh, brick=brick, **more)
+
+
+def uniform_tree(shape: tuple[int, int, int] = (4, 4, 4), *, brick: int = 4, voxel: float = 0.1, sigma: float = 5.0, logit: float = 0.7) -> NerfTree:
+    """Every voxel stored, all alike."""
+    indices = np.argwhere(np.ones(np.array(shape) * brick, bool))
+    sh = np.full((len(indices), 1, 3), logit / 0.28209479177387814, np.float32)
+    return tree_from_voxels(shape, voxel, LOW, indices, np.full(len(indices), sigma, np.float32), sh, brick=brick)
+
+
+def rays_at(tree: NerfTree, count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions: from outside, from inside, along the axes, and past the tree, a quarter each."""
+    rng = np.random.default_rng(seed)
+    target = rng.uniform(tree.bounds_min, tree.bounds_max, (count, 3))
+    directions = rng.normal(size=(count, 3))
+    kind = np.arange(count) % 4
+    axis = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
+    directions = np.where((kind == 2)[:, None], axis, directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    origins = target - directions * np.where(kind == 1, 0.0, 4.0)[:, None]
+    return np.where((kind == 3)[:, None], target + 3 * directions, origins), directions
