@@ -227,7 +227,7 @@ class Torture:
                 encoding = while_encoding(run)
                 moment = lambda child, late=late, encoding=encoding: encoding(child) or late(child)  # type: ignore[misc]  # noqa: E731
             else:
-                moment = at_share(stage, self.random.uniform(0.0, 0.8), self.seconds[stage])
+                moment = at_share(stage, self.random.uniform(0.0, 0.6), self.seconds[stage])
             if kill_when(self.arguments(run), moment, kill, run):
                 self.note(kill)
         self.end(run, f"round with kills at {', '.join(aims)}")
@@ -283,22 +283,22 @@ def source_of(images: int, folder: Path) -> Path:
 
 
 def torment(torture: Torture, kills: int, swaps: Sequence[tuple[str, str]]) -> None:
-    """`kills` in all: the swaps, matching and the video twice each if there is room, and the rest spread over the stages, two each at least."""
+    """At least `kills`: the swaps, matching and the video twice each, and the rest spread over the stages, two each at least."""
     for stage, after in swaps:
         torture.swap(stage, after)
-    special = ["matching", "mp4", "matching", "mp4"][: max(0, kills - len(torture.kills))]
-    while len(torture.kills) < kills or special:
+    wanted = {"matching": "poses", "mp4": "turntable"}
+    while True:
         room = kills - len(torture.kills)
         hits = Counter(kill.stage for kill in torture.kills)
+        special = [aim for aim in wanted if sum(kill.aim == aim and kill.stage == wanted[aim] for kill in torture.kills) < min(2, kills // 10 + 1)]
+        if room <= 0 and not special:
+            return
         plan: list[str] = []
         for stage in STAGES:
             # The plain moments first: after a kill in its last part, little of a stage is left to be hit.
-            plan += [stage] * (1 if hits[stage] >= 2 else 2 - hits[stage])
-            for aim in ("matching", "mp4"):
-                if aim in special and {"matching": "poses", "mp4": "turntable"}[aim] == stage:
-                    special.remove(aim)
-                    plan.append(aim)
-        torture.round(plan[: max(1, room)] if room > 0 else plan[:1])
+            plan += [stage] * max(0 if room <= 0 else 1, 2 - hits[stage])
+            plan += [aim for aim in special if wanted[aim] == stage]
+        torture.round(plan if room <= 0 or special else plan[: max(room, 1)])
 
 
 def main() -> int:
