@@ -22,7 +22,7 @@ MAJOR, MINOR = 1, 0
 METADATA_KEY = "nerftree"
 HEADER_LIMIT = 16 * 2**20
 MAX_CELLS = 2**30
-DTYPES = {"U8": np.dtype("<u1"), "U64": np.dtype("<u8"), "F16": np.dtype("<f2")}
+DTYPES: dict[str, np.dtype[Any]] = {"U8": np.dtype("<u1"), "U64": np.dtype("<u8"), "F16": np.dtype("<f2")}
 TENSORS = {"coarse.occupancy": "U8", "brick.mask": "U64", "voxel.density": "F16", "voxel.sh": "F16"}
 DENSITY_LIMIT = 65000.0  # fits a half
 
@@ -33,8 +33,9 @@ class FormatError(ValueError):
 
 def _bits_of(tree: NerfTree) -> tuple[np.ndarray, np.ndarray]:
     """Occupancy bits of the coarse cells, and one 64-bit mask (or several words) per brick."""
-    occupancy = np.packbits((tree.brick_index.reshape(-1) >= 0), bitorder="little")
-    stored = tree.voxel_index >= 0
+    owner = tree.brick_index.reshape(-1)
+    occupancy = np.packbits(owner >= 0, bitorder="little")
+    stored = tree.voxel_index[owner[owner >= 0]] >= 0  # bricks in the order of their cells
     words = math.ceil(tree.brick**3 / 64)
     padded = np.zeros((len(stored), words * 64), bool)
     padded[:, : tree.brick**3] = stored
@@ -53,8 +54,12 @@ def serialize(tree: NerfTree) -> bytes:
     from safetensors.numpy import save as save_tensors
 
     occupancy, mask = _bits_of(tree)
-    # Stored voxels must lie in the order of the masks: brick by brick, bit by bit.
-    order = tree.voxel_index[tree.voxel_index >= 0]
+    # Stored voxels must lie in the order of the masks: brick by brick in the order of the cells, bit by bit.
+    owner = tree.brick_index.reshape(-1)
+    order = tree.voxel_index[owner[owner >= 0]]
+    order = order[order >= 0]
+    if (tree.density_values[order] < 0).any():
+        raise FormatError("voxel.density: holds values below zero; such a tree can't be saved")
     tensors = {
         "coarse.occupancy": occupancy,
         "brick.mask": mask,
@@ -107,10 +112,14 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _json(name: str, text: bytes | str) -> dict[str, Any]:
     def refuse(token: str) -> float:
-        raise FormatError(f"{name}: JSON holds {token}, which is no number")
+        raise FormatError(f"{name}: JSON holds {token[:60]}, which is no finite number")
+
+    def finite(token: str) -> float:
+        return float(token) if math.isfinite(float(token)) else refuse(token)
 
     try:
-        value = json.loads(text, object_pairs_hook=_unique, parse_constant=refuse)
+        text = text.decode("utf-8") if isinstance(text, bytes) else text
+        value = json.loads(text, object_pairs_hook=_unique, parse_constant=refuse, parse_float=finite)
     except FormatError as error:
         raise FormatError(f"{name}: {error}") from None
     except (ValueError, RecursionError) as error:
@@ -130,7 +139,7 @@ class _Header:
             with open(path, "rb") as file:
                 first = file.read(8)
                 if len(first) < 8:
-                    raise FormatError(f"{self.name}: {self.size} bytes; a NerfTree begins with an 8-byte header length. The file is cut short or is something else.")
+                    raise FormatError(f"{self.name}: {self.size} bytes; a NerfTree begins with an 8-byte header length. The file is cut short or is none.")
                 length = int.from_bytes(first, "little")
                 if length > HEADER_LIMIT or 8 + length > self.size:
                     raise FormatError(f"{self.name}: header of {length} bytes in a file of {self.size}; the file is cut short or is no NerfTree.")
@@ -171,7 +180,7 @@ class _Header:
             raise FormatError(f"{self.name}: {self.size - self.start - at} bytes after the last tensor; the file was appended to.")
 
     def read(self, name: str) -> np.ndarray:
-        dtype, shape, begin, end = self.tensors[name]
+        dtype, shape, begin, _ = self.tensors[name]
         values = np.fromfile(self.path, DTYPES[dtype], count=math.prod(shape), offset=self.start + begin)
         if len(values) != math.prod(shape):
             raise FormatError(f"{self.name}: tensor '{name}' could not be read whole; the file changed while it was read")
@@ -192,6 +201,33 @@ def _numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, 
     return value
 
 
+def _check_frame(name: str, meta: dict[str, Any]) -> None:
+    """What may be said of the capture's frame and of the cameras' orbit must be sound where it is said."""
+    for key in ("world_from_capture", "orbit"):
+        if not isinstance(meta.get(key, {}), dict):
+            raise FormatError(f"{name}: metadata '{key}' is {str(meta[key])[:60]}; expected an object")
+    if type(meta.get("metric", False)) is not bool:
+        raise FormatError(f"{name}: metadata 'metric' is {str(meta['metric'])[:60]}; expected true or false")
+    if "world_from_capture" in meta:
+        similarity = meta["world_from_capture"]
+        _number(name, similarity, "scale", 1e-30, 1e30, whole=False)
+        _numbers(name, similarity, "translation", 3, -1e30, 1e30)
+        rows = similarity.get("rotation")
+        if not (isinstance(rows, list) and len(rows) == 3):
+            raise FormatError(f"{name}: metadata 'rotation' is {str(rows)[:60]}; expected three rows")
+        rotation = np.array([_numbers(name, {"rotation": row}, "rotation", 3, -2, 2) for row in rows], np.float64)
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+            raise FormatError(f"{name}: metadata 'rotation' is not a rotation")
+    if "orbit" in meta:
+        orbit = meta["orbit"]
+        _numbers(name, orbit, "centre", 3, -1e30, 1e30)
+        _number(name, orbit, "radius", 1e-30, 1e30, whole=False)
+        _number(name, orbit, "elevation", -90, 90, whole=False)
+        _number(name, orbit, "heading", -360, 360, whole=False)
+        if type(orbit.get("forward_facing")) is not bool:
+            raise FormatError(f"{name}: metadata 'forward_facing' is {str(orbit.get('forward_facing'))[:60]}; expected true or false")
+
+
 def _open(path: str | Path) -> _Header:
     """The header with its metadata and the tensors' shapes checked; no tensor is read."""
     header = _Header(Path(path))
@@ -199,14 +235,15 @@ def _open(path: str | Path) -> _Header:
     if meta.get("format") != "nerftree":
         raise FormatError(f"{name}: metadata 'format' is {str(meta.get('format'))[:60]}; expected nerftree")
     version = str(meta.get("format_version")).split(".")
-    if len(version) != 2 or not all(part.isdecimal() and len(part) < 6 for part in version):
+    if len(version) != 2 or not all(part.isascii() and part.isdecimal() and len(part) < 6 for part in version):
         raise FormatError(f"{name}: format version {str(meta.get('format_version'))[:60]}; expected MAJOR.MINOR")
     if int(version[0]) != MAJOR:
         raise FormatError(f"{name}: format version {'.'.join(version)}; this build reads {MAJOR}.x. Upgrade efficientnerf.")
     if meta.get("layout") != "sparse":
         raise FormatError(f"{name}: layout {str(meta.get('layout'))[:60]}; this build reads 'sparse'. Upgrade efficientnerf.")
     if meta.get("sh_convention") != "real-orthonormal-plenoctree" or meta.get("colour_space") != "srgb-sigmoid":
-        raise FormatError(f"{name}: harmonics {str(meta.get('sh_convention'))[:60]} in {str(meta.get('colour_space'))[:60]}; expected real-orthonormal-plenoctree in srgb-sigmoid")
+        found = f"harmonics {str(meta.get('sh_convention'))[:60]} in {str(meta.get('colour_space'))[:60]}"
+        raise FormatError(f"{name}: {found}; expected real-orthonormal-plenoctree in srgb-sigmoid")
     shape = _numbers(name, meta, "shape", 3, 1, 2**16)
     if not all(type(n) is int for n in shape) or math.prod(shape) > MAX_CELLS:
         raise FormatError(f"{name}: shape {shape}; expected whole numbers with a product of at most {MAX_CELLS}")
@@ -214,8 +251,11 @@ def _open(path: str | Path) -> _Header:
     degree = int(_number(name, meta, "sh_degree", 0, MAX_DEGREE, whole=True))
     _number(name, meta, "voxel", 1e-30, 1e30, whole=False)
     _numbers(name, meta, "bounds_min", 3, -1e30, 1e30)
-    if meta.get("background") is not None:
+    if "background" not in meta:
+        raise FormatError(f"{name}: metadata 'background' is missing; expected three numbers or null")
+    if meta["background"] is not None:
         _numbers(name, meta, "background", 3, 0, 1)
+    _check_frame(name, meta)
     for tensor in header.tensors:
         if tensor not in TENSORS and not tensor.startswith("x."):
             raise FormatError(f"{name}: unknown tensor '{tensor[:60]}'; only names that begin with 'x.' may be ignored")
@@ -252,7 +292,8 @@ def load(path: str | Path) -> NerfTree:
         want = digests.get(tensor) if isinstance(digests, dict) else None
         found = hashlib.sha256(raw[tensor].tobytes()).hexdigest()
         if found != want:
-            raise FormatError(f"{name}: tensor '{tensor}' has SHA-256 {found[:12]}…, the file says {str(want)[:12]}…; the file is damaged. Bake it again or copy it anew.")
+            said = f"has SHA-256 {found[:12]}…, the file says {str(want)[:12]}…"
+            raise FormatError(f"{name}: tensor '{tensor}' {said}; the file is damaged. Bake it again or copy it anew.")
     shape, brick = tuple(int(n) for n in meta["shape"]), int(meta["brick"])
     cells = math.prod(shape)
     occupied = np.flatnonzero(np.unpackbits(raw["coarse.occupancy"], count=cells, bitorder="little"))

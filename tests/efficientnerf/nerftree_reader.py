@@ -1,0 +1,95 @@
+"""A reader of NerfTree files written from efficientnerf/nerftree/FORMAT.md alone: plain numpy and loops, no checks beyond what it needs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class Tree:
+    """Stored voxels by coordinate, and the set of occupied cells."""
+
+    def __init__(self, path: Path) -> None:
+        data = path.read_bytes()
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(data[8 : 8 + length].decode("utf-8"))
+        meta: dict[str, Any] = json.loads(header["__metadata__"]["nerftree"])
+        kinds = {"U8": "<u1", "U64": "<u8", "F16": "<f2"}
+        tensors = {}
+        for name in ("coarse.occupancy", "brick.mask", "voxel.density", "voxel.sh"):
+            begin, end = header[name]["data_offsets"]
+            raw = data[8 + length + begin : 8 + length + end]
+            assert hashlib.sha256(raw).hexdigest() == meta["sha256"][name]
+            tensors[name] = np.frombuffer(raw, kinds[header[name]["dtype"]]).reshape(header[name]["shape"])
+        self.meta, self.brick, self.voxel = meta, meta["brick"], meta["voxel"]
+        self.low, self.shape = np.array(meta["bounds_min"]), meta["shape"]
+        self.occupied: set[tuple[int, ...]] = set()
+        self.stored: dict[tuple[int, ...], int] = {}
+        row = 0
+        for number, cell in enumerate(np.ndindex(*self.shape)):
+            if not tensors["coarse.occupancy"][number // 8] >> np.uint8(number % 8) & np.uint8(1):
+                continue
+            self.occupied.add(cell)
+            for v, (p, q, r) in enumerate(np.ndindex(self.brick, self.brick, self.brick)):
+                if int(tensors["brick.mask"][row, v // 64]) >> (v % 64) & 1:
+                    x, y, z = (n * self.brick for n in cell)
+                    self.stored[x + p, y + q, z + r] = len(self.stored)
+            row += 1
+        self.densities, self.sh = tensors["voxel.density"].astype(np.float64), tensors["voxel.sh"].astype(np.float64)
+        assert len(self.stored) == len(self.densities) == len(self.sh)
+
+    def around(self, u: np.ndarray) -> list[tuple[int, float]]:
+        low = np.floor(u - 0.5).astype(int)
+        f = u - 0.5 - low
+        found = []
+        for offset in np.ndindex(2, 2, 2):
+            voxel = self.stored.get(tuple(int(n) for n in low + offset))
+            if voxel is not None:
+                found.append((voxel, math.prod(a if o else 1 - a for a, o in zip(f, offset, strict=True))))
+        return found
+
+    def density(self, point: np.ndarray) -> float:
+        u = (point - self.low) / self.voxel
+        if tuple(int(n) for n in np.floor(u / self.brick)) not in self.occupied:
+            return 0.0
+        return sum(weight * self.densities[voxel] for voxel, weight in self.around(u))
+
+    def colour(self, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        found = self.around((point - self.low) / self.voxel)
+        total = sum(weight for _, weight in found)
+        if total == 0:
+            return np.full(3, 0.5)
+        coefficients = sum(weight * self.sh[voxel] for voxel, weight in found) / total  # (K, 3)
+        return 1 / (1 + np.exp(-(harmonics(direction, self.meta["sh_degree"]) @ coefficients)))
+
+    def ray(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, float]:
+        with np.errstate(divide="ignore"):
+            crossings = np.sort([(self.low - origin) / direction, (self.low + np.array(self.shape) * self.brick * self.voxel - origin) / direction], axis=0)
+        enter, leave = max(0.0, crossings[0].max()), crossings[1].min()
+        light, colour, n = 1.0, np.zeros(3), 0
+        while (t := enter + (n + 0.5) * self.voxel / 2) < leave:
+            alpha = 1 - math.exp(-self.density(origin + t * direction) * self.voxel / 2)
+            if alpha > 0:
+                colour = colour + light * alpha * self.colour(origin + t * direction, direction)
+            light *= 1 - alpha
+            n += 1
+        return colour, 1 - light
+
+
+def harmonics(direction: np.ndarray, degree: int) -> np.ndarray:
+    x, y, z = direction
+    out, azimuth = [], math.atan2(y, x)
+    for l in range(degree + 1):
+        for m in range(-l, l + 1):
+            a = abs(m)
+            # P_l^a(z) by Rodrigues' formula: (-1)^a (1 - z^2)^(a/2) / (2^l l!) times the (l + a)-th derivative of (z^2 - 1)^l
+            derived = (np.polynomial.Polynomial([-1, 0, 1]) ** l).deriv(l + a) if l + a else np.polynomial.Polynomial([1])
+            p = (-1) ** a * (1 - z * z) ** (a / 2) / (2**l * math.factorial(l)) * derived(z)
+            n = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - a) / math.factorial(l + a))
+            out.append(n * p * (1.0 if m == 0 else math.sqrt(2) * (math.cos(m * azimuth) if m > 0 else math.sin(a * azimuth))))
+    return np.array(out)
