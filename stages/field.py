@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from efficientnerf.settings import TrainSettings
-from pipeline.errors import CorruptArtifact
+from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.stage import settings_from
 
 if TYPE_CHECKING:
@@ -84,5 +84,5 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
         m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device)
         restore(m, tensors)
         return FieldRenderer(m, float(about["near"]), float(about["far"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (UsageError, KeyError, TypeError, ValueError) as error:
         raise CorruptArtifact(f"{path}: {error}. Train again.") from None

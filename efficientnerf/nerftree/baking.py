@@ -43,10 +43,10 @@ def visible_voxels(
     greatest = torch.zeros(int(size.prod()))
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
     total = len(pixels)
-    # A stride that shares no factor with the usual widths walks over all columns and rows.
+    # One pixel of each stretch of `stride`, at random: always the same one would visit a few columns alone where the stride divides the width.
     stride = max(1, total // max(count, 1))
-    stride += 1 - stride % 2
-    chosen = np.arange(0, total, stride)
+    stretches = np.arange(0, total, stride)
+    chosen = np.minimum(stretches + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(stretches)), total - 1)
     if pixels.usable is not None:
         chosen = chosen[pixels.usable[chosen]]
     for begin in range(0, len(chosen), RAYS_PER_BLOCK):
