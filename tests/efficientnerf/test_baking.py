@@ -1,0 +1,135 @@
+"""From a field to a tree: which voxels are kept, and what is written into them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from efficientnerf.model import Model
+from efficientnerf.nerftree import baking
+from efficientnerf.nerftree.baking import blocks_of, chosen_voxels, grid_of, visible_voxels, voxel_values
+from tests.efficientnerf.balls import BOUNDS, pixels, untrained
+
+
+class Ball(nn.Module):
+    """log density 5 in a ball of radius 0.5 round the world's origin, -12 outside; harmonics linear in the position. Grid coordinates of the box."""
+
+    activation, degree = "exp", 1
+
+    def forward(self, points: Tensor) -> Tensor:
+        world = points * 2 - 1
+        raw = torch.where(world.norm(dim=1) < 0.5, 5.0, -12.0)
+        return torch.cat([raw[:, None], world.repeat(1, 4)], dim=1)
+
+
+def model_of_a_ball(**changes: Any) -> Model:
+    m = untrained(coarse_samples=64, **changes)
+    m.coarse, m.fine = Ball(), Ball()
+    return m
+
+
+def greatest(count: int = 10**6, resolution: int = 16, **changes: Any) -> np.ndarray:
+    shape, voxel = grid_of(BOUNDS, resolution, 4)
+    flat = visible_voxels(model_of_a_ball(**changes), pixels(8, 24), shape, voxel, BOUNDS[0], 4, count, lambda done, total: None)
+    return flat.reshape(16, 16, 16)
+
+
+@pytest.mark.parametrize(("extent", "resolution", "brick"), [((2, 2, 2), 64, 4), ((2, 1, 0.3), 100, 4), ((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])
+def test_cells_cover_the_box_and_no_more(extent: tuple[float, float, float], resolution: int, brick: int) -> None:
+    bounds = np.array([[1.0, 2.0, 3.0], np.add(extent, (1, 2, 3))])
+    shape, voxel = grid_of(bounds, resolution, brick)
+    assert voxel == pytest.approx(max(extent) / resolution)
+    covered = np.array(shape) * brick * voxel
+    assert (covered >= np.array(extent) - 1e-6 * voxel).all()
+    assert (covered - brick * voxel < np.array(extent)).all()
+
+
+def test_visible_voxels_are_the_balls_skin() -> None:
+    weight = greatest()
+    centre = np.stack(np.meshgrid(*[np.arange(16) / 8 - 1 + 1 / 16] * 3, indexing="ij"), -1)
+    away = np.linalg.norm(centre, axis=-1)
+    assert weight.max() <= 1 + 1e-5
+    assert not weight[away > 0.5 + 0.5 * 3**0.5 / 8 + 1e-6].any()
+    skin = (away > 0.42) & (away < 0.5)
+    assert (weight[skin] > 1e-3).mean() > 0.9
+    assert weight[away < 0.2].max() < 1e-3  # nobody sees the inside
+
+
+def test_more_pixels_never_make_a_voxel_less_visible() -> None:
+    few, many = greatest(500), greatest()
+    assert few.any()
+    assert (few <= many + 1e-6).all()
+    assert (few > 0).sum() < (many > 0).sum()
+
+
+def test_masked_pixels_are_not_looked_at_and_progress_ends_at_its_total() -> None:
+    some = pixels(8, 24)
+    some.usable = np.zeros(len(some), bool)
+    some.usable[:7] = True
+    shape, voxel = grid_of(BOUNDS, 16, 4)
+    calls: list[tuple[int, int]] = []
+    weight = visible_voxels(model_of_a_ball(), some, shape, voxel, BOUNDS[0], 4, 10**6, lambda done, total: calls.append((done, total)))
+    assert not weight.any()  # a corner of one picture
+    assert calls[-1] == (7, 7)
+
+
+def test_looked_at_pixels_are_spread_over_columns_and_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    some, seen = pixels(10, 25), []
+    bundle = some.bundle
+    monkeypatch.setattr(some, "bundle", lambda index: (seen.append(index), bundle(index))[1])
+    shape, voxel = grid_of(BOUNDS, 16, 4)
+    visible_voxels(model_of_a_ball(), some, shape, voxel, BOUNDS[0], 4, 10 * 25 * 25 // 5, lambda done, total: None)
+    index = np.concatenate(seen)
+    assert 1000 <= len(index) <= 1500
+    assert len(np.unique(index)) == len(index)
+    assert len(np.unique(index % 25)) == 25
+    assert len(np.unique(index // 25)) > 240
+
+
+def test_chosen_voxels_are_those_above_the_threshold_and_their_neighbours() -> None:
+    weight = np.zeros((8, 4, 4), np.float32)
+    weight[5, 1, 2], weight[0, 0, 0], weight[3, 3, 3] = 0.5, 1e-3, 2e-3
+    plain = chosen_voxels(weight.reshape(-1), (2, 1, 1), 4, 1e-3, 0)
+    assert plain.tolist() == [[3, 3, 3], [5, 1, 2]]  # in the order of the grid; at the threshold is not above it
+    grown = chosen_voxels(weight.reshape(-1), (2, 1, 1), 4, 1e-3, 1)
+    distance = np.abs(grown[:, None] - plain).max(2).min(1)
+    assert distance.max() == 1
+    assert len(np.unique(grown, axis=0)) == len(grown) == 27 + 12 - 2  # cut by the border, and two voxels belong to both
+    assert not len(chosen_voxels(np.zeros(128, np.float32), (2, 1, 1), 4, 1e-3, 2))
+
+
+def test_values_are_means_over_the_voxel() -> None:
+    m = model_of_a_ball()
+    indices = np.array([[8, 8, 8], [0, 0, 0], [11, 8, 8], [12, 9, 8]], np.int32)
+    ((density, sh),) = voxel_values(m, indices, 1 / 8, BOUNDS[0], 256, 0)
+    assert density.dtype == sh.dtype == np.float32
+    assert sh.shape == (4, 4, 3)
+    assert density[0] == pytest.approx(np.exp(5), rel=1e-5)
+    assert density[1] == pytest.approx(np.exp(-12), rel=1e-5)
+    assert 0.5 * np.exp(5) < density[2] < np.exp(5)  # the surface passes through it
+    # Coefficient k of channel c is raw[1 + 4c + k]; the network gives (x, y, z) over and over.
+    centre = BOUNDS[0] + (indices[0] + 0.5) / 8
+    expected = np.tile(centre, 4).reshape(3, 4).T
+    np.testing.assert_allclose(sh[0], expected, atol=0.01)
+    # Where half of a voxel is empty, its colour is that of the other half.
+    assert sh[2, 0, 0] < BOUNDS[0][0] + 11.5 / 8 + 0.01
+
+
+@pytest.mark.parametrize("first", [0, 1, 2])
+def test_blocks_do_not_depend_on_where_one_begins(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
+    monkeypatch.setattr(baking, "POINTS_PER_BLOCK", 40)
+    m = model_of_a_ball()
+    indices = np.argwhere(np.ones((3, 3, 3), bool)).astype(np.int32)
+    assert blocks_of(27, 4) == 3
+    whole = list(voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 7))
+    assert [len(density) for density, _ in whole] == [10, 10, 7]
+    rest = list(voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 7, first=first))
+    for (a, b), (c, d) in zip(whole[first:], rest, strict=True):
+        assert np.array_equal(a, c)
+        assert np.array_equal(b, d)
+    other = next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 8)))
+    assert not np.array_equal(other[1], next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 7)))[1])

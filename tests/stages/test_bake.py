@@ -1,0 +1,136 @@
+"""The bake stage: the same bytes whatever happened on the way, and an asset that needs no run."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.nerftree import baking
+from efficientnerf.nerftree.tree import NerfTree
+from pipeline.errors import Interrupted, StageFailed
+from pipeline.stage import Job
+from stages import bake, train
+from stages.bake import ASSET, BakeSettings, chosen_resolution
+from stages.field import FILE, load_renderer, save_model
+from stages.scene import load
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
+
+QUICK = BakeSettings(resolution=24, points=4, licence="CC0-1.0")
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("bake")
+    scene = poses(folder / "poses")
+    train.run(job(folder / "train", settings(iterations=30, samples=4096, warm_up=10), poses=scene))
+    return {"poses": scene, "train": folder / "train" / "out"}
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baking, "POINTS_PER_BLOCK", 8192)
+    monkeypatch.setattr(baking, "RAYS_PER_BLOCK", 512)
+
+
+def run(made: Job) -> str:
+    bake.run(made)
+    return hashlib.sha256((made.out / ASSET).read_bytes() + (made.out / "report.json").read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Job, int]:
+    """The digest, the job, and how often it could have been stopped."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baking, "POINTS_PER_BLOCK", 8192)
+        patch.setattr(baking, "RAYS_PER_BLOCK", 512)
+        never = StopAt()
+        made = job(tmp_path_factory.mktemp("undisturbed"), QUICK, stop=never, **inputs)
+        return run(made), made, never.count
+
+
+def test_the_same_twice(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int]) -> None:
+    assert run(job(tmp_path, QUICK, **inputs)) == undisturbed[0]
+
+
+def test_stopped_anywhere_it_ends_in_the_same_bytes(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int]) -> None:
+    digest, _, calls = undisturbed
+    assert calls > 6
+    for k, call in enumerate(sorted({1, 2, calls // 2, calls - 2, calls - 1, calls})):
+        stop = StopAt(call)
+        with pytest.raises(Interrupted):
+            run(job(tmp_path / str(k), QUICK, stop=stop, **inputs))
+        stop.count = 0
+        before = len(list((tmp_path / str(k) / "work").glob("block_*.npy")))
+        stop.calls = set()
+        assert run(job(tmp_path / str(k), QUICK, stop=stop, **inputs)) == digest
+        baked_again = len(list((tmp_path / str(k) / "work").glob("block_*.npy"))) - before
+        if before:
+            assert stop.count == baked_again  # neither the voxels nor the blocks that were there are made anew
+
+
+@pytest.mark.parametrize("damage", [b"", b"\x93NUMPY", None])
+def test_damaged_scratch_is_made_anew(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], damage: bytes | None) -> None:
+    digest, _, calls = undisturbed
+    with pytest.raises(Interrupted):
+        run(job(tmp_path, QUICK, stop=StopAt(calls), **inputs))
+    block = sorted((tmp_path / "work").glob("block_*.npy"))[1]
+    block.write_bytes(block.read_bytes()[:-7] if damage is None else damage)
+    (tmp_path / "work" / "voxels.npy").write_bytes(b"")
+    (tmp_path / "work" / "block_000000.part").write_bytes(b"half")
+    assert run(job(tmp_path, QUICK, **inputs)) == digest
+
+
+def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tuple[str, Job, int]) -> None:
+    made = undisturbed[1]
+    tree = NerfTree.load(made.out / ASSET)
+    about = tree.metadata
+    assert about["world_from_capture"] == {"scale": SIMILARITY.scale, "rotation": SIMILARITY.rotation.tolist(), "translation": SIMILARITY.translation.tolist()}
+    assert about["orbit"] == {**dataclasses.asdict(ORBIT), "centre": list(ORBIT.centre)}
+    assert about["metric"] is True
+    assert about["licence"] == "CC0-1.0"
+    assert about["provenance"]["kind"] == "ball"
+    assert about["provenance"]["training_views"] == 7
+    assert about["provenance"]["iterations"] == 30
+    assert tree.background == (1.0, 1.0, 1.0)
+    assert tree.resolution == (24, 24, 24)
+    assert tree.degree == 1
+    np.testing.assert_allclose(tree.bounds_min, -1)
+    report = json.loads((made.out / "report.json").read_text())
+    assert report == {
+        "resolution": [24, 24, 24],
+        "voxels": len(tree.density_values),
+        "bricks": len(tree.voxel_index),
+        "bytes": (made.out / ASSET).stat().st_size,
+    }
+
+
+def test_the_asset_looks_like_the_field(inputs: dict[str, Path], undisturbed: tuple[str, Job, int]) -> None:
+    view = load(inputs["poses"]).views[-1]
+    field = load_renderer(inputs["train"]).render(view.camera)
+    asset = NerfTree.load(undisturbed[1].out / ASSET).render(view.camera, background=(1.0, 1.0, 1.0))
+    assert np.sqrt(((field.colour - asset.colour) ** 2).mean()) < 0.08
+
+
+def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
+    m = load_renderer(inputs["train"]).model
+    m.voxels.values.fill_(-1.0)
+    (tmp_path / "train").mkdir()
+    save_model(m, 1.0, 5.0, tmp_path / "train" / FILE)
+    with pytest.raises(StageFailed, match=r"the trained field is empty.*Train longer, or check the box"):
+        run(job(tmp_path, QUICK, poses=inputs["poses"], train=tmp_path / "train"))
+
+
+def test_the_resolution_follows_the_pixels(inputs: dict[str, Path]) -> None:
+    s = load(inputs["poses"])
+    # A pixel covers 3 / (1.3 * 16) at the centre, a voxel three quarters of that; the box is 2 wide; 32 at least.
+    assert chosen_resolution(s, 384) == 32
+    focal = 100.0
+    sharper = tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, params=(focal, 8.0, 8.0))) for v in s.views)
+    assert chosen_resolution(dataclasses.replace(s, views=sharper), 384) == round(2 / (0.75 * 3 / focal))
+    assert chosen_resolution(dataclasses.replace(s, views=sharper), 64) == 64

@@ -1,0 +1,81 @@
+"""The trained field on disk: the same after a round trip, and every kind of damage has its sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.cameras import Camera
+from efficientnerf.model import state_of
+from pipeline.errors import CorruptArtifact
+from stages.field import FILE, load_renderer, read_tensors, save_model, write_tensors
+from tests.efficientnerf.balls import pose, untrained
+
+CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3))
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("field", ["hash", "mlp"])
+def test_a_saved_field_draws_the_same_picture(tmp_path: Path, field: str, contracted: bool) -> None:
+    from efficientnerf.render import FieldRenderer
+
+    m = untrained(field=field, contracted=contracted)
+    with torch.no_grad():
+        for _, p in m.parameters():
+            p.add_(torch.randn(p.shape, generator=torch.Generator().manual_seed(0)) * 0.1)
+    save_model(m, 0.5, 20.0, tmp_path / FILE)
+    again = load_renderer(tmp_path)
+    assert (again.near, again.far) == (0.5, 20.0)
+    assert again.model.settings == m.settings
+    assert again.model.background == m.background
+    for name, tensor in state_of(m).items():
+        assert torch.equal(tensor, state_of(again.model)[name]), name
+    assert np.array_equal(again.render(CAMERA).colour, FieldRenderer(m, 0.5, 20.0).render(CAMERA).colour)
+    before = (tmp_path / FILE).read_bytes()
+    save_model(again.model, 0.5, 20.0, tmp_path / FILE)
+    assert (tmp_path / FILE).read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+
+
+def test_damage_is_told(tmp_path: Path) -> None:
+    path = tmp_path / FILE
+    m = untrained()
+    save_model(m, 0.5, 20.0, path)
+    data = path.read_bytes()
+    for damaged in (b"", data[:5], data[:2000], data[:-1], data + b"\0", b"\xff" * 40, b"{}" * 20):
+        path.write_bytes(damaged)
+        with pytest.raises(CorruptArtifact, match=r"not a readable field file.*Train again"):
+            load_renderer(tmp_path)
+    path.unlink()
+    with pytest.raises(CorruptArtifact, match=f"{FILE}: not a readable field file"):
+        load_renderer(tmp_path)
+
+
+def test_files_that_are_something_else_are_told(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    path = tmp_path / FILE
+    save_file({"a": torch.zeros(1)}, str(path))
+    with pytest.raises(CorruptArtifact, match="field file of format None; this build reads 1"):
+        read_tensors(path)
+    write_tensors({"a": torch.zeros(1)}, {"format": 2}, path)
+    with pytest.raises(CorruptArtifact, match="field file of format 2; this build reads 1"):
+        read_tensors(path)
+    write_tensors({"a": torch.zeros(1)}, {}, path)
+    with pytest.raises(CorruptArtifact, match=r"'background'\. Train again"):
+        load_renderer(tmp_path)
+
+
+def test_tensors_that_do_not_fit_are_named(tmp_path: Path) -> None:
+    path = tmp_path / FILE
+    save_model(untrained(), 0.5, 20.0, path)
+    tensors, about = read_tensors(path)
+    write_tensors({name: t for name, t in tensors.items() if name != "sky.sh"}, about, path)
+    with pytest.raises(CorruptArtifact, match=r"tensor 'sky\.sh' is missing\. Train again"):
+        load_renderer(tmp_path)
+    write_tensors(tensors, {**about, "settings": {"iterations": "many"}}, path)
+    with pytest.raises(CorruptArtifact, match="iterations"):
+        load_renderer(tmp_path)

@@ -1,0 +1,139 @@
+"""The train stage: the same bytes whatever happened on the way."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import Interrupted
+from pipeline.stage import Job
+from stages import train
+from stages.field import FILE, load_renderer
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import StopAt, job, poses
+
+QUICK = {"iterations": 13, "checkpoint_every": 4, "samples": 1024, "warm_up": 6, "preview_every": 5}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return poses(tmp_path_factory.mktemp("train") / "poses")
+
+
+@pytest.fixture(autouse=True)
+def no_curve(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Drawing the curve takes longer than this little training; one test wants it."""
+    if "curve" not in request.node.name:
+        monkeypatch.setattr("stages.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+
+
+def run(made: Job) -> str:
+    """The digest of the field."""
+    train.run(made)
+    return hashlib.sha256((made.out / FILE).read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    return run(job(tmp_path_factory.mktemp("undisturbed"), settings(**QUICK), poses=scene))
+
+
+def checkpoints(made: Job) -> list[str]:
+    return sorted(path.name for path in made.work.glob("checkpoint_*"))
+
+
+def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    events: list[dict[str, Any]] = []
+    made = job(tmp_path, settings(**QUICK), poses=scene, events=events)
+    assert run(made) == undisturbed  # twice the same
+    assert sorted(path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()) == [
+        "curve.png", FILE, "log.jsonl", "previews/preview_000005.png", "previews/preview_000010.png",
+    ]  # fmt: skip
+    lines = [json.loads(line) for line in (made.out / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [10, 13]
+    assert all(0 < line["valid"] <= line["tried"] and 0 < line["occupied"] <= 1 for line in lines)
+    assert checkpoints(made) == ["checkpoint_00000008.safetensors", "checkpoint_00000012.safetensors"]
+    assert events[-1]["event"] == "progress"
+    assert events[-1]["done"] == events[-1]["total"] == 13
+    assert np.isfinite(load_renderer(made.out).model.voxels.values.numpy()).all()
+
+
+@pytest.mark.parametrize("calls", [(1,), (7,), (2, 3, 9), (13,)])
+def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, undisturbed: str, calls: tuple[int, ...]) -> None:
+    stop = StopAt(*calls)
+    for _ in calls:
+        with pytest.raises(Interrupted):
+            run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop))
+        assert not (tmp_path / "out" / FILE).exists()
+        assert 1 <= len(checkpoints(job(tmp_path, None))) <= 2
+    events: list[dict[str, Any]] = []
+    assert run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop, events=events)) == undisturbed
+    assert any("training goes on from step" in event.get("text", "") for event in events)
+    lines = [json.loads(line)["step"] for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
+    assert lines == [10, 13]
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "other"])
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path: Path, undisturbed: str, damage: str) -> None:
+    from stages.field import write_tensors
+
+    with pytest.raises(Interrupted):
+        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(9)))
+    newest = sorted((tmp_path / "work").glob("checkpoint_*"))[-1]
+    assert newest.name == "checkpoint_00000009.safetensors"
+    if damage == "other":
+        write_tensors({}, {}, newest)
+    else:
+        newest.write_bytes(newest.read_bytes()[: 5000 if damage == "cut" else 0])
+    events: list[dict[str, Any]] = []
+    assert run(job(tmp_path, settings(**QUICK), poses=scene, events=events)) == undisturbed
+    assert any(event["event"] == "warning" and "checkpoint_00000009" in event["text"] for event in events)
+    assert any("goes on from step 8" in event.get("text", "") for event in events)
+
+
+def test_a_kill_leaves_rubbish_that_does_no_harm(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    with pytest.raises(Interrupted):
+        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(6)))
+    work = tmp_path / "work"
+    (work / ".checkpoint_00000007.safetensors.123.part").write_bytes(b"half of it")
+    with open(work / "log.jsonl", "a", encoding="utf-8") as log:
+        log.write('{"step": 6, "psnr": 1.0}\n{"step": 10, "ps')
+    assert run(job(tmp_path, settings(**QUICK), poses=scene)) == undisturbed
+
+
+def test_all_checkpoints_gone_means_from_the_start(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    with pytest.raises(Interrupted):
+        run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(6)))
+    for path in (tmp_path / "work").glob("checkpoint_*"):
+        path.write_bytes(b"")
+    assert run(job(tmp_path, settings(**QUICK), poses=scene)) == undisturbed
+
+
+def test_other_settings_give_other_bytes(scene: Path, tmp_path: Path, undisturbed: str) -> None:
+    assert run(job(tmp_path, settings(**{**QUICK, "seed": 1}), poses=scene)) != undisturbed
+
+
+def test_photographs_with_masks(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from PIL import Image
+
+    from stages import scene as scenes
+
+    folder = poses(tmp_path / "poses", photographs=True)
+    s = scenes.load(folder)
+    mask = np.full((16, 16), 255, np.uint8)
+    mask[:8] = 0
+    Image.fromarray(mask).save(folder / "images" / "mask.png")
+    scenes.save(replace(s, views=tuple(replace(view, mask="images/mask.png") for view in s.views)), folder)
+    few = settings(**{**QUICK, "iterations": 3})
+    train.run(job(tmp_path / "a", few, poses=folder))
+    assert load_renderer(tmp_path / "a" / "out").model.background is None
+    Image.fromarray(0 * mask).save(folder / "images" / "mask.png")
+    with pytest.raises(ValueError, match="masks leave no pixel"):
+        train.run(job(tmp_path / "b", few, poses=folder))
