@@ -53,12 +53,34 @@ def sample_weights(depth: Tensor, first: Tensor) -> Tensor:
 
 
 class Composite(NamedTuple):
-    """colour (R, 3) over the background, opacity (R,), weight (N,), sample_colour (N, 3)."""
+    """colour (R, 3) over the background, opacity (R,), distortion (R,), weight (N,), sample_colour (N, 3)."""
 
     colour: Tensor
     opacity: Tensor
+    distortion: Tensor
     weight: Tensor
     sample_colour: Tensor
+
+
+def ray_distortion(weight: Tensor, length: Tensor, first: Tensor) -> Tensor:
+    """How far a ray's weights are spread along it: large for fog, small for one thin surface.
+
+        sum_i sum_j w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 l_i
+
+    weight, length (N,), first (R + 1,); s is the running sum of the lengths, up to the middle of each sample; returns (R,), the lengths' unit
+
+    Barron et al. 2022, "Mip-NeRF 360", equation 15.
+    """
+    ray = ray_of_sample(first, len(weight))
+    weight, length = weight.double(), length.double()
+
+    def before(values: Tensor) -> Tensor:
+        total = torch.cumsum(values, dim=0) - values
+        return total - total[first[:-1].clamp(max=len(total) - 1)][ray] if len(total) else total
+
+    s = before(length) + length / 2
+    pairs = 2 * weight * (s * before(weight) - before(weight * s))
+    return weight.new_zeros(len(first) - 1).index_add(0, ray, pairs + weight * weight * length / 3)
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
@@ -78,4 +100,5 @@ def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, bac
     rays = len(first) - 1
     opacity = raw.new_zeros(rays).index_add(0, ray, weight)
     colour = raw.new_zeros(rays, 3).index_add(0, ray, weight[:, None] * rgb)
-    return Composite(colour + (1 - opacity)[:, None] * background, opacity, weight, rgb)
+    distortion = ray_distortion(weight, length, first).to(raw.dtype)
+    return Composite(colour + (1 - opacity)[:, None] * background, opacity, distortion, weight, rgb)

@@ -84,6 +84,7 @@ class Look(NamedTuple):
     fine_opacity: Tensor
     fine_weight: Tensor
     fine_rgb: Tensor
+    distortion: Tensor
 
 
 def model(space: Space, settings: TrainSettings, background: tuple[float, float, float] | None, device: str = "cpu") -> Model:
@@ -92,11 +93,12 @@ def model(space: Space, settings: TrainSettings, background: tuple[float, float,
     if settings.field == "hash":
         coarse: nn.Module = HashField(
             levels=max(1, settings.levels // 2), log2_table=max(8, settings.log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, settings.finest // 4),
-            hidden=settings.coarse_hidden, layers=settings.coarse_layers, degree=0, generator=generator,
+            hidden=settings.coarse_hidden, layers=settings.coarse_layers, degree=0, initial_density=settings.initial_density, generator=generator,
         )  # fmt: skip
         fine: nn.Module = HashField(
             levels=settings.levels, log2_table=settings.log2_table, coarsest=COARSEST, finest=settings.finest,
-            hidden=settings.hidden, layers=settings.layers, degree=settings.degree, generator=generator,
+            hidden=settings.hidden, layers=settings.layers, degree=settings.degree, initial_density=settings.initial_density,
+            generator=generator,
         )  # fmt: skip
     else:
         coarse = MlpField(hidden=settings.coarse_hidden, layers=settings.coarse_layers, degree=settings.degree, generator=generator)
@@ -129,11 +131,11 @@ def look(m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tenso
     coarse = dispatch.valid_samples(m.space, origins, directions, near, far, offset, m.step, m.slots, m.voxels.values, threshold)
     coarse_raw = m.coarse(coarse.point)
     seen = dispatch.composite(coarse_raw, coarse.length, coarse.first, basis(directions, m.coarse.degree), behind, m.coarse.activation)
-    pivotal = seen.weight.detach() > m.settings.pivotal_weight
+    pivotal = dispatch.pivots(seen.weight.detach(), coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
     fine = dispatch.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, m.settings.fine_samples)
     fine_raw = m.fine(fine.point)
     out = dispatch.composite(fine_raw, fine.length, fine.first, basis(directions, m.fine.degree), behind, m.fine.activation)
-    return Look(coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, out.colour, out.opacity, out.weight, out.sample_colour)
+    return Look(coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, out.colour, out.opacity, out.weight, out.sample_colour, seen.distortion + out.distortion)
 
 
 def state_of(m: Model) -> dict[str, Tensor]:
@@ -143,7 +145,7 @@ def state_of(m: Model) -> dict[str, Tensor]:
 
 def restore(m: Model, state: dict[str, Tensor]) -> None:
     """Put `state_of`'s tensors back; ValueError names what does not fit."""
-    wanted: dict[str, Any] = {name: p for name, p in m.parameters()} | {"voxels": m.voxels.values}
+    wanted: dict[str, Any] = dict(m.parameters()) | {"voxels": m.voxels.values}
     for name, tensor in wanted.items():
         if name not in state:
             raise ValueError(f"tensor '{name}' is missing")

@@ -56,7 +56,7 @@ def valid_samples(
 
     origins, directions  (R, 3) world frame, unit directions
     near, far, offset    (R,) distances, and the offset in [0, 1)
-    step, slots          length of an interval in the box; at most so many intervals on a ray
+    step, slots          length of an interval in the box (the last of a ray is cut short); at most so many intervals on a ray
     voxels               (D, D, D) density voxels over the grid coordinates
     """
     t, leave = clip_to_space(space, origins, directions, near, far)
@@ -72,13 +72,13 @@ def valid_samples(
         alive = t < leave
         if not alive.any():
             break
-        extent = step * stretch
+        extent = torch.minimum(step * stretch, leave - t)  # the last interval ends where the ray leaves
         point = space.grid(origins + (t + offset * extent)[:, None] * directions)
         cell = (point * side).long().clamp(0, side - 1)
         valid = alive & (voxels[cell[:, 0], cell[:, 1], cell[:, 2]] > threshold)
         tried += int(alive.sum())
         columns.append((valid, t, extent, extent / stretch, point))
-        t = t + extent
+        t = t + step * stretch
     if not columns:
         empty = origins.new_zeros(0)
         return Samples(torch.zeros(len(origins) + 1, dtype=torch.int64, device=origins.device), empty, empty, empty, empty.reshape(0, 3), 0)
@@ -87,6 +87,22 @@ def valid_samples(
     point = torch.stack([c[4] for c in columns], dim=1)[valid]
     first = torch.cat([valid.new_zeros(1, dtype=torch.int64), valid.sum(dim=1).cumsum(dim=0)])
     return Samples(first, start, extent, length, point, tried)
+
+
+def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+    """Which coarse samples are pivotal: (N,) bool, those with a weight above `threshold`, the `most` heaviest of a ray.
+
+    The cap bounds the work where a field is still fog. The lowest weights are dropped, in training and in rendering alike; among equals the
+    nearer is kept. (The authors' release drops a random subset.)
+    """
+    pivotal = weight > threshold
+    counts = first[1:] - first[:-1]
+    ray = torch.repeat_interleave(torch.arange(len(counts), device=weight.device), counts, output_size=len(weight))
+    order = torch.argsort(weight, descending=True, stable=True)
+    order = order[torch.argsort(ray[order], stable=True)]  # ray by ray, heaviest first
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(order), device=weight.device) - first[ray[order]]
+    return pivotal & (rank < most)
 
 
 def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:

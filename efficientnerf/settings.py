@@ -28,8 +28,12 @@ class TrainSettings:
     coarse_hidden: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
     coarse_layers: int = _setting(1, "hidden layers of the coarse network (the paper: 4)", minimum=1, maximum=16)
     coarse_samples: int = _setting(128, "N_c: intervals over the diagonal of the box", minimum=8, maximum=1024)
-    fine_samples: int = _setting(4, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
+    fine_samples: int = _setting(2, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
     pivotal_weight: float = _setting(1e-4, "epsilon: weight above which a coarse sample is pivotal", minimum=0.0, maximum=1.0)
+    max_pivots: int = _setting(8, "pivotal samples on a ray at most; the lightest are dropped", minimum=1, maximum=4096)
+    distortion: float = _setting(0.01, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog", minimum=0.0)
+    anchors: float = _setting(0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0)
+    initial_density: float = _setting(0.1, "hash: density that the fields start with, per world unit", minimum=1e-6, maximum=1e3)
     voxels: int = _setting(0, "D: side of the density voxels; 0 chooses 128, or 192 where surroundings are learned too", minimum=0, maximum=512)
     voxel_rule: str = _setting(
         "maximum", "momentum: equation 7 on raw densities, threshold 0, as in the paper; maximum: decayed maximum of densities", choices=("momentum", "maximum")

@@ -17,13 +17,15 @@ import torch
 from torch import Tensor
 
 from efficientnerf.cameras import Camera, rays
-from efficientnerf.compositing import activate
+from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
-from efficientnerf.model import Model, look
+from efficientnerf.model import Look, Model, look
 
 RATE_WARM_UP = 100  # steps in which the rate rises
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15  # Mueller et al. 2022; epsilon this small because a table entry's gradient can be
 FEWEST_RAYS = 64
+ANCHOR_SHARE = 8  # one ray to a sparse point for so many rays of pixels
+ANCHOR_WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as at the point
 SWEEP_PARTS = 8  # refreshes of the warm-up that together ask about every voxel
 
 
@@ -91,6 +93,22 @@ class Pixels:
         return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, self.images[index].astype(np.float32) / np.float32(255)
 
 
+@dataclass(frozen=True)
+class Anchors:
+    """Rays from training cameras to sparse points that structure from motion saw there.
+
+    origins, directions  (A, 3) float32, unit directions
+    distance             (A,) float32, to the point
+    """
+
+    origins: np.ndarray
+    directions: np.ndarray
+    distance: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+
 class Adam:
     """Kingma and Ba's Adam over named parameters. A hash table's entries without a gradient are left alone (as Mueller et al. do)."""
 
@@ -155,8 +173,8 @@ class Trainer:
 
 
 def trainer(m: Model) -> Trainer:
-    # Until it is known better, every interval is sampled by both stages.
-    return Trainer(m, Adam(m.parameters()), 0, float(m.slots * (1 + m.settings.fine_samples)))
+    # Until it is known better, every interval is sampled, and as many pivots as there may be.
+    return Trainer(m, Adam(m.parameters()), 0, float(m.slots + m.settings.max_pivots * m.settings.fine_samples))
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
@@ -184,7 +202,7 @@ def learning_rate(step: int, settings_rate: float, final: float, iterations: int
     return settings_rate * min(1.0, step / RATE_WARM_UP) * final ** (step / iterations)
 
 
-def train(t: Trainer, pixels: Pixels) -> Iterator[Progress]:
+def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterator[Progress]:
     """Train until the settings' last step, yielding after each."""
     m, settings = t.model, t.model.settings
     device = m.device
@@ -207,6 +225,12 @@ def train(t: Trainer, pixels: Pixels) -> Iterator[Progress]:
         seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up)
         fine_loss = ((seen.fine_colour - colour) ** 2).mean()
         loss = fine_loss + ((seen.coarse_colour - colour) ** 2).mean()
+        if m.space.contracted:
+            loss = loss + settings.distortion * seen.distortion.mean()
+            _quieten_near_cameras(m, origins, seen)
+            strength = settings.anchors * max(0.0, 1 - 2 * number / settings.iterations)
+            if anchors is not None and strength > 0:
+                loss = loss + strength * anchor_loss(m, anchors, max(1, count // ANCHOR_SHARE), rng, prune=number > settings.warm_up)
         loss.backward()
         t.adam.step(number, learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations))
 
@@ -227,6 +251,40 @@ def train(t: Trainer, pixels: Pixels) -> Iterator[Progress]:
         t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((fine + valid) / count, 1.0)
         t.step = number
         yield Progress(number, float(fine_loss.detach()), count, seen.coarse.tried, valid, int(seen.pivotal.sum()), fine)
+
+
+def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator, *, prune: bool) -> Tensor:
+    """How much of the light on some rays is not absorbed close to the point that was seen there, for both stages: 0 to 2.
+
+        1 - sum_i w_i max(0, 1 - |t_i - d| / (ANCHOR_WIDTH e_i))
+
+    with t_i the middle of interval i, e_i its extent (of a coarse interval for both stages) and d the distance of the point. What is before the
+    point is cleared away by it, which photographs alone take long to do: they look as well explained by fog of the right colour.
+    """
+    pick = rng.integers(len(anchors), size=count)
+    origins, directions, distance = (torch.from_numpy(a[pick]).to(m.device) for a in (anchors.origins, anchors.directions, anchors.distance))
+    offset = torch.from_numpy(rng.random(count, np.float32)).to(m.device)
+    near, far = 0.1 * distance, 4 * distance
+    seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune)
+    loss = origins.new_zeros(())
+    for samples, weight, share in ((seen.coarse, seen.coarse_weight, 1), (seen.fine, seen.fine_weight, m.settings.fine_samples)):
+        ray = ray_of_sample(samples.first, len(samples.start))
+        off = (samples.start + samples.extent / 2 - distance[ray]).abs() / (ANCHOR_WIDTH * share * samples.extent)
+        loss = loss + 1 - (weight * (1 - off).clamp(min=0)).sum() / count
+    return loss
+
+
+def _quieten_near_cameras(m: Model, origins: Tensor, seen: Look) -> None:
+    """Scale gradients by the square of the distance to the camera, up to the distance of the box's centre.
+
+    Close to a camera rays crowd together, so that samples there are pulled far more often than those on the subject, and matter hangs before
+    the lens. Philip and Deschaintre 2023, "Floaters no more: radiance field gradient scaling for improved near-camera training".
+    """
+    subject = (origins - torch.as_tensor(m.space.centre, dtype=origins.dtype, device=origins.device)).norm(dim=-1)
+    for samples, raw in ((seen.coarse, seen.coarse_raw), (seen.fine, seen.fine_raw)):
+        ray = ray_of_sample(samples.first, len(samples.start))
+        scale = (samples.start / subject[ray]).clamp(max=1) ** 2
+        raw.register_hook(lambda grad, scale=scale: grad * scale[:, None])
 
 
 def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None) -> None:

@@ -23,11 +23,12 @@ from efficientnerf.settings import TrainSettings
 from pipeline.stage import Job, Stage
 
 if TYPE_CHECKING:
-    from efficientnerf.training import Pixels, Progress, Trainer
+    from efficientnerf.training import Anchors, Pixels, Progress, Trainer
     from stages.scene import Scene, View
 
 LOG_EVERY = 10
 CHECKPOINTS_KEPT = 2
+FEWEST_OBSERVERS = 3
 
 
 def run(job: Job) -> None:
@@ -56,7 +57,7 @@ def run(job: Job) -> None:
     lines: list[str] = []
     started, first, loss = time.monotonic(), t.step, 0.0
     held_back: float | None = None
-    for done in training.train(t, pixels):
+    for done in training.train(t, pixels, anchors_of(folder, s)):
         loss = done.loss if done.step == first + 1 else 0.95 * loss + 0.05 * done.loss
         if done.step % LOG_EVERY == 0 or done.step == settings.iterations:
             lines.append(json.dumps(_line(done, loss, m.voxels.occupied, time.monotonic() - started), sort_keys=True))
@@ -85,6 +86,25 @@ def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
     masks = [scene.read_mask(folder, view) for view in views]
     near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
     return Pixels([view.camera for view in views], images, masks, near, far)
+
+
+def anchors_of(folder: Path, s: Scene) -> Anchors | None:
+    """Rays of training cameras to the sparse points that were seen there; only points that three photographs or more agree on."""
+    from efficientnerf.training import Anchors
+    from stages import scene
+
+    if not s.points:
+        return None
+    points = scene.read_points(folder)
+    training = np.array([view.split == "train" for view in s.views])
+    centres = np.array([view.camera.centre for view in s.views])
+    pairs = [(n, view) for n, seen in enumerate(points.observers) if len(seen) >= FEWEST_OBSERVERS for view in seen if training[view]]
+    if not pairs:
+        return None
+    which, view = np.array(pairs, np.int64).T
+    away = points.xyz[which] - centres[view]
+    distance = np.linalg.norm(away, axis=1)
+    return Anchors(centres[view].astype(np.float32), (away / distance[:, None]).astype(np.float32), distance.astype(np.float32))
 
 
 def use_all_cores() -> None:

@@ -6,6 +6,7 @@ fits is stored whole, one that does not is hashed); then a small ReLU network. T
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -23,7 +24,9 @@ class HashField(nn.Module):
 
     activation = "exp"
 
-    def __init__(self, *, levels: int, log2_table: int, coarsest: int, finest: int, hidden: int, layers: int, degree: int, generator: torch.Generator) -> None:
+    def __init__(
+        self, *, levels: int, log2_table: int, coarsest: int, finest: int, hidden: int, layers: int, degree: int, initial_density: float, generator: torch.Generator
+    ) -> None:
         super().__init__()
         self.degree = degree
         growth = math.exp((math.log(finest) - math.log(coarsest)) / max(levels - 1, 1))
@@ -38,17 +41,21 @@ class HashField(nn.Module):
         self.table = nn.Parameter((torch.rand(sum(counts), FEATURES, generator=generator) * 2 - 1) * 1e-4)
         widths = [levels * FEATURES, *[hidden] * layers, 1 + 3 * harmonics_count(degree)]
         self.weights = nn.ParameterList()
-        for inputs, outputs in zip(widths[:-1], widths[1:], strict=True):
+        for inputs, outputs in itertools.pairwise(widths):
             bound = math.sqrt(6 / inputs)  # He initialisation for ReLU
             self.weights.append(nn.Parameter((torch.rand(outputs, inputs, generator=generator) * 2 - 1) * bound))
-        # The last layer starts small: grey colours, density near exp(0) = 1 per world unit, so thin that every ray sees through.
+        # The last layer starts small: grey colours, a density so thin that every ray sees through.
         self.weights[-1].data.mul_(0.1)
+        self.log_initial_density = math.log(initial_density)
 
     def forward(self, points: Tensor) -> Tensor:
-        return self._network(encode(points, self), self.weights[-1])
+        raw = self._network(encode(points, self), self.weights[-1])
+        offset = torch.zeros(raw.shape[1], device=raw.device)
+        offset[0] = self.log_initial_density
+        return raw + offset
 
     def density(self, points: Tensor) -> Tensor:
-        return self._network(encode(points, self), self.weights[-1][:1])[:, 0]
+        return self._network(encode(points, self), self.weights[-1][:1])[:, 0] + self.log_initial_density
 
     def _network(self, x: Tensor, last: Tensor) -> Tensor:
         for weight in list(self.weights)[:-1]:

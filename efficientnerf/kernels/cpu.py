@@ -48,7 +48,7 @@ def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, s
         if t >= leave:
             break
         tried += 1
-        size = step * stretch
+        size = min(step * stretch, leave - t)
         at = t + offset * size
         px, py, pz = ux + at * vx, uy + at * vy, uz + at * vz
         if contracted:
@@ -65,7 +65,7 @@ def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, s
                 start[n], extent[n], length[n] = t, size, size / stretch
                 point[n, 0], point[n, 1], point[n, 2] = gx, gy, gz
             valid += 1
-        t = t + size
+        t = t + step * stretch
     return valid, tried
 
 
@@ -103,6 +103,31 @@ def valid_samples(origins, directions, near, far, offset, centre, half, contract
     start, extent, length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
     _write_valid(*args, first, start, extent, length, point)
     return first, start, extent, length, point, int(tried.sum())
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def pivots(weight, first, threshold, most, out):  # type: ignore[no-untyped-def]
+    """`efficientnerf.sampling.pivots`: out (N,) bool."""
+    rays = len(first) - 1
+    for block in numba.prange((rays + BLOCK - 1) // BLOCK):
+        for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
+            lo, hi = first[r], first[r + 1]
+            count = 0
+            for n in range(lo, hi):
+                out[n] = weight[n] > threshold
+                count += out[n]
+            if count <= most:
+                continue
+            least = np.sort(weight[lo:hi])[hi - lo - most]  # the lightest weight that stays
+            heavier = 0
+            for n in range(lo, hi):
+                heavier += weight[n] > least
+            for n in range(lo, hi):
+                stays = weight[n] > least
+                if weight[n] == least and heavier < most:
+                    stays = True
+                    heavier += 1
+                out[n] = out[n] and stays
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -217,7 +242,7 @@ def _activate(x, exponential):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def composite(raw, length, first, harmonics, background, exponential, colour, opacity, weight, rgb):  # type: ignore[no-untyped-def]
+def composite(raw, length, first, harmonics, background, exponential, colour, opacity, distortion, weight, rgb):  # type: ignore[no-untyped-def]
     """`efficientnerf.compositing.composite`, forward."""
     terms = harmonics.shape[1]
     one = np.float32(1)
@@ -226,6 +251,7 @@ def composite(raw, length, first, harmonics, background, exponential, colour, op
         for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
             light = one
             c0 = c1 = c2 = np.float32(0)
+            at = spread = near_weight = near_moment = np.float32(0)
             for n in range(first[r], first[r + 1]):
                 density, _ = _activate(raw[n, 0], exponential)
                 alpha = one - np.exp(-density * length[n])
@@ -240,15 +266,30 @@ def composite(raw, length, first, harmonics, background, exponential, colour, op
                 c1 += w * rgb[n, 1]
                 c2 += w * rgb[n, 2]
                 weight[n] = w
+                middle = at + np.float32(0.5) * length[n]
+                spread += np.float32(2) * w * (middle * near_weight - near_moment) + w * w * length[n] / np.float32(3)
+                near_weight += w
+                near_moment += w * middle
+                at += length[n]
+            distortion[r] = spread
             colour[r, 0] = c0 + light * background[r, 0]
             colour[r, 1] = c1 + light * background[r, 1]
             colour[r, 2] = c2 + light * background[r, 2]
             opacity[r] = one - light
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _pull(g0, g1, g2, rgb, gs, w, length, middle, near_weight, near_moment, all_weight, all_moment):  # type: ignore[no-untyped-def]
+    """Gradient with respect to a sample's weight: of the colours, and of the distortion, 2 sum_j w_j |s - s_j| + 2/3 w l."""
+    two = np.float32(2)
+    far_weight, far_moment = all_weight - near_weight - w, all_moment - near_moment - w * middle
+    spread = two * (middle * near_weight - near_moment + far_moment - middle * far_weight) + two / np.float32(3) * w * length
+    return g0 * rgb[0] + g1 * rgb[1] + g2 * rgb[2] + gs * spread
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def composite_backward(raw, length, first, harmonics, background, exponential, weight, rgb, grad_colour, grad_opacity, grad_raw, grad_background):  # type: ignore[no-untyped-def]
-    """Gradients of colour and opacity with respect to raw and background."""
+def composite_backward(raw, length, first, harmonics, background, exponential, weight, rgb, grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background):  # type: ignore[no-untyped-def]
+    """Gradients of colour, opacity, distortion and weights with respect to raw and background."""
     terms = harmonics.shape[1]
     one = np.float32(1)
     rays = len(first) - 1
@@ -259,17 +300,34 @@ def composite_backward(raw, length, first, harmonics, background, exponential, w
             # What lies behind sample n contributes `rest`: the background's share and the samples', front to back from the total.
             light = one
             rest = np.float32(0)
+            at = all_weight = all_moment = np.float32(0)
+            gs = grad_distortion[r]
             for n in range(first[r], first[r + 1]):
-                rest += weight[n] * (g0 * rgb[n, 0] + g1 * rgb[n, 1] + g2 * rgb[n, 2])
                 light -= weight[n]
+                all_weight += weight[n]
+                all_moment += weight[n] * (at + np.float32(0.5) * length[n])
+                at += length[n]
+            at = near_weight = near_moment = np.float32(0)
+            for n in range(first[r], first[r + 1]):
+                middle = at + np.float32(0.5) * length[n]
+                pull = _pull(g0, g1, g2, rgb[n], gs, weight[n], length[n], middle, near_weight, near_moment, all_weight, all_moment)
+                rest += weight[n] * (grad_weight[n] + pull)
+                near_weight += weight[n]
+                near_moment += weight[n] * middle
+                at += length[n]
             light = max(light, np.float32(0))
             rest += light * behind
             grad_background[r, 0], grad_background[r, 1], grad_background[r, 2] = light * g0, light * g1, light * g2
             before = one
+            at = near_weight = near_moment = np.float32(0)
             for n in range(first[r], first[r + 1]):
                 density, slope = _activate(raw[n, 0], exponential)
                 w = weight[n]
-                own = g0 * rgb[n, 0] + g1 * rgb[n, 1] + g2 * rgb[n, 2]
+                middle = at + np.float32(0.5) * length[n]
+                own = grad_weight[n] + _pull(g0, g1, g2, rgb[n], gs, w, length[n], middle, near_weight, near_moment, all_weight, all_moment)
+                near_weight += w
+                near_moment += w * middle
+                at += length[n]
                 rest -= w * own
                 after = before * np.exp(-density * length[n])
                 grad_raw[n, 0] = (after * own - rest) * length[n] * slope

@@ -39,6 +39,17 @@ def valid_samples(
     return Samples(*(torch.from_numpy(a) for a in (first, start, extent, length, point)), tried)
 
 
+def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+    """See `efficientnerf.sampling.pivots`."""
+    if not _fast(weight):
+        return sampling.pivots(weight, first, threshold, most)
+    from efficientnerf.kernels import cpu
+
+    out = torch.empty(len(weight), dtype=torch.bool)
+    cpu.pivots(_array(weight), _array(first), np.float32(threshold), most, out.numpy())
+    return out
+
+
 def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
     """See `efficientnerf.sampling.pivotal_samples`."""
     if not _fast(origins, directions, offset, coarse.start):
@@ -51,7 +62,7 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
-    """See `efficientnerf.compositing.composite`; on the CPU only colour and opacity carry gradients."""
+    """See `efficientnerf.compositing.composite`; on the CPU the samples' colours carry no gradient."""
     if not _fast(raw, length, harmonics, background):
         return compositing.composite(raw, length, first, harmonics, background, activation)
     return Composite(*_Composite.apply(raw, length, first, harmonics, background, activation == "exp"))
@@ -63,16 +74,16 @@ class _Composite(torch.autograd.Function):
         from efficientnerf.kernels import cpu
 
         rays = len(first) - 1
-        colour, opacity = torch.empty(rays, 3), torch.empty(rays)
+        colour, opacity, distortion = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays)
         weight, rgb = torch.empty(len(raw)), torch.empty(len(raw), 3)
         cpu.composite(
             _array(raw), _array(length), _array(first), _array(harmonics), _array(background), exponential,
-            colour.numpy(), opacity.numpy(), weight.numpy(), rgb.numpy(),
+            colour.numpy(), opacity.numpy(), distortion.numpy(), weight.numpy(), rgb.numpy(),
         )  # fmt: skip
         ctx.save_for_backward(raw, length, first, harmonics, background, weight, rgb)
         ctx.exponential = exponential
-        ctx.mark_non_differentiable(weight, rgb)
-        return colour, opacity, weight, rgb
+        ctx.mark_non_differentiable(rgb)
+        return colour, opacity, distortion, weight, rgb
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
@@ -82,6 +93,6 @@ class _Composite(torch.autograd.Function):
         grad_raw, grad_background = torch.empty(raw.shape), torch.empty(background.shape)
         cpu.composite_backward(
             *(_array(t) for t in (raw, length, first, harmonics, background)), ctx.exponential, _array(weight), _array(rgb),
-            _array(grads[0]), _array(grads[1]), grad_raw.numpy(), grad_background.numpy(),
+            _array(grads[0]), _array(grads[1]), _array(grads[2]), _array(grads[3]), grad_raw.numpy(), grad_background.numpy(),
         )  # fmt: skip
         return grad_raw, None, None, None, grad_background, None
