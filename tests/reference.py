@@ -68,6 +68,13 @@ def composite(density: Sequence[float], length: Sequence[float], rgb: Sequence[S
     return Pixel([c + light * b for c, b in zip(colour, background, strict=True)], 1 - light, weights)
 
 
+def distortion(weights: Sequence[float], length: Sequence[float]) -> float:
+    """How far one ray's weights are spread (Barron et al. 2022, "Mip-NeRF 360", equation 15), along the running sum of its lengths."""
+    middle = [sum(length[:n]) + length[n] / 2 for n in range(len(length))]
+    pairs = sum(a * b * abs(s - t) for a, s in zip(weights, middle, strict=True) for b, t in zip(weights, middle, strict=True))
+    return pairs + sum(w * w * extent for w, extent in zip(weights, length, strict=True)) / 3
+
+
 def momentum(values: Sequence[float], cells: Sequence[int], densities: Sequence[float], beta: float) -> list[float]:
     """Equation 7; the samples of one step in one voxel make one update, by their mean."""
     out = list(values)

@@ -17,7 +17,7 @@ from tests import reference
 def hash_field(degree: int = 2, seed: int = 0) -> HashField:
     """Levels of 4, 8 and 16 points a side: the first two stored whole, the last hashed into 1024 entries."""
     generator = torch.Generator().manual_seed(seed)
-    field = HashField(levels=3, log2_table=10, coarsest=4, finest=16, hidden=16, layers=2, degree=degree, generator=generator)
+    field = HashField(levels=3, log2_table=10, coarsest=4, finest=16, hidden=16, layers=2, degree=degree, initial_density=1.0, generator=generator)
     field.table.data.normal_(generator=generator)
     return field
 
@@ -101,9 +101,11 @@ def test_every_parameter_has_a_gradient(make: Callable[..., nn.Module]) -> None:
 
 
 def test_an_untrained_hash_field_is_thin_and_grey() -> None:
-    field = HashField(levels=4, log2_table=10, coarsest=4, finest=64, hidden=16, layers=1, degree=2, generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    field = HashField(levels=4, log2_table=10, coarsest=4, finest=64, hidden=16, layers=1, degree=2, initial_density=0.2, generator=generator)
     out = field(points()).detach()
-    assert out.abs().max() < 0.1
+    assert out[:, 1:].abs().max() < 0.1
+    torch.testing.assert_close(out[:, 0].exp(), torch.full((len(out),), 0.2), rtol=0.1, atol=0)
 
 
 @pytest.mark.parametrize(

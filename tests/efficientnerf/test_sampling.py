@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -75,8 +76,8 @@ def test_valid_samples_are_those_of_the_loop(kind: str, contracted: bool, thresh
         if wanted.samples:
             start, extent, length, point = (np.array(column) for column in zip(*wanted.samples, strict=True))
             np.testing.assert_allclose(found.start[begin:end], start, rtol=1e-4, atol=1e-5)
-            np.testing.assert_allclose(found.extent[begin:end], extent, rtol=1e-4)
-            np.testing.assert_allclose(found.length[begin:end], length, rtol=1e-4)
+            np.testing.assert_allclose(found.extent[begin:end], extent, rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(found.length[begin:end], length, rtol=1e-4, atol=1e-5)
             np.testing.assert_allclose(found.point[begin:end], point, atol=1e-5)
     assert compared > 40
     if kind == "missing" and not contracted:
@@ -141,6 +142,22 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     last = found.first[1:] - 1
     reach = space.unit(origins + (found.start + found.extent)[last][:, None] * along).abs().amax(dim=1)
     assert reach.min() > reference.FARTHEST
+
+
+@pytest.mark.parametrize("choose", [sampling.pivots, dispatch.pivots], ids=["torch", "kernel"])
+@pytest.mark.parametrize("most", [1, 3, 5, 100])
+def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[..., torch.Tensor], most: int) -> None:
+    rng = np.random.default_rng(3)
+    counts = [0, 4, 12, 1, 7, 0, 30]
+    weight = np.round(rng.random(sum(counts)), 1).astype(np.float32)  # many equals
+    first = np.concatenate([[0], np.cumsum(counts)])
+    expected = np.zeros(len(weight), bool)
+    for begin, end in itertools.pairwise(first):
+        heaviest = sorted(range(begin, end), key=lambda n: (-weight[n], n))[:most]
+        expected[[n for n in heaviest if weight[n] > 0.3]] = True
+    found = choose(torch.from_numpy(weight), torch.from_numpy(first), float(np.float32(0.3)), most)
+    assert found.dtype == torch.bool
+    assert np.array_equal(found.numpy(), expected)
 
 
 def coarse_samples_of(rays: Rays, contracted: bool) -> tuple[Space, Samples, torch.Tensor]:

@@ -12,7 +12,7 @@ import torch
 
 from efficientnerf import training
 from efficientnerf.model import Model, look
-from efficientnerf.training import Pixels, Progress, learning_rate, restore, state_of, train, trainer
+from efficientnerf.training import Adam, Anchors, Pixels, Progress, anchor_loss, learning_rate, restore, state_of, train, trainer
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
 
 MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_rate": 1e-2}
@@ -131,6 +131,23 @@ def test_transparent_pixels_teach_no_colour() -> None:
     assert hidden.any()
     losses = [[step.loss for step in train(trainer(untrained(iterations=5)), p)] for p in (some, other)]
     assert losses[0] == losses[1]
+
+
+def test_anchors_pull_the_light_to_their_points() -> None:
+    m = untrained(contracted=True)
+    origins = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (4, 1))
+    directions = np.float32([[1, 0, 0], [0.995, 0.0998, 0], [0.995, 0, 0.0998], [0.995, -0.0998, 0]])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    anchors = Anchors(origins, directions, np.full(4, 3.0, np.float32))
+    adam = Adam(m.parameters())
+    losses = []
+    for step in range(1, 61):
+        loss = anchor_loss(m, anchors, 16, np.random.default_rng(step), prune=False)
+        loss.backward()
+        adam.step(step, 3e-2)
+        losses.append(float(loss.detach()))
+    assert 1.5 < losses[0] <= 2
+    assert losses[-1] < 0.8
 
 
 def test_settings_say_what_they_mean() -> None:
