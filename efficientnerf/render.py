@@ -207,7 +207,9 @@ def render_tree_reference(
         alpha = torch.where(t < leave, alpha, 0)
         stored = torch.where(index >= 0, weight, 0)
         share = stored / stored.sum(dim=-1, keepdim=True).clamp(min=1e-12)
-        mixed = (share[..., None, None] * sh[index.clamp(min=0)]).sum(dim=1) if len(sh) else torch.zeros(len(t), harmonics.shape[1], 3, device=device, dtype=dtype)
+        mixed = torch.zeros(len(t), harmonics.shape[1], 3, device=device, dtype=dtype)
+        if len(sh):
+            mixed = (share[..., None, None] * sh[index.clamp(min=0)]).sum(dim=1)
         rgb = torch.sigmoid((harmonics[:, :, None] * mixed).sum(dim=1))  # (R, 3)
         colour = colour + (light * alpha)[:, None] * rgb
         light = light * (1 - alpha)

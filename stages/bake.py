@@ -58,11 +58,13 @@ def run(job: Job) -> None:
     if not len(indices):
         from pipeline.errors import StageFailed
 
-        raise StageFailed("bake: the trained field is empty: no voxel of the box contributes to any training image. Train longer, or check the box (poses.box).")
+        found = "no voxel of the box contributes to any training image"
+        raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
     density, sh = _values(job, m, indices, voxel, low)
     tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=metadata_of(s, settings, m))
     format.save(tree, job.out / ASSET)
-    report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": (job.out / ASSET).stat().st_size}
+    size = (job.out / ASSET).stat().st_size
+    report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size}
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
@@ -101,7 +103,12 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
         },
         "metric": bool(s.metric),
         "licence": settings.licence,
-        "provenance": {"tool": f"efficientnerf {tool}", "kind": s.kind, "training_views": sum(v.split == "train" for v in s.views), "iterations": m.settings.iterations},
+        "provenance": {
+            "tool": f"efficientnerf {tool}",
+            "kind": s.kind,
+            "training_views": sum(v.split == "train" for v in s.views),
+            "iterations": m.settings.iterations,
+        },
     }
 
 

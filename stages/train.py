@@ -219,7 +219,7 @@ def _publish_log(log: Path, job: Job) -> None:
     shutil.copyfile(log, job.out / "log.jsonl")
     curve(
         job.out / "curve.png",
-        {"training PSNR": (np.array([x["step"] for x in lines]), np.array([x["psnr"] for x in lines]))},
+        {"training PSNR": ([x["step"] for x in lines], [x["psnr"] for x in lines])},
         x_label="step",
         y_label="PSNR / dB",
     )

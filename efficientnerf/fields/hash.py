@@ -25,8 +25,9 @@ class HashField(nn.Module):
     activation = "exp"
 
     def __init__(
-        self, *, levels: int, log2_table: int, coarsest: int, finest: int, hidden: int, layers: int, degree: int, initial_density: float, generator: torch.Generator
-    ) -> None:
+        self, *, levels: int, log2_table: int, coarsest: int, finest: int, hidden: int, layers: int, degree: int,
+        initial_density: float, generator: torch.Generator,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.degree = degree
         growth = math.exp((math.log(finest) - math.log(coarsest)) / max(levels - 1, 1))
@@ -72,7 +73,7 @@ def encode(points: Tensor, field: HashField) -> Tensor:
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points: Tensor, table: Tensor, field: HashField) -> Tensor:  # type: ignore[no-untyped-def, override]
+    def forward(ctx, points: Tensor, table: Tensor, field: HashField) -> Tensor:  # type: ignore[no-untyped-def]
         from efficientnerf.kernels import cpu
 
         out = torch.empty(len(points), FEATURES * len(field.sides))
@@ -82,7 +83,7 @@ class _Encode(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[None, Tensor, None]:  # type: ignore[no-untyped-def, override]
+    def backward(ctx, grad: Tensor) -> tuple[None, Tensor, None]:  # type: ignore[no-untyped-def]
         from efficientnerf.kernels import cpu
 
         points, table = ctx.saved_tensors

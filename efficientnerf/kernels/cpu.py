@@ -131,7 +131,10 @@ def pivots(weight, first, threshold, most, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _pivotal(origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point):  # type: ignore[no-untyped-def]
+def _pivotal(  # type: ignore[no-untyped-def]
+    origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot,
+    fine_first, fine_start, fine_extent, fine_length, point,
+):  # fmt: skip
     one, two = np.float32(1), np.float32(2)
     scale = np.float32(0.25) if contracted else np.float32(0.5)
     shift = two if contracted else one
@@ -163,7 +166,10 @@ def pivotal_samples(origins, directions, offset, centre, half, contracted, first
     fine_first = total[first] * per_pivot
     n = int(fine_first[-1])
     fine_start, fine_extent, fine_length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
-    _pivotal(origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot, fine_first, fine_start, fine_extent, fine_length, point)
+    _pivotal(
+        origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot,
+        fine_first, fine_start, fine_extent, fine_length, point,
+    )  # fmt: skip
     return fine_first, fine_start, fine_extent, fine_length, point
 
 
@@ -288,7 +294,10 @@ def _pull(g0, g1, g2, rgb, gs, w, length, middle, near_weight, near_moment, all_
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def composite_backward(raw, length, first, harmonics, background, exponential, weight, rgb, grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background):  # type: ignore[no-untyped-def]
+def composite_backward(  # type: ignore[no-untyped-def]
+    raw, length, first, harmonics, background, exponential, weight, rgb,
+    grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background,
+):  # fmt: skip
     """Gradients of colour, opacity, distortion and weights with respect to raw and background."""
     terms = harmonics.shape[1]
     one = np.float32(1)

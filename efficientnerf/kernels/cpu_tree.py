@@ -82,9 +82,12 @@ def _density(u, v, w, brick, brick_index, voxel_index, density, index, weight): 
 def _gradient(u, v, w, brick, brick_index, voxel_index, density, index, weight, out):  # type: ignore[no-untyped-def]
     """Unit normal (down the gradient, central differences of one voxel) into `out`."""
     h = np.float32(1)
-    gx = _density(u + h, v, w, brick, brick_index, voxel_index, density, index, weight) - _density(u - h, v, w, brick, brick_index, voxel_index, density, index, weight)
-    gy = _density(u, v + h, w, brick, brick_index, voxel_index, density, index, weight) - _density(u, v - h, w, brick, brick_index, voxel_index, density, index, weight)
-    gz = _density(u, v, w + h, brick, brick_index, voxel_index, density, index, weight) - _density(u, v, w - h, brick, brick_index, voxel_index, density, index, weight)
+    gx = _density(u + h, v, w, brick, brick_index, voxel_index, density, index, weight)
+    gx -= _density(u - h, v, w, brick, brick_index, voxel_index, density, index, weight)
+    gy = _density(u, v + h, w, brick, brick_index, voxel_index, density, index, weight)
+    gy -= _density(u, v - h, w, brick, brick_index, voxel_index, density, index, weight)
+    gz = _density(u, v, w + h, brick, brick_index, voxel_index, density, index, weight)
+    gz -= _density(u, v, w - h, brick, brick_index, voxel_index, density, index, weight)
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     if length > 0:
         out[0], out[1], out[2] = -gx / length, -gy / length, -gz / length
@@ -182,7 +185,10 @@ def _render(origins, directions, bases, brick, brick_index, voxel_index, density
                     if hit == np.inf and left <= 0.5:
                         hit = t - 0.5 * step + np.log(2 * light) / (sigma * units)
                         at = np.float32(hit)
-                        _gradient(np.float32(ox + at * dx), np.float32(oy + at * dy), np.float32(oz + at * dz), brick, brick_index, voxel_index, density, index, weight, normal[ray])
+                        _gradient(
+                            np.float32(ox + at * dx), np.float32(oy + at * dy), np.float32(oz + at * dz),
+                            brick, brick_index, voxel_index, density, index, weight, normal[ray],
+                        )  # fmt: skip
                     light = left
                     if light < stop:
                         break

@@ -34,9 +34,10 @@ def valid_samples(
         return sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold)
     from efficientnerf.kernels import cpu
 
-    arrays = [_array(t) for t in (origins, directions, near, far, offset)]
-    first, start, extent, length, point, tried = cpu.valid_samples(*arrays, *_box(space), step, slots, _array(voxels), threshold)
-    return Samples(*(torch.from_numpy(a) for a in (first, start, extent, length, point)), tried)
+    *packed, tried = cpu.valid_samples(
+        _array(origins), _array(directions), _array(near), _array(far), _array(offset), *_box(space), step, slots, _array(voxels), threshold
+    )
+    return Samples._make([*(torch.from_numpy(a) for a in packed), tried])
 
 
 def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
@@ -56,9 +57,11 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
         return sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
     from efficientnerf.kernels import cpu
 
-    arrays = [_array(t) for t in (coarse.first, coarse.start, coarse.extent, coarse.length, pivotal)]
-    fine = cpu.pivotal_samples(_array(origins), _array(directions), _array(offset), *_box(space), *arrays, per_pivot)
-    return Samples(*(torch.from_numpy(a) for a in fine), coarse.tried)
+    fine = cpu.pivotal_samples(
+        _array(origins), _array(directions), _array(offset), *_box(space),
+        _array(coarse.first), _array(coarse.start), _array(coarse.extent), _array(coarse.length), _array(pivotal), per_pivot,
+    )  # fmt: skip
+    return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried])
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
@@ -70,7 +73,7 @@ def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, bac
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, exponential: bool) -> tuple[Tensor, ...]:  # type: ignore[override]
+    def forward(ctx: Any, raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, exponential: bool) -> tuple[Tensor, ...]:
         from efficientnerf.kernels import cpu
 
         rays = len(first) - 1

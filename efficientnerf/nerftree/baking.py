@@ -89,7 +89,7 @@ def voxel_values(
         jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32))
         world = (block[:, None] + jitter) * voxel + low
         raw = m.fine(m.space.grid(world.reshape(-1, 3)).to(m.device)).cpu()
-        density = activate(raw[:, 0], m.fine.activation).reshape(len(block), points)  # type: ignore[arg-type]
+        density = activate(raw[:, 0], m.fine.activation).reshape(len(block), points)
         share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
         yield density.mean(dim=1).numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().numpy()
