@@ -46,8 +46,8 @@ class Model:
 
     space: Space
     settings: TrainSettings
-    coarse: nn.Module
-    fine: nn.Module
+    coarse: HashField | MlpField
+    fine: HashField | MlpField
     voxels: DensityVoxels
     sky: Sky
     background: tuple[float, float, float] | None
@@ -91,11 +91,11 @@ def model(space: Space, settings: TrainSettings, background: tuple[float, float,
     """An untrained model; the same settings give the same numbers."""
     generator = torch.Generator().manual_seed(settings.seed)
     if settings.field == "hash":
-        coarse: nn.Module = HashField(
+        coarse: HashField | MlpField = HashField(
             levels=max(1, settings.levels // 2), log2_table=max(8, settings.log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, settings.finest // 4),
             hidden=settings.coarse_hidden, layers=settings.coarse_layers, degree=0, initial_density=settings.initial_density, generator=generator,
         )  # fmt: skip
-        fine: nn.Module = HashField(
+        fine: HashField | MlpField = HashField(
             levels=settings.levels, log2_table=settings.log2_table, coarsest=COARSEST, finest=settings.finest,
             hidden=settings.hidden, layers=settings.layers, degree=settings.degree, initial_density=settings.initial_density,
             generator=generator,
