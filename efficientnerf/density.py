@@ -38,7 +38,9 @@ class DensityVoxels:
         return float((self.values > self.threshold).float().mean())
 
 
-def density_voxels(side: int, rule: str, *, initial: float = 10.0, beta: float = 0.1, decay: float = 0.95, threshold: float = 0.0, device: str = "cpu") -> DensityVoxels:
+def density_voxels(
+    side: int, rule: str, *, initial: float = 10.0, beta: float = 0.1, decay: float = 0.95, threshold: float = 0.0, device: str = "cpu"
+) -> DensityVoxels:
     """Fresh voxels; all are valid."""
     if rule not in ("momentum", "maximum"):
         raise ValueError(f"density voxels updated by {rule!r}: expected 'momentum' or 'maximum'")
