@@ -23,7 +23,7 @@ import numpy as np
 from stages.upright import UnreadableImage, UprightPhoto, mask_of, upright_photo, write_png
 
 LAYOUT = 1  # of the work folder; raise it when what is written there changes meaning
-BLOCK = 5  # images to a side of a block of pairs: a block takes a second or two, and nothing answers inside one
+BLOCK = 8  # images to a side of a block of pairs: a block takes a second or three, nothing answers inside one, and each builds its images' indices anew
 FINE_BELOW = 1000  # px, longest side: smaller images are searched at twice their size (four times slower, four times as exact)
 NEIGHBOURS = 10  # images matched after each one in a sequence
 KEYFRAMES = 40  # images of a sequence that are matched with each other, to close its loops
@@ -293,14 +293,19 @@ def pairs_to_match(count: int, how: str) -> list[list[tuple[int, int]]]:
 
 
 def match(work: Path, images: Sequence[WorkImage], *, how: str, seed: int, progress: Progress, safe_point: SafePoint) -> None:
-    """Matches and two-view geometries of the pairs that have none yet, a block at a time."""
+    """Matches and two-view geometries of the pairs that have none yet, a block at a time.
+
+    COLMAP compares descriptors by FAISS, which multiplies matrices with an OpenBLAS built for a single thread: two threads that ask for its
+    scratch memory at once may be given the same piece, and then some matches are wrong, about once in sixty runs on a busy machine. One
+    thread compares (COLMAP verifies in another one meanwhile, without BLAS).
+    """
     with quiet_pycolmap() as pycolmap:
         with pycolmap.Database.open(database_path(work)) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             verified = {tuple(sorted(pair)) for pair in verified_pairs(database_path(work))}
         matching = pycolmap.FeatureMatchingOptions()
         matching.use_gpu = False
-        matching.num_threads = threads()
+        matching.num_threads = 1
         geometry = pycolmap.TwoViewGeometryOptions()
         geometry.ransac.random_seed = seed
         pairing = pycolmap.ImportedPairingOptions()
