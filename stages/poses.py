@@ -36,7 +36,7 @@ class PosesSettings:
     box: tuple[float, float, float, float, float, float] | None = setting(
         None, "Crop box in the capture's frame: x y z of one corner, then of the opposite one; none estimates it."
     )
-    margin: float = setting(0.05, "Room left on each side of an estimated box, as a fraction of its size.", minimum=0.0, maximum=2.0)
+    margin: float = setting(0.05, "Room left on each side of an estimated box, as a fraction of its longest side.", minimum=0.0, maximum=2.0)
     alpha: str = setting(
         "auto",
         "What alpha means: composite (an object on a constant background, white) or mask (transparent pixels are left out).",
