@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from efficientnerf.settings import TrainSettings
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.stage import settings_from
+from stages.exporters.aside import written_aside
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,15 +30,8 @@ def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path)
 
     text = json.dumps({"format": FORMAT, **about}, sort_keys=True)
     data = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata={"field": text})
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(aside, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    with written_aside(path) as aside:
+        aside.write_bytes(data)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

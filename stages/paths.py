@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 
 from efficientnerf.cameras import Camera, Similarity, pose_from_opengl
 from pipeline.errors import BadInput
+from pipeline.files import Unreadable, read_json
 from stages.scene import Orbit
 
 if TYPE_CHECKING:
@@ -239,17 +239,12 @@ def _shown(value: Any) -> str:
 
 
 def _read_json(path: Path) -> Any:
-    def refuse(constant: str) -> float:
-        raise ValueError(f"{constant} is no number")
-
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise BadInput(f"{path}: larger than {LARGEST_FILE >> 20} MiB; no camera path.")
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    except OSError as error:
+        return read_json(path, LARGEST_FILE)
+    except FileNotFoundError as error:
         raise BadInput(f"{path}: {error.strerror}.") from error
-    except (ValueError, RecursionError) as error:
-        raise BadInput(f"{path}: not JSON ({error}).") from error
+    except Unreadable as error:
+        raise BadInput(f"{path}: {error}; no camera path.") from error
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import numpy as np
 
 from efficientnerf.cameras import Camera, Similarity
 from pipeline.errors import BadInput
+from pipeline.files import Unreadable, read_json
 from stages.capture import SparsePoints
 
 FORMAT = 1
@@ -323,17 +324,12 @@ def _triple(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def _read_json(path: Path) -> Any:
-    def refuse(constant: str) -> float:
-        raise ValueError(f"{constant} is no number")
-
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise BadInput(f"{path}: larger than {LARGEST_FILE >> 20} MiB; not written by the poses stage.")
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    except OSError as error:
+        return read_json(path, LARGEST_FILE)
+    except FileNotFoundError as error:
         raise BadInput(f"{path}: {error.strerror}. Run the poses stage first.") from error
-    except (ValueError, RecursionError) as error:
-        raise BadInput(f"{path}: not JSON ({error}). Run the poses stage again.") from error
+    except Unreadable as error:
+        raise BadInput(f"{path}: {error}. Run the poses stage again.") from error
 
 
 @dataclass(frozen=True)

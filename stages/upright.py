@@ -70,15 +70,15 @@ def upright_photo(path: Path, max_side: int) -> UprightPhoto:
                 orientation = orientation if orientation in range(1, 9) else 1
                 full = image.size
                 _draft(image, max_side)
-                rgb, alpha = _pixels(image)
+                rgb, alpha = pixels_and_alpha(image)
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise UnreadableImage(f"cannot be read ({reason.splitlines()[0] if reason else type(error).__name__})") from error
     width, height = full if orientation < 5 else full[::-1]
-    rgb = _resized(_upright(rgb, orientation), working_size(width, height, max_side))
+    rgb = _resized(upright(rgb, orientation), working_size(width, height, max_side))
     opaque = None
     if alpha is not None and (alpha < 128).any():
-        opaque = _resized(_upright(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
+        opaque = _resized(upright(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
     maker = " ".join(str(exif.get(tag, "")).strip(" \0") for tag in (_MAKE, _MODEL)).strip()
     return UprightPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *full), maker)
 
@@ -91,7 +91,7 @@ def alpha_channel(path: Path) -> np.ndarray | None:
         with Image.open(path) as image:
             if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
                 return None
-            return _upright(np.asarray(image.convert("RGBA"))[..., 3], image.getexif().get(_ORIENTATION, 1))
+            return upright(np.asarray(image.convert("RGBA"))[..., 3], image.getexif().get(_ORIENTATION, 1))
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise UnreadableImage(f"{path.name} cannot be read") from error
 
@@ -106,7 +106,7 @@ def mask_of(path: Path, photo: UprightPhoto) -> np.ndarray:
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise UnreadableImage(f"{path.name} cannot be read") from error
     if photo.orientation >= 5 and _same_aspect(mask.shape[::-1], (photo.height, photo.width)):
-        mask = _upright(mask, photo.orientation)  # drawn over the pixels as stored
+        mask = upright(mask, photo.orientation)  # drawn over the pixels as stored
     if not _same_aspect(mask.shape, (photo.height, photo.width)):
         raise UnreadableImage(f"{path.name} is {mask.shape[1]}x{mask.shape[0]}, the photograph {photo.width}x{photo.height}")
     height, width = photo.rgb.shape[:2]
@@ -154,7 +154,7 @@ def _draft(image: Any, max_side: int) -> None:
             image.draft(image.mode, (image.size[0] // scale, image.size[1] // scale))
 
 
-def _pixels(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
+def pixels_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
     """(rgb, alpha or None) as uint8; sixteen bits are cut to eight, which Pillow's own conversion would clip."""
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image).astype(np.float64)
@@ -166,7 +166,7 @@ def _pixels(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
     return np.asarray(image.convert("RGB")), None
 
 
-def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Undo EXIF's orientation (tag 274): where row 0 and column 0 of the stored image belong."""
     if orientation >= 5:
         pixels = pixels.swapaxes(0, 1)

@@ -51,7 +51,7 @@ def decode(path: Path) -> Decoded:
 
     from PIL import Image
 
-    from stages.upright import _pixels, _upright
+    from stages.upright import pixels_and_alpha, upright
 
     orientation = _orientation(path)
     try:
@@ -59,12 +59,12 @@ def decode(path: Path) -> Decoded:
             warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
             with Image.open(path) as image:
                 verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image, path)
-                rgb, alpha = _pixels(image)
+                rgb, alpha = pixels_and_alpha(image)
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UnreadableImage(f"cannot be decoded ({reason[:100]})") from error
     pixels = rgb if alpha is None else np.dstack([rgb, alpha])
-    return Decoded(np.ascontiguousarray(_upright(pixels, orientation)), verbatim, orientation)
+    return Decoded(np.ascontiguousarray(upright(pixels, orientation)), verbatim, orientation)
 
 
 def has_transparency(path: Path) -> bool:
@@ -190,7 +190,7 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def _usable(photo: Photo, size: tuple[int, int], turned: int) -> tuple[np.ndarray, list[str]]:
     """(h, w) bool at working size from the photo's mask file, and warnings."""
-    from stages.upright import _upright
+    from stages.upright import upright
 
     assert photo.mask is not None
     try:
@@ -199,7 +199,7 @@ def _usable(photo: Photo, size: tuple[int, int], turned: int) -> tuple[np.ndarra
         raise UnreadableImage(f"its mask {photo.mask.name} {error}") from error
     expected = photo.camera.width, photo.camera.height
     if turned >= 5 and not same_aspect(mask.shape[::-1], expected):
-        mask = _upright(mask, turned)  # drawn over the pixels as stored
+        mask = upright(mask, turned)  # drawn over the pixels as stored
     found = mask.shape[1], mask.shape[0]
     sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
     if not same_aspect(found, expected):

@@ -8,18 +8,10 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.cameras import Camera, Similarity, rays
+from efficientnerf.nerftree.tree import Rendering
+from efficientnerf.render import FieldRendering
 
 WHITE = (1.0, 1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """What NerfTree.render hands over; see there."""
-
-    colour: np.ndarray
-    opacity: np.ndarray
-    depth: np.ndarray
-    normal: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,18 +104,6 @@ class BallTree:
             colour = colour + (1.0 - flat.opacity[:, None]) * np.asarray(background, np.float32)
         depth = flat.depth * (directions @ camera.forward).astype(np.float32)
         return Rendering(colour.reshape(*size, 3), flat.opacity.reshape(size), depth.reshape(size), flat.normal.reshape(*size, 3))
-
-
-@dataclass(frozen=True)
-class FieldRendering:
-    """What FieldRenderer.render hands over; see there."""
-
-    colour: np.ndarray
-    opacity: np.ndarray
-    depth: np.ndarray
-    before: np.ndarray
-    behind: np.ndarray
-    inside_opacity: np.ndarray
 
 
 @dataclass

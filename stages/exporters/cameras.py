@@ -7,11 +7,11 @@ into the folder of the source images, whose names it uses.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from efficientnerf.cameras import Camera, opengl_from_pose
+from stages.exporters.aside import written_aside
 from stages.scene import SPLITS, Scene, views_of
 
 # nerfstudio knows these; what it does not know is written as the one that contains it.
@@ -38,9 +38,8 @@ def transforms_from_scene(scene: Scene) -> dict[str, Any]:
 
 def write(scene: Scene, path: Path) -> None:
     """Write transforms.json for a scene; the file appears by rename."""
-    aside = path.with_name(path.name + ".part")
-    aside.write_text(json.dumps(transforms_from_scene(scene), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(aside, path)
+    with written_aside(path) as aside:
+        aside.write_text(json.dumps(transforms_from_scene(scene), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _lens(camera: Camera) -> dict[str, Any]:

@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.colour import linear_from_srgb
 from efficientnerf.mesh import Mesh
 
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, linear_from_srgb, write_aside
+from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_aside
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963  # buffer view targets
@@ -39,7 +40,7 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> 
     check_mesh(mesh, path)
     rotation = gltf_from_capture(frame.up)
     normals = mesh.normals @ rotation.T
-    linear = np.concatenate([linear_from_srgb(mesh.colours), np.ones((len(mesh.colours), 1))], 1)
+    linear = np.concatenate([linear_from_srgb(np.clip(mesh.colours.astype(np.float64), 0, 1)), np.ones((len(mesh.colours), 1))], 1)
     arrays = [  # each is a multiple of four bytes long, as alignment asks
         np.ascontiguousarray(mesh.vertices @ rotation.T, "<f4"),
         np.ascontiguousarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), "<f4"),

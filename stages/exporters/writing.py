@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,8 @@ import numpy as np
 from efficientnerf.cameras import Similarity
 from efficientnerf.mesh import Mesh, PointCloud
 from pipeline.errors import BadInput
+from pipeline.files import sync_folder
+from stages.exporters.aside import written_aside
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,27 +75,8 @@ def bytes_from_srgb(colours: np.ndarray) -> np.ndarray:
     return np.round(np.clip(colours, 0, 1) * 255).astype(np.uint8)
 
 
-def linear_from_srgb(colours: np.ndarray) -> np.ndarray:
-    """sRGB 0-1 -> linear light 0-1 (IEC 61966-2-1), float64."""
-    colours = np.clip(colours.astype(np.float64), 0, 1)
-    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-
-
 def write_aside(path: Path, parts: Iterable[bytes | memoryview]) -> None:
     """Write a file under a name of its own, sync it, then put it in place: `path` holds all of it, or what it held before."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with open(aside, "wb") as file:
-            for part in parts:
-                file.write(part)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    except BaseException:
-        aside.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with written_aside(path) as aside, open(aside, "wb") as file:
+        file.writelines(parts)
+    sync_folder(path.parent)
