@@ -172,20 +172,3 @@ def test_a_uniform_ball_has_its_closed_form(composite: object) -> None:
     expected = 1 - np.exp(-sigma * chord)
     np.testing.assert_allclose(out.opacity, expected, atol=1e-6)
     np.testing.assert_allclose(out.colour[:, 0], 0.5 * expected + 1 - expected, atol=1e-6)
-
-
-def test_the_kernel_gives_the_same_bytes_whatever_the_number_of_threads() -> None:
-    import numba
-
-    b = in_float32(bundle(3, (40,) * 500))
-    usual = numba.get_num_threads()
-    pictures = []
-    for threads in (1, usual):
-        numba.set_num_threads(threads)
-        raw = b.raw.clone().requires_grad_()
-        out = dispatch.composite(raw, *b[1:], "exp")
-        out.colour.sum().backward()
-        assert raw.grad is not None
-        pictures.append((out.colour.detach().numpy().tobytes(), raw.grad.numpy().tobytes()))
-    numba.set_num_threads(usual)
-    assert pictures[0] == pictures[1]

@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import math
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -20,15 +19,9 @@ MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> object:
-    """The rate rises in a few steps; and one thread: sums are repeatable for a fixed number, and one keeps other work from slowing these small ones."""
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rate rises in a few steps."""
     monkeypatch.setattr(training, "RATE_WARM_UP", 10)
-    usual, kernels = torch.get_num_threads(), numba.get_num_threads()
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    yield
-    torch.set_num_threads(usual)
-    numba.set_num_threads(kernels)
 
 
 def run(m: Model, which: Pixels | None = None) -> list[Progress]:

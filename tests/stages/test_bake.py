@@ -7,7 +7,6 @@ import hashlib
 import json
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 
@@ -23,15 +22,6 @@ from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
 
 QUICK = BakeSettings(resolution=24, points=4, licence="CC0-1.0")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> object:
-    """Kernels this small only wait for each other on several threads; the bytes are the same."""
-    usual = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(usual)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import itertools
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -123,6 +125,19 @@ def test_mp4_decodes_to_its_frames(tmp_path: Path, size: tuple[int, int]) -> Non
     # Colours come back without a cast: the wrong matrix or range would shift the means (the decoder rounds down, by up to 1.5).
     means = [np.abs(np.mean(a[: size[0], : size[1]].astype(float) - f, axis=(0, 1))).max() for f, a in zip(frames, decoded, strict=True)]
     assert max(means) < 2.0
+
+
+def test_mp4_of_more_frames_than_the_encoder_looks_ahead_shows_each_at_its_time(tmp_path: Path) -> None:
+    write_mp4(moving_frames(75, 32, 32), tmp_path / "a.mp4", fps=30)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        stream = container.streams.video[0]
+        packets = [packet for packet in container.demux(stream) if packet.pts is not None]
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        shown = [frame.time for frame in container.decode(container.streams.video[0])]
+    assert sorted(packet.pts * packet.time_base for packet in packets) == [Fraction(k, 30) for k in range(75)]
+    assert [packet.dts for packet in packets] == sorted({packet.dts for packet in packets})
+    assert shown == pytest.approx([k / 30 for k in range(75)])
+    assert all(before < after for before, after in itertools.pairwise(shown))
 
 
 def test_mp4_index_lies_before_the_pictures_and_no_program_signs_it(tmp_path: Path) -> None:

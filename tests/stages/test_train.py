@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
@@ -19,15 +18,6 @@ from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
 QUICK = {"iterations": 13, "checkpoint_every": 4, "samples": 1024, "warm_up": 6, "preview_every": 5}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> object:
-    """Kernels this small only wait for each other on several threads; the bytes are the same."""
-    usual = numba.get_num_threads()
-    numba.set_num_threads(1)
-    yield
-    numba.set_num_threads(usual)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,44 @@
+"""The kernels give the same bytes on one thread and on two."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = """
+import hashlib
+
+import numba
+import numpy as np
+
+from efficientnerf.training import state_of, train, trainer
+from tests.efficientnerf.balls import pixels, untrained
+from tests.efficientnerf.trees import random_tree, rays_at
+
+print(numba.get_num_threads())
+t = trainer(untrained(contracted=True, iterations=5, warm_up=2))
+list(train(t, pixels()))
+for name, tensor in sorted(state_of(t).items()):
+    print(name, hashlib.sha256(tensor.numpy().tobytes()).hexdigest())
+tree = random_tree()
+seen = tree.render_rays(*rays_at(tree, 3000))
+points = np.random.default_rng(0).uniform(tree.bounds_min, tree.bounds_max, (5000, 3))
+for values in (seen.colour, seen.opacity, seen.depth, seen.normal, tree.density(points), tree.normal(points), tree.colour(points, None)):
+    print(hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest())
+"""
+
+
+def lines(threads: int) -> list[str]:
+    environment = {**os.environ, "NUMBA_NUM_THREADS": str(threads)}
+    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()
+
+
+def test_the_number_of_threads_changes_no_byte() -> None:
+    (one, *alone), (two, *together) = lines(1), lines(2)
+    assert (one, two) == ("1", "2")
+    assert len(alone) > 10
+    assert alone == together
