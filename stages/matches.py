@@ -8,11 +8,14 @@ left in the database is what an undisturbed run would have put there.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import json
 import os
 import shutil
+import signal
 import sqlite3
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,11 +57,37 @@ class WorkImage:
     camera_key: str
 
 
+# What glog catches. It does so from the moment pycolmap is imported, prints a stack trace and aborts: at SIGTERM too, instead of what the
+# process has arranged to do.
+_CAUGHT = (signal.SIGSEGV, signal.SIGILL, signal.SIGFPE, signal.SIGABRT, signal.SIGBUS, signal.SIGTERM)
+_ROOM = 1024  # bytes; a struct sigaction takes 152 on Linux
+
+
+def import_pycolmap() -> Any:
+    """pycolmap; the only place that imports it. Every signal is handled afterwards as it was before.
+
+    The handlers are kept as C has them: Python's own record knows nothing of those that faulthandler or another library has set, and
+    sets handlers in the main thread only.
+    """
+    if "pycolmap" not in sys.modules:
+        libc = ctypes.CDLL(None)
+        handlers = [(number, ctypes.create_string_buffer(_ROOM)) for number in _CAUGHT]
+        for number, handler in handlers:
+            libc.sigaction(int(number), None, handler)
+        try:
+            import pycolmap
+        finally:
+            for number, handler in handlers:
+                libc.sigaction(int(number), handler, None)
+    import pycolmap
+
+    return pycolmap
+
+
 @contextlib.contextmanager
 def quiet_pycolmap() -> Iterator[Any]:
     """pycolmap with its log silenced, except for fatal errors."""
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 3
     try:
@@ -208,8 +237,7 @@ def _first_guess(image: WorkImage) -> Any:
     Richer lenses are tried once the scene is known. Without EXIF data the focal length starts at 1.2 times the longest side, a
     moderate wide angle as phones and small cameras have it.
     """
-    import pycolmap
-
+    pycolmap = import_pycolmap()
     scale = np.sqrt(image.work_width * image.work_height / (image.width * image.height))
     focal = image.focal * scale if image.focal else 1.2 * max(image.work_width, image.work_height)
     camera = pycolmap.Camera(

@@ -377,5 +377,38 @@ def test_one_thread_compares_descriptors(ten: tuple[list[str], Path, Capture], t
     assert set(asked) == {1}
 
 
+TERMINATED = """
+import os, signal, sys
+from dataclasses import replace
+from pathlib import Path
+from pipeline.errors import PipelineError
+from pipeline.runner import run_stages
+from stages.matches import quiet_pycolmap
+from tests.pipeline.toy import STAGES, make_run
+
+def work(job):
+    with quiet_pycolmap():
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    job.safe_point()
+
+if sys.argv[1] == "none":
+    with quiet_pycolmap():
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+try:
+    run_stages(make_run(Path(sys.argv[1])), [replace(STAGES[0], run=work), *STAGES[1:]])
+except PipelineError as error:
+    sys.exit(error.exit_code)
+"""
+
+
+@pytest.mark.parametrize(("engine", "code"), [(True, 143), (False, -signal.SIGTERM)])
+def test_colmap_leaves_sigterm_as_it_was(tmp_path: Path, engine: bool, code: int) -> None:
+    command = [sys.executable, "-c", TERMINATED, str(tmp_path) if engine else "none"]
+    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
 def test_threads_are_those_allowed() -> None:
     assert 1 <= matches.threads() <= (os.cpu_count() or 1)
