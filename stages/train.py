@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 LOG_EVERY = 10
 CHECKPOINTS_KEPT = 2
 FEWEST_OBSERVERS = 3
+NOWHERE = 1e-9  # scene is 2 across: nearer to a camera than this, a point has no direction
 
 
 def run(job: Job) -> None:
@@ -89,7 +90,8 @@ def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
 
 
 def anchors_of(folder: Path, s: Scene) -> Anchors | None:
-    """Rays of training cameras to the sparse points that were seen there; only points that three photographs or more agree on."""
+    """Rays of training cameras to the sparse points that were seen there; only points that three photographs or more agree on, and only
+    from cameras they lie before: posed data sets name points behind a camera, or in it, too."""
     from efficientnerf.training import Anchors
     from stages import scene
 
@@ -104,6 +106,11 @@ def anchors_of(folder: Path, s: Scene) -> Anchors | None:
     which, view = np.array(pairs, np.int64).T
     away = points.xyz[which] - centres[view]
     distance = np.linalg.norm(away, axis=1)
+    forward = np.array([v.camera.forward for v in s.views])
+    before = (away * forward[view]).sum(1) > NOWHERE  # so is the distance; what is not a number is not before anything
+    if not before.any():
+        return None
+    away, distance, view = away[before], distance[before], view[before]
     return Anchors(centres[view].astype(np.float32), (away / distance[:, None]).astype(np.float32), distance.astype(np.float32))
 
 

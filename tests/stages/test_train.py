@@ -12,7 +12,9 @@ import pytest
 
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
+from stages import scene as scenes
 from stages import train
+from stages.capture import SparsePoints
 from stages.field import FILE, load_renderer
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
@@ -137,3 +139,32 @@ def test_photographs_with_masks(tmp_path: Path) -> None:
     Image.fromarray(0 * mask).save(folder / "images" / "mask.png")
     with pytest.raises(ValueError, match="masks leave no pixel"):
         train.run(job(tmp_path / "b", few, poses=folder))
+
+
+def test_points_in_a_camera_or_behind_it_are_no_anchors(tmp_path: Path) -> None:
+    folder = poses(tmp_path / "poses", points=True)
+    s = scenes.load(folder)
+    cameras = [view.camera for view in s.views]
+    xyz = np.array([[0.0, 0, 0], cameras[0].centre, cameras[1].centre - cameras[1].forward, [0.1, 0, 0], [np.nan, 0, 0]])
+    seen = ((0, 1, 2), (0, 1, 2), (1, 3, 4), (0, 1), (0, 1, 2))
+    points = SparsePoints(xyz, np.zeros((5, 3), np.uint8), np.zeros(5), seen)
+
+    def rays(points: SparsePoints) -> tuple[list[tuple[int, int]], Any]:
+        """(point, camera) of each anchor, found again from the ray."""
+        scenes.save_points(points, folder)
+        anchors = train.anchors_of(folder, s)
+        if anchors is None:
+            return [], None
+        np.testing.assert_allclose(np.linalg.norm(anchors.directions, axis=1), 1, atol=1e-6)
+        ends = anchors.origins + anchors.distance[:, None] * anchors.directions
+        found = [(int(np.nanargmin(np.linalg.norm(points.xyz - end, axis=1))), int(np.argmin(np.linalg.norm(centres - origin, axis=1))))
+                 for origin, end in zip(anchors.origins, ends, strict=True)]  # fmt: skip
+        return sorted(found), anchors
+
+    centres = np.array([camera.centre for camera in cameras])
+    before = {(n, view) for n, views in enumerate(seen) for view in views if len(views) > 2 and (xyz[n] - centres[view]) @ cameras[view].forward > 1e-9}
+    assert {(0, 0), (0, 1), (0, 2)} <= before
+    assert not {(1, 0), (2, 1)} & before
+    assert rays(points)[0] == sorted(before)
+    only = SparsePoints(np.repeat(cameras[0].centre[None], 1, axis=0), points.rgb[:1], points.error[:1], ((0, 0, 0),))
+    assert rays(only) == ([], None)
