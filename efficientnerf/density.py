@@ -20,13 +20,14 @@ from torch import Tensor
 
 @dataclass
 class DensityVoxels:
-    """values (D, D, D) float32 over grid coordinates; x slowest."""
+    """values (D, D, D) float32 over grid coordinates, x slowest; `start` is what they began with."""
 
     values: Tensor
     rule: str
     beta: float
     decay: float
     threshold: float
+    start: float
 
     @property
     def side(self) -> int:
@@ -46,7 +47,7 @@ def density_voxels(
         raise ValueError(f"density voxels updated by {rule!r}: expected 'momentum' or 'maximum'")
     # A maximum that starts at twice the threshold is forgotten after some fourteen refreshes at the usual decay, and each cell has been asked by then.
     start = initial if rule == "momentum" else 2 * threshold
-    return DensityVoxels(torch.full((side, side, side), start, device=device), rule, beta, decay, threshold)
+    return DensityVoxels(torch.full((side, side, side), start, device=device), rule, beta, decay, threshold, start)
 
 
 def cell_of(points: Tensor, side: int) -> Tensor:

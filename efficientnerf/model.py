@@ -135,7 +135,10 @@ def look(m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tenso
     fine = dispatch.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, m.settings.fine_samples)
     fine_raw = m.fine(fine.point)
     out = dispatch.composite(fine_raw, fine.length, fine.first, basis(directions, m.fine.degree), behind, m.fine.activation)
-    return Look(coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, out.colour, out.opacity, out.weight, out.sample_colour, seen.distortion + out.distortion)
+    return Look(
+        coarse, coarse_raw, seen.weight, seen.colour, pivotal,
+        fine, fine_raw, out.colour, out.opacity, out.weight, out.sample_colour, seen.distortion + out.distortion,
+    )  # fmt: skip
 
 
 def state_of(m: Model) -> dict[str, Tensor]:

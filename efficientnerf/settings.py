@@ -14,7 +14,7 @@ def _setting(default: Any, doc: str, **limits: Any) -> Any:
 class TrainSettings:
     """How a scene is learned. The defaults are for two CPU cores (`preview`)."""
 
-    iterations: int = _setting(2000, "optimisation steps", minimum=1)
+    iterations: int = _setting(3000, "optimisation steps", minimum=1)
     samples: int = _setting(65536, "network evaluations aimed at in a step; the number of rays follows from it", minimum=64)
     rays: int = _setting(8192, "rays in a step at most", minimum=1)
     seed: int = _setting(0, "seed of every random choice", minimum=0)

@@ -247,6 +247,10 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
                 for part in range(0, len(cell), 2**17):
                     remember(m, point[part : part + 2**17], m.coarse.density(point[part : part + 2**17]), cell[part : part + 2**17])
 
+                if not bool((m.voxels.values > m.voxels.threshold).any()):
+                    # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
+                    m.voxels.values.fill_(m.voxels.start)
+
         fine, valid = len(seen.fine.start), len(seen.coarse.start)
         t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((fine + valid) / count, 1.0)
         t.step = number
