@@ -119,19 +119,27 @@ def model(space: Space, settings: TrainSettings, background: tuple[float, float,
     return Model(space, settings, coarse.to(device), fine.to(device), voxels, Sky().to(device), background, step, slots)
 
 
-def look(m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, behind: Tensor, *, prune: bool = True) -> Look:
+def look(
+    m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, behind: Tensor, *,
+    prune: bool = True, rng: np.random.Generator | None = None,
+) -> Look:  # fmt: skip
     """Both stages along a bundle of rays: valid samples through the coarse field, pivotal ones through the fine one.
 
     origins, directions  (R, 3) world frame, unit directions
     near, far, offset    (R,) distances, and the offset of the samples in their intervals
     behind               (R, 3) colour beyond all samples
     prune                whether the density voxels are heeded (not in the warm-up)
+    rng                  in training: a random share of the valid intervals is looked at by the fine field too. Without it the fine field would be
+                         free to put matter where this ray has no pivot and another has one, and the baked asset, which has no coarse
+                         stage to hide it, would show it.
     """
     threshold = m.voxels.threshold if prune else -math.inf
     coarse = dispatch.valid_samples(m.space, origins, directions, near, far, offset, m.step, m.slots, m.voxels.values, threshold)
     coarse_raw = m.coarse(coarse.point)
     seen = dispatch.composite(coarse_raw, coarse.length, coarse.first, basis(directions, m.coarse.degree), behind, m.coarse.activation)
     pivotal = dispatch.pivots(seen.weight.detach(), coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
+    if rng is not None and m.settings.explored > 0:
+        pivotal = pivotal | torch.from_numpy(rng.random(len(pivotal), np.float32) < m.settings.explored).to(pivotal.device)
     fine = dispatch.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, m.settings.fine_samples)
     fine_raw = m.fine(fine.point)
     out = dispatch.composite(fine_raw, fine.length, fine.first, basis(directions, m.fine.degree), behind, m.fine.activation)

@@ -31,6 +31,7 @@ class TrainSettings:
     fine_samples: int = _setting(2, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
     pivotal_weight: float = _setting(1e-4, "epsilon: weight above which a coarse sample is pivotal", minimum=0.0, maximum=1.0)
     max_pivots: int = _setting(8, "pivotal samples on a ray at most; the lightest are dropped", minimum=1, maximum=4096)
+    explored: float = _setting(0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0)
     distortion: float = _setting(0.01, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog", minimum=0.0)
     anchors: float = _setting(0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0)
     initial_density: float = _setting(0.1, "hash: density that the fields start with, per world unit", minimum=1e-6, maximum=1e3)

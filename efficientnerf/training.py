@@ -21,7 +21,7 @@ from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
 from efficientnerf.model import Look, Model, look
 
-RATE_WARM_UP = 100  # steps in which the rate rises
+RATE_WARM_UP = 100  # steps in which the rate rises, or the first tenth of a shorter run
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15  # Mueller et al. 2022; epsilon this small because a table entry's gradient can be
 FEWEST_RAYS = 64
 ANCHOR_SHARE = 8  # one ray to a sparse point for so many rays of pixels
@@ -199,7 +199,8 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
 
 def learning_rate(step: int, settings_rate: float, final: float, iterations: int) -> float:
     """Rises over the first steps, then falls exponentially to `final` of itself."""
-    return settings_rate * min(1.0, step / RATE_WARM_UP) * final ** (step / iterations)
+    rise = max(1, min(RATE_WARM_UP, iterations // 10))
+    return settings_rate * min(1.0, step / rise) * final ** (step / iterations)
 
 
 def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterator[Progress]:
@@ -222,7 +223,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
 
         # Both stages, both losses (weighted equally, as in the authors' release).
-        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up)
+        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up, rng=rng)
         fine_loss = ((seen.fine_colour - colour) ** 2).mean()
         loss = fine_loss + ((seen.coarse_colour - colour) ** 2).mean()
         if m.space.contracted:
@@ -269,7 +270,7 @@ def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator
     origins, directions, distance = (torch.from_numpy(a[pick]).to(m.device) for a in (anchors.origins, anchors.directions, anchors.distance))
     offset = torch.from_numpy(rng.random(count, np.float32)).to(m.device)
     near, far = 0.1 * distance, 4 * distance
-    seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune)
+    seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng)
     loss = origins.new_zeros(())
     for samples, weight, share in ((seen.coarse, seen.coarse_weight, 1), (seen.fine, seen.fine_weight, m.settings.fine_samples)):
         ray = ray_of_sample(samples.first, len(samples.start))

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from efficientnerf.compositing import activate
+from efficientnerf.density import cell_of
 from efficientnerf.model import Model, look
 from efficientnerf.training import Pixels
 
@@ -80,6 +81,8 @@ def voxel_values(
 
     points  jittered points to a voxel: one in each of so many slices along a diagonal permutation, averaged; densities as they are,
             harmonics weighted by density
+
+    Where the density voxels say that space is empty the density is zero: the fine field was never asked there and may say anything.
     """
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
     per_block = max(1, POINTS_PER_BLOCK // points)
@@ -88,8 +91,10 @@ def voxel_values(
         rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 1, number]))
         jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32))
         world = (block[:, None] + jitter) * voxel + low
-        raw = m.fine(m.space.grid(world.reshape(-1, 3)).to(m.device)).cpu()
-        density = activate(raw[:, 0], m.fine.activation).reshape(len(block), points)
+        point = m.space.grid(world.reshape(-1, 3)).to(m.device)
+        raw = m.fine(point).cpu()
+        valid = (m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold).cpu()
+        density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
         share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
         yield density.mean(dim=1).numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().numpy()
