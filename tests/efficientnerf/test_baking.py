@@ -133,3 +133,16 @@ def test_blocks_do_not_depend_on_where_one_begins(monkeypatch: pytest.MonkeyPatc
         assert np.array_equal(b, d)
     other = next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 8)))
     assert not np.array_equal(other[1], next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 7)))[1])
+
+
+def test_nothing_is_baked_where_the_voxels_are_empty() -> None:
+    m = untrained()
+    indices = np.argwhere(np.ones((8, 8, 8), bool)).astype(np.int32)
+    ((before, _),) = voxel_values(m, indices, 2 / 8, BOUNDS[0], 4, 0)
+    half = m.voxels.side // 2
+    m.voxels.values[:half] = m.voxels.threshold - 1
+    ((after, _),) = voxel_values(m, indices, 2 / 8, BOUNDS[0], 4, 0)
+    empty = indices[:, 0] < 4
+    assert (before > 0).all()
+    assert (after[empty] == 0).all()
+    np.testing.assert_array_equal(after[~empty], before[~empty])

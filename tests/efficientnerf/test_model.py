@@ -62,6 +62,23 @@ def test_nothing_is_evaluated_twice_and_nothing_that_need_not_be() -> None:
     torch.testing.assert_close(everything.fine_opacity, seen.fine_opacity, rtol=0, atol=2e-2)
 
 
+def test_training_explores_intervals_without_a_pivot_and_rendering_does_not() -> None:
+    m = untrained(explored=0.5)
+    rays = bundle()
+    behind = torch.ones(len(rays[0]), 3)
+    with torch.no_grad():
+        m.coarse, m.fine = Counting(), Counting()
+        drawn = look(m, *rays, behind)
+        one, same = (look(m, *rays, behind, rng=np.random.default_rng(3)) for _ in range(2))
+        none = look(untrained(explored=0.0), *rays, behind, rng=np.random.default_rng(3))
+    assert torch.equal(one.pivotal, same.pivotal)
+    assert (one.pivotal | ~drawn.pivotal).all()  # pivots stay pivots
+    share = float((one.pivotal & ~drawn.pivotal).sum()) / float((~drawn.pivotal).sum())
+    assert 0.4 < share < 0.6
+    assert len(one.fine.start) == m.settings.fine_samples * int(one.pivotal.sum())
+    assert int(none.pivotal.sum()) <= int((none.coarse_weight > m.settings.pivotal_weight).sum())
+
+
 def test_rays_that_meet_nothing_show_the_background() -> None:
     for field in ("hash", "mlp"):
         m = untrained(field=field)
