@@ -31,7 +31,7 @@ class BakeSettings:
     resolution: int = setting(0, "voxels along the longest side of the box; 0 chooses from what a pixel covers, up to max_resolution", minimum=0, maximum=4096)
     max_resolution: int = setting(384, "the most voxels along the longest side that are chosen by themselves", minimum=8, maximum=4096)
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
-    pixels: int = setting(2_000_000, "training pixels that are looked at to see which voxels matter", minimum=1000)
+    pixels: int = setting(1_000_000, "training pixels that are looked at to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
     dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
     points: int = setting(8, "jittered points averaged in a voxel", minimum=1, maximum=256)
