@@ -33,6 +33,7 @@ class BakeSettings:
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
     pixels: int = setting(1_000_000, "training pixels that are looked at to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
+    max_mib: int = setting(128, "how large the asset may get; a larger one keeps only voxels of greater weight", minimum=1, unit="MiB")
     dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
     points: int = setting(8, "jittered points averaged in a voxel", minimum=1, maximum=256)
     seed: int = setting(0, "seed of the jitter", minimum=0)
@@ -77,6 +78,13 @@ def chosen_resolution(s: Scene, most: int) -> int:
         footprints.append(np.linalg.norm(view.camera.centre - centre) / focal)
     side = float((s.bounds[1] - s.bounds[0]).max())
     return int(np.clip(round(side / (0.75 * float(np.median(footprints)))), 32, most))
+
+
+def bytes_per_voxel(degree: int) -> int:
+    """On disk: halves for the density and for each coefficient of three colours."""
+    from efficientnerf.harmonics import harmonics_count
+
+    return 2 + 2 * 3 * harmonics_count(degree)
 
 
 def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
@@ -129,7 +137,18 @@ def _kept(job: Job, s: Scene, m: Any, shape: tuple[int, int, int], voxel: float,
 
     pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
     greatest = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked)
-    indices = baking.chosen_voxels(greatest, shape, settings.brick, settings.weight, settings.dilate)
+    threshold = settings.weight
+    indices = baking.chosen_voxels(greatest, shape, settings.brick, threshold, settings.dilate)
+    most = settings.max_mib * 2**20 // bytes_per_voxel(m.fine.degree)
+    weights = np.sort(greatest[greatest > threshold])
+    while len(indices) > most and len(weights) > 1:
+        job.safe_point()
+        # Grown voxels are about in proportion to the kept ones; a little less, so that this ends soon.
+        weights = weights[-max(1, int(0.95 * len(weights) * most / len(indices))) :]
+        threshold = float(weights[0])
+        indices = baking.chosen_voxels(greatest, shape, settings.brick, threshold, settings.dilate)
+    if threshold > settings.weight:
+        job.say(f"voxels that never weigh more than {threshold:.3g} in a pixel are left out, to keep the asset within {settings.max_mib} MiB (bake.max_mib)")
     _write_npy(indices, stored)
     return indices
 

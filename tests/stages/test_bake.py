@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -134,3 +135,16 @@ def test_the_resolution_follows_the_pixels(inputs: dict[str, Path]) -> None:
     sharper = tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, params=(focal, 8.0, 8.0))) for v in s.views)
     assert chosen_resolution(dataclasses.replace(s, views=sharper), 384) == round(2 / (0.75 * 3 / focal))
     assert chosen_resolution(dataclasses.replace(s, views=sharper), 64) == 64
+
+
+def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: dict[str, Path], tmp_path: Path) -> None:
+    sizes = {}
+    for most in (1, 64):
+        told: list[dict[str, Any]] = []
+        made = job(tmp_path / str(most), BakeSettings(resolution=64, points=1, max_mib=most), **inputs)
+        made._report = told.append
+        run(made)
+        sizes[most] = (made.out / ASSET).stat().st_size
+        assert any("bake.max_mib" in event.get("text", "") for event in told) == (most == 1)
+    assert sizes[1] <= 2**20 + 2**16  # the voxels, and what says where they are
+    assert sizes[64] > sizes[1] > 2**16
