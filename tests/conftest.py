@@ -7,6 +7,12 @@ longer than the work takes where the machine is busy. Set before anything is imp
 from __future__ import annotations
 
 import os
+import signal
+import threading
 
 for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ[variable] = "1"
+
+# A test run that was started in the background inherits an ignored SIGINT, and would hand it on to the programs that the tests interrupt.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
