@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import click
 
-from workflows import cli_files, cli_presets, cli_run, cli_state
+from workflows import cli_files, cli_paper, cli_presets, cli_run, cli_state
 from workflows.failures import report_failure
 
 
@@ -36,6 +36,7 @@ for command in (
     cli_files.render,
     cli_files.inspect,
     cli_presets.presets,
+    cli_paper.paper,
 ):
     enerf.add_command(command)
 
