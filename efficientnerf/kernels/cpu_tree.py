@@ -263,7 +263,7 @@ def normal_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
 
 def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
     if directions is None:
-        bases = np.zeros((len(points), tree.sh.shape[1]), np.float32)
+        bases = np.zeros((len(points), tree.harmonics_count), np.float32)
         bases[:, 0] = basis_numpy(np.array([0, 0, 1], np.float32), 0)[0]
     else:
         bases = basis_numpy(np.ascontiguousarray(directions, np.float32), tree.degree)

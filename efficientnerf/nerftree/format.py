@@ -325,7 +325,7 @@ def load(path: str | Path) -> NerfTree:
         brick_index=brick_index.reshape(shape),
         voxel_index=voxel_index,
         density_values=density,
-        sh=sh,
+        harmonics=sh,
         background=None if background is None else tuple(float(x) for x in background),  # type: ignore[arg-type]
         metadata={key: value for key, value in meta.items() if key not in _STRUCTURE},
     )

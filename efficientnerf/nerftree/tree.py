@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from efficientnerf.harmonics import harmonics_count
+from efficientnerf.nerftree.palettes import PaletteHarmonics
 
 if TYPE_CHECKING:
     from efficientnerf.cameras import Camera
@@ -49,9 +50,14 @@ class NerfTree:
     bounds_min   (3,) float64, corner of the grid, world units
     brick_index  shape int32: which brick a coarse cell owns, -1 where it is empty
     voxel_index  (B, brick^3) int32: which stored voxel, -1 where none (x slowest, z fastest)
-    density      (N,) float32, per world unit, >= 0
-    sh           (N, K, 3) float32
+    density_values  (N,) float32, per world unit, >= 0
+    harmonics    what the voxels' colours are made of, one of two:
+                 (N, K, 3) float32, or PaletteHarmonics: codes into palettes, as files of the layout `compact` load
     background   sRGB colour that the training images lay on, or None for photographs with surroundings
+
+    For renderers: `sh` is always there as plain floats, but decoding a palette costs 12 K bytes a voxel and is remembered; a kernel
+    that matters reads `harmonics` itself where it is a PaletteHarmonics, whose docstring states what its arrays mean. A kernel for codes
+    needs no second form for plain floats if it reads `sh` there.
     """
 
     shape: tuple[int, int, int]
@@ -61,14 +67,24 @@ class NerfTree:
     brick_index: np.ndarray
     voxel_index: np.ndarray
     density_values: np.ndarray
-    sh: np.ndarray
+    harmonics: np.ndarray | PaletteHarmonics
     background: tuple[float, float, float] | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def sh(self) -> np.ndarray:
+        """Coefficients (N, K, 3) float32; decoded, once, where `harmonics` are codes."""
+        return self.harmonics.decoded() if isinstance(self.harmonics, PaletteHarmonics) else self.harmonics
+
+    @property
+    def harmonics_count(self) -> int:
+        """K."""
+        return self.harmonics.count if isinstance(self.harmonics, PaletteHarmonics) else self.harmonics.shape[1]
 
     @property
     def degree(self) -> int:
         """Degree of the spherical harmonics."""
-        return round(self.sh.shape[1] ** 0.5) - 1
+        return round(self.harmonics_count**0.5) - 1
 
     @property
     def resolution(self) -> tuple[int, int, int]:
@@ -160,6 +176,14 @@ class NerfTree:
         out[np.ix_(*inside)] = np.where(index >= 0, self.density_values[np.maximum(index, 0)], 0)
         return out
 
+    def with_values(self, density: np.ndarray, sh: np.ndarray) -> NerfTree:
+        """The same voxels with other densities (N,) and coefficients (N, K, 3)."""
+        count = len(self.density_values)
+        if density.shape != (count,) or sh.ndim != 3 or sh.shape[::2] != (count, 3):
+            raise ValueError(f"values of shapes {density.shape} and {sh.shape} for {count} voxels; expected ({count},) and ({count}, K, 3)")
+        harmonics_count(round(sh.shape[1] ** 0.5) - 1)
+        return replace(self, density_values=np.ascontiguousarray(density, np.float32), harmonics=np.ascontiguousarray(sh, np.float32))
+
     def with_metadata(self, **entries: Any) -> NerfTree:
         return replace(self, metadata={**self.metadata, **entries})
 
@@ -211,7 +235,7 @@ def tree_from_voxels(
         brick_index=brick_index.reshape(x, y, z),
         voxel_index=voxel_index,
         density_values=np.ascontiguousarray(density[order], np.float32),
-        sh=np.ascontiguousarray(sh[order], np.float32),
+        harmonics=np.ascontiguousarray(sh[order], np.float32),
         background=background,
         metadata=dict(metadata or {}),
     )

@@ -107,7 +107,7 @@ def test_bricks_are_written_in_the_order_of_their_cells() -> None:
         brick_index=np.where(tree.brick_index >= 0, np.argsort(bricks)[tree.brick_index], -1).astype(np.int32),
         voxel_index=np.where(tree.voxel_index >= 0, back[tree.voxel_index], -1)[bricks].astype(np.int32),
         density_values=tree.density_values[voxels],
-        sh=tree.sh[voxels],
+        harmonics=tree.sh[voxels],
     )
     points = np.random.default_rng(1).uniform(tree.bounds_min, tree.bounds_max, (100, 3))
     assert np.array_equal(other.density(points), tree.density(points))

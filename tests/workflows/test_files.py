@@ -35,7 +35,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
         brick_index=np.arange(cells**3, dtype=np.int32).reshape((cells,) * 3),
         voxel_index=np.arange(cells**3 * brick**3, dtype=np.int32).reshape(cells**3, brick**3),
         density_values=blocks.reshape(-1).astype(np.float32),
-        sh=sh,
+        harmonics=sh,
         metadata={"world_from_capture": {"scale": SCALE, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}},
     )
     path = tmp_path_factory.mktemp("asset") / "ball.nerftree"

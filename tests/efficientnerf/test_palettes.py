@@ -1,0 +1,58 @@
+"""Harmonics kept as codes into palettes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from efficientnerf.nerftree.palettes import PaletteHarmonics
+from tests.efficientnerf.trees import random_tree, rays_at
+
+
+def random_palette(count: int, groups: tuple[int, ...], *, entries: int = 7, seed: int = 0) -> PaletteHarmonics:
+    rng = np.random.default_rng(seed)
+    return PaletteHarmonics(
+        base=rng.integers(0, 5, (count, 3)).astype(np.uint8),
+        base_table=rng.normal(size=(5, 3)).astype(np.float32),
+        codes=rng.integers(0, entries, (count, len(groups))).astype(np.uint16 if entries > 256 else np.uint8),
+        palette=rng.normal(size=(entries, sum(groups), 3)).astype(np.float32),
+        groups=groups,
+    )
+
+
+@pytest.mark.parametrize(("groups", "entries"), [((), 1), ((3,), 7), ((1, 1, 1), 256), ((3, 5), 300), ((1, 2, 12, 9), 9)])
+def test_each_coefficient_is_its_entry(groups: tuple[int, ...], entries: int) -> None:
+    codes = random_palette(50, groups, entries=entries)
+    decoded = codes.decoded()
+    assert decoded.shape == (len(codes), codes.count, 3)
+    assert decoded.dtype == np.float32
+    for n, k, c in np.ndindex(decoded.shape):
+        group = next(g for g in range(len(groups)) if k <= sum(groups[: g + 1])) if k else None
+        assert decoded[n, k, c] == (codes.base_table[codes.base[n, c], c] if group is None else codes.palette[codes.codes[n, group], k - 1, c])
+    some = np.array([4, 0, 9])
+    assert np.array_equal(codes.decoded(some), decoded[some])
+    assert np.array_equal(codes.chosen(some).decoded(), decoded[some])
+
+
+def test_a_tree_of_codes_is_asked_like_one_of_floats() -> None:
+    plain = random_tree(1, degree=2)
+    coded = replace(plain, harmonics=random_palette(len(plain.density_values), (1,) * 8))
+    assert (coded.degree, coded.harmonics_count) == (2, 9)
+    twin = plain.with_values(plain.density_values, coded.sh)
+    assert np.array_equal(coded.sh, twin.sh)
+    origins, directions = rays_at(plain)
+    for name in ("colour", "opacity", "depth", "normal"):
+        np.testing.assert_allclose(getattr(coded.render_rays(origins, directions), name), getattr(twin.render_rays(origins, directions), name), atol=1e-5)
+    assert np.allclose(coded.colour(origins + directions), twin.colour(origins + directions), atol=1e-5)
+    assert coded.with_metadata(a=1).harmonics is coded.harmonics
+
+
+def test_values_of_another_number_are_refused() -> None:
+    tree = random_tree(1)
+    with pytest.raises(ValueError, match=r"values of shapes \(3,\) and"):
+        tree.with_values(np.ones(3), tree.sh)
+    with pytest.raises(ValueError, match="expected 0 to 4"):
+        tree.with_values(tree.density_values, np.zeros((len(tree.density_values), 49, 3)))
+    assert tree.with_values(tree.density_values, tree.sh[:, :1]).degree == 0
