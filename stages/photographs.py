@@ -157,7 +157,7 @@ def _capture(
     }
     warnings = _doubts(photos, points, agreement, [by_file[image.name].focal for image in registered])
     if rejected:
-        warnings.append(f"{len(rejected)} photographs found no place: {_listed([name for name, _ in rejected])}.")
+        warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} found no place: {_listed([name for name, _ in rejected])}.")
     return Capture(
         kind="photographs",
         photos=photos,

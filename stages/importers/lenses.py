@@ -98,7 +98,10 @@ def rotation(columns: np.ndarray, where: str) -> np.ndarray:
     if abs(scale - 1) > 1e-3 and np.ptp(lengths) < 1e-3 * scale:
         raise BadInput(f"{where}: the rotation is scaled by {scale:.6g}. Divide the upper left 3x3 of every matrix by it, and leave the positions as they are.")
     if np.abs(columns.T @ columns - np.eye(3)).max() > 2e-3:
-        raise BadInput(f"{where}: the matrix is no rotation: its axes have lengths {', '.join(f'{n:.4g}' for n in lengths)} or are not at right angles.")
+        raise BadInput(
+            f"{where}: the matrix is no rotation: its axes have lengths {', '.join(f'{n:.4g}' for n in lengths)} or are not at right angles. "
+            "Write the data set again, with rotation and scale kept apart."
+        )
     if np.linalg.det(columns) < 0:
         raise BadInput(f"{where}: the matrix is left-handed (a mirror image). Negate one axis where the data set was written.")
     left, _, right = np.linalg.svd(columns)
