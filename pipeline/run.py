@@ -63,7 +63,7 @@ class Run:
         try:
             run.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise _cannot_write(run.path, error) from None
+            raise cannot_write(run.path, error) from None
         with run.locked():
             run.check_free()  # another may have been quicker
             run._save()
@@ -167,7 +167,7 @@ class Run:
         try:
             files.write_atomically(self.path / NAME, files.pretty_json(self.plain()))
         except OSError as error:
-            raise _cannot_write(self.path, error) from None
+            raise cannot_write(self.path, error) from None
 
 
 def disk_full(folder: Path, what: str) -> DiskFull:
@@ -181,7 +181,8 @@ def is_disk_full(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
-def _cannot_write(path: Path, error: OSError) -> BadInput | DiskFull:
+def cannot_write(path: Path, error: OSError) -> BadInput | DiskFull:
+    """What to raise where a file of a run could not be written."""
     if is_disk_full(error):
         return disk_full(path, str(path))
     return BadInput(f"{path}: cannot be written ({error.strerror or error}).")

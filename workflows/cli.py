@@ -32,6 +32,7 @@ for command in (
     cli_run.stage,
     cli_state.status,
     cli_state.verify,
+    cli_state.report,
     cli_files.export,
     cli_files.render,
     cli_files.inspect,

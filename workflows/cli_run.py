@@ -96,6 +96,8 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
             if not dry_run:
                 run = plan.write()
             outcomes = run_stages(run, asset.STAGES, device=device, report=show, dry_run=dry_run, **selection)
+            if any(outcome.action == "ran" for outcome in outcomes):
+                _describe(run)
     except (Exception, KeyboardInterrupt) as error:
         raise Reported(error, summary(run.path, ())) from error
     facts = summary(run.path, outcomes)
@@ -103,6 +105,15 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
         write_json({"event": "summary", "ok": True, **facts, "elapsed": time.monotonic() - started, "device": device, "exit_code": 0})
     elif not quiet and not dry_run:
         click.echo(in_words(run.path, outcomes))
+
+
+def _describe(run: Run) -> None:
+    """The page about the run: made anew whenever a stage was."""
+    from pipeline.decide import survey
+    from workflows import asset
+    from workflows.report import write_report
+
+    write_report(run, survey(asset.STAGES, run))
 
 
 def _check_stages(selection: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""`enerf status` and `enerf verify`."""
+"""`enerf status`, `enerf verify` and `enerf report`."""
 
 from __future__ import annotations
 
@@ -83,3 +83,23 @@ def verify(run_folder: Path, as_json: bool, quiet: bool) -> None:
     elif not quiet:
         total = sum(each.size for each in outcomes)
         click.echo(f"{run.path}: {len(outcomes)} stages, {size(total)}, all as written")
+
+
+@click.command(short_help="Write a page about a run: pictures, figures, settings.")
+@click.argument("run_folder", metavar="RUN", type=folder_type)
+@json_option
+@common_options
+def report(run_folder: Path, as_json: bool) -> None:
+    """Write RUN/report.html: what was made, how it looks, how good it is, of what settings. 'enerf run' writes it, too, when it is done."""
+    from pipeline.decide import survey
+    from pipeline.run import Run
+    from workflows import asset
+    from workflows.progress import write_json
+    from workflows.report import write_report
+
+    run = Run.open(run_folder)
+    path = write_report(run, survey(asset.STAGES, run))
+    if as_json:
+        write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), "exit_code": 0})
+    else:
+        click.echo(str(path))

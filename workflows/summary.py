@@ -21,8 +21,9 @@ ARTIFACTS = {
     "mesh_glb": "mesh/mesh.glb",
     "mesh_ply": "mesh/mesh.ply",
     "points": "points/points.ply",
+    "report": "report.html",
 }
-TITLES = {"asset": "asset", "turntable": "turntable", "mesh_glb": "mesh", "mesh_ply": "mesh", "points": "points"}
+TITLES = {"asset": "asset", "turntable": "turntable", "mesh_glb": "mesh", "mesh_ply": "mesh", "points": "points", "report": "report"}
 
 
 def artifacts(run: Path) -> dict[str, str]:

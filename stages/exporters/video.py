@@ -24,10 +24,12 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
     import av
 
     count, size = 0, None
-    # bitexact: no names or versions of libraries, no dates. One thread: x264's decisions depend on their number.
+    # bitexact: no names or versions of libraries, no dates. One thread: x264's decisions depend on their number. cpu-independent: x264's kernels for
+    # AVX-512 that look ahead do not even repeat themselves; without them every processor writes the same bytes.
+    encoding = {"crf": str(crf), "preset": "medium", "flags": "+bitexact", "x264-params": "cpu-independent=1"}
     options = {"movflags": "+faststart", "fflags": "+bitexact"}
     with written_aside(path) as aside, av.open(str(aside), "w", format="mp4", container_options=options) as container:
-        stream = container.add_stream("libx264", rate=fps, options={"crf": str(crf), "preset": "medium", "flags": "+bitexact"})
+        stream = container.add_stream("libx264", rate=fps, options=encoding)
         stream.thread_count = 1
         stream.pix_fmt = "yuv420p"
         stream.time_base = Fraction(1, fps)

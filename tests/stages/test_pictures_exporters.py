@@ -127,6 +127,16 @@ def test_mp4_decodes_to_its_frames(tmp_path: Path, size: tuple[int, int]) -> Non
     assert max(means) < 2.0
 
 
+def test_mp4_repeats_to_the_byte_whatever_lies_in_memory(tmp_path: Path) -> None:
+    frames = [np.random.default_rng(n).integers(0, 256, (72, 96, 3), np.uint8) // 8 + frame // 2 for n, frame in enumerate(moving_frames(12, 72, 96))]
+    contents, clutter = set(), []
+    for attempt in range(12):
+        clutter.append(np.random.default_rng(attempt).random(7919 * (attempt + 1)))
+        write_mp4(frames, tmp_path / "a.mp4", fps=6)
+        contents.add((tmp_path / "a.mp4").read_bytes())
+    assert len(contents) == 1
+
+
 def test_mp4_of_more_frames_than_the_encoder_looks_ahead_shows_each_at_its_time(tmp_path: Path) -> None:
     write_mp4(moving_frames(75, 32, 32), tmp_path / "a.mp4", fps=30)
     with av.open(str(tmp_path / "a.mp4")) as container:

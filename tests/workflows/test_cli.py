@@ -41,7 +41,7 @@ def test_json_is_one_object_per_line_and_ends_in_a_summary(enerf: Enerf, toys: P
     assert any(event["event"] == "progress" and event["stage"] == "train" and event["total"] == 3 for event in events)
     summary = events[-1]
     assert (summary["event"], summary["ok"], summary["exit_code"]) == ("summary", True, 0)
-    assert summary["artifacts"] == {"points": str(tmp_path / "run/points/points.ply")}
+    assert summary["artifacts"] == {"points": str(tmp_path / "run/points/points.ply"), "report": str(tmp_path / "run/report.html")}
     assert set(summary["seconds"]) == {"poses", "train", "points"}
     assert summary["metrics"] is None
 
