@@ -74,11 +74,14 @@ def import_pycolmap() -> Any:
         handlers = [(number, ctypes.create_string_buffer(_ROOM)) for number in _CAUGHT]
         for number, handler in handlers:
             libc.sigaction(int(number), None, handler)
+        # A SIGTERM that comes while glog holds its handler waits until ours is back.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         try:
             import pycolmap
         finally:
             for number, handler in handlers:
                 libc.sigaction(int(number), handler, None)
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     import pycolmap
 
     return pycolmap

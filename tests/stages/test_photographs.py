@@ -410,5 +410,32 @@ def test_colmap_leaves_sigterm_as_it_was(tmp_path: Path, engine: bool, code: int
     assert (done.returncode, done.stderr) == (code, "")
 
 
+WHILE_IMPORTING = """
+import os, signal, sys
+from stages.matches import quiet_pycolmap
+
+sent = 0
+def answer(number, frame):
+    sys.exit(143 if sent > 1 else 1)
+
+def hook(event, arguments):
+    global sent
+    if event == "import" and str(arguments[0]).startswith("pycolmap"):
+        sent += 1
+        os.kill(os.getpid(), signal.SIGTERM)  # before COLMAP's library is loaded and again and again until it is
+
+signal.signal(signal.SIGTERM, answer)
+sys.addaudithook(hook)
+with quiet_pycolmap():
+    pass
+sys.exit(2)
+"""
+
+
+def test_sigterm_while_colmap_is_imported_is_answered_by_us() -> None:
+    done = subprocess.run([sys.executable, "-c", WHILE_IMPORTING], cwd=ROOT, check=False, capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (143, "")
+
+
 def test_threads_are_those_allowed() -> None:
     assert 1 <= matches.threads() <= (os.cpu_count() or 1)
