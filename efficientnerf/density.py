@@ -36,7 +36,7 @@ class DensityVoxels:
     @property
     def occupied(self) -> float:
         """Share of valid voxels."""
-        return float((self.values > self.threshold).float().mean())
+        return int(torch.count_nonzero(self.values > self.threshold)) / self.values.numel()
 
 
 def density_voxels(

@@ -10,17 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from efficientnerf.compositing import Composite, ray_of_sample
 from efficientnerf.density import DensityVoxels, density_voxels
 from efficientnerf.fields.hash import HashField
 from efficientnerf.fields.mlp import MlpField
+from efficientnerf.fields.nerf import NerfField
 from efficientnerf.grid import Space
 from efficientnerf.harmonics import basis, harmonics_count
 from efficientnerf.kernels import dispatch
-from efficientnerf.sampling import FARTHEST, Samples
+from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples, united
 from efficientnerf.settings import TrainSettings
 
 SKY_DEGREE = 2
 COARSEST = 16
+
+AnyField = HashField | MlpField | NerfField
 
 
 class Sky(nn.Module):
@@ -42,17 +46,24 @@ class Model:
     step        length of a coarse interval in the box, world units
     slots       intervals on a ray at most
     background  constant colour behind the scene, or None: then `sky` is
+    span        near and far along the view axis, world units, where the settings say between what the intervals lie
     """
 
     space: Space
     settings: TrainSettings
-    coarse: HashField | MlpField
-    fine: HashField | MlpField
+    coarse: AnyField
+    fine: AnyField
     voxels: DensityVoxels
     sky: Sky
     background: tuple[float, float, float] | None
     step: float
     slots: int
+    span: tuple[float, float] | None = None
+
+    @property
+    def prunes(self) -> bool:
+        """Whether the density voxels are used."""
+        return self.settings.sampling in ("efficient", "valid")
 
     @property
     def device(self) -> torch.device:
@@ -71,12 +82,15 @@ class Model:
 
 
 class Look(NamedTuple):
-    """What one bundle of rays met: samples of both stages, what the fields said, and whether each coarse sample was pivotal."""
+    """What one bundle of rays met: samples of both stages, what the fields said, and whether each coarse sample was pivotal.
+
+    Uniform sampling has no coarse stage: no coarse samples then, and no coarse colour.
+    """
 
     coarse: Samples
     coarse_raw: Tensor
     coarse_weight: Tensor
-    coarse_colour: Tensor
+    coarse_colour: Tensor | None
     pivotal: Tensor
     fine: Samples
     fine_raw: Tensor
@@ -87,25 +101,18 @@ class Look(NamedTuple):
     distortion: Tensor
 
 
-def model(space: Space, settings: TrainSettings, background: tuple[float, float, float] | None, device: str = "cpu") -> Model:
+def model(
+    space: Space, settings: TrainSettings, background: tuple[float, float, float] | None, device: str = "cpu", span: tuple[float, float] | None = None
+) -> Model:
     """An untrained model; the same settings give the same numbers."""
     generator = torch.Generator().manual_seed(settings.seed)
-    if settings.field == "hash":
-        coarse: HashField | MlpField = HashField(
-            levels=max(1, settings.levels // 2), log2_table=max(8, settings.log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, settings.finest // 4),
-            hidden=settings.coarse_hidden, layers=settings.coarse_layers, degree=0, initial_density=settings.initial_density, generator=generator,
-        )  # fmt: skip
-        fine: HashField | MlpField = HashField(
-            levels=settings.levels, log2_table=settings.log2_table, coarsest=COARSEST, finest=settings.finest,
-            hidden=settings.hidden, layers=settings.layers, degree=settings.degree, initial_density=settings.initial_density,
-            generator=generator,
-        )  # fmt: skip
-    else:
-        coarse = MlpField(hidden=settings.coarse_hidden, layers=settings.coarse_layers, degree=settings.degree, generator=generator)
-        fine = MlpField(hidden=settings.hidden, layers=settings.layers, degree=settings.degree, generator=generator)
+    coarse, fine = _fields(settings, generator)
     diagonal = 2 * float(np.linalg.norm(space.half))
-    step = diagonal / settings.coarse_samples
-    slots = settings.coarse_samples + 1
+    if settings.far > 0 and (span is None or space.contracted):
+        raise ValueError("train.near and train.far need a scene on a constant background. Leave them 0.")
+    span = span if settings.far > 0 else None
+    step = (diagonal if span is None else span[1] - span[0]) / settings.coarse_samples
+    slots = math.ceil(diagonal / step) + 1
     if space.contracted:
         # In front of the box and behind it: the contracted distance from the edge of space to the box and back, in steps, with some room
         # for rays that run slantwise through the shell.
@@ -116,37 +123,125 @@ def model(space: Space, settings: TrainSettings, background: tuple[float, float,
     voxels = density_voxels(
         side, settings.voxel_rule, initial=settings.voxel_initial, beta=settings.voxel_beta, decay=settings.voxel_decay, threshold=threshold, device=device
     )
-    return Model(space, settings, coarse.to(device), fine.to(device), voxels, Sky().to(device), background, step, slots)
+    return Model(space, settings, coarse.to(device), fine.to(device), voxels, Sky().to(device), background, step, slots, span)
+
+
+def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField, AnyField]:
+    """The coarse and the fine field, untrained."""
+    if s.field == "hash":
+        return HashField(
+            levels=max(1, s.levels // 2), log2_table=max(8, s.log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, s.finest // 4),
+            hidden=s.coarse_hidden, layers=s.coarse_layers, degree=0, initial_density=s.initial_density, generator=generator,
+        ), HashField(
+            levels=s.levels, log2_table=s.log2_table, coarsest=COARSEST, finest=s.finest,
+            hidden=s.hidden, layers=s.layers, degree=s.degree, initial_density=s.initial_density, generator=generator,
+        )  # fmt: skip
+    if s.field == "nerf":
+        return (
+            NerfField(hidden=s.coarse_hidden, layers=s.coarse_layers, generator=generator, precision=s.precision),
+            NerfField(hidden=s.hidden, layers=s.layers, generator=generator, precision=s.precision),
+        )
+    return (
+        MlpField(hidden=s.coarse_hidden, layers=s.coarse_layers, degree=s.degree, generator=generator, precision=s.precision),
+        MlpField(hidden=s.hidden, layers=s.layers, degree=s.degree, generator=generator, precision=s.precision),
+    )
 
 
 def look(
     m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, behind: Tensor, *,
     prune: bool = True, rng: np.random.Generator | None = None,
 ) -> Look:  # fmt: skip
-    """Both stages along a bundle of rays: valid samples through the coarse field, pivotal ones through the fine one.
+    """Both stages along a bundle of rays: valid samples through the coarse field, pivotal ones through the fine one, or as `settings.sampling` says.
 
     origins, directions  (R, 3) world frame, unit directions
     near, far, offset    (R,) distances, and the offset of the samples in their intervals
     behind               (R, 3) colour beyond all samples
     prune                whether the density voxels are heeded (not in the warm-up)
-    rng                  in training: a random share of the valid intervals is looked at by the fine field too. Without it the fine field would be
+    rng                  in training: samples by importance are jittered, some rays are looked at whole where the settings say so, and a random
+                         share of the valid intervals is looked at by the fine field too. Without that the fine field would be
                          free to put matter where this ray has no pivot and another has one, and the baked asset, which has no coarse
                          stage to hide it, would show it.
     """
-    threshold = m.voxels.threshold if prune else -math.inf
-    coarse = dispatch.valid_samples(m.space, origins, directions, near, far, offset, m.step, m.slots, m.voxels.values, threshold)
-    coarse_raw = m.coarse(coarse.point)
-    seen = dispatch.composite(coarse_raw, coarse.length, coarse.first, basis(directions, m.coarse.degree), behind, m.coarse.activation)
-    pivotal = dispatch.pivots(seen.weight.detach(), coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
-    if rng is not None and m.settings.explored > 0:
-        pivotal = pivotal | torch.from_numpy(rng.random(len(pivotal), np.float32) < m.settings.explored).to(pivotal.device)
-    fine = dispatch.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, m.settings.fine_samples)
-    fine_raw = m.fine(fine.point)
-    out = dispatch.composite(fine_raw, fine.length, fine.first, basis(directions, m.fine.degree), behind, m.fine.activation)
-    return Look(
-        coarse, coarse_raw, seen.weight, seen.colour, pivotal,
-        fine, fine_raw, out.colour, out.opacity, out.weight, out.sample_colour, seen.distortion + out.distortion,
-    )  # fmt: skip
+    bundle = (origins, directions, near, far)
+    if m.settings.sampling == "uniform":
+        samples, _ = _even_samples(m, *bundle, offset, m.settings.coarse_samples + m.settings.importance_samples, rng)
+        raw, out = _seen(m.fine, directions, samples, behind)
+        nothing = samples.start[:0]
+        none = Samples(torch.zeros_like(samples.first), nothing, nothing, nothing, samples.point[:0], samples.tried)
+        return Look(none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
+    if m.settings.sampling == "hierarchical":
+        coarse, at = _even_samples(m, *bundle, offset, m.settings.coarse_samples, rng)
+    else:
+        coarse = _valid_samples(m, *bundle, offset, prune=prune, rng=rng)
+        at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent
+    coarse_raw, seen = _seen(m.coarse, directions, coarse, behind)
+    weight = seen.weight.detach()
+    pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
+    if m.settings.sampling == "efficient":
+        if rng is not None and m.settings.explored > 0:
+            pivotal = pivotal | torch.from_numpy(rng.random(len(pivotal), np.float32) < m.settings.explored).to(pivotal.device)
+        fine = dispatch.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, m.settings.fine_samples)
+    else:
+        quantile = _strata(len(origins), m.settings.importance_samples, rng, offset.device)
+        fine = importance_samples(m.space, origins, directions, coarse, at, weight, quantile)
+    fine_raw, out = _seen(m.fine, directions, fine, behind)
+    return Look(coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
+
+
+def _seen(field: AnyField, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:
+    """What a field says at samples (N, 1 + 3K), and how it looks along their rays."""
+    if isinstance(field, NerfField):
+        raw = field(samples.point, directions[ray_of_sample(samples.first, len(samples.start))])
+        harmonics = torch.ones_like(directions[:, :1])  # the colour is what the network says
+    else:
+        raw, harmonics = field(samples.point), basis(directions, field.degree)
+    return raw, dispatch.composite(raw, samples.length, samples.first, harmonics, behind, field.activation)
+
+
+def _summed(out: Composite, coarse_distortion: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The last five entries of a Look."""
+    return out.colour, out.opacity, out.weight, out.sample_colour, out.distortion + coarse_distortion
+
+
+def _valid_samples(
+    m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, *, prune: bool, rng: np.random.Generator | None
+) -> Samples:
+    """Coarse samples where the voxels say that something is; of the first rays, which are as random as any, all, where the settings say so."""
+
+    def of(rays: slice, threshold: float) -> Samples:
+        return dispatch.valid_samples(
+            m.space, origins[rays], directions[rays], near[rays], far[rays], offset[rays], m.step, m.slots, m.voxels.values, threshold
+        )
+
+    if not prune:
+        return of(slice(None), -math.inf)
+    whole = math.ceil(m.settings.refresh_rays * len(origins)) if rng is not None else 0
+    if whole == 0:
+        return of(slice(None), m.voxels.threshold)
+    return united(of(slice(whole), -math.inf), of(slice(whole, None), m.voxels.threshold))
+
+
+def _even_samples(
+    m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, count: int, rng: np.random.Generator | None
+) -> tuple[Samples, Tensor]:
+    """`count` stratified samples between near and far, or between where the ray enters the box and leaves it; their distances (N,)."""
+    if m.space.contracted:  # intervals that grow with the distance, all of them
+        step = m.step * m.settings.coarse_samples / count
+        slots = math.ceil(m.slots * count / m.settings.coarse_samples)
+        samples = dispatch.valid_samples(m.space, origins, directions, near, far, offset, step, slots, m.voxels.values, -math.inf)
+        return samples, samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
+    if m.span is None:
+        near, far = clip_to_space(m.space, origins, directions, near, far)
+    jitter = offset[:, None].expand(-1, count)
+    if rng is not None:
+        jitter = torch.from_numpy(rng.random((len(origins), count), np.float32)).to(offset.device)
+    return stratified_samples(m.space, origins, directions, near, far, jitter, outside=m.settings.field != "hash")
+
+
+def _strata(rays: int, count: int, rng: np.random.Generator | None, device: torch.device) -> Tensor:
+    """(rays, count) quantiles, one in each of `count` equal parts of [0, 1]: random in training, the middles in rendering."""
+    within = torch.full((rays, count), 0.5) if rng is None else torch.from_numpy(rng.random((rays, count), np.float32))
+    return ((torch.arange(count) + within) / count).to(device)
 
 
 def state_of(m: Model) -> dict[str, Tensor]:

@@ -122,3 +122,84 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
     per_ray = torch.zeros(rays, dtype=torch.int64, device=origins.device).index_add(0, ray, torch.full_like(ray, per_pivot))
     first = torch.cat([per_ray.new_zeros(1), per_ray.cumsum(dim=0)])
     return Samples(first, start.reshape(-1), extent.reshape(-1), length.reshape(-1), point.reshape(-1, 3), coarse.tried)
+
+
+def stratified_samples(
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, jitter: Tensor, *, outside: bool
+) -> tuple[Samples, Tensor]:
+    """NeRF's coarse samples: one in each of S equal intervals between near and far (Mildenhall et al. 2020, equation 2), and their distances (N,).
+
+    near, far  (R,) distances; a ray whose far is not beyond its near gets none
+    jitter     (R, S) in [0, 1), where in its interval each sample lies
+    outside    whether samples outside of the space are kept (a network can be asked there, a grid can't)
+    """
+    count = jitter.shape[1]
+    extent = ((far - near) / count)[:, None].expand(-1, count)  # (R, S)
+    start = near[:, None] + torch.arange(count, device=near.device) * extent
+    at = start + jitter * extent
+    point = space.grid(origins[:, None] + at[..., None] * directions[:, None])  # (R, S, 3)
+    kept = extent > 0
+    if not outside:
+        kept = kept & ((point >= 0) & (point <= 1)).all(dim=-1)
+    first = torch.cat([kept.new_zeros(1, dtype=torch.int64), kept.sum(dim=1).cumsum(dim=0)])
+    return Samples(first, start[kept], extent[kept], extent[kept], point[kept], kept.numel()), at[kept]
+
+
+IMPORTANCE_FLOOR = 1e-5  # added to every weight, as in NeRF's code, so that a ray that meets nothing is searched evenly
+
+
+def importance_samples(
+    space: Space, origins: Tensor, directions: Tensor, coarse: Samples, at: Tensor, weight: Tensor, quantile: Tensor
+) -> Samples:
+    """NeRF's fine samples: F drawn in proportion to the coarse weights, united with the coarse ones (Mildenhall et al. 2020, section 5.2).
+
+        p_i = (w_i + 1e-5) / sum_j (w_j + 1e-5),  t = CDF^-1(quantile), p constant over each coarse interval
+
+    Every interval is then divided among the samples in it, halfway between neighbours, so that their lengths sum to its own: a sample that pruning
+    has left alone does not reach across the gap. (NeRF gives each sample the distance to the next and the last one 1e10; notes 4.)
+
+    at        (N,) distance of each coarse sample
+    weight    (N,) of each coarse sample, without gradient
+    quantile  (R, F) in [0, 1]; rays without coarse samples get none
+    """
+    rays, drawn = quantile.shape
+    counts = coarse.first[1:] - coarse.first[:-1]
+    samples = len(at)
+    if samples == 0:
+        return coarse
+    chance = weight.double() + IMPORTANCE_FLOOR
+    total = torch.cumsum(chance, dim=0)
+    padded = torch.cat([total.new_zeros(1), total])
+    below, above = padded[coarse.first[:-1]], padded[coarse.first[1:]]
+    hit = counts > 0
+    target = (below[:, None] + quantile.double() * (above - below)[:, None])[hit]  # (H, F)
+    low, high = coarse.first[:-1][hit][:, None], (coarse.first[1:] - 1)[hit][:, None]
+    owner = torch.searchsorted(total, target).maximum(low).minimum(high)  # the interval that each falls into
+    inside = ((target - padded[owner]) / chance[owner]).clamp(0, 1)
+    fine_at = coarse.start[owner] + inside.to(at.dtype) * coarse.extent[owner]
+
+    # Both kinds in order: by interval, then by distance.
+    owner = torch.cat([torch.arange(samples, device=at.device), owner.reshape(-1)])
+    t = torch.cat([at, fine_at.reshape(-1)])
+    within = ((t - coarse.start[owner]) / coarse.extent[owner]).double().clamp(0, 1 - 1e-9)
+    order = torch.argsort(owner + within, stable=True)
+    owner, t = owner[order], t[order]
+    end = coarse.start[owner] + coarse.extent[owner]
+    same = owner[1:] == owner[:-1]
+    middle = (t[1:] + t[:-1]) / 2
+    right = torch.cat([torch.where(same, middle, end[:-1]), end[-1:]])
+    left = torch.cat([coarse.start[owner[:1]], torch.where(same, middle, coarse.start[owner[1:]])])
+    extent = right - left
+    length = extent * (coarse.length[owner] / coarse.extent[owner])
+    ray = torch.repeat_interleave(torch.arange(rays, device=at.device), counts, output_size=samples)[owner]
+    point = space.grid(origins[ray] + t[:, None] * directions[ray])
+    first = torch.cat([counts.new_zeros(1), (counts + drawn * hit).cumsum(dim=0)])
+    return Samples(first, left, extent, length, point, coarse.tried)
+
+
+def united(one: Samples, other: Samples) -> Samples:
+    """The samples of one bundle of rays, then those of another."""
+    first = torch.cat([one.first, other.first[1:] + one.first[-1]])
+    pairs = ((one.start, other.start), (one.extent, other.extent), (one.length, other.length), (one.point, other.point))
+    start, extent, length, point = (torch.cat(pair) for pair in pairs)
+    return Samples(first, start, extent, length, point, one.tried + other.tried)

@@ -15,10 +15,21 @@ class TrainSettings:
     """How a scene is learned. The defaults are for two CPU cores (`preview`)."""
 
     iterations: int = _setting(3000, "optimisation steps", minimum=1)
-    samples: int = _setting(65536, "network evaluations aimed at in a step; the number of rays follows from it", minimum=64)
+    samples: int = _setting(65536, "network evaluations aimed at in a step; the number of rays follows from it; 0: always `rays`", minimum=0)
     rays: int = _setting(8192, "rays in a step at most", minimum=1)
     seed: int = _setting(0, "seed of every random choice", minimum=0)
-    field: str = _setting("hash", "hash: multiresolution hash grid; mlp: the paper's networks", choices=("hash", "mlp"))
+    field: str = _setting(
+        "hash", "hash: multiresolution hash grid; mlp: the paper's networks; nerf: those of the original NeRF, which can't be baked",
+        choices=("hash", "mlp", "nerf"),
+    )  # fmt: skip
+    precision: str = _setting(
+        "auto", "mlp, nerf: what products are computed in; auto: bfloat16 where the device has it", choices=("auto", "float32", "bfloat16")
+    )
+    sampling: str = _setting(
+        "efficient",
+        "efficient: valid, then pivotal samples; valid: valid, then by importance; hierarchical: NeRF's, all, then by importance; uniform: evenly, once",
+        choices=("efficient", "valid", "hierarchical", "uniform"),
+    )
     degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
     levels: int = _setting(12, "hash: levels", minimum=1, maximum=24)
     log2_table: int = _setting(17, "hash: entries of a level's table, as a power of two", minimum=8, maximum=24)
@@ -27,8 +38,18 @@ class TrainSettings:
     layers: int = _setting(2, "hidden layers of the fine network (the paper: 8)", minimum=1, maximum=16)
     coarse_hidden: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
     coarse_layers: int = _setting(1, "hidden layers of the coarse network (the paper: 4)", minimum=1, maximum=16)
-    coarse_samples: int = _setting(128, "N_c: intervals over the diagonal of the box", minimum=8, maximum=1024)
+    coarse_samples: int = _setting(128, "N_c: intervals over the diagonal of the box, or between near and far", minimum=8, maximum=1024)
     fine_samples: int = _setting(2, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
+    importance_samples: int = _setting(
+        128, "N_f: fine samples of a ray by importance, beside the coarse ones (sampling valid, hierarchical; uniform adds them to N_c)",
+        minimum=1, maximum=4096,
+    )  # fmt: skip
+    near: float = _setting(
+        0.0, "where rays begin, in the capture's units along the view axis (the paper: 2 for synthetic scenes); with far = 0 the scene says", minimum=0.0
+    )
+    far: float = _setting(
+        0.0, "where rays end (the paper: 6); N_c intervals lie between near and far then, and those outside of the box are never valid", minimum=0.0
+    )
     pivotal_weight: float = _setting(1e-4, "epsilon: weight above which a coarse sample is pivotal", minimum=0.0, maximum=1.0)
     max_pivots: int = _setting(8, "pivotal samples on a ray at most; the lightest are dropped", minimum=1, maximum=4096)
     explored: float = _setting(0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0)
@@ -44,9 +65,23 @@ class TrainSettings:
     voxel_decay: float = _setting(0.95, "maximum: what a voxel keeps at each refresh", minimum=0.0, maximum=1.0)
     voxel_absorption: float = _setting(0.01, "maximum: share of light that an interval of a valid voxel absorbs at least", minimum=0.0, maximum=1.0)
     refresh_every: int = _setting(16, "steps between looks at random voxels, which let pruned space return", minimum=1)
-    refresh_share: float = _setting(0.03125, "share of the voxels looked at in a refresh", minimum=0.0, maximum=1.0)
+    refresh_share: float = _setting(0.03125, "share of the voxels looked at in a refresh; in the warm-up an eighth, unless 0", minimum=0.0, maximum=1.0)
+    refresh_rays: float = _setting(
+        0.0, "share of the rays of a step whose pruned samples are looked at too, which lets pruned space return (the authors' release: 0.01)",
+        minimum=0.0, maximum=1.0,
+    )  # fmt: skip
     warm_up: int = _setting(256, "steps in which no voxel is pruned", minimum=0)
     learning_rate: float = _setting(1e-2, "Adam's rate after the first steps (the paper: 5e-4, with field mlp)", minimum=0.0)
-    final_rate: float = _setting(0.05, "what is left of the rate at the last step; it falls exponentially", minimum=0.0, maximum=1.0)
+    final_rate: float = _setting(0.05, "what is left of the rate after rate_steps; it falls exponentially", minimum=0.0, maximum=1.0)
+    rate_steps: int = _setting(0, "steps in which the rate falls to final_rate of itself (the paper: 0.1 every 500,000); 0: all of them", minimum=0)
+    adam_beta2: float = _setting(0.99, "Adam's second decay (0.999 by default elsewhere, so for the paper)", minimum=0.0, maximum=0.99999)
+    adam_epsilon: float = _setting(1e-15, "Adam's epsilon: this small because a table entry's gradient can be (1e-8 by default elsewhere)", minimum=0.0)
+    crop_steps: int = _setting(
+        0, "first steps that see only the middle half of each picture's sides, so that thin scenes on white don't collapse to white (NeRF: 500)", minimum=0
+    )
+    backdrop: str = _setting(
+        "random", "behind cut-out objects in training; random: a colour for each ray, so that no background is learned; scene: the scene's (NeRF: white)",
+        choices=("random", "scene"),
+    )  # fmt: skip
     checkpoint_every: int = _setting(250, "steps between checkpoints", minimum=1)
     preview_every: int = _setting(500, "steps between preview pictures of a held-back view; 0: none", minimum=0)

@@ -22,7 +22,7 @@ from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, upd
 from efficientnerf.model import Look, Model, look
 
 RATE_WARM_UP = 100  # steps in which the rate rises, or the first tenth of a shorter run
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15  # Mueller et al. 2022; epsilon this small because a table entry's gradient can be
+BETA1 = 0.9
 FEWEST_RAYS = 64
 ANCHOR_SHARE = 8  # one ray to a sparse point for so many rays of pixels
 ANCHOR_WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as at the point
@@ -47,6 +47,8 @@ class Pixels:
             self.images[at : at + len(flat), : flat.shape[1]] = flat
             if flat.shape[1] < channels:
                 self.images[at : at + len(flat), 3] = 255
+        self.width = np.array([camera.width for camera in cameras], np.int64)
+        self.height = np.array([camera.height for camera in cameras], np.int64)
         self.usable = None
         if any(mask is not None for mask in masks):
             self.usable = np.concatenate([np.ones(n, bool) if mask is None else mask.reshape(-1) for n, mask in zip(sizes, masks, strict=True)])
@@ -70,15 +72,25 @@ class Pixels:
     def __len__(self) -> int:
         return len(self.images)
 
-    def choose(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Indices of `count` usable pixels, with replacement."""
-        if self.usable is None:
+    def choose(self, count: int, rng: np.random.Generator, *, middle: bool = False) -> np.ndarray:
+        """Indices of `count` usable pixels, with replacement; with `middle`, of the middle half of the pictures' sides where any is usable there."""
+        if self.usable is None and not middle:
             return rng.integers(len(self), size=count)
         found = np.empty(0, np.int64)
         while len(found) < count:
             tried = rng.integers(len(self), size=2 * count)
-            found = np.concatenate([found, tried[self.usable[tried]]])
+            if self.usable is not None:
+                tried = tried[self.usable[tried]]
+            if middle:
+                tried = tried[self._in_middle(tried)] if self._in_middle(tried).any() else tried
+            found = np.concatenate([found, tried])
         return found[:count]
+
+    def _in_middle(self, index: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether pixels lie at least a quarter of their picture's width and height from its sides."""
+        view = np.searchsorted(self.offsets, index, side="right") - 1
+        y, x = np.divmod(index - self.offsets[view], self.width[view])
+        return (np.abs(2 * x + 1 - self.width[view]) < self.width[view] / 2) & (np.abs(2 * y + 1 - self.height[view]) < self.height[view] / 2)
 
     def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""
@@ -112,13 +124,13 @@ class Anchors:
 class Adam:
     """Kingma and Ba's Adam over named parameters. A hash table's entries without a gradient are left alone (as Mueller et al. do)."""
 
-    def __init__(self, parameters: list[tuple[str, torch.nn.Parameter]]) -> None:
-        self.parameters = parameters
+    def __init__(self, parameters: list[tuple[str, torch.nn.Parameter]], beta2: float = 0.99, epsilon: float = 1e-15) -> None:
+        self.parameters, self.beta2, self.epsilon = parameters, beta2, epsilon
         self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters}
 
     def step(self, number: int, rate: float) -> None:
         """The `number`-th step, from 1; clears the gradients."""
-        correction1, correction2 = 1 - BETA1**number, 1 - BETA2**number
+        correction1, correction2 = 1 - BETA1**number, 1 - self.beta2**number
         for name, p in self.parameters:
             if p.grad is None:
                 continue
@@ -128,13 +140,13 @@ class Adam:
                 from efficientnerf.kernels import cpu
 
                 flat = [t.detach().view(-1).numpy() for t in (p, p.grad.contiguous(), first, second)]
-                cpu.adam(*flat, *(np.float32(x) for x in (rate, BETA1, BETA2, correction1, correction2, EPSILON)), sparse)
+                cpu.adam(*flat, *(np.float32(x) for x in (rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
             else:
                 with torch.no_grad():
                     touched = (p.grad != 0) if sparse else torch.ones_like(p.grad, dtype=torch.bool)
                     first.copy_(torch.where(touched, first.lerp(p.grad, 1 - BETA1), first))
-                    second.copy_(torch.where(touched, second.lerp(p.grad**2, 1 - BETA2), second))
-                    p.sub_(touched * rate * (first / correction1) / ((second / correction2).sqrt() + EPSILON))
+                    second.copy_(torch.where(touched, second.lerp(p.grad**2, 1 - self.beta2), second))
+                    p.sub_(touched * rate * (first / correction1) / ((second / correction2).sqrt() + self.epsilon))
             p.grad = None
 
 
@@ -174,7 +186,7 @@ class Trainer:
 
 def trainer(m: Model) -> Trainer:
     # Until it is known better, every interval is sampled, and as many pivots as there may be.
-    return Trainer(m, Adam(m.parameters()), 0, float(m.slots + m.settings.max_pivots * m.settings.fine_samples))
+    return Trainer(m, Adam(m.parameters(), m.settings.adam_beta2, m.settings.adam_epsilon), 0, float(m.slots + m.settings.max_pivots * m.settings.fine_samples))
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
@@ -197,10 +209,10 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     t.step, t.samples_per_ray = int(state["progress"][0]), float(state["progress"][1])
 
 
-def learning_rate(step: int, settings_rate: float, final: float, iterations: int) -> float:
-    """Rises over the first steps, then falls exponentially to `final` of itself."""
+def learning_rate(step: int, settings_rate: float, final: float, iterations: int, fall: int = 0) -> float:
+    """Rises over the first steps, then falls exponentially, to `final` of itself in every `fall` steps (0: by the last)."""
     rise = max(1, min(RATE_WARM_UP, iterations // 10))
-    return settings_rate * min(1.0, step / rise) * final ** (step / iterations)
+    return settings_rate * min(1.0, step / rise) * final ** (step / (fall or iterations))
 
 
 def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterator[Progress]:
@@ -213,19 +225,21 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         rng = np.random.Generator(np.random.Philox(key=settings.seed, counter=[0, 0, 0, number]))
 
         # A bundle of rays of about as many samples as the settings ask for.
-        count = int(min(settings.rays, max(FEWEST_RAYS, settings.samples / t.samples_per_ray)))
-        origins, directions, near, far, colour = (torch.from_numpy(a).to(device) for a in pixels.bundle(pixels.choose(count, rng)))
+        count = int(min(settings.rays, max(FEWEST_RAYS, settings.samples / t.samples_per_ray))) if settings.samples else settings.rays
+        chosen = pixels.choose(count, rng, middle=number <= settings.crop_steps)
+        origins, directions, near, far, colour = (torch.from_numpy(a).to(device) for a in pixels.bundle(chosen))
         offset = torch.from_numpy(rng.random(count, np.float32)).to(device)
         behind = m.behind(directions)
         if transparent:
-            # Behind an object cut out of its background anything may lie: a new colour for each ray keeps the field from learning one.
-            behind = torch.from_numpy(rng.random((count, 3), np.float32)).to(device)
+            if settings.backdrop == "random" or m.background is None:
+                # Behind an object cut out of its background anything may lie: a new colour for each ray keeps the field from learning one.
+                behind = torch.from_numpy(rng.random((count, 3), np.float32)).to(device)
             colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
 
         # Both stages, both losses (weighted equally, as in the authors' release).
         seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up, rng=rng)
         fine_loss = ((seen.fine_colour - colour) ** 2).mean()
-        loss = fine_loss + ((seen.coarse_colour - colour) ** 2).mean()
+        loss = fine_loss if seen.coarse_colour is None else fine_loss + ((seen.coarse_colour - colour) ** 2).mean()
         if m.space.contracted:
             loss = loss + settings.distortion * seen.distortion.mean()
             _quieten_near_cameras(m, origins, seen)
@@ -233,24 +247,17 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             if anchors is not None and strength > 0:
                 loss = loss + strength * anchor_loss(m, anchors, max(1, count // ANCHOR_SHARE), rng, prune=number > settings.warm_up)
         loss.backward()
-        t.adam.step(number, learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations))
+        t.adam.step(number, learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations, settings.rate_steps))
 
         # The voxels remember what the coarse field said on the rays, and are refreshed at random.
         with torch.no_grad():
-            remember(m, seen.coarse.point, seen.coarse_raw[:, 0].detach())
-            if number % settings.refresh_every == 0:
-                generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-                fade(m.voxels)
-                if number <= settings.warm_up:
-                    cell, point = sweep_cells(m.voxels, number // settings.refresh_every, SWEEP_PARTS, generator)
-                else:
-                    cell, point = refresh_cells(m.voxels, int(settings.refresh_share * m.voxels.side**3), generator)
-                for part in range(0, len(cell), 2**17):
-                    remember(m, point[part : part + 2**17], m.coarse.density(point[part : part + 2**17]), cell[part : part + 2**17])
-
-                if not bool((m.voxels.values > m.voxels.threshold).any()):
-                    # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
-                    m.voxels.values.fill_(m.voxels.start)
+            if m.prunes:
+                remember(m, seen.coarse.point, seen.coarse_raw[:, 0].detach())
+            if m.prunes and number % settings.refresh_every == 0:
+                refresh(m, number, rng)
+            if m.prunes and len(seen.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
+                # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
+                m.voxels.values.fill_(m.voxels.start)
 
         fine, valid = len(seen.fine.start), len(seen.coarse.start)
         t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((fine + valid) / count, 1.0)
@@ -287,9 +294,25 @@ def _quieten_near_cameras(m: Model, origins: Tensor, seen: Look) -> None:
     """
     subject = (origins - torch.as_tensor(m.space.centre, dtype=origins.dtype, device=origins.device)).norm(dim=-1)
     for samples, raw in ((seen.coarse, seen.coarse_raw), (seen.fine, seen.fine_raw)):
+        if not raw.requires_grad:  # uniform sampling has no coarse stage
+            continue
         ray = ray_of_sample(samples.first, len(samples.start))
         scale = (samples.start / subject[ray]).clamp(max=1) ** 2
         raw.register_hook(lambda grad, scale=scale: grad * scale[:, None])
+
+
+def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
+    """Let the voxels forget a little, and ask the coarse field about a share of them: all of them in turn in the warm-up, then random ones."""
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    fade(m.voxels)
+    if m.settings.refresh_share == 0:
+        return
+    if number <= m.settings.warm_up:
+        cell, point = sweep_cells(m.voxels, number // m.settings.refresh_every, SWEEP_PARTS, generator)
+    else:
+        cell, point = refresh_cells(m.voxels, int(m.settings.refresh_share * m.voxels.side**3), generator)
+    for part in range(0, len(cell), 2**17):
+        remember(m, point[part : part + 2**17], m.coarse.density(point[part : part + 2**17]), cell[part : part + 2**17])
 
 
 def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None) -> None:

@@ -50,6 +50,10 @@ def run(job: Job) -> None:
     settings: BakeSettings = job.settings
     use_all_cores()
     m = load_renderer(job.inputs["train"], job.device).model
+    if m.settings.field == "nerf":
+        from pipeline.errors import UsageError
+
+        raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
     resolution = settings.resolution or chosen_resolution(s, settings.max_resolution)
     shape, voxel = baking.grid_of(s.bounds, resolution, settings.brick)

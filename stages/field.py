@@ -74,8 +74,9 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     try:
         background = about["background"]
         space = Space(np.asarray(about["bounds"], np.float64).reshape(2, 3), bool(about["contracted"]))
-        m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device)
+        span = (float(about["near"]), float(about["far"]))
+        m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device, span)
         restore(m, tensors)
-        return FieldRenderer(m, float(about["near"]), float(about["far"]))
+        return FieldRenderer(m, *span)
     except (UsageError, KeyError, TypeError, ValueError) as error:
         raise CorruptArtifact(f"{path}: {error}. Train again.") from None

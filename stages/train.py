@@ -46,8 +46,11 @@ def run(job: Job) -> None:
     views = scene.views_of(s, "train")
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views)
-    m = model(Space(s.bounds, contracted=s.background is None), settings, s.background, job.device)
     near, far = min(view.near for view in s.views), max(view.far for view in s.views)
+    if settings.far > 0:
+        near, far = stated_range(s, settings)
+        pixels.near[:], pixels.far[:] = near, far
+    m = model(Space(s.bounds, contracted=s.background is None), settings, s.background, job.device, (near, far))
     t = training.trainer(m)
     log = job.work / "log.jsonl"
     _resume(t, job, log)
@@ -76,6 +79,17 @@ def run(job: Job) -> None:
     _append(log, lines)
     field.save_model(m, near, far, job.out / field.FILE)
     _publish_log(log, job)
+
+
+def stated_range(s: Scene, settings: TrainSettings) -> tuple[float, float]:
+    """train.near and train.far in the training frame."""
+    from pipeline.errors import UsageError
+
+    if s.background is None:
+        raise UsageError("train.near and train.far are for scenes on a constant background; this one has surroundings. Leave them 0.")
+    if settings.near >= settings.far:
+        raise UsageError(f"train.near={settings.near:g}, train.far={settings.far:g}: rays must end beyond where they begin.")
+    return settings.near * float(s.world_from_capture.scale), settings.far * float(s.world_from_capture.scale)
 
 
 def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:

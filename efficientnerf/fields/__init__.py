@@ -2,15 +2,15 @@
 
     field(points)          (N, 3) grid coordinates -> (N, 1 + 3K)
     field.density(points)  (N, 3) -> (N,) the density alone, before its activation
-    field.basis(dirs)      (R, 3) unit directions -> (R, K): what a colour's K coefficients are weighted with
     field.activation       "exp" or "softplus"
     field.degree           of the harmonics
-    field.directional      whether it is asked field(points, directions) instead, K = 1: such a field cannot be baked
+
+The original NeRF's field alone is asked with directions beside the points, has K = 1 and cannot be baked.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,12 +19,9 @@ if TYPE_CHECKING:
 class Field(Protocol):
     activation: str
     degree: int
-    directional: bool
 
-    def __call__(self, points: Tensor, *directions: Tensor) -> Tensor: ...
+    def __call__(self, points: Tensor) -> Tensor: ...
 
     def density(self, points: Tensor) -> Tensor: ...
 
-    def basis(self, directions: Tensor) -> Tensor: ...
-
-    def parameters(self) -> Any: ...
+    def parameters(self) -> object: ...

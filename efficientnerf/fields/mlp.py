@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.harmonics import basis, harmonics_count
+from efficientnerf.harmonics import harmonics_count
 from efficientnerf.kernels.mlp import chain, precision_of
 
 FREQUENCIES = 10
@@ -44,7 +44,6 @@ class MlpField(nn.Module):
     """
 
     activation = "softplus"
-    directional = False
 
     def __init__(self, *, hidden: int, layers: int, degree: int, generator: torch.Generator, precision: str = "float32") -> None:
         super().__init__()
@@ -60,9 +59,6 @@ class MlpField(nn.Module):
 
     def density(self, points: Tensor) -> Tensor:
         return self._ask(points, self.weights[-1][:1], self.biases[-1][:1])[:, 0]
-
-    def basis(self, directions: Tensor) -> Tensor:
-        return basis(directions, self.degree)
 
     def _ask(self, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         weights, biases = [*list(self.weights)[:-1], weight], [*list(self.biases)[:-1], bias]

@@ -19,8 +19,7 @@ class NerfField(nn.Module):
     """See `efficientnerf.fields`; asked with the samples' directions beside their points, it says the density and the colour before its sigmoid."""
 
     activation = "softplus"
-    directional = True
-    degree = 0
+    degree = 0  # one coefficient a colour, of a constant
 
     def __init__(self, *, hidden: int, layers: int, generator: torch.Generator, precision: str = "float32") -> None:
         super().__init__()
@@ -45,7 +44,3 @@ class NerfField(nn.Module):
         weights, biases = [*list(self.weights)[:-1], self.weights[-1][:1]], [*list(self.biases)[:-1], self.biases[-1][:1]]
         precision = precision_of(self.precision, points.device.type)
         return chain(positional_encoding(points * 2 - 1), weights, biases, skip=self.skip, precision=precision)[:, 0]
-
-    def basis(self, directions: Tensor) -> Tensor:
-        """One constant of 1: the colour is what the network says."""
-        return torch.ones(len(directions), 1, device=directions.device, dtype=directions.dtype)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,7 +30,8 @@ def has_bfloat16(device: str) -> bool:
     if not capability.startswith("AVX512"):
         return False
     try:
-        flags = next(line for line in open("/proc/cpuinfo", encoding="utf-8") if line.startswith("flags")).split()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        flags = next(line for line in lines if line.startswith("flags")).split()
     except (OSError, StopIteration):
         return False
     return "avx512_bf16" in flags or "amx_bf16" in flags
@@ -54,7 +56,9 @@ def chain_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tenso
     return x
 
 
-def chain(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, skip: int | None = None, relu_last: bool = False, precision: torch.dtype) -> Tensor:
+def chain(
+    x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, skip: int | None = None, relu_last: bool = False, precision: torch.dtype
+) -> Tensor:
     """Linear layers with a ReLU after each but the last.
 
     x          (N, I) float32
@@ -67,7 +71,7 @@ def chain(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, ski
         return chain_reference(x, weights, biases, skip, relu_last)
     if skip is not None and x.requires_grad:
         return chain_reference(x, weights, biases, skip, relu_last)
-    return _Chain.apply(x, skip, relu_last, precision, len(weights), *weights, *biases)  # type: ignore[no-any-return]
+    return _Chain.apply(x, skip, relu_last, precision, len(weights), *weights, *biases)
 
 
 def _product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
@@ -103,13 +107,13 @@ class _Chain(torch.autograd.Function):
             out[begin : begin + ROWS] = y
             if keep:
                 kept.append([*inputs, y] if relu_last else inputs)
-        ctx.kept, ctx.weights, ctx.skip, ctx.relu_last = kept, weights, skip, relu_last
+        ctx.kept, ctx.weights, ctx.relu_last = kept, weights, relu_last
         return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         (grad,) = grads
-        weights, skip, layers = ctx.weights, ctx.skip, len(ctx.weights)
+        weights, layers = ctx.weights, len(ctx.weights)
         transposed = [w.t().contiguous() for w in weights]
         weight_grads = [torch.zeros(w.shape, device=grad.device) for w in weights]
         bias_grads = [torch.zeros(len(w), device=grad.device) for w in weights]
