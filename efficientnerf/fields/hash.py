@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from efficientnerf.harmonics import harmonics_count
 from efficientnerf.kernels.cpu import PRIME_Y, PRIME_Z
+from efficientnerf.kernels.dispatch import on_device
 
 FEATURES = 2
 
@@ -68,6 +69,10 @@ def encode(points: Tensor, field: HashField) -> Tensor:
     """Features (N, 2L) at points (N, 3) in grid coordinates; differentiable in the table."""
     if points.device.type == "cpu" and points.dtype == torch.float32 and field.table.dtype == torch.float32:
         return _Encode.apply(points, field.table, field)
+    if on_device(points, field.table):
+        from efficientnerf.kernels import cuda
+
+        return cuda.Encode.apply(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
     return encode_reference(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
 
 

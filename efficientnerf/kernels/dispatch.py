@@ -1,7 +1,11 @@
-"""The kernels under the signatures of the torch functions they replace: numba for float32 on the CPU, else the torch function itself."""
+"""The kernels under the signatures of the torch functions they replace: numba for float32 on the CPU, Triton for float32 on CUDA, else the torch
+function itself.
+"""
 
 from __future__ import annotations
 
+import functools
+import warnings
 from typing import Any
 
 import numpy as np
@@ -18,6 +22,21 @@ def _fast(*tensors: Tensor) -> bool:
     return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
 
 
+def on_device(*tensors: Tensor) -> bool:
+    """Whether the Triton kernels take these tensors: float32 on CUDA, and they can be built here."""
+    return all(t.is_cuda and t.dtype == torch.float32 for t in tensors) and _triton_usable()
+
+
+@functools.cache
+def _triton_usable() -> bool:
+    try:
+        from efficientnerf.kernels import cuda
+    except ImportError as error:
+        warnings.warn(f"Triton cannot be imported ({error}); plain torch is used on CUDA, many times slower. Install triton.", RuntimeWarning, stacklevel=3)
+        return False
+    return cuda.usable()
+
+
 def _array(t: Tensor) -> np.ndarray:
     return t.detach().contiguous().numpy()
 
@@ -30,6 +49,10 @@ def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float
 ) -> Samples:
     """See `efficientnerf.sampling.valid_samples`."""
+    if on_device(origins, directions, near, far, offset, voxels):
+        from efficientnerf.kernels import cuda_sampling
+
+        return cuda_sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold)
     if not _fast(origins, directions, near, far, offset, voxels):
         return sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold)
     from efficientnerf.kernels import cpu
@@ -42,6 +65,10 @@ def valid_samples(
 
 def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
     """See `efficientnerf.sampling.pivots`."""
+    if on_device(weight):
+        from efficientnerf.kernels import cuda_sampling
+
+        return cuda_sampling.pivots(weight, first, threshold, most)
     if not _fast(weight):
         return sampling.pivots(weight, first, threshold, most)
     from efficientnerf.kernels import cpu
@@ -53,6 +80,10 @@ def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor
 
 def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
     """See `efficientnerf.sampling.pivotal_samples`."""
+    if on_device(origins, directions, offset, coarse.start):
+        from efficientnerf.kernels import cuda_sampling
+
+        return cuda_sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
     if not _fast(origins, directions, offset, coarse.start):
         return sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
     from efficientnerf.kernels import cpu
@@ -65,7 +96,11 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
-    """See `efficientnerf.compositing.composite`; on the CPU the samples' colours carry no gradient."""
+    """See `efficientnerf.compositing.composite`; by kernels the samples' colours, the lengths and the harmonics carry no gradient."""
+    if on_device(raw, length, harmonics, background):
+        from efficientnerf.kernels import cuda_compositing
+
+        return cuda_compositing.composite(raw, length, first, harmonics, background, activation)
     if not _fast(raw, length, harmonics, background):
         return compositing.composite(raw, length, first, harmonics, background, activation)
     return Composite(*_Composite.apply(raw, length, first, harmonics, background, activation == "exp"))

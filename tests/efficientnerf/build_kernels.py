@@ -1,0 +1,91 @@
+"""Calls every function of the CUDA kernels with small tensors, and where it would launch a kernel builds it for devices that need not be there.
+
+    python -m tests.efficientnerf.build_kernels
+
+A line for each kernel as launched and each generation: name, constants, registers a thread, bytes of stack (what does not fit the registers).
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from triton.runtime.jit import JITFunction
+
+GENERATIONS = (80, 90)  # compute capability: A100 and RTX 30 run code for 8.0, H100 and H200 that for 9.0
+TYPES = {
+    torch.float32: "*fp32", torch.float16: "*fp16", torch.int64: "*i64", torch.int32: "*i32", torch.int8: "*i8", torch.uint8: "*u8", torch.bool: "*i1",
+}  # fmt: skip
+DUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+seen: set[str] = set()
+
+
+def resources(cubin: bytes) -> tuple[int, int]:
+    """Registers a thread and bytes of stack."""
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(cubin)
+        file.flush()
+        said = subprocess.run([DUMP, "-res-usage", file.name], capture_output=True, text=True, check=True).stdout
+    found = re.search(r"REG:(\d+) STACK:(\d+)", said)
+    assert found is not None, said
+    return int(found[1]), int(found[2])
+
+
+def build(self: JITFunction, *args: Any, grid: Any, warmup: bool, num_warps: int = 4, **kwargs: Any) -> None:
+    """Stands for `JITFunction.run`."""
+    given = dict(zip(self.arg_names, args, strict=False)) | kwargs
+    constants = {p.name: given[p.name] for p in self.params if p.is_constexpr}
+    signature, attributes = {}, {}
+    for place, name in enumerate(self.arg_names):
+        value = given[name]
+        if name in constants:
+            signature[name] = "constexpr"
+        elif isinstance(value, torch.Tensor):
+            signature[name] = TYPES[value.dtype]
+            attributes[(place,)] = [["tt.divisibility", 16]]  # as the allocator gives them
+        else:
+            signature[name] = "fp32" if isinstance(value, float) else "i32"
+    key = f"{self.__name__} {constants} {signature}"
+    if key in seen:
+        return
+    seen.add(key)
+    for generation in GENERATIONS:
+        source = ASTSource(fn=self, signature=signature, constexprs=constants, attrs=attributes)
+        made = triton.compile(source, target=GPUTarget("cuda", generation, 32), options={"num_warps": num_warps})
+        registers, stack = resources(made.asm["cubin"])
+        print(f"{self.__name__} {constants} sm_{generation}: registers {registers}, spilled {stack}", flush=True)
+
+
+def training_step() -> None:
+    from efficientnerf.grid import Space
+    from efficientnerf.kernels import cuda, cuda_compositing, cuda_sampling
+
+    sides, dense, starts = np.array([4, 64]), np.array([True, False]), np.array([0, 64])
+    table = torch.zeros(1000, 2, requires_grad=True)
+    cuda.Encode.apply(torch.zeros(8, 3), table, sides, dense, starts, 255).sum().backward()
+    for skip_zeros in (False, True):
+        cuda.adam(*(torch.zeros(64) for _ in range(4)), 0.1, 0.9, 0.99, 1.0, 1.0, 1e-15, skip_zeros=skip_zeros)
+    for contracted in (False, True):
+        space = Space(np.array([[-1.0] * 3, [1.0] * 3]), contracted)
+        rays = (torch.zeros(8, 3), torch.ones(8, 3), torch.zeros(8), torch.ones(8), torch.zeros(8))
+        found = cuda_sampling.valid_samples(space, *rays, 0.1, 4, torch.ones(4, 4, 4), 0.0, capacity=32)
+        pivotal = cuda_sampling.pivots(found.start, found.first, 0.1, 4)
+        cuda_sampling.pivotal_samples(space, rays[0], rays[1], rays[4], found, pivotal, 2, capacity=64)
+    for terms in (1, 9, 25):
+        for activation in ("exp", "softplus"):
+            raw, background = torch.zeros(32, 1 + 3 * terms, requires_grad=True), torch.ones(8, 3)
+            out = cuda_compositing.composite(raw, torch.ones(32), torch.zeros(9, dtype=torch.int64), torch.ones(8, terms), background, activation)
+            out.colour.sum().backward()
+
+
+if __name__ == "__main__":
+    JITFunction.run = build
+    training_step()

@@ -1,0 +1,117 @@
+"""Valid and pivotal samples by the CUDA kernels against torch, with and without a fixed capacity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf import sampling
+from efficientnerf.grid import Space
+from efficientnerf.sampling import Samples
+from tests.efficientnerf.device import DEVICE
+from tests.efficientnerf.test_sampling import BOUNDS, STEP, Rays, coarse_samples_of, make_rays, voxels_of
+
+cuda = pytest.importorskip("efficientnerf.kernels.cuda_sampling")
+
+
+def there(rays: Rays) -> Rays:
+    return Rays(*(t.to(DEVICE) for t in rays))
+
+
+def here(samples: Samples) -> Samples:
+    return Samples(*(t.cpu() for t in samples[:5]), int(samples.tried))
+
+
+def of_ray(samples: Samples, r: int) -> list[torch.Tensor]:
+    begin, end = samples.first[r : r + 2].tolist()
+    return [t[begin:end] for t in samples[1:5]]
+
+
+@pytest.mark.parametrize("kind", ["outside", "inside", "missing", "parallel"])
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("threshold", [0.4, -math.inf])
+def test_valid_samples_are_those_of_torch(kind: str, contracted: bool, threshold: float) -> None:
+    rays, space = make_rays(kind), Space(BOUNDS, contracted)
+    ours = here(cuda.valid_samples(space, *there(rays), STEP, 60, voxels_of().to(DEVICE), threshold))
+    theirs = sampling.valid_samples(space, *(t.double() for t in rays), STEP, 60, voxels_of().double(), threshold)
+    assert ours.first.dtype == torch.int64
+    assert abs(ours.tried - theirs.tried) <= 2  # where a ray ends, rounding may turn a decision
+    alike = [r for r in range(len(rays.origins)) if ours.first[r + 1] - ours.first[r] == theirs.first[r + 1] - theirs.first[r]]
+    assert len(alike) >= len(rays.origins) - 2
+    for r in alike:
+        for a, b in zip(of_ray(ours, r), of_ray(theirs, r), strict=True):
+            torch.testing.assert_close(a.double(), b, rtol=1e-4, atol=2e-5)
+    if kind == "missing" and not contracted:
+        assert ours.first[-1] == 0
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("room", [0, 1, 100, 4000])
+def test_a_capacity_cuts_off_the_end_or_pads_it(contracted: bool, room: int) -> None:
+    rays, space = there(make_rays("outside")), Space(BOUNDS, contracted)
+    args = (space, *rays, STEP, 60, voxels_of().to(DEVICE), 0.4)
+    whole, cut = cuda.valid_samples(*args), cuda.valid_samples(*args, capacity=room)
+    total = int(whole.first[-1])
+    assert 100 < total < 4000
+    kept = min(room, total)
+    assert torch.equal(cut.first, whole.first.clamp(max=room))
+    for a, b in zip(cut[1:5], whole[1:5], strict=True):
+        assert len(a) == room
+        assert torch.equal(a[:kept], b[:kept])
+        assert not a[kept:].any()
+    assert isinstance(cut.tried, torch.Tensor)
+    assert int(cut.tried) == whole.tried
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("per_pivot", [1, 3])
+@pytest.mark.parametrize("room", [None, 0, 50, 5000])
+def test_pivotal_samples_are_those_of_torch(contracted: bool, per_pivot: int, room: int | None) -> None:
+    rays = make_rays("inside")
+    space, coarse, pivotal = coarse_samples_of(rays, contracted)
+    theirs = sampling.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, pivotal, per_pivot)
+    padded, marked = coarse, pivotal
+    if room is not None:  # what comes of a coarse stage with a capacity: padding, and the choice of padding by chance
+        more = [torch.cat([t, t.new_zeros(40, *t.shape[1:])]) for t in coarse[1:5]]
+        padded, marked = Samples(coarse.first, *more, coarse.tried), torch.cat([pivotal, torch.ones(40, dtype=torch.bool)])
+    at = there(rays)
+    on_device = Samples(*(t.to(DEVICE) for t in padded[:5]), padded.tried)
+    ours = here(cuda.pivotal_samples(space, at.origins, at.directions, at.offset, on_device, marked.to(DEVICE), per_pivot, room))
+    kept = len(theirs.start) if room is None else min(room, len(theirs.start))
+    assert torch.equal(ours.first, theirs.first.clamp(max=kept))
+    for a, b in zip(ours[1:5], theirs[1:5], strict=True):
+        assert len(a) == (kept if room is None else room)
+        torch.testing.assert_close(a[:kept], b[:kept], rtol=1e-4, atol=1e-5)
+        assert not a[kept:].any()
+
+
+@pytest.mark.parametrize("most", [1, 3, 5, 100])
+def test_pivots_are_those_of_torch(most: int) -> None:
+    rng = np.random.default_rng(3)
+    counts = [0, 4, 12, 1, 7, 0, 30, 0]
+    weight = torch.from_numpy(np.round(rng.random(sum(counts)), 1).astype(np.float32))  # many equals
+    first = torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]))
+    expected = sampling.pivots(weight, first, float(np.float32(0.3)), most)
+    assert torch.equal(cuda.pivots(weight.to(DEVICE), first.to(DEVICE), float(np.float32(0.3)), most).cpu(), expected)
+    padded = torch.cat([weight, torch.ones(9)]).to(DEVICE)  # heavy, but of no ray
+    ours = cuda.pivots(padded, first.to(DEVICE), float(np.float32(0.3)), most).cpu()
+    assert torch.equal(ours, torch.cat([expected, torch.zeros(9, dtype=torch.bool)]))
+
+
+def test_no_rays_no_slots_and_no_samples_are_fine() -> None:
+    voxels = voxels_of().to(DEVICE)
+    none = there(Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), torch.zeros(0)))
+    for room in (None, 4):
+        found = cuda.valid_samples(Space(BOUNDS, False), *none, STEP, 60, voxels, 0.4, room)
+        assert found.first.tolist() == [0]
+        assert found.point.shape == (room or 0, 3)
+    rays, space = there(make_rays("outside")), Space(BOUNDS, False)
+    empty = cuda.valid_samples(space, *rays, STEP, 0, voxels, 0.4)
+    assert not empty.first.any()
+    assert cuda.pivots(empty.start, empty.first, 0.1, 3).shape == (0,)
+    fine = cuda.pivotal_samples(space, rays.origins, rays.directions, rays.offset, empty, torch.zeros(0, dtype=torch.bool, device=DEVICE), 2)
+    assert not fine.first.any()
+    assert fine.point.shape == (0, 3)
