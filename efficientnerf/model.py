@@ -131,10 +131,10 @@ def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField, Any
     if s.field == "hash":
         return HashField(
             levels=max(1, s.levels // 2), log2_table=max(8, s.log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, s.finest // 4),
-            hidden=s.coarse_hidden, layers=s.coarse_layers, degree=0, initial_density=s.initial_density, generator=generator,
+            hidden=s.coarse_hidden, layers=s.coarse_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
         ), HashField(
             levels=s.levels, log2_table=s.log2_table, coarsest=COARSEST, finest=s.finest,
-            hidden=s.hidden, layers=s.layers, degree=s.degree, initial_density=s.initial_density, generator=generator,
+            hidden=s.hidden, layers=s.layers, degree=s.degree, initial_density=s.initial_density, generator=generator, precision=s.precision,
         )  # fmt: skip
     if s.field == "nerf":
         return (

@@ -137,16 +137,18 @@ class Adam:
             first, second = self.moments[name]
             sparse = name.endswith("table")
             if p.device.type == "cpu":
-                from efficientnerf.kernels import cpu
+                from efficientnerf.kernels import cpu_network
 
                 flat = [t.detach().view(-1).numpy() for t in (p, p.grad.contiguous(), first, second)]
-                cpu.adam(*flat, *(np.float32(x) for x in (rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
+                cpu_network.adam(*flat, *(np.float32(x) for x in (rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
             else:
                 with torch.no_grad():
                     touched = (p.grad != 0) if sparse else torch.ones_like(p.grad, dtype=torch.bool)
                     first.copy_(torch.where(touched, first.lerp(p.grad, 1 - BETA1), first))
                     second.copy_(torch.where(touched, second.lerp(p.grad**2, 1 - self.beta2), second))
                     p.sub_(touched * rate * (first / correction1) / ((second / correction2).sqrt() + self.epsilon))
+            if sparse and p.device.type == "cpu" and p.grad.is_contiguous():
+                p.cleared_grad = p.grad  # type: ignore[attr-defined]  # for the next step: a new one would have to be cleared again
             p.grad = None
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,8 +17,10 @@ from torch import Tensor, nn
 from efficientnerf.harmonics import harmonics_count
 from efficientnerf.kernels.cpu import PRIME_Y, PRIME_Z
 from efficientnerf.kernels.dispatch import on_device
+from efficientnerf.kernels.mlp import outer, precision_of, product
 
 FEATURES = 2
+ROWS = 2048  # to a multiple of which a network's input is padded
 
 
 class HashField(nn.Module):
@@ -27,7 +30,7 @@ class HashField(nn.Module):
 
     def __init__(
         self, *, levels: int, log2_table: int, coarsest: int, finest: int, hidden: int, layers: int, degree: int,
-        initial_density: float, generator: torch.Generator,
+        initial_density: float, generator: torch.Generator, precision: str = "float32",
     ) -> None:  # fmt: skip
         super().__init__()
         self.degree = degree
@@ -49,25 +52,34 @@ class HashField(nn.Module):
         # The last layer starts small: grey colours, a density so thin that every ray sees through.
         self.weights[-1].data.mul_(0.1)
         self.log_initial_density = math.log(initial_density)
+        self.precision = precision
 
     def forward(self, points: Tensor) -> Tensor:
-        raw = self._network(encode(points, self), self.weights[-1])
+        raw = self._network(points, self.weights[-1])
         offset = torch.zeros(raw.shape[1], device=raw.device)
         offset[0] = self.log_initial_density
         return raw + offset
 
     def density(self, points: Tensor) -> Tensor:
-        return self._network(encode(points, self), self.weights[-1][:1])[:, 0] + self.log_initial_density
+        return self._network(points, self.weights[-1][:1])[:, 0] + self.log_initial_density
 
-    def _network(self, x: Tensor, last: Tensor) -> Tensor:
-        for weight in list(self.weights)[:-1]:
+    def _network(self, points: Tensor, last: Tensor) -> Tensor:
+        weights = [*list(self.weights)[:-1], last]
+        if _by_kernel(points, self) and torch.is_grad_enabled():
+            return _Network.apply(points, self.table, self, *weights)
+        x = encode(points, self)
+        for weight in weights[:-1]:
             x = torch.relu(x @ weight.t())
         return x @ last.t()
 
 
+def _by_kernel(points: Tensor, field: HashField) -> bool:
+    return points.device.type == "cpu" and points.dtype == torch.float32 and field.table.dtype == torch.float32
+
+
 def encode(points: Tensor, field: HashField) -> Tensor:
     """Features (N, 2L) at points (N, 3) in grid coordinates; differentiable in the table."""
-    if points.device.type == "cpu" and points.dtype == torch.float32 and field.table.dtype == torch.float32:
+    if _by_kernel(points, field):
         return _Encode.apply(points, field.table, field)
     if on_device(points, field.table):
         from efficientnerf.kernels import cuda
@@ -76,28 +88,85 @@ def encode(points: Tensor, field: HashField) -> Tensor:
     return encode_reference(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
 
 
+def _encoded(points: Tensor, table: Tensor, field: HashField) -> tuple[Tensor, Tensor]:
+    """Points (3, N) and features (2L, N): the order that the kernels want."""
+    from efficientnerf.kernels import cpu_hash
+
+    points = points.t().contiguous()
+    out = torch.empty(FEATURES * len(field.sides), points.shape[1])
+    cpu_hash.encode(points.numpy(), table.detach().numpy(), field.sides, field.dense, field.starts, field.mask, out.numpy())
+    return points, out
+
+
+def _add_table_gradient(points: Tensor, grad: Tensor, table: Tensor, field: HashField) -> None:
+    """Add to the table's gradient what features (2L, N) pull at points (3, N).
+
+    It is added here, and not handed to autograd, because a step looks through a field more than once and each sum over the whole table costs as much
+    as the encoding. The buffer is the one that `Adam` left cleared, if there is one.
+    """
+    from efficientnerf.kernels import cpu_hash
+
+    if table.grad is None:
+        cleared = table.__dict__.pop("cleared_grad", None)
+        table.grad = torch.zeros_like(table) if cleared is None else cleared
+    cpu_hash.encode_backward(points.numpy(), grad.numpy(), field.sides, field.dense, field.starts, field.mask, table.grad.numpy())
+
+
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points: Tensor, table: Tensor, field: HashField) -> Tensor:  # type: ignore[no-untyped-def]
-        from efficientnerf.kernels import cpu
-
-        out = torch.empty(len(points), FEATURES * len(field.sides))
-        cpu.encode(points.contiguous().numpy(), table.detach().numpy(), field.sides, field.dense, field.starts, field.mask, out.numpy())
-        ctx.save_for_backward(points, table)
-        ctx.field = field
-        return out
+    def forward(ctx: Any, points: Tensor, table: Tensor, field: HashField) -> Tensor:
+        at, out = _encoded(points, table, field)
+        ctx.save_for_backward(at)
+        ctx.table, ctx.field = table, field
+        return out.t()
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[None, Tensor, None]:  # type: ignore[no-untyped-def]
-        from efficientnerf.kernels import cpu
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, ...]:
+        _add_table_gradient(ctx.saved_tensors[0], grad.t().contiguous(), ctx.table, ctx.field)
+        return None, None, None
 
-        points, table = ctx.saved_tensors
-        field = ctx.field
-        table_grad = torch.zeros_like(table)
-        cpu.encode_backward(
-            points.contiguous().numpy(), grad.contiguous().numpy(), field.sides, field.dense, field.starts, field.mask, table_grad.numpy()
-        )
-        return None, table_grad, None
+
+class _Network(torch.autograd.Function):
+    """Encoding and network: (N, 3) to (N, O), products in `field.precision`.
+
+    Rows are padded with zeros to a multiple of `ROWS`: oneDNN prepares code for each new shape, which costs more than the product itself, and each step
+    has another number of samples.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, table: Tensor, field: HashField, *weights: Tensor) -> Tensor:
+        at, features = _encoded(points, table, field)
+        precision, count = precision_of(field.precision, "cpu"), len(points)
+        x = torch.zeros(-(-count // ROWS) * ROWS, len(features), dtype=precision)
+        x[:count] = features.t()
+        layers, small = [x], [weight.to(precision) for weight in weights]
+        for weight in small[:-1]:
+            layers.append(product(layers[-1], weight, None, True))
+        ctx.save_for_backward(at, *layers, *small)
+        ctx.table, ctx.field = table, field
+        return product(layers[-1], small[-1], None, False)[:count].float()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        from efficientnerf.kernels import cpu_network
+
+        at, *rest = ctx.saved_tensors
+        layers, small = rest[: len(rest) // 2], rest[len(rest) // 2 :]
+        pull = torch.zeros(len(layers[0]), grad.shape[1], dtype=layers[0].dtype)
+        pull[: len(grad)] = grad
+        of_weights = []
+        for x, weight in zip(reversed(layers[1:]), reversed(small[1:]), strict=True):
+            of_weights.append(outer(pull, x))
+            pull = product(pull, weight.t(), None, False)
+            cpu_network.relu_backward(_bits(x), _bits(pull))
+        of_weights.append(outer(pull, layers[0]))
+        _add_table_gradient(at, product(pull, small[0].t(), None, False)[: len(grad)].t().float().contiguous(), ctx.table, ctx.field)
+        return None, None, None, *reversed(of_weights)
+
+
+def _bits(x: Tensor) -> np.ndarray:
+    """The memory of a contiguous tensor of 16 or 32-bit floats as a flat array of whole numbers."""
+    return x.view(-1).view(torch.int16 if x.element_size() == 2 else torch.int32).numpy()
 
 
 def encode_reference(points: Tensor, table: Tensor, sides: np.ndarray, dense: np.ndarray, starts: np.ndarray, mask: int) -> Tensor:

@@ -1,7 +1,7 @@
 """The training step's kernels on the CPU (numba, all cores): same results as the torch functions they stand for.
 
-Parallel without races: rays and samples are split into fixed blocks, and a hash table's gradient is summed level by level, each level by one
-thread. So the bytes depend neither on timing nor on the number of threads.
+Parallel without races: rays are split into fixed blocks, and a ray belongs to one thread. So the bytes depend neither on timing nor on the number of
+threads.
 """
 
 from __future__ import annotations
@@ -174,66 +174,6 @@ def pivotal_samples(origins, directions, offset, centre, half, contracted, first
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _slot(x, y, z, side, dense, mask):  # type: ignore[no-untyped-def]
-    """Where a lattice point lies in its level's table: its own place where the level fits, else its hash."""
-    if dense:
-        return (x * side + y) * side + z
-    return np.int64((np.uint32(x) ^ (np.uint32(y) * PRIME_Y) ^ (np.uint32(z) * PRIME_Z)) & mask)
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def encode(points, table, sides, dense, starts, mask, out):  # type: ignore[no-untyped-def]
-    """Multiresolution hash encoding with two features a level, forward: points (N, 3), table (T, 2), out (N, 2L)."""
-    samples, levels = points.shape[0], sides.shape[0]
-    one = np.float32(1)
-    for block in numba.prange((samples + 2047) // 2048):
-        lo, hi = block * 2048, min(samples, block * 2048 + 2048)
-        for level in range(levels):
-            side, begin, flat = sides[level], starts[level], dense[level]
-            cells = np.float32(side - 1)
-            for n in range(lo, hi):
-                x, y, z = points[n, 0] * cells, points[n, 1] * cells, points[n, 2] * cells
-                i = min(max(int(x), 0), side - 2)
-                j = min(max(int(y), 0), side - 2)
-                k = min(max(int(z), 0), side - 2)
-                fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-                a = b = np.float32(0)
-                for c in range(8):
-                    p, q, s = c >> 2, (c >> 1) & 1, c & 1
-                    w = (fx if p else one - fx) * (fy if q else one - fy) * (fz if s else one - fz)
-                    at = begin + _slot(i + p, j + q, k + s, side, flat, mask)
-                    a += w * table[at, 0]
-                    b += w * table[at, 1]
-                out[n, 2 * level] = a
-                out[n, 2 * level + 1] = b
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def encode_backward(points, grad, sides, dense, starts, mask, table_grad):  # type: ignore[no-untyped-def]
-    """Adds the gradient with respect to the table: grad (N, 2L), table_grad (T, 2). One thread owns a level."""
-    samples, levels = points.shape[0], sides.shape[0]
-    one = np.float32(1)
-    for level in numba.prange(levels):
-        side, begin, flat = sides[level], starts[level], dense[level]
-        cells = np.float32(side - 1)
-        for n in range(samples):
-            ga, gb = grad[n, 2 * level], grad[n, 2 * level + 1]
-            if ga == 0 and gb == 0:
-                continue
-            x, y, z = points[n, 0] * cells, points[n, 1] * cells, points[n, 2] * cells
-            i = min(max(int(x), 0), side - 2)
-            j = min(max(int(y), 0), side - 2)
-            k = min(max(int(z), 0), side - 2)
-            fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-            for c in range(8):
-                p, q, s = c >> 2, (c >> 1) & 1, c & 1
-                w = (fx if p else one - fx) * (fy if q else one - fy) * (fz if s else one - fz)
-                at = begin + _slot(i + p, j + q, k + s, side, flat, mask)
-                table_grad[at, 0] += w * ga
-                table_grad[at, 1] += w * gb
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
 def _activate(x, exponential):  # type: ignore[no-untyped-def]
     """Density and its derivative."""
     one = np.float32(1)
@@ -347,23 +287,6 @@ def composite_backward(  # type: ignore[no-untyped-def]
                     d = w * g * c * (one - c)
                     for k in range(terms):
                         grad_raw[n, 1 + channel * terms + k] = d * harmonics[r, k]
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def adam(value, grad, first, second, rate, beta1, beta2, correction1, correction2, eps, skip_zeros):  # type: ignore[no-untyped-def]
-    """Kingma and Ba's Adam in place on flat arrays; with `skip_zeros`, entries without a gradient are left alone. Clears the gradient."""
-    one = np.float32(1)
-    count = len(value)
-    for block in numba.prange((count + 8191) // 8192):
-        for n in range(block * 8192, min(count, (block + 1) * 8192)):
-            g = grad[n]
-            if skip_zeros and g == 0:
-                continue
-            m = beta1 * first[n] + (one - beta1) * g
-            v = beta2 * second[n] + (one - beta2) * g * g
-            first[n], second[n] = m, v
-            value[n] -= rate * (m / correction1) / (np.sqrt(v / correction2) + eps)
-            grad[n] = 0
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

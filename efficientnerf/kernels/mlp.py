@@ -74,7 +74,7 @@ def chain(
     return _Chain.apply(x, skip, relu_last, precision, len(weights), *weights, *biases)
 
 
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
+def product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
     """x weight^T + bias, and ReLU. On the CPU through oneDNN itself: it fuses all three, and its float32 is twice MKL's on some processors."""
     if x.device.type == "cpu" and len(x):
         return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu" if relu else "none", [], "")
@@ -82,7 +82,7 @@ def _product(x: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tens
     return y.relu_() if relu else y
 
 
-def _outer(grad: Tensor, x: Tensor) -> Tensor:
+def outer(grad: Tensor, x: Tensor) -> Tensor:
     """grad^T x in float32."""
     if grad.dtype == torch.float32 and grad.device.type == "cpu":
         return torch.ops.mkldnn._linear_pointwise(grad.t(), x.t(), None, "none", [], "")
@@ -103,7 +103,7 @@ class _Chain(torch.autograd.Function):
             for layer in range(layers):
                 y = torch.cat([y, first], dim=1) if layer == skip else y
                 inputs.append(y)
-                y = _product(y, weights[layer], biases[layer], relu_last or layer < layers - 1)
+                y = product(y, weights[layer], biases[layer], relu_last or layer < layers - 1)
             out[begin : begin + ROWS] = y
             if keep:
                 kept.append([*inputs, y] if relu_last else inputs)
@@ -125,13 +125,13 @@ class _Chain(torch.autograd.Function):
                 g = torch.ops.aten.threshold_backward(g, kept[layers], 0)
             for layer in reversed(range(layers)):
                 y = kept[layer]
-                weight_grads[layer] += _outer(g, y)
+                weight_grads[layer] += outer(g, y)
                 bias_grads[layer] += g.sum(0, dtype=torch.float32)
                 if layer:
                     hidden = len(weights[layer - 1])  # what x adds at the skip needs no gradient
-                    g = _product(g, transposed[layer][:hidden], None, False)
+                    g = product(g, transposed[layer][:hidden], None, False)
                     g = torch.ops.aten.threshold_backward(g, y[:, :hidden], 0)
                 elif x_grad is not None:
-                    x_grad[begin : begin + ROWS] = _product(g, transposed[0], None, False)
+                    x_grad[begin : begin + ROWS] = product(g, transposed[0], None, False)
         ctx.kept = None
         return (x_grad, None, None, None, None, *weight_grads, *bias_grads)
