@@ -23,7 +23,7 @@ class TrainSettings:
         choices=("hash", "mlp", "nerf"),
     )  # fmt: skip
     precision: str = _setting(
-        "auto", "mlp, nerf: what products are computed in; auto: bfloat16 where the device has it", choices=("auto", "float32", "bfloat16")
+        "auto", "what matrix products of training are computed in; auto: bfloat16 where the device has it", choices=("auto", "float32", "bfloat16")
     )
     sampling: str = _setting(
         "efficient",

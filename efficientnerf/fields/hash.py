@@ -65,8 +65,9 @@ class HashField(nn.Module):
 
     def _network(self, points: Tensor, last: Tensor) -> Tensor:
         weights = [*list(self.weights)[:-1], last]
-        if _by_kernel(points, self) and torch.is_grad_enabled():
-            return _Network.apply(points, self.table, self, *weights)
+        if _by_kernel(points, self):
+            precision = precision_of(self.precision, "cpu") if torch.is_grad_enabled() else torch.float32
+            return _Network.apply(points, self.table, self, precision, *weights)
         x = encode(points, self)
         for weight in weights[:-1]:
             x = torch.relu(x @ weight.t())
@@ -127,16 +128,16 @@ class _Encode(torch.autograd.Function):
 
 
 class _Network(torch.autograd.Function):
-    """Encoding and network: (N, 3) to (N, O), products in `field.precision`.
+    """Encoding and network: (N, 3) to (N, O), products in `precision`.
 
     Rows are padded with zeros to a multiple of `ROWS`: oneDNN prepares code for each new shape, which costs more than the product itself, and each step
     has another number of samples.
     """
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, field: HashField, *weights: Tensor) -> Tensor:
+    def forward(ctx: Any, points: Tensor, table: Tensor, field: HashField, precision: torch.dtype, *weights: Tensor) -> Tensor:
         at, features = _encoded(points, table, field)
-        precision, count = precision_of(field.precision, "cpu"), len(points)
+        count = len(points)
         x = torch.zeros(-(-count // ROWS) * ROWS, len(features), dtype=precision)
         x[:count] = features.t()
         layers, small = [x], [weight.to(precision) for weight in weights]
@@ -161,7 +162,7 @@ class _Network(torch.autograd.Function):
             cpu_network.relu_backward(_bits(x), _bits(pull))
         of_weights.append(outer(pull, layers[0]))
         _add_table_gradient(at, product(pull, small[0].t(), None, False)[: len(grad)].t().float().contiguous(), ctx.table, ctx.field)
-        return None, None, None, *reversed(of_weights)
+        return None, None, None, None, *reversed(of_weights)
 
 
 def _bits(x: Tensor) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import numpy as np
@@ -135,3 +136,40 @@ def test_positional_encoding_has_63_numbers_and_its_closed_form() -> None:
 def test_shallow_networks_work(layers: int) -> None:
     field = MlpField(hidden=8, layers=layers, degree=0, generator=torch.Generator().manual_seed(0))
     assert field(torch.rand(3, 3)).shape == (3, 4)
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-5), ("bfloat16", 2e-2)])
+@pytest.mark.parametrize("count", [1, 203, 2300])
+def test_the_hash_fields_passes_are_autograds(precision: str, tolerance: float, count: int) -> None:
+    """Values and gradients of the written-out passes against plain torch in float64, relative to the largest."""
+    field, at = hash_field(), points(count)
+    field.precision = precision
+    towards = torch.randn(len(at), 28, generator=torch.Generator().manual_seed(2))
+    seen = field(at)
+    (seen * towards).sum().backward()
+    exact = copy.deepcopy(field).double()
+    exact.zero_grad()
+    expected = exact(at.double())
+    (expected * towards).sum().backward()
+    assert (seen - expected).abs().max() <= tolerance * expected.abs().max()
+    for (name, ours), theirs in zip(field.named_parameters(), exact.parameters(), strict=True):
+        assert ours.grad is not None
+        assert theirs.grad is not None
+        assert (ours.grad - theirs.grad).abs().max() <= tolerance * theirs.grad.abs().max(), name
+
+
+def test_a_field_asked_twice_sums_its_gradients() -> None:
+    field, at = hash_field(), points()
+    once = copy.deepcopy(field)
+    (field(at[:50]).sum() + field(at[50:]).sum()).backward()
+    once(at).sum().backward()
+    for ours, theirs in zip(field.parameters(), once.parameters(), strict=True):
+        torch.testing.assert_close(ours.grad, theirs.grad, rtol=1e-4, atol=1e-4)
+
+
+def test_no_samples_are_no_trouble() -> None:
+    field = hash_field()
+    out = field(torch.zeros(0, 3))
+    assert out.shape == (0, 28)
+    out.sum().backward()
+    assert all(p.grad is not None and not p.grad.any() for p in field.parameters())
