@@ -138,7 +138,7 @@ class _Network(torch.autograd.Function):
     def forward(ctx: Any, points: Tensor, table: Tensor, field: HashField, precision: torch.dtype, *weights: Tensor) -> Tensor:
         at, features = _encoded(points, table, field)
         count = len(points)
-        x = torch.zeros(-(-count // ROWS) * ROWS, len(features), dtype=precision)
+        x = torch.zeros(max(1, -(-count // ROWS)) * ROWS, len(features), dtype=precision)
         x[:count] = features.t()
         layers, small = [x], [weight.to(precision) for weight in weights]
         for weight in small[:-1]:
