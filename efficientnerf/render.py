@@ -22,47 +22,21 @@ from efficientnerf.model import Look, Model, look
 if TYPE_CHECKING:
     from efficientnerf.nerftree.tree import NerfTree, Rendering
 
-RAYS_PER_BLOCK = 2**18
+RAYS_PER_BAND = 2**20  # of supersampled pictures at once
 FIELD_RAYS_PER_BLOCK = 8192
-
-
-def subpixels(camera: Camera, rows: range, supersample: int) -> np.ndarray:
-    """Where the rays of some rows of pixels pass: (rows * width * supersample^2, 2), the samples of a pixel together."""
-    offsets = (np.arange(supersample) + 0.5) / supersample
-    y, x, sy, sx = np.meshgrid(np.arange(rows.start, rows.stop), np.arange(camera.width), offsets, offsets, indexing="ij")
-    return np.stack([(x + sx).reshape(-1), (y + sy).reshape(-1)], axis=-1)
 
 
 def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
     """See `NerfTree.render`."""
+    from efficientnerf.kernels.cpu_tree import render_picture
     from efficientnerf.nerftree.tree import Rendering
 
     if supersample < 1:
         raise ValueError(f"supersample {supersample}: expected at least 1")
-    height, width = camera.height, camera.width
-    colour, opacity = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
-    depth, normal = np.empty((height, width), np.float32), np.empty((height, width, 3), np.float32)
-    step = max(1, RAYS_PER_BLOCK // (width * supersample**2))
-    for top in range(0, height, step):
-        span = range(top, min(height, top + step))
-        origins, directions = rays(camera, subpixels(camera, span, supersample))
-        part = tree.render_rays(origins, directions)
-        shape = (len(span), width, supersample**2)
-        colour[span.start : span.stop] = part.colour.reshape(*shape, 3).mean(axis=2)
-        opacity[span.start : span.stop] = part.opacity.reshape(shape).mean(axis=2)
-        along = (part.depth * (directions @ camera.forward)).astype(np.float32).reshape(shape)
-        # The nearest half of the samples decides; the mean of a near and a far surface would lie on neither.
-        along.sort(axis=2)
-        hits = np.isfinite(along).sum(axis=2, keepdims=True)  # less than half may do, where the others are half transparent
-        middle = np.clip(hits - 1, 0, (supersample**2 - 1) // 2)
-        depth[span.start : span.stop] = np.take_along_axis(along, middle, axis=2)[:, :, 0]
-        facing = part.normal.reshape(*shape, 3).sum(axis=2)
-        normal[span.start : span.stop] = facing / np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-12)
-    depth[opacity < 0.5] = np.inf
-    normal[opacity < 0.5] = 0
-    if background is not None:
-        colour += (1 - opacity[..., None]) * np.asarray(background, np.float32)
-    return Rendering(colour, opacity, depth, normal)
+    behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
+    if behind.shape != (3,):
+        raise ValueError(f"background {background}: expected three numbers, red, green and blue")
+    return Rendering(*render_picture(tree, camera, supersample, behind, normals=True, rays_per_band=RAYS_PER_BAND))
 
 
 @dataclass(frozen=True)

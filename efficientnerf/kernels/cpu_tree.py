@@ -1,25 +1,26 @@
-"""Rendering and querying a NerfTree on the CPU (numba, all cores).
+"""Rendering and querying a NerfTree on the CPU (numba, all cores): from trees and cameras to the kernels' arrays.
 
-Every ray samples at t = t_enter + (k + 1/2) * step, step = half a voxel, whatever it skips, so that skipping empty space changes no value.
-A ray in an empty coarse cell leaps to the end of the empty cube around it (`NerfTree.leap`). A ray stops when less than 1e-3 of the
-light is left. The torch reference is `efficientnerf.render.render_tree_reference`.
+Pictures and rays go through `cpu_picture` and `cpu_march` over the tree's `packed` form; single points are looked up in the tree as it lies.
+The torch reference is `efficientnerf.render.render_tree_reference`.
 """
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
+from efficientnerf.cameras import Camera, rays
 from efficientnerf.harmonics import basis_numpy
+from efficientnerf.kernels.cpu_picture import TILE, Shot, merge, trace
 
 if TYPE_CHECKING:
     from efficientnerf.nerftree.tree import NerfTree
 
-STEP = 0.5  # of a voxel
-STOP = 1e-3  # transmittance at which a ray ends
-FAINT = 1e-4  # weight under which a sample's colour is not looked up; the next one that is looked up stands for it
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+SIGHTS_PER_BAND = 2**22  # directions of cameras with distortion that are kept from one picture to the next: 48 MB
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -123,82 +124,6 @@ def _colour(index, weight, sh, basis, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _render(origins, directions, bases, brick, brick_index, voxel_index, density, sh, leap, step, stop, faint, units, colour, opacity, depth, normal):  # type: ignore[no-untyped-def]
-    """Rays in voxel coordinates; `units` world units per voxel; densities per world unit."""
-    nx, ny, nz = brick_index.shape[0] * brick, brick_index.shape[1] * brick, brick_index.shape[2] * brick
-    rays = origins.shape[0]
-    blocks = (rays + 255) // 256
-    for block in numba.prange(blocks):
-        index = np.empty(8, np.int32)
-        weight = np.empty(8, np.float32)
-        rgb = np.empty(3, np.float32)
-        for ray in range(block * 256, min(rays, block * 256 + 256)):
-            ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-            dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-            ix = 1 / dx if dx != 0 else 1e30
-            iy = 1 / dy if dy != 0 else 1e30
-            iz = 1 / dz if dz != 0 else 1e30
-            t0 = max(min(-ox * ix, (nx - ox) * ix), min(-oy * iy, (ny - oy) * iy), min(-oz * iz, (nz - oz) * iz), 0.0)
-            t1 = min(max(-ox * ix, (nx - ox) * ix), max(-oy * iy, (ny - oy) * iy), max(-oz * iz, (nz - oz) * iz))
-            # A ray that runs along a face of the box and outside of it never enters.
-            if (dx == 0 and (ox < 0 or ox > nx)) or (dy == 0 and (oy < 0 or oy > ny)) or (dz == 0 and (oz < 0 or oz > nz)):
-                t1 = -1.0
-            light = np.float32(1)
-            hit = np.inf
-            r = g = b = owed = np.float32(0)
-            k = 0
-            last = int(np.floor((t1 - t0) / step)) + 1 if t1 > t0 else 0
-            while k < last:
-                t = t0 + (k + 0.5) * step
-                if t >= t1:
-                    break
-                u, v, w = ox + t * dx, oy + t * dy, oz + t * dz
-                a = min(max(int(u) // brick, 0), brick_index.shape[0] - 1)
-                e = min(max(int(v) // brick, 0), brick_index.shape[1] - 1)
-                c = min(max(int(w) // brick, 0), brick_index.shape[2] - 1)
-                far = int(leap[a, e, c])
-                if far > 0:
-                    # To the end of the empty cube: the nearest of its three far faces.
-                    fx = ((a + far) * brick - ox) * ix if dx > 0 else ((a - far + 1) * brick - ox) * ix
-                    fy = ((e + far) * brick - oy) * iy if dy > 0 else ((e - far + 1) * brick - oy) * iy
-                    fz = ((c + far) * brick - oz) * iz if dz > 0 else ((c - far + 1) * brick - oz) * iz
-                    if dx == 0:
-                        fx = 1e30
-                    if dy == 0:
-                        fy = 1e30
-                    if dz == 0:
-                        fz = 1e30
-                    k = max(k + 1, int(np.ceil((min(fx, fy, fz) - t0) / step - 0.5)))
-                    continue
-                sigma = _density(np.float32(u), np.float32(v), np.float32(w), brick, brick_index, voxel_index, density, index, weight)
-                if sigma > 0:
-                    reach = sigma * np.float32(step * units)
-                    alpha = np.float32(1) - np.exp(-reach)
-                    owed += light * alpha
-                    if owed > faint:
-                        _colour(index, weight, sh, bases[ray], rgb)
-                        r += owed * rgb[0]
-                        g += owed * rgb[1]
-                        b += owed * rgb[2]
-                        owed = np.float32(0)
-                    left = light * (np.float32(1) - alpha)
-                    if hit == np.inf and left <= 0.5:
-                        hit = t - 0.5 * step + np.log(2 * light) / (sigma * units)
-                        at = np.float32(hit)
-                        _gradient(
-                            np.float32(ox + at * dx), np.float32(oy + at * dy), np.float32(oz + at * dz),
-                            brick, brick_index, voxel_index, density, index, weight, normal[ray],
-                        )  # fmt: skip
-                    light = left
-                    if light < stop:
-                        break
-                k += 1
-            colour[ray, 0], colour[ray, 1], colour[ray, 2] = r, g, b
-            opacity[ray] = np.float32(1) - light
-            depth[ray] = hit * units
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
 def _density_at(points, brick, brick_index, voxel_index, density, out):  # type: ignore[no-untyped-def]
     blocks = (points.shape[0] + 1023) // 1024
     for block in numba.prange(blocks):
@@ -234,19 +159,71 @@ def _grid_points(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray((np.asarray(points, np.float64) - tree.bounds_min) / tree.voxel, np.float32)
 
 
-def render_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Colour (R, 3) premultiplied, opacity (R,), distance (R,), normal (R, 3) of rays of the world; see `Rendering`."""
-    start = np.ascontiguousarray((np.asarray(origins, np.float64) - tree.bounds_min) / tree.voxel)
-    along = np.ascontiguousarray(directions, np.float64)
-    rays = len(start)
-    bases = np.ascontiguousarray(basis_numpy(along.astype(np.float32), tree.degree))
-    colour, opacity = np.empty((rays, 3), np.float32), np.empty(rays, np.float32)
-    depth, normal = np.empty(rays, np.float32), np.zeros((rays, 3), np.float32)
-    _render(
-        start, along, bases, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, tree.sh, tree.leap,
-        STEP, np.float32(STOP), np.float32(FAINT), np.float32(tree.voxel), colour, opacity, depth, normal,
-    )  # fmt: skip
+def _pixels(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Room for colour, opacity, depth, normal."""
+    shape = (height, width)
+    normal = np.empty((*shape, 3) if normals else (0, 0, 3), np.float32)
+    return np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32), normal
+
+
+def _trace(tree: NerfTree, shot: Shot, behind: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...]) -> None:
+    trace(shot, behind, tree.brick, tree.packed, tree.degree, float(tree.voxel), tile, numba.get_num_threads(), *out)
+
+
+def render_rays(
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, looking: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Colour (R, 3) premultiplied, opacity (R,), distance (R,), normal (R, 3) of rays; see `Rendering`.
+
+    origins, directions  (R, 3) in the frame of the tree's bounds, unit directions
+    looking              (R, 3) unit directions of the same rays in the world, where that is another frame: what the harmonics are asked for
+    """
+    starts = ((np.asarray(origins, np.float64) - tree.bounds_min) / tree.voxel)[None]
+    alongs = np.asarray(directions, np.float64)[None]
+    looks = np.zeros((0, 0, 3), np.float32) if looking is None else np.ascontiguousarray(looking, np.float32)[None]
+    nothing = np.zeros((0, 0, 3), np.float32)
+    shot = Shot(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), nothing, np.ascontiguousarray(starts), np.ascontiguousarray(alongs), looks)
+    out = _pixels(1, len(origins), normals=True)
+    if len(origins):
+        _trace(tree, shot, np.zeros(3, np.float32), (1, TILE * TILE), out)
+    colour, opacity, depth, normal = (part[0] for part in out)
     return colour, opacity, depth, normal
+
+
+@functools.lru_cache(maxsize=1)
+def _sights(model: str, params: tuple[float, ...], width: int, height: int, supersample: int, top: int, low: int) -> np.ndarray:
+    """Directions in the camera's frame of the rays through rows top to low: ((low - top) * supersample, width * supersample, 3) float32."""
+    camera = Camera("", width, height, model, params, np.eye(4))
+    y, x = np.mgrid[top * supersample : low * supersample, 0 : width * supersample]
+    pixels = (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) / supersample
+    return rays(camera, pixels)[1].astype(np.float32).reshape(*x.shape, 3)
+
+
+def render_picture(
+    tree: NerfTree, camera: Camera, supersample: int, behind: np.ndarray, *, normals: bool, rays_per_band: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) over `behind`, opacity (H, W), depth (H, W) along the view axis, normal (H, W, 3) of a camera's pixels."""
+    k, height, width = camera.intrinsics, camera.height, camera.width
+    lens, turn = np.array([k["fx"], k["fy"], k["cx"], k["cy"]]), np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64)
+    centre = (np.asarray(camera.centre, np.float64) - tree.bounds_min) / tree.voxel
+    nothing = np.zeros((0, 0, 3), np.float32)
+    behind = np.ascontiguousarray(behind, np.float32)
+    picture = _pixels(height, width, normals=normals)
+    step = height if supersample == 1 else max(1, rays_per_band // (width * supersample**2))
+    if camera.model not in PINHOLES:
+        step = min(height, max(1, SIGHTS_PER_BAND // (width * supersample**2)))
+    for top in range(0, height, step):
+        low = min(top + step, height)
+        sights = nothing if camera.model in PINHOLES else _sights(camera.model, camera.params, width, height, supersample, top, low)
+        shot = Shot(lens, 1 / supersample, top * supersample, turn, centre, sights, nothing.astype(np.float64), nothing.astype(np.float64), nothing)
+        part = tuple(whole[top:low] if len(whole) else whole for whole in picture)
+        if supersample == 1:
+            _trace(tree, shot, behind, (TILE, TILE), part)
+            continue
+        fine = _pixels((low - top) * supersample, width * supersample, normals=normals)
+        _trace(tree, shot, behind, (TILE, TILE), fine)
+        merge(supersample, *fine, *part)
+    return picture
 
 
 def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:

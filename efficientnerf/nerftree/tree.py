@@ -21,6 +21,7 @@ from efficientnerf.nerftree.palettes import PaletteHarmonics
 
 if TYPE_CHECKING:
     from efficientnerf.cameras import Camera
+    from efficientnerf.kernels.packed_tree import Packed
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,13 @@ class NerfTree:
         if empty.all():
             return np.full(self.shape, 255, np.uint8)
         return np.ascontiguousarray(np.minimum(distance_transform_cdt(empty, metric="chessboard"), 255).astype(np.uint8))
+
+    @cached_property
+    def packed(self) -> Packed:
+        """The densities and harmonics as the renderer on the CPU reads them; made at the first picture. Values changed in place later are not seen."""
+        from efficientnerf.kernels.packed_tree import pack
+
+        return pack(self)
 
     @staticmethod
     def load(path: str | Path) -> NerfTree:

@@ -164,7 +164,7 @@ def test_pictures_do_not_depend_on_how_they_are_cut(monkeypatch: pytest.MonkeyPa
 
     tree = random_tree(0, share=0.7)
     whole = tree.render(looking(tree), supersample=2)
-    monkeypatch.setattr(render, "RAYS_PER_BLOCK", 100)
+    monkeypatch.setattr(render, "RAYS_PER_BAND", 100)
     cut = tree.render(looking(tree), supersample=2)
     for name in ("colour", "opacity", "depth", "normal"):
         assert np.array_equal(getattr(whole, name), getattr(cut, name)), name
