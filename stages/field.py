@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,13 +26,23 @@ FORMAT = 1
 
 
 def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path) -> None:
-    """A safetensors file with one metadata entry, "field", a JSON text: the same input gives the same bytes."""
+    """A safetensors file with one metadata entry, "field", a JSON text with a digest of the tensors: the same input gives the same bytes."""
     from safetensors.torch import save
 
-    text = json.dumps({"format": FORMAT, **about}, sort_keys=True)
-    data = save({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, metadata={"field": text})
+    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    text = json.dumps({"format": FORMAT, "sha256": digest_of(plain), **about}, sort_keys=True)
+    data = save(plain, metadata={"field": text})
     with written_aside(path) as aside:
         aside.write_bytes(data)
+
+
+def digest_of(tensors: dict[str, Tensor]) -> str:
+    """SHA-256 over names, types, shapes and bytes, in the order of the names. The format itself has no check: a flipped bit would be trained on."""
+    digest = hashlib.sha256()
+    for name, t in sorted(tensors.items()):
+        digest.update(f"{name} {t.dtype} {tuple(t.shape)}\n".encode())
+        digest.update(t.numpy().tobytes())
+    return digest.hexdigest()
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -46,6 +57,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise CorruptArtifact(f"{path}: not a readable field file ({str(error)[:80]}). Train again.") from None
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise CorruptArtifact(f"{path}: field file of format {about.get('format') if isinstance(about, dict) else None}; this build reads {FORMAT}.")
+    if digest_of(tensors) != about.get("sha256"):
+        raise CorruptArtifact(f"{path}: damaged field file: its tensors are not those that its SHA-256 was made of. Train again.")
     return tensors, about
 
 

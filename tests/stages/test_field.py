@@ -49,6 +49,10 @@ def test_damage_is_told(tmp_path: Path) -> None:
         path.write_bytes(damaged)
         with pytest.raises(CorruptArtifact, match=r"not a readable field file.*Train again"):
             load_renderer(tmp_path)
+    for at in (len(data) // 2, len(data) - 1, data.index(b'"sha256') + 14):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+        with pytest.raises(CorruptArtifact, match=r"damaged field file.*Train again"):
+            load_renderer(tmp_path)
     path.unlink()
     with pytest.raises(CorruptArtifact, match=f"{FILE}: not a readable field file"):
         load_renderer(tmp_path)

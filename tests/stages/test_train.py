@@ -80,7 +80,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, un
     assert lines == [10, 13]
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "other"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "other", "flipped"])
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path: Path, undisturbed: str, damage: str) -> None:
     from stages.field import write_tensors
 
@@ -90,6 +90,10 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path:
     assert newest.name == "checkpoint_00000009.safetensors"
     if damage == "other":
         write_tensors({}, {}, newest)
+    elif damage == "flipped":
+        data = bytearray(newest.read_bytes())
+        data[len(data) // 2] ^= 4
+        newest.write_bytes(bytes(data))
     else:
         newest.write_bytes(newest.read_bytes()[: 5000 if damage == "cut" else 0])
     events: list[dict[str, Any]] = []
