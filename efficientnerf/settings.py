@@ -15,6 +15,9 @@ class TrainSettings:
     """How a scene is learned. The defaults are for two CPU cores (`preview`)."""
 
     iterations: int = _setting(3000, "optimisation steps", minimum=1)
+    budget: float = _setting(
+        0.0, "seconds to train for, in place of a number of steps: the first are timed, the number that fits is fixed and reported; 0: iterations", minimum=0.0
+    )
     samples: int = _setting(65536, "network evaluations aimed at in a step; the number of rays follows from it; 0: always `rays`", minimum=0)
     rays: int = _setting(8192, "rays in a step at most", minimum=1)
     seed: int = _setting(0, "seed of every random choice", minimum=0)
@@ -74,6 +77,7 @@ class TrainSettings:
     learning_rate: float = _setting(1e-2, "Adam's rate after the first steps (the paper: 5e-4, with field mlp)", minimum=0.0)
     final_rate: float = _setting(0.05, "what is left of the rate after rate_steps; it falls exponentially", minimum=0.0, maximum=1.0)
     rate_steps: int = _setting(0, "steps in which the rate falls to final_rate of itself (the paper: 0.1 every 500,000); 0: all of them", minimum=0)
+    rate_hold: int = _setting(0, "first steps in which the rate does not fall; 0: none, or with a budget those that are timed", minimum=0)
     adam_beta2: float = _setting(0.99, "Adam's second decay (0.999 by default elsewhere, so for the paper)", minimum=0.0, maximum=0.99999)
     adam_epsilon: float = _setting(1e-15, "Adam's epsilon: this small because a table entry's gradient can be (1e-8 by default elsewhere)", minimum=0.0)
     crop_steps: int = _setting(

@@ -211,19 +211,28 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     t.step, t.samples_per_ray = int(state["progress"][0]), float(state["progress"][1])
 
 
-def learning_rate(step: int, settings_rate: float, final: float, iterations: int, fall: int = 0) -> float:
-    """Rises over the first steps, then falls exponentially, to `final` of itself in every `fall` steps (0: by the last)."""
-    rise = max(1, min(RATE_WARM_UP, iterations // 10))
-    return settings_rate * min(1.0, step / rise) * final ** (step / (fall or iterations))
+def share_of_fall(step: int, iterations: int, hold: int = 0) -> float:
+    """How much of the way from the end of the hold to the last step is gone: 0 to 1."""
+    return max(0, step - hold) / max(1, iterations - hold)
+
+
+def learning_rate(step: int, settings_rate: float, final: float, iterations: int, fall: int = 0, hold: int = 0) -> float:
+    """Rises over the first steps, is held up to step `hold`, then falls exponentially, to `final` of itself in every `fall` steps (0: by the last).
+
+    With a hold, the rate up to its end does not depend on the number of iterations.
+    """
+    rise = max(1, min(RATE_WARM_UP, hold or iterations // 10))
+    share = max(0, step - hold) / fall if fall else share_of_fall(step, iterations, hold)
+    return settings_rate * min(1.0, step / rise) * final**share
 
 
 def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterator[Progress]:
-    """Train until the settings' last step, yielding after each."""
-    m, settings = t.model, t.model.settings
+    """Train until the settings' last step, yielding after each. The model's settings may change on the way: the number of steps, while the rate is held."""
+    m = t.model
     device = m.device
     transparent = pixels.images.shape[1] == 4
-    while t.step < settings.iterations:
-        number = t.step + 1
+    while t.step < m.settings.iterations:
+        number, settings = t.step + 1, m.settings
         rng = np.random.Generator(np.random.Philox(key=settings.seed, counter=[0, 0, 0, number]))
 
         # A bundle of rays of about as many samples as the settings ask for.
@@ -245,11 +254,12 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         if m.space.contracted:
             loss = loss + settings.distortion * seen.distortion.mean()
             _quieten_near_cameras(m, origins, seen)
-            strength = settings.anchors * max(0.0, 1 - 2 * number / settings.iterations)
+            strength = settings.anchors * max(0.0, 1 - 2 * share_of_fall(number, settings.iterations, settings.rate_hold))
             if anchors is not None and strength > 0:
                 loss = loss + strength * anchor_loss(m, anchors, max(1, count // ANCHOR_SHARE), rng, prune=number > settings.warm_up)
         loss.backward()
-        t.adam.step(number, learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations, settings.rate_steps))
+        rate = learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations, settings.rate_steps, settings.rate_hold)
+        t.adam.step(number, rate)
 
         # The voxels remember what the coarse field said on the rays, and are refreshed at random.
         with torch.no_grad():

@@ -30,7 +30,7 @@ def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path)
     from safetensors.torch import save
 
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
-    text = json.dumps({"format": FORMAT, "sha256": digest_of(plain), **about}, sort_keys=True)
+    text = json.dumps({"format": FORMAT, **about, "sha256": digest_of(plain)}, sort_keys=True)
     data = save(plain, metadata={"field": text})
     with written_aside(path) as aside:
         aside.write_bytes(data)

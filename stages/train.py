@@ -1,6 +1,7 @@
 """The train stage: a scene in, a trained field out.
 
     field.safetensors  both fields, the density voxels, what they mean
+    report.json        steps and seconds, and the settings that give the same field again
     log.jsonl          a line every few steps
     curve.png          PSNR over steps
     previews/          a held-back view every so often
@@ -21,6 +22,7 @@ import numpy as np
 
 from efficientnerf.settings import TrainSettings
 from pipeline.stage import Job, Stage
+from stages.budget import MOST, TIMED, Budget
 
 if TYPE_CHECKING:
     from efficientnerf.training import Anchors, Pixels, Progress, Trainer
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 LOG_EVERY = 10
 CHECKPOINTS_KEPT = 2
 FEWEST_OBSERVERS = 3
+clock = time.monotonic
 NOWHERE = 1e-9  # scene is 2 across: nearer to a camera than this, a point has no direction
 
 
@@ -53,32 +56,57 @@ def run(job: Job) -> None:
     m = model(Space(s.bounds, contracted=s.background is None), settings, s.background, job.device, (near, far))
     t = training.trainer(m)
     log = job.work / "log.jsonl"
-    _resume(t, job, log)
+    spent = _resume(t, job, log)
+    budget = Budget(settings, job.work, spent, clock) if settings.budget else None
+    if budget is not None:
+        m.settings = budget.planned()
 
     renderer = FieldRenderer(m, near, far)
     watched = _watched(s)
     _preview(renderer, watched, folder, job, t.step, settings)
     lines: list[str] = []
-    started, first, loss = time.monotonic(), t.step, 0.0
+    started, first, loss = clock(), t.step, 0.0
     held_back: float | None = None
     for done in training.train(t, pixels, anchors_of(folder, s)):
         loss = done.loss if done.step == first + 1 else 0.95 * loss + 0.05 * done.loss
-        if done.step % LOG_EVERY == 0 or done.step == settings.iterations:
-            lines.append(json.dumps(_line(done, loss, m.voxels.occupied, time.monotonic() - started), sort_keys=True))
+        if budget is not None and m.settings.iterations == MOST and (fixed := budget.after(done.step)) is not None:
+            m.settings = fixed
+            job.say(f"{fixed.iterations} steps fit into the budget of {settings.budget:g} s")
+        last = done.step == m.settings.iterations
+        seconds = spent + clock() - started
+        if done.step % LOG_EVERY == 0 or last:
+            lines.append(json.dumps(_line(done, loss, m.voxels.occupied, seconds), sort_keys=True))
         facts = {"psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), "rays": done.rays}
-        job.progress(done.step, settings.iterations, "training", **facts, **({} if held_back is None else {"held_back_psnr": held_back}))
-        if done.step % settings.checkpoint_every == 0 and done.step < settings.iterations:
-            _checkpoint(t, job, log, lines)
+        goal = settings.warm_up + TIMED if m.settings.iterations == MOST else m.settings.iterations
+        job.progress(min(done.step, goal), goal, "training", **facts, **({} if held_back is None else {"held_back_psnr": held_back}))
+        if done.step % settings.checkpoint_every == 0 and not last:
+            _checkpoint(t, job, log, lines, seconds)
         held_back = _preview(renderer, watched, folder, job, done.step, settings) or held_back
         try:
             job.safe_point()
         except BaseException:
-            if done.step < settings.iterations:
-                _checkpoint(t, job, log, lines)
+            if not last:
+                _checkpoint(t, job, log, lines, seconds)
             raise
     _append(log, lines)
     field.save_model(m, near, far, job.out / field.FILE)
+    _report(job, t, spent + clock() - started, held_back)
     _publish_log(log, job)
+
+
+def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> None:
+    """What was reached, and how to make the same field again; seconds make it differ from run to run."""
+    reached = t.model.settings
+    report = {
+        "iterations": reached.iterations,
+        "rate_hold": reached.rate_hold,
+        "budget": job.settings.budget,
+        "seconds": round(seconds, 1),
+        "held_back_psnr": held_back,
+        "occupied": t.model.voxels.occupied,
+        "again": f"--set train.budget=0 --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}",
+    }
+    (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def stated_range(s: Scene, settings: TrainSettings) -> tuple[float, float]:
@@ -141,26 +169,29 @@ def _checkpoints(job: Job) -> list[Path]:
     return sorted(job.work.glob("checkpoint_*.safetensors"))
 
 
-def _checkpoint(t: Trainer, job: Job, log: Path, lines: list[str]) -> None:
+def _checkpoint(t: Trainer, job: Job, log: Path, lines: list[str], seconds: float) -> None:
     from efficientnerf.training import state_of
     from stages.field import write_tensors
 
     _append(log, lines)
     lines.clear()
-    write_tensors(state_of(t), {"step": t.step}, job.work / f"checkpoint_{t.step:08d}.safetensors")
+    write_tensors(state_of(t), {"step": t.step, "seconds": seconds}, job.work / f"checkpoint_{t.step:08d}.safetensors")
     for old in _checkpoints(job)[:-CHECKPOINTS_KEPT]:
         old.unlink()
 
 
-def _resume(t: Trainer, job: Job, log: Path) -> None:
-    """Go on from the newest checkpoint that can be read, if there is one."""
+def _resume(t: Trainer, job: Job, log: Path) -> float:
+    """Go on from the newest checkpoint that can be read, if there is one; the seconds that were trained up to it."""
     from efficientnerf.training import restore
     from pipeline.errors import CorruptArtifact
     from stages.field import read_tensors
 
+    spent = 0.0
     for path in reversed(_checkpoints(job)):
         try:
-            restore(t, read_tensors(path)[0])
+            tensors, about = read_tensors(path)
+            restore(t, tensors)
+            spent = float(about["seconds"])
         except (CorruptArtifact, KeyError, ValueError) as error:
             job.warn(f"{path.name} can't be used ({error}); going on from the one before it")
             path.unlink()
@@ -171,6 +202,7 @@ def _resume(t: Trainer, job: Job, log: Path) -> None:
     if log.exists():
         kept = [line for line in _lines(log) if line["step"] <= t.step]
         log.write_text("".join(json.dumps(line, sort_keys=True) + "\n" for line in kept), encoding="utf-8")
+    return spent
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
@@ -253,9 +285,9 @@ def _publish_log(log: Path, job: Job) -> None:
 
 STAGE = Stage(
     name="train",
-    version=1,
+    version=2,
     settings=TrainSettings,
     needs=("poses",),
     run=run,
-    volatile=("log.jsonl", "curve.png", "previews/*"),
+    volatile=("log.jsonl", "curve.png", "previews/*", "report.json"),
 )

@@ -11,7 +11,7 @@ from pipeline.errors import BadInput, UsageError
 from pipeline.run import NAME, Run
 from pipeline.stage import Stage
 from workflows.device import has_cuda
-from workflows.resolve import Config, Settings, read_config, read_preset, table_of
+from workflows.resolve import Config, Settings, read_config, read_preset, seconds_of, table_of
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class Options:
     config: Path | None = None
     sets: tuple[str, ...] = ()
     seed: int | None = None
+    budget: str | None = None
     device: str | None = None
     strict: bool = False
     allow_outside: bool = False
@@ -91,6 +92,8 @@ def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
     ):
         if value is not None:
             settings.put("poses", name, [value], origin)
+    if options.budget is not None:
+        settings.put("train", "budget", [seconds_of(options.budget)], f"--budget {options.budget}")
     run = Run(
         path,
         _source(options.source, standing),

@@ -7,6 +7,7 @@ what TOML gives: `{stage: {setting: value}}`.
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -87,6 +88,15 @@ def parse_value(text: str) -> list[Any]:
         if parsed.keys() == {"value"}:
             readings.append(parsed["value"])
     return [None, text] if text == "none" else [*readings, text]
+
+
+def seconds_of(text: str) -> float:
+    """Seconds in `90`, `90s`, `10m` or `1h30m`."""
+    found = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    if found is None or not any(found.groups()):
+        raise UsageError(f"--budget {text}: expected a time, as in 90s, 10m or 1h30m.")
+    hours, minutes, seconds = (float(part or 0) for part in found.groups())
+    return 3600 * hours + 60 * minutes + seconds
 
 
 class Settings:

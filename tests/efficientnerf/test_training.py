@@ -118,6 +118,14 @@ def test_the_rate_rises_and_falls() -> None:
     assert rates[-1] == pytest.approx(5e-4)
 
 
+def test_a_held_rate_does_not_depend_on_the_end() -> None:
+    short, long = ([learning_rate(step, 1e-2, 0.05, n, hold=300) for step in range(1, n + 1)] for n in (500, 5000))
+    assert short[:300] == long[:300]
+    assert short[299] == 1e-2
+    assert short[-1] == pytest.approx(5e-4)
+    assert long[-1] == pytest.approx(5e-4)
+
+
 def test_transparent_pixels_teach_no_colour() -> None:
     """The colour under alpha 0 is anything; it must not be seen."""
     some = pixels()

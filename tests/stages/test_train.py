@@ -54,7 +54,7 @@ def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Pat
     made = job(tmp_path, settings(**QUICK), poses=scene, events=events)
     assert run(made) == undisturbed  # twice the same
     assert sorted(path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()) == [
-        "curve.png", FILE, "log.jsonl", "previews/preview_000005.png", "previews/preview_000010.png",
+        "curve.png", FILE, "log.jsonl", "previews/preview_000005.png", "previews/preview_000010.png", "report.json",
     ]  # fmt: skip
     lines = [json.loads(line) for line in (made.out / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [10, 13]

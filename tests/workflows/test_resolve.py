@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from stages.settings import describe_settings, name_of_type, setting
-from workflows.resolve import Settings, parse_value, read_config, read_preset, shown, table_of
+from workflows.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
 
 @dataclass(frozen=True)
@@ -162,3 +162,14 @@ def test_what_settings_say_about_themselves() -> None:
     assert about["kind"].choices == ("plain", "fancy")
     assert name_of_type(tuple[int, ...]) == "list of whole number"
     assert about["box"].type_name == "3 x number or none"
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("1.5m", 90), (" 2m30s ", 150), ("0", 0)])
+def test_times_are_read(text: str, seconds: float) -> None:
+    assert seconds_of(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "soon", "10 minutes", "m", "-3s", "5s1m"])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"--budget .*expected a time, as in 90s, 10m or 1h30m"):
+        seconds_of(text)

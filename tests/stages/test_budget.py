@@ -1,0 +1,109 @@
+"""A budget of seconds becomes a number of steps that gives the same bytes again; the clock is a made one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from efficientnerf import training
+from efficientnerf.training import Progress, Trainer
+from pipeline.errors import Interrupted
+from pipeline.stage import Job
+from stages import train
+from stages.budget import MOST, TIMED, Budget
+from stages.field import FILE, load_renderer
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import StopAt, job, poses
+
+QUICK: dict[str, Any] = {"checkpoint_every": 10, "samples": 512, "warm_up": 4, "preview_every": 0, "iterations": 5, "budget": 40.0}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return poses(tmp_path_factory.mktemp("budget") / "poses")
+
+
+@pytest.fixture(autouse=True)
+def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step takes half a second, or two in the warm-up; nothing else takes any time."""
+    now, steps = [0.0], training.train
+
+    def timed(t: Trainer, *rest: Any) -> Iterator[Progress]:
+        for done in steps(t, *rest):
+            now[0] += 2.0 if done.step <= QUICK["warm_up"] else 0.5
+            yield done
+
+    monkeypatch.setattr(train, "clock", lambda: now[0])
+    monkeypatch.setattr(training, "train", timed)
+    monkeypatch.setattr("stages.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+
+
+def digest(made: Job) -> str:
+    train.run(made)
+    return hashlib.sha256((made.out / FILE).read_bytes()).hexdigest()
+
+
+def report(made: Job) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((made.out / "report.json").read_text())
+    return found
+
+
+def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
+    budgeted = job(tmp_path / "a", settings(**QUICK), poses=scene)
+    first = digest(budgeted)
+    said = report(budgeted)
+    assert said["iterations"] > QUICK["warm_up"] + TIMED  # it was long enough to be planned
+    assert 0.95 * QUICK["budget"] <= said["seconds"] <= QUICK["budget"]
+    assert said["again"] == f"--set train.budget=0 --set train.iterations={said['iterations']} --set train.rate_hold={said['rate_hold']}"
+    plain = replace(settings(**QUICK), budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"])
+    assert digest(job(tmp_path / "b", plain, poses=scene)) == first
+    assert load_renderer(budgeted.out).model.settings == plain
+
+
+@pytest.mark.parametrize("at", [6, 60])
+def test_an_interrupted_run_keeps_to_its_plan(scene: Path, tmp_path: Path, at: int) -> None:
+    """Stopped before and after the number of steps is fixed."""
+    stop = StopAt(at)
+    with pytest.raises(Interrupted):
+        train.run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop))
+    plan = tmp_path / "work" / "plan.json"
+    assert plan.exists() == (at > QUICK["warm_up"] + TIMED)
+    known = json.loads(plan.read_text())["iterations"] if plan.exists() else None
+    again = job(tmp_path, settings(**QUICK), poses=scene, stop=stop)
+    first = digest(again)
+    said = report(again)
+    assert known in (None, said["iterations"])
+    assert 0.95 * QUICK["budget"] <= said["seconds"] <= QUICK["budget"]  # what was spent before counts
+    plain = replace(settings(**QUICK), budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"])
+    assert digest(job(tmp_path / "plain", plain, poses=scene)) == first
+
+
+def test_a_budget_that_is_over_before_anything_is_timed_ends_the_training(scene: Path, tmp_path: Path) -> None:
+    made = job(tmp_path, settings(**{**QUICK, "budget": 2.0}), poses=scene)
+    train.run(made)
+    assert 1 <= report(made)["iterations"] < QUICK["warm_up"] + TIMED
+    assert load_renderer(made.out).model.settings.iterations == report(made)["iterations"]
+
+
+def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
+    """The warm-up's steps are slower than those that follow, and say nothing about them."""
+    now = [0.0]
+    budget = Budget(settings(warm_up=10, budget=100.0), tmp_path, 0.0, lambda: now[0])
+    assert budget.planned().iterations == MOST
+    fixed = None
+    for step in range(1, 100):
+        now[0] += 3.0 if step <= 10 else 0.5
+        if (fixed := budget.after(step)) is not None:
+            break
+    assert step == 10 + TIMED
+    assert fixed is not None
+    assert fixed.iterations == step + int((97 - 54) / 0.5)
+    assert Budget(settings(warm_up=10, budget=100.0), tmp_path, 54.0, lambda: 0.0).planned() == fixed
+    (tmp_path / "plan.json").write_text("{")
+    assert Budget(settings(warm_up=10, budget=100.0), tmp_path, 54.0, lambda: 0.0).planned().iterations == MOST
