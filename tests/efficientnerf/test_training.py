@@ -157,3 +157,50 @@ def test_anchors_pull_the_light_to_their_points() -> None:
 def test_settings_say_what_they_mean() -> None:
     for f in dataclasses.fields(settings()):
         assert f.metadata["doc"], f.name
+
+
+def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
+    """No random colours behind the object, momentum voxels with threshold 0, no refresh but whole rays.
+
+    The middle of the pictures comes first, and pruning waits until the coarse network knows where matter is: without the first, or pruned after 80
+    steps, the ball fades away (opacity below 0.15 after as many steps).
+    """
+    paper = {"backdrop": "scene", "voxel_rule": "momentum", "refresh_share": 0.0, "refresh_rays": 0.05, "explored": 0.0, "samples": 0, "rays": 256}
+    m = untrained(**paper, **MLP, iterations=300, warm_up=220, crop_steps=60)
+    thin = pixels(8, 20, 0.25)
+    steps = run(m, thin)
+    assert steps[-1].valid < 0.2 * steps[200].valid  # most is pruned
+    origins, directions, near, far = (torch.from_numpy(a) for a in thin.bundle(np.arange(len(thin)))[:4])
+    with torch.no_grad():
+        opacity = look(m, origins, directions, near, far, torch.full_like(near, 0.5), torch.ones(len(thin), 3)).fine_opacity.numpy()
+    on_ball = thin.images[:, 3] > 200
+    assert opacity[on_ball].mean() > 0.35
+    assert opacity[~on_ball].mean() < 0.02
+
+
+def test_the_middle_of_the_pictures_comes_first() -> None:
+    some = pixels(4, 16)
+    rng = np.random.default_rng(0)
+    chosen = some.choose(2000, rng, middle=True)
+    y, x = np.divmod(chosen % 256, 16)
+    assert x.min() == y.min() == 4
+    assert x.max() == y.max() == 11
+    assert len(np.unique(chosen)) > 0.99 * 4 * 64 * (1 - math.exp(-2000 / 256))
+    some.usable = np.ones(len(some), bool)
+    some.usable[y.min() * 16 :] = False  # the first rows only, none of them in the middle
+    assert some.choose(50, rng, middle=True).max() < 64
+
+
+@pytest.mark.parametrize("strategy", ["uniform", "hierarchical", "valid"])
+@pytest.mark.parametrize("field", ["mlp", "nerf"])
+def test_other_samplings_learn_too_and_only_those_that_prune_touch_the_voxels(field: str, strategy: str) -> None:
+    m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, importance_samples=16, samples=0, rays=128)
+    steps = run(m)
+    assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 1
+    assert {step.rays for step in steps} == {128}  # a fixed batch
+    assert bool((m.voxels.values == m.voxels.start).all()) == (strategy != "valid")
+
+
+def test_the_rate_can_fall_by_a_tenth_in_so_many_steps() -> None:
+    assert learning_rate(500_000, 5e-4, 0.1, 1_000_000, 500_000) == pytest.approx(5e-5)
+    assert learning_rate(1_000_000, 5e-4, 0.1, 1_000_000, 500_000) == pytest.approx(5e-6)

@@ -17,11 +17,31 @@ def test_the_workflow_is_in_order() -> None:
         assert set(stage.needs) <= set(names[:place])
 
 
-def test_there_are_four() -> None:
-    assert preset_names() == ["high", "preview", "standard", "tiny"]
+PAPER = ["paper-n1", "paper-n2", "paper-n3", "paper-n4"]
 
 
-@pytest.mark.parametrize("name", ["tiny", "preview", "standard", "high"])
+def test_these_are_there() -> None:
+    assert preset_names() == ["high", "nerf", *PAPER, "preview", "standard", "tiny"]
+
+
+def test_the_papers_presets_are_the_papers() -> None:
+    """Section 4.1 and table 3."""
+    samples = []
+    for name in PAPER:
+        settings = Settings(TYPES)
+        settings.put_table(read_preset(name).table, name)
+        train, bake = (settings.resolved()[stage] for stage in ("train", "bake"))
+        samples.append((train.coarse_samples, train.fine_samples))
+        assert (train.field, train.degree, train.hidden, train.layers, train.coarse_hidden, train.coarse_layers) == ("mlp", 3, 256, 8, 128, 4)
+        assert (train.voxels, train.voxel_initial, train.voxel_beta, train.voxel_rule) == (384, 10.0, 0.1, "momentum")
+        assert (train.pivotal_weight, train.sampling, train.near, train.far) == (1e-4, "efficient", 2.0, 6.0)
+        assert (train.rays, train.samples, train.iterations, train.learning_rate) == (1024, 0, 1_000_000, 5e-4)
+        assert (train.final_rate, train.rate_steps) == (0.1, 500_000)
+        assert (bake.resolution // bake.brick, bake.brick) == (384, 4)
+    assert samples == [(64, 2), (64, 3), (96, 4), (128, 5)]
+
+
+@pytest.mark.parametrize("name", preset_names())
 def test_presets_resolve_and_hold_only_what_differs(name: str) -> None:
     preset = read_preset(name)
     assert preset.description.endswith(".")
