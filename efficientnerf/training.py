@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.cameras import Camera, rays
 from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
 from efficientnerf.model import Look, Model, look
+from efficientnerf.pixels import Pixels
 
 RATE_WARM_UP = 100  # steps in which the rate rises, or the first tenth of a shorter run
 BETA1 = 0.9
@@ -27,82 +27,6 @@ FEWEST_RAYS = 64
 ANCHOR_SHARE = 8  # one ray to a sparse point for so many rays of pixels
 ANCHOR_WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as at the point
 SWEEP_PARTS = 8  # refreshes of the warm-up that together ask about every voxel
-
-
-class Pixels:
-    """All training pixels: bytes, and directions by lookup, one table for all views that share a lens.
-
-    images   (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha
-    usable   (P,) bool or None: pixels that masks leave in
-    """
-
-    def __init__(self, cameras: list[Camera], images: list[np.ndarray], masks: list[np.ndarray | None], near: np.ndarray, far: np.ndarray) -> None:
-        self.near, self.far = near.astype(np.float32), far.astype(np.float32)
-        channels = max(image.shape[-1] for image in images)
-        sizes = [camera.width * camera.height for camera in cameras]
-        self.offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        self.images = np.empty((int(self.offsets[-1]), channels), np.uint8)
-        for at, image in zip(self.offsets, images, strict=False):
-            flat = image.reshape(-1, image.shape[-1])
-            self.images[at : at + len(flat), : flat.shape[1]] = flat
-            if flat.shape[1] < channels:
-                self.images[at : at + len(flat), 3] = 255
-        self.width = np.array([camera.width for camera in cameras], np.int64)
-        self.height = np.array([camera.height for camera in cameras], np.int64)
-        self.usable = None
-        if any(mask is not None for mask in masks):
-            self.usable = np.concatenate([np.ones(n, bool) if mask is None else mask.reshape(-1) for n, mask in zip(sizes, masks, strict=True)])
-            if not self.usable.any():
-                raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
-        self.rotation = np.stack([camera.world_from_camera[:3, :3] for camera in cameras]).astype(np.float32)
-        self.centre = np.stack([camera.centre for camera in cameras]).astype(np.float32)
-        lenses: dict[tuple, int] = {}
-        tables, self.lens = [], np.empty(len(cameras), np.int64)
-        at = 0
-        for n, camera in enumerate(cameras):
-            key = (camera.width, camera.height, camera.model, camera.params)
-            if key not in lenses:
-                lenses[key] = at
-                still = Camera(camera.name, camera.width, camera.height, camera.model, camera.params, np.eye(4))
-                tables.append(rays(still, None)[1].astype(np.float32))
-                at += sizes[n]
-            self.lens[n] = lenses[key]
-        self.lookup = np.concatenate(tables)
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    def choose(self, count: int, rng: np.random.Generator, *, middle: bool = False) -> np.ndarray:
-        """Indices of `count` usable pixels, with replacement; with `middle`, of the middle half of the pictures' sides where any is usable there."""
-        if self.usable is None and not middle:
-            return rng.integers(len(self), size=count)
-        found = np.empty(0, np.int64)
-        while len(found) < count:
-            tried = rng.integers(len(self), size=2 * count)
-            if self.usable is not None:
-                tried = tried[self.usable[tried]]
-            if middle:
-                tried = tried[self._in_middle(tried)] if self._in_middle(tried).any() else tried
-            found = np.concatenate([found, tried])
-        return found[:count]
-
-    def _in_middle(self, index: np.ndarray) -> np.ndarray:
-        """(N,) bool: whether pixels lie at least a quarter of their picture's width and height from its sides."""
-        view = np.searchsorted(self.offsets, index, side="right") - 1
-        y, x = np.divmod(index - self.offsets[view], self.width[view])
-        return (np.abs(2 * x + 1 - self.width[view]) < self.width[view] / 2) & (np.abs(2 * y + 1 - self.height[view]) < self.height[view] / 2)
-
-    def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""
-        from efficientnerf.kernels import cpu
-
-        view = np.searchsorted(self.offsets, index, side="right") - 1
-        directions = np.empty((len(index), 3), np.float32)
-        pixel = index - self.offsets[view]
-        cpu.ray_directions(self.lookup, self.lens, pixel, self.rotation, view, directions)
-        slant = np.einsum("ri,ri->r", directions, self.rotation[view, :, 2])
-        slant = np.maximum(slant, 1e-3)  # near and far are measured along the view axis
-        return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, self.images[index].astype(np.float32) / np.float32(255)
 
 
 @dataclass(frozen=True)

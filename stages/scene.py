@@ -187,6 +187,17 @@ def read_image(folder: Path, view: View) -> np.ndarray:
     return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
 
 
+def has_alpha(folder: Path, view: View) -> bool:
+    """Whether the working image has an alpha channel; only its header is read."""
+    from PIL import Image
+
+    try:
+        with Image.open(folder / view.image) as image:
+            return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+    except OSError:
+        return False  # reading it will say what is wrong
+
+
 def read_mask(folder: Path, view: View) -> np.ndarray | None:
     """bool (H, W), True = use; None where every pixel counts."""
     import cv2

@@ -25,7 +25,8 @@ from pipeline.stage import Job, Stage
 from stages.budget import MOST, TIMED, Budget
 
 if TYPE_CHECKING:
-    from efficientnerf.training import Anchors, Pixels, Progress, Trainer
+    from efficientnerf.pixels import Pixels
+    from efficientnerf.training import Anchors, Progress, Trainer
     from stages.scene import Scene, View
 
 LOG_EVERY = 10
@@ -121,14 +122,15 @@ def stated_range(s: Scene, settings: TrainSettings) -> tuple[float, float]:
 
 
 def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
-    """All pixels of some views of a scene, as bytes."""
-    from efficientnerf.training import Pixels
+    """All pixels of some views of a scene, as bytes; one image at a time is held beside them."""
+    from efficientnerf.pixels import Pixels
     from stages import scene
 
-    images = [scene.read_image(folder, view) for view in views]
-    masks = [scene.read_mask(folder, view) for view in views]
+    images = (scene.read_image(folder, view) for view in views)
+    masks = (scene.read_mask(folder, view) for view in views)
     near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
-    return Pixels([view.camera for view in views], images, masks, near, far)
+    channels = 4 if any(scene.has_alpha(folder, view) for view in views) else 3
+    return Pixels([view.camera for view in views], images, masks, near, far, channels)
 
 
 def anchors_of(folder: Path, s: Scene) -> Anchors | None:

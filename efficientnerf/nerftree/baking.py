@@ -18,7 +18,7 @@ import torch
 from efficientnerf.compositing import activate
 from efficientnerf.density import cell_of
 from efficientnerf.model import Model, look
-from efficientnerf.training import Pixels
+from efficientnerf.pixels import Pixels
 
 RAYS_PER_BLOCK = 8192
 POINTS_PER_BLOCK = 2**17

@@ -12,7 +12,8 @@ import torch
 
 from efficientnerf import training
 from efficientnerf.model import Model, look
-from efficientnerf.training import Adam, Anchors, Pixels, Progress, anchor_loss, learning_rate, restore, state_of, train, trainer
+from efficientnerf.pixels import Pixels
+from efficientnerf.training import Adam, Anchors, Progress, anchor_loss, learning_rate, restore, state_of, train, trainer
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
 
 MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_rate": 1e-2}
