@@ -187,8 +187,8 @@ def test_the_middle_of_the_pictures_comes_first() -> None:
     assert x.min() == y.min() == 4
     assert x.max() == y.max() == 11
     assert len(np.unique(chosen)) > 0.99 * 4 * 64 * (1 - math.exp(-2000 / 256))
-    some.usable = np.ones(len(some), bool)
-    some.usable[y.min() * 16 :] = False  # the first rows only, none of them in the middle
+    usable = np.arange(len(some)) < y.min() * 16
+    some.usable = np.packbits(usable)  # the first rows only, none of them in the middle
     assert some.choose(50, rng, middle=True).max() < 64
 
 
