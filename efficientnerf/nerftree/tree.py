@@ -124,10 +124,11 @@ class NerfTree:
 
         return load(path)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, layout: str | None = None) -> None:
+        """Write the asset file, whole or not at all: `compact`, `small`, `sparse`, `full` or `full32`; by default the one that loses nothing more."""
         from efficientnerf.nerftree.format import save
 
-        save(self, path)
+        save(self, path, layout)
 
     def render(self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
         """The picture that a camera in the training frame takes.

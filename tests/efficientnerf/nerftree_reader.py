@@ -1,4 +1,4 @@
-"""A reader of NerfTree files written from efficientnerf/nerftree/FORMAT.md alone: plain numpy and loops, no checks beyond what it needs."""
+"""A reader of NerfTree files, all layouts, written from efficientnerf/nerftree/FORMAT.md alone in 100 lines: plain numpy, checks no more than it needs."""
 
 from __future__ import annotations
 
@@ -10,37 +10,44 @@ from typing import Any
 
 import numpy as np
 
+KINDS = {"U8": "<u1", "U16": "<u2", "U64": "<u8", "F16": "<f2", "F32": "<f4"}
+
 
 class Tree:
-    """Stored voxels by coordinate, and the set of occupied cells."""
+    """Stored voxels by coordinate, in the order of the file, with their densities and coefficients; and the set of occupied cells."""
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
         length = int.from_bytes(data[:8], "little")
         header = json.loads(data[8 : 8 + length].decode("utf-8"))
         meta: dict[str, Any] = json.loads(header["__metadata__"]["nerftree"])
-        kinds = {"U8": "<u1", "U64": "<u8", "F16": "<f2"}
         tensors = {}
-        for name in ("coarse.occupancy", "brick.mask", "voxel.density", "voxel.sh"):
+        for name, digest in meta["sha256"].items():
             begin, end = header[name]["data_offsets"]
             raw = data[8 + length + begin : 8 + length + end]
-            assert hashlib.sha256(raw).hexdigest() == meta["sha256"][name]
-            tensors[name] = np.frombuffer(raw, kinds[header[name]["dtype"]]).reshape(header[name]["shape"])
+            assert hashlib.sha256(raw).hexdigest() == digest
+            tensors[name] = np.frombuffer(raw, KINDS[header[name]["dtype"]]).reshape(header[name]["shape"])
         self.meta, self.brick, self.voxel = meta, meta["brick"], meta["voxel"]
         self.low, self.shape = np.array(meta["bounds_min"]), meta["shape"]
-        self.occupied: set[tuple[int, ...]] = set()
+        occupancy = [int(byte) for byte in tensors["coarse.occupancy"]]
+        self.occupied = [cell for c, cell in enumerate(np.ndindex(*self.shape)) if occupancy[c // 8] >> c % 8 & 1]
         self.stored: dict[tuple[int, ...], int] = {}
-        row = 0
-        for number, cell in enumerate(np.ndindex(*self.shape)):
-            if not tensors["coarse.occupancy"][number // 8] >> np.uint8(number % 8) & np.uint8(1):
-                continue
-            self.occupied.add(cell)
+        for row, (x, y, z) in enumerate(self.occupied):
             for v, (p, q, r) in enumerate(np.ndindex(self.brick, self.brick, self.brick)):
-                if int(tensors["brick.mask"][row, v // 64]) >> (v % 64) & 1:
-                    x, y, z = (n * self.brick for n in cell)
-                    self.stored[x + p, y + q, z + r] = len(self.stored)
-            row += 1
-        self.densities, self.sh = tensors["voxel.density"].astype(np.float64), tensors["voxel.sh"].astype(np.float64)
+                if meta["layout"] == "full" or int(tensors["brick.mask"][row, v // 64]) >> (v % 64) & 1:
+                    self.stored[x * self.brick + p, y * self.brick + q, z * self.brick + r] = len(self.stored)
+        if meta["layout"] == "compact":
+            densities, sh = tensors["density.table"][tensors["voxel.density"]], np.empty((len(self.stored), (meta["sh_degree"] + 1) ** 2, 3))
+            groups = [g for g, size in enumerate(meta["sh_groups"]) for _ in range(size)]
+            for c in range(3):
+                sh[:, 0, c] = tensors["base.table"][tensors["voxel.base"][:, c], c]
+                for k in range(1, sh.shape[1]):
+                    sh[:, k, c] = tensors["sh.palette"][tensors["voxel.sh"][:, groups[k - 1]], k - 1, c]
+        elif meta["layout"] == "full":
+            densities, sh = tensors["brick.density"].reshape(-1), tensors["brick.sh"].reshape(len(self.stored), -1, 3)
+        else:
+            densities, sh = tensors["voxel.density"], tensors["voxel.sh"]
+        self.densities, self.sh = densities.astype(np.float64), sh.astype(np.float64)
         assert len(self.stored) == len(self.densities) == len(self.sh)
 
     def around(self, u: np.ndarray) -> list[tuple[int, float]]:
@@ -48,8 +55,7 @@ class Tree:
         f = u - 0.5 - low
         found = []
         for offset in np.ndindex(2, 2, 2):
-            voxel = self.stored.get(tuple(int(n) for n in low + offset))
-            if voxel is not None:
+            if (voxel := self.stored.get(tuple(int(n) for n in low + offset))) is not None:
                 found.append((voxel, math.prod(a if o else 1 - a for a, o in zip(f, offset, strict=True))))
         return found
 
@@ -82,14 +88,12 @@ class Tree:
 
 
 def harmonics(direction: np.ndarray, degree: int) -> np.ndarray:
-    x, y, z = direction
-    out, azimuth = [], math.atan2(y, x)
+    (x, y, z), out = direction, []
     for l in range(degree + 1):
         for m in range(-l, l + 1):
             a = abs(m)
-            # P_l^a(z) by Rodrigues' formula: (-1)^a (1 - z^2)^(a/2) / (2^l l!) times the (l + a)-th derivative of (z^2 - 1)^l
             derived = (np.polynomial.Polynomial([-1, 0, 1]) ** l).deriv(l + a) if l + a else np.polynomial.Polynomial([1])
             p = (-1) ** a * (1 - z * z) ** (a / 2) / (2**l * math.factorial(l)) * derived(z)
             n = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - a) / math.factorial(l + a))
-            out.append(n * p * (1.0 if m == 0 else math.sqrt(2) * (math.cos(m * azimuth) if m > 0 else math.sin(a * azimuth))))
+            out.append(n * p * (1.0 if m == 0 else math.sqrt(2) * (math.cos(m * math.atan2(y, x)) if m > 0 else math.sin(a * math.atan2(y, x)))))
     return np.array(out)

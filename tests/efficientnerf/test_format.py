@@ -18,52 +18,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from efficientnerf.nerftree import format
-from efficientnerf.nerftree.format import FormatError, describe, load, save, serialize
+from efficientnerf.nerftree.container import HEADER_LIMIT
+from efficientnerf.nerftree.format import LAYOUTS, FormatError, describe, load, save, serialize
+from efficientnerf.nerftree.metadata import MAJOR, STRUCTURE
 from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from tests.efficientnerf import nerftree_reader
+from tests.efficientnerf.hostile import HOSTILE, METADATA, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.trees import random_tree, rays_at
 
 GOLDEN = Path(__file__).parents[1] / "data" / "golden"
-SIMILARITY = {"scale": 0.5, "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "translation": [1, 2, 3]}
-ORBIT = {"centre": [0.0, 0.1, 0.2], "radius": 3.0, "elevation": 25.0, "forward_facing": False, "heading": 40.0}
-METADATA = {"world_from_capture": SIMILARITY, "orbit": ORBIT, "metric": True, "licence": "CC0-1.0", "provenance": {"tool": "a test"}}
-
-
-def tiny(**more: Any) -> NerfTree:
-    return random_tree(1, shape=(2, 1, 2), brick=2, degree=0, share=0.7, metadata=METADATA, **more)
-
-
-def parts(data: bytes) -> tuple[dict[str, Any], dict[str, Any], bytes]:
-    """Header without metadata, the metadata, the data."""
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    return header, json.loads(header.pop("__metadata__")["nerftree"]), data[8 + length :]
-
-
-def joined(header: dict[str, Any], meta: dict[str, Any] | str, data: bytes) -> bytes:
-    text = meta if isinstance(meta, str) else json.dumps(meta)
-    raw = json.dumps({"__metadata__": {"nerftree": text}, **header}).encode()
-    return len(raw).to_bytes(8, "little") + raw + data
-
-
-def with_tensor(name: str, values: np.ndarray) -> bytes:
-    """The tiny file with one tensor replaced, digest and offsets put right."""
-    header, meta, data = parts(serialize(tiny()))
-    begin, end = header[name]["data_offsets"]
-    raw = values.tobytes()
-    for entry in header.values():
-        entry["data_offsets"] = [n + len(raw) - (end - begin) if n >= end else n for n in entry["data_offsets"]]
-    header[name] = {"dtype": header[name]["dtype"], "shape": list(values.shape), "data_offsets": [begin, begin + len(raw)]}
-    meta["sha256"][name] = hashlib.sha256(raw).hexdigest()
-    return joined(header, meta, data[:begin] + raw + data[end:])
-
-
-def tensor(name: str) -> np.ndarray:
-    header, _, data = parts(serialize(tiny()))
-    begin, end = header[name]["data_offsets"]
-    return np.frombuffer(data[begin:end], {"U8": "<u1", "U64": "<u8", "F16": "<f2"}[header[name]["dtype"]]).reshape(header[name]["shape"]).copy()
-
-
 def refusal(data: bytes, folder: Path) -> str:
     path = folder / "hostile.nerftree"
     path.write_bytes(data)
@@ -182,7 +146,8 @@ def test_a_reader_written_from_the_text_alone_sees_the_same(tmp_path: Path, bric
 
 def test_the_text_names_all_that_the_reader_knows() -> None:
     text = (Path(format.__file__).parent / "FORMAT.md").read_text(encoding="utf-8")
-    for word in [*format.TENSORS, *format._STRUCTURE, "world_from_capture", "orbit", "metric", f"{format.MAJOR}.{format.MINOR}", f"{format.HEADER_LIMIT:,}"]:
+    tensors = [name for layout in LAYOUTS.values() for name in layout.tensors]
+    for word in [*tensors, *LAYOUTS, *STRUCTURE, "world_from_capture", "orbit", "metric", f"{MAJOR}.1", f"{HEADER_LIMIT:,}"]:
         assert word in text, word
 
 
@@ -204,16 +169,39 @@ def test_golden_files_stay_readable(path: Path, tmp_path: Path) -> None:
     assert {key: about[key] for key in known["describe"]} == known["describe"]
     theirs = Tree(path)
     np.testing.assert_allclose([theirs.density(p) for p in points], known["density"], atol=1e-3)
+    np.testing.assert_allclose([theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], known["colour"], atol=1e-4)
 
 
-def test_there_are_golden_files() -> None:
-    assert {path.stem for path in GOLDEN.glob("*.nerftree")} >= {"sparse-1.0", "wide-1.0"}
+@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.nerftree")), ids=lambda path: path.stem)
+def test_a_reader_written_from_the_text_alone_decodes_golden_files_to_the_same_voxels(path: Path) -> None:
+    ours, theirs = load(path), Tree(path)
+    assert len(Path(nerftree_reader.__file__).read_text().splitlines()) <= 100
+    assert "efficientnerf" not in re.sub('""".*?"""', "", Path(nerftree_reader.__file__).read_text(), flags=re.S)
+    assert [tuple(cell) for cell in np.argwhere(ours.brick_index >= 0)] == theirs.occupied
+    number = {}
+    for at in np.ndindex(*ours.resolution):
+        cell, local = np.divmod(at, ours.brick)
+        owner = ours.brick_index[tuple(cell)]
+        if owner >= 0 and (voxel := ours.voxel_index[owner, (local[0] * ours.brick + local[1]) * ours.brick + local[2]]) >= 0:
+            number[at] = voxel
+    assert number == theirs.stored
+    assert np.array_equal(ours.density_values, theirs.densities.astype(np.float32))
+    assert np.array_equal(ours.sh, theirs.sh.astype(np.float32))
 
 
-def test_golden_files_are_written_to_the_same_bytes(tmp_path: Path) -> None:
-    path = GOLDEN / "sparse-1.0.nerftree"
-    save(load(path), tmp_path / "a.nerftree")
-    assert (tmp_path / "a.nerftree").read_bytes() == path.read_bytes()
+def test_there_is_a_golden_file_for_each_layout_and_released_version() -> None:
+    found = {(about["layout"], about["format_version"]) for about in map(describe, GOLDEN.glob("*.nerftree"))}
+    assert found == {("sparse", "1.0"), ("compact", "1.1"), ("full", "1.1")}
+    assert {layout for layout, _ in found} == set(LAYOUTS)
+
+
+@pytest.mark.parametrize(
+    ("stem", "layout"),
+    [("sparse-1.0", None), ("compact-1.1", None), ("compact-1.1", "compact"), ("groups-1.1", None), ("full-1.1", "full"), ("floats-1.1", "full32")],
+)
+def test_golden_files_are_written_to_the_same_bytes(tmp_path: Path, stem: str, layout: str | None) -> None:
+    save(load(GOLDEN / f"{stem}.nerftree"), tmp_path / "a.nerftree", layout)
+    assert (tmp_path / "a.nerftree").read_bytes() == (GOLDEN / f"{stem}.nerftree").read_bytes()
 
 
 def test_describe_reads_the_header_alone(tmp_path: Path) -> None:
@@ -231,174 +219,6 @@ def test_describe_reads_the_header_alone(tmp_path: Path) -> None:
 
 
 # Hostile files.
-
-
-def meta_with(**changes: Any) -> bytes:
-    header, meta, data = parts(serialize(tiny()))
-    return joined(header, {key: value for key, value in {**meta, **changes}.items() if value != "absent"}, data)
-
-
-def header_with(name: str, **changes: Any) -> bytes:
-    header, meta, data = parts(serialize(tiny()))
-    header[name] = {key: value for key, value in {**header[name], **changes}.items() if value != "absent"}
-    return joined(header, meta, data)
-
-
-def replaced(old: bytes, new: bytes) -> bytes:
-    """The tiny file with its header text changed; the header's length follows."""
-    data = serialize(tiny())
-    length = int.from_bytes(data[:8], "little")
-    raw = data[8 : 8 + length]
-    assert old in raw
-    raw = raw.replace(old, new, 1)
-    return len(raw).to_bytes(8, "little") + raw + data[8 + length :]
-
-
-def without(name: str) -> bytes:
-    header, meta, data = parts(serialize(tiny()))
-    begin, end = header.pop(name)["data_offsets"]
-    for entry in header.values():
-        entry["data_offsets"] = [n - (end - begin) if n >= end else n for n in entry["data_offsets"]]
-    return joined(header, meta, data[:begin] + data[end:])
-
-
-def added(name: str, dtype: str = "F64") -> bytes:
-    header, meta, data = parts(serialize(tiny()))
-    header[name] = {"dtype": dtype, "shape": [1], "data_offsets": [len(data), len(data) + 8]}
-    return joined(header, meta, data + bytes(8))
-
-
-def negative(name: str) -> np.ndarray:
-    values = tensor(name)
-    values.reshape(-1)[0] = -1 if name == "voxel.density" else np.inf
-    return values
-
-
-def nan(name: str) -> np.ndarray:
-    values = tensor(name)
-    values.reshape(-1)[-1] = np.nan
-    return values
-
-
-def flipped(name: str, bit: int) -> np.ndarray:
-    values = tensor(name)
-    values.reshape(-1)[-1] ^= np.array(1 << bit).astype(values.dtype)
-    return values
-
-
-def rotated(**changes: Any) -> bytes:
-    return meta_with(world_from_capture={**SIMILARITY, **changes})
-
-
-def orbiting(**changes: Any) -> bytes:
-    return meta_with(orbit={**ORBIT, **changes})
-
-
-HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
-    # container
-    "empty": (lambda: b"", "0 bytes; a NerfTree begins with an 8-byte header length"),
-    "header longer than the file": (lambda: (10**6).to_bytes(8, "little") + b"{}", "header of 1000000 bytes in a file of 10"),
-    "header longer than anything": (lambda: b"\xff" * 8 + b"{}", "header of 18446744073709551615 bytes"),
-    "a PNG": (lambda: b"\x89PNG\r\n\x1a\n" + bytes(100), "no NerfTree"),
-    "not JSON": (lambda: (4).to_bytes(8, "little") + b"{]]}", "header is not JSON"),
-    "not UTF-8": (lambda: replaced(b'"bounds_min', b'"bounds\xff_min'[1:]), "header is not JSON"),
-    "UTF-16": (lambda: (lambda raw: len(raw).to_bytes(8, "little") + raw)("{}".encode("utf-16")), "header is not JSON"),
-    "nested deep": (lambda: (lambda raw: len(raw).to_bytes(8, "little") + raw)(b"[" * 200_000), "header is not JSON"),
-    "a list": (lambda: (2).to_bytes(8, "little") + b"[]", "header is not a JSON object"),
-    "no metadata": (lambda: (2).to_bytes(8, "little") + b"{}", "a safetensors file without 'nerftree' metadata"),
-    "metadata is no text": (lambda: (lambda raw: len(raw).to_bytes(8, "little") + raw)(b'{"__metadata__":{"nerftree":3}}'), "without 'nerftree' metadata"),
-    "metadata is not JSON": (lambda: joined({}, "{", b""), "header is not JSON"),
-    "a key named twice": (lambda: joined({}, '{"format": "nerftree", "format": "nerftree"}', b""), "names a key twice"),
-    "NaN in the metadata": (lambda: joined({}, '{"format": NaN}', b""), "NaN, which is no finite number"),
-    "an infinite number": (lambda: meta_with(note="x").replace(b'\\"note\\": \\"x\\"', b'\\"note\\": 1e999'), "1e999, which is no finite number"),
-    "an entry with more keys": (lambda: header_with("brick.mask", colour="red"), "expected dtype, shape and data_offsets"),
-    "an entry with fewer keys": (lambda: header_with("brick.mask", shape="absent"), "expected dtype, shape and data_offsets"),
-    "a negative count": (lambda: header_with("brick.mask", shape=[-1, 1]), "is not a list of counts"),
-    "a fractional count": (lambda: header_with("brick.mask", shape=[1.5, 1]), "is not a list of counts"),
-    "a huge count": (lambda: header_with("brick.mask", shape=[2**60, 1]), "is not a list of counts"),
-    "offsets the wrong way": (lambda: header_with("brick.mask", data_offsets=[8, 0]), "are not a range"),
-    "offsets beyond the end": (lambda: header_with("brick.mask", data_offsets=[0, 10**9]), "the file is cut short"),
-    "too few bytes for the shape": (lambda: header_with("brick.mask", shape=[1000, 1]), "does not fill its"),
-    "overlapping tensors": (lambda: overlapping(), "tensors must lie end to end"),
-    "a gap": (lambda: without_entry("voxel.density"), "tensors must lie end to end|appended to"),
-    "bytes appended": (lambda: serialize(tiny()) + b"\0", "1 bytes after the last tensor; the file was appended to"),
-    # metadata
-    "another format": (lambda: meta_with(format="octree"), "metadata 'format' is octree; expected nerftree"),
-    "version 2": (lambda: meta_with(format_version="2.0"), r"format version 2\.0; this build reads 1\.x\. Upgrade"),
-    "no version": (lambda: meta_with(format_version="absent"), "expected MAJOR.MINOR"),
-    "a strange version": (lambda: meta_with(format_version="1.٠"), "expected MAJOR.MINOR"),
-    "a version that is a number": (lambda: meta_with(format_version=1), "expected MAJOR.MINOR"),
-    "another layout": (lambda: meta_with(layout="octree"), "layout octree; this build reads 'sparse'. Upgrade"),
-    "other harmonics": (lambda: meta_with(sh_convention="complex"), "harmonics complex"),
-    "another colour space": (lambda: meta_with(colour_space="linear"), "expected real-orthonormal-plenoctree in srgb-sigmoid"),
-    "no shape": (lambda: meta_with(shape="absent"), "'shape' is None; expected 3 numbers"),
-    "a shape of two": (lambda: meta_with(shape=[2, 2]), "expected 3 numbers"),
-    "a fractional shape": (lambda: meta_with(shape=[2, 1, 2.5]), "expected whole numbers"),
-    "a shape of nothing": (lambda: meta_with(shape=[0, 1, 2]), "expected 3 numbers from 1"),
-    "a shape too large": (lambda: meta_with(shape=[65536, 65536, 65536]), "a product of at most 1073741824"),
-    "a shape of true": (lambda: meta_with(shape=[True, 1, 2]), "expected 3 numbers"),
-    "brick 0": (lambda: meta_with(brick=0), "'brick' is 0; expected a whole number from 1 to 16"),
-    "brick 17": (lambda: meta_with(brick=17), "expected a whole number from 1 to 16"),
-    "degree 5": (lambda: meta_with(sh_degree=5), "expected a whole number from 0 to 4"),
-    "degree true": (lambda: meta_with(sh_degree=True), "expected a whole number from 0 to 4"),
-    "no voxel": (lambda: meta_with(voxel=0), "'voxel' is 0"),
-    "a voxel of text": (lambda: meta_with(voxel="1"), "'voxel' is 1; expected a number"),
-    "no corner": (lambda: meta_with(bounds_min=[0, 0]), "'bounds_min'"),
-    "a corner far away": (lambda: meta_with(bounds_min=[0, 0, 10**400]), "'bounds_min'"),
-    "no background": (lambda: meta_with(background="absent"), "'background' is missing"),
-    "a bright background": (lambda: meta_with(background=[1, 1, 2]), "expected 3 numbers from 0 to 1"),
-    "a similarity of text": (lambda: meta_with(world_from_capture="identity"), "'world_from_capture' is identity; expected an object"),
-    "a similarity without scale": (lambda: meta_with(world_from_capture={}), "'scale' is None"),
-    "a scale of zero": (lambda: rotated(scale=0), "'scale' is 0"),
-    "a rotation of two rows": (lambda: rotated(rotation=[[1, 0, 0], [0, 1, 0]]), "expected three rows"),
-    "a rotation of short rows": (lambda: rotated(rotation=[[1, 0], [0, 1, 0], [0, 0, 1]]), "expected 3 numbers"),
-    "a reflection": (lambda: rotated(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "is not a rotation"),
-    "a shear": (lambda: rotated(rotation=[[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]), "is not a rotation"),
-    "a translation of text": (lambda: rotated(translation="0 0 0"), "'translation'"),
-    "an orbit of text": (lambda: meta_with(orbit="round"), "'orbit' is round; expected an object"),
-    "an orbit without centre": (lambda: meta_with(orbit={"radius": 1}), "'centre' is None"),
-    "an orbit of no radius": (lambda: orbiting(radius=0), "'radius' is 0"),
-    "an orbit below the ground": (lambda: orbiting(elevation=-91), "'elevation' is -91"),
-    "an orbit that winds": (lambda: orbiting(heading=1e9), "'heading'"),
-    "an orbit facing 1": (lambda: orbiting(forward_facing=1), "'forward_facing' is 1; expected true or false"),
-    "metric 1": (lambda: meta_with(metric=1), "'metric' is 1; expected true or false"),
-    # tensors
-    "a tensor of another name": (lambda: added("voxel.roughness"), r"unknown tensor 'voxel\.roughness'; only names that begin with 'x\.'"),
-    **{f"no {name}": (lambda name=name: without(name), f"tensor '{re.escape(name)}' is missing") for name in format.TENSORS},  # type: ignore[misc]
-    "densities of integers": (lambda: header_with("voxel.density", dtype="I16"), "is I16; expected F16"),
-    "a dtype of another world": (lambda: header_with("voxel.density", dtype=["F16"]), "expected F16"),
-    "too few cells": (lambda: with_tensor("coarse.occupancy", np.zeros(0, "<u1")), r"has shape \(0,\); expected \(1,\)"),
-    "masks of two words": (lambda: with_tensor("brick.mask", np.zeros((3, 2), "<u8")), r"'brick\.mask' has shape \(3, 2\)"),
-    "fewer harmonics than densities": (lambda: with_tensor("voxel.sh", tensor("voxel.sh")[:-1]), r"'voxel\.sh' has shape"),
-    "harmonics of another degree": (lambda: meta_with(sh_degree=1), r"'voxel\.sh' has shape"),
-    "densities in a table": (lambda: with_tensor("voxel.density", tensor("voxel.density")[:, None]), r"'voxel\.density' has shape"),
-    "a wrong digest": (lambda: meta_with(sha256=dict.fromkeys(format.TENSORS, "0" * 64)), "SHA-256 .* the file says 0{12}…; the file is damaged"),
-    "no digests": (lambda: meta_with(sha256="absent"), "the file is damaged"),
-    "a cell beyond the last": (lambda: with_tensor("coarse.occupancy", flipped("coarse.occupancy", 7)), "bits set beyond its 4 cells"),
-    "a brick without a cell": (lambda: with_tensor("coarse.occupancy", np.zeros(1, "<u1")), "0 occupied cells but"),
-    "a voxel beyond the brick": (lambda: with_tensor("brick.mask", flipped("brick.mask", 8)), "bits set beyond the 8 voxels of a brick"),
-    "a voxel more than stored": (lambda: with_tensor("brick.mask", tensor("brick.mask") * np.uint64(0)), "masks name 0 voxels but"),
-    "a density below zero": (lambda: with_tensor("voxel.density", negative("voxel.density")), "densities must be finite and not negative"),
-    "a density that is no number": (lambda: with_tensor("voxel.density", nan("voxel.density")), "densities must be finite"),
-    "an infinite harmonic": (lambda: with_tensor("voxel.sh", negative("voxel.sh")), "harmonics finite"),
-}
-
-
-def padded(data: bytes) -> bytes:
-    end = 8 + int.from_bytes(data[:8], "little")
-    return (end - 8 + 5).to_bytes(8, "little") + data[8:end] + b"     " + data[end:]
-
-
-def overlapping() -> bytes:
-    header, meta, data = parts(serialize(tiny()))
-    header["x.a"] = {"dtype": "F64", "shape": [1], "data_offsets": [0, 8]}
-    return joined(header, meta, data)
-
-
-def without_entry(name: str) -> bytes:
-    header, meta, data = parts(serialize(tiny()))
-    del header[name]
-    return joined(header, meta, data)
 
 
 @pytest.mark.parametrize("which", HOSTILE)
@@ -420,14 +240,16 @@ def test_what_may_be_there_may_be_there(tmp_path: Path) -> None:
         assert np.array_equal(load(path).density_values, tiny().density_values)
 
 
-def test_a_file_cut_short_anywhere_is_refused(tmp_path: Path) -> None:
-    data = serialize(tiny())
+@pytest.mark.parametrize("of", LAYOUTS)
+def test_a_file_cut_short_anywhere_is_refused(tmp_path: Path, of: str) -> None:
+    data = blob(of)
     for length in range(len(data)):
         refusal(data[:length], tmp_path)
 
 
-def test_any_flipped_bit_of_the_data_is_noticed(tmp_path: Path) -> None:
-    data = serialize(tiny())
+@pytest.mark.parametrize("of", LAYOUTS)
+def test_any_flipped_bit_of_the_data_is_noticed(tmp_path: Path, of: str) -> None:
+    data = blob(of)
     for at in range(8 + int.from_bytes(data[:8], "little"), len(data)):
         refusal(data[:at] + bytes([data[at] ^ 1 << at % 8]) + data[at + 1 :], tmp_path)
 
@@ -471,9 +293,12 @@ def outcome(path: Path, data: bytes) -> NerfTree | None:
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4))
-def test_a_header_of_noise_raises_nothing_else(tmp_path: Path, changes: list[tuple[float, bytes]]) -> None:
-    data = serialize(tiny())
+@given(
+    of=st.sampled_from(sorted(LAYOUTS)),
+    changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4),
+)
+def test_a_header_of_noise_raises_nothing_else(tmp_path: Path, of: str, changes: list[tuple[float, bytes]]) -> None:
+    data = blob(of)
     end = 8 + int.from_bytes(data[:8], "little")
     for share, noise in changes:
         at = int(share * end)
@@ -489,12 +314,13 @@ JSON = st.recursive(
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(key=st.sampled_from([*sorted(format._STRUCTURE), "world_from_capture", "orbit", "metric"]), value=JSON)
-def test_any_value_of_any_key_raises_nothing_else(tmp_path: Path, key: str, value: Any) -> None:
-    outcome(tmp_path / "a.nerftree", meta_with(**{key: value}))
+@given(of=st.sampled_from(sorted(LAYOUTS)), key=st.sampled_from([*sorted(STRUCTURE), "world_from_capture", "orbit", "metric"]), value=JSON)
+def test_any_value_of_any_key_raises_nothing_else(tmp_path: Path, of: str, key: str, value: Any) -> None:
+    outcome(tmp_path / "a.nerftree", meta_with(of, **{key: value}))
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(name=st.sampled_from(sorted(format.TENSORS)), key=st.sampled_from(["dtype", "shape", "data_offsets"]), value=JSON)
-def test_any_value_of_any_entry_raises_nothing_else(tmp_path: Path, name: str, key: str, value: Any) -> None:
-    outcome(tmp_path / "a.nerftree", header_with(name, **{key: value}))
+@given(of=st.sampled_from(sorted(LAYOUTS)), which=st.integers(0, 7), key=st.sampled_from(["dtype", "shape", "data_offsets"]), value=JSON)
+def test_any_value_of_any_entry_raises_nothing_else(tmp_path: Path, of: str, which: int, key: str, value: Any) -> None:
+    names = ["coarse.occupancy", *LAYOUTS[of].tensors]
+    outcome(tmp_path / "a.nerftree", header_with(names[which % len(names)], of, **{key: value}))

@@ -1,0 +1,72 @@
+"""Nearest of many vectors, and sums per cluster (numba, all cores): what k-means needs.
+
+Each sum is taken in one order whatever the number of threads, without fastmath: the same vectors give the same palettes.
+
+n vectors of D numbers, P centroids.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+LANES = 64
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def nearest(vectors_t, centroids, found, distance):  # type: ignore[no-untyped-def]
+    """Index of the nearest centroid of each vector, the first of equals, and the squared distance to it.
+
+    vectors_t  (D, n) float32, transposed: the inner loops run over neighbouring vectors, and are a processor's vectors
+    centroids  (P, D) float32
+    found      (n,) int32, written
+    distance   (n,) float32, written
+    """
+    size, count = vectors_t.shape
+    for block in numba.prange((count + LANES - 1) // LANES):
+        squared, least, best = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.int32)
+        begin = block * LANES
+        lanes = min(LANES, count - begin)
+        least[:] = np.inf
+        best[:] = 0
+        for p in range(np.int32(centroids.shape[0])):
+            squared[:] = 0
+            for d in range(size):
+                x = centroids[p, d]
+                row = vectors_t[d, begin : begin + lanes]
+                for lane in range(lanes):
+                    away = row[lane] - x
+                    squared[lane] += away * away
+            for lane in range(lanes):
+                nearer = squared[lane] < least[lane]
+                least[lane] = squared[lane] if nearer else least[lane]
+                best[lane] = np.int32(p) if nearer else best[lane]
+        for lane in range(lanes):
+            found[begin + lane], distance[begin + lane] = best[lane], least[lane]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def sums(vectors, found, total, count):  # type: ignore[no-untyped-def]
+    """Adds each vector to the sum of its cluster, in order: total (P, D) float64, count (P,) int64."""
+    for n in range(vectors.shape[0]):
+        count[found[n]] += 1
+        for d in range(vectors.shape[1]):
+            total[found[n], d] += vectors[n, d]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def approach(vectors_t, centroid, distance):  # type: ignore[no-untyped-def]
+    """Lowers distance (n,) to the squared distance from `centroid` (D,) to each of vectors_t (D, n) where that is less."""
+    size, count = vectors_t.shape
+    for block in numba.prange((count + 16 * LANES - 1) // (16 * LANES)):
+        begin = block * 16 * LANES
+        lanes = min(16 * LANES, count - begin)
+        squared = np.zeros(lanes, np.float32)
+        for d in range(size):
+            x = centroid[d]
+            row = vectors_t[d, begin : begin + lanes]
+            for lane in range(lanes):
+                away = row[lane] - x
+                squared[lane] += away * away
+        for lane in range(lanes):
+            distance[begin + lane] = min(distance[begin + lane], squared[lane])

@@ -1,0 +1,210 @@
+"""From floats to codes, and the layouts that hold them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.kernels import cpu_clusters
+from efficientnerf.nerftree.format import WRITERS, describe, load, save, serialize
+from efficientnerf.nerftree.palettes import PaletteHarmonics
+from efficientnerf.nerftree.quantising import ENTRIES, clustered, compacted, quantised_density, quantised_harmonics
+from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from tests.efficientnerf.trees import LOW, random_tree, rays_at
+
+
+def smooth_tree(size: int = 24, degree: int = 2, sigma: float = 300.0) -> NerfTree:
+    """A ball whose colour turns with the place and with the direction: values as different as voxels are, but not noise."""
+    at = np.argwhere(np.ones((size,) * 3, bool))
+    place = (at + 0.5) / size * 2 - 1
+    inside = np.linalg.norm(place, axis=1)
+    kept = inside < 0.9
+    place, at = place[kept], at[kept]
+    density = (sigma * np.clip(0.8 - inside[kept], 0, None)).astype(np.float32)
+    rng = np.random.default_rng(0)
+    waves = rng.normal(size=(3, (degree + 1) ** 2 * 3))
+    sh = np.sin(3 * place @ waves).reshape(len(at), -1, 3) * np.where(np.arange((degree + 1) ** 2) == 0, 3.0, 0.5)[:, None]
+    return tree_from_voxels((size // 4,) * 3, 2 / size, -np.ones(3), at, density, sh.astype(np.float32))
+
+
+def seen(tree: NerfTree) -> np.ndarray:
+    return tree.render_rays(*rays_at(tree, 2000)).colour
+
+
+# k-means
+
+
+@pytest.mark.parametrize(("count", "size", "entries"), [(1, 1, 1), (200, 3, 7), (130, 24, 64), (64, 9, 300)])
+def test_the_nearest_is_the_nearest(count: int, size: int, entries: int) -> None:
+    rng = np.random.default_rng(count)
+    vectors, centroids = rng.normal(size=(count, size)).astype(np.float32), rng.normal(size=(entries, size)).astype(np.float32)
+    found, distance = np.zeros(count, np.int32), np.zeros(count, np.float32)
+    cpu_clusters.nearest(np.ascontiguousarray(vectors.T), centroids, found, distance)
+    squared = ((vectors[:, None].astype(np.float64) - centroids) ** 2).sum(2)
+    assert np.array_equal(found, squared.argmin(1))
+    np.testing.assert_allclose(distance, squared.min(1), rtol=1e-5, atol=1e-6)
+    total, number = np.zeros((entries, size)), np.zeros(entries, np.int64)
+    cpu_clusters.sums(vectors, found, total, number)
+    for p in range(entries):
+        assert number[p] == (found == p).sum()
+        np.testing.assert_allclose(total[p], vectors[found == p].sum(0, dtype=np.float64), atol=1e-9)
+    approached = np.full(count, 1.0, np.float32)
+    cpu_clusters.approach(np.ascontiguousarray(vectors.T), centroids[0], approached)
+    np.testing.assert_allclose(approached, np.minimum(squared[:, 0], 1), rtol=1e-5, atol=1e-6)
+
+
+def test_clusters_are_found_and_equals_are_the_first() -> None:
+    rng = np.random.default_rng(0)
+    centres = rng.normal(size=(8, 3)).astype(np.float16).astype(np.float32) * 10
+    owner = rng.integers(0, 8, 3000)
+    centroids, code = clustered(centres[owner] + rng.normal(0, 0.01, (3000, 3)).astype(np.float32), np.ones(3000), 8, 0)
+    assert len(centroids) == 8
+    np.testing.assert_allclose(centroids[code], centres[owner], atol=0.06)
+
+
+def test_fewer_different_vectors_than_entries_are_kept() -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(100, 6)).astype(np.float16).astype(np.float32)
+    vectors = values[rng.integers(0, 100, 5000)]
+    centroids, code = clustered(vectors, np.ones(5000), ENTRIES, 0)
+    assert len(centroids) <= 100
+    assert np.array_equal(centroids[code], vectors)
+    assert clustered(vectors[:0], np.ones(0), ENTRIES, 0)[0].shape == (0, 6)
+
+
+def test_what_shows_more_is_served_better() -> None:
+    """Two heaps of vectors: the one with a thousand times the share gets most entries, the other some."""
+    rng = np.random.default_rng(0)
+    vectors = rng.normal(size=(200_000, 2)).astype(np.float32) + np.repeat([[0.0], [50.0]], 100_000, axis=0).astype(np.float32)
+    share = np.repeat([1.0, 1e-3], 100_000)
+    centroids, code = clustered(vectors, share, 64, 0)
+    off = ((centroids[code] - vectors) ** 2).sum(1)
+    assert off[:100_000].mean() < 0.5 * off[100_000:].mean()
+    assert off[100_000:].mean() < 2.5
+
+
+def test_codes_repeat_whatever_the_threads() -> None:
+    import numba
+
+    tree = smooth_tree()
+    first = serialize(tree, "small")
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        assert serialize(tree, "small") == first
+    finally:
+        numba.set_num_threads(before)
+
+
+# Values
+
+
+def test_densities_are_rounded_by_a_few_percent() -> None:
+    voxel = 0.01
+    density = np.concatenate([[0], np.geomspace(1e-6, 1e5, 5000)]).astype(np.float32)
+    rounded = quantised_density(density, voxel)
+    assert len(np.unique(rounded)) <= 256
+    depth = density.astype(np.float64) * voxel
+    middle = (depth > 1e-3) & (depth < 50)
+    np.testing.assert_allclose(rounded[middle], density[middle], rtol=0.022)
+    assert (rounded[depth < 5e-4] == 0).all()
+    assert np.allclose(rounded[depth > 50] * voxel, 50)
+    assert np.array_equal(quantised_density(rounded, voxel), rounded)
+    assert not quantised_density(np.linspace(0, 1e-5, 1000, dtype=np.float32), voxel).any()
+
+
+def test_the_base_colour_keeps_eight_bits() -> None:
+    """Within one of 256 steps of the colour that it makes, for ordinary and for saturated bases alike, and in the middle range better."""
+    rng = np.random.default_rng(0)
+    sh = np.clip(rng.normal(0, 8, size=(5000, 1, 3)), -25, 25).astype(np.float32)
+    codes = quantised_harmonics(sh, np.ones(5000), ENTRIES, ())
+    colour = 1 / (1 + np.exp(-0.28209479 * np.stack([sh, codes.decoded()])))
+    assert np.abs(colour[0] - colour[1]).max() < 1 / 256
+    assert np.abs(codes.decoded() - sh).max() < 1.0
+
+
+def test_groups_must_hold_all_harmonics() -> None:
+    with pytest.raises(ValueError, match=r"groups \(1, 1\) hold 2 harmonics; expected 3"):
+        quantised_harmonics(np.zeros((5, 4, 3), np.float32), np.ones(5), 16, (1, 1))
+
+
+# Layouts
+
+
+@pytest.mark.parametrize(("layout", "most"), [("compact", 0.003), ("small", 0.01), ("sparse", 0.0005), ("full", 0.003), ("full32", 0.003)])
+def test_a_layout_shows_the_same(tmp_path: Path, layout: str, most: float) -> None:
+    tree = smooth_tree()
+    save(tree, tmp_path / "a.nerftree", layout)
+    again = load(tmp_path / "a.nerftree")
+    error = np.sqrt(((seen(again) - seen(tree)) ** 2).mean())
+    assert error < most, f"{layout}: {error}"
+    again.save(tmp_path / "b.nerftree", layout)
+    assert (tmp_path / "a.nerftree").read_bytes() == (tmp_path / "b.nerftree").read_bytes()
+
+
+def test_a_compact_file_is_small_and_stays_small_in_memory(tmp_path: Path) -> None:
+    tree = smooth_tree(32)
+    for layout, a_voxel in (("compact", 12), ("small", 6), ("sparse", 56)):
+        save(tree, tmp_path / "a.nerftree", layout)
+        about = describe(tmp_path / "a.nerftree")
+        assert about["bytes_per_voxel"] == a_voxel
+        assert about["voxels"] == len(tree.density_values)
+    coded = load(tmp_path / "a.nerftree").harmonics
+    assert isinstance(coded, np.ndarray)
+    save(tree, tmp_path / "a.nerftree", "compact")
+    held = load(tmp_path / "a.nerftree").harmonics
+    assert isinstance(held, PaletteHarmonics)
+    assert held.base.nbytes + held.codes.nbytes == 11 * len(tree.density_values)
+
+
+def test_codes_are_written_as_they_are(tmp_path: Path) -> None:
+    """A tree of codes keeps them by default, whatever its groups; asked for another layout it is coded anew, from what its codes stand for."""
+    tree = compacted(random_tree(3, degree=2, shape=(6, 5, 4)), 300, (3, 5))
+    save(tree, tmp_path / "a.nerftree")
+    again = load(tmp_path / "a.nerftree")
+    assert again.harmonics.groups == (3, 5)  # type: ignore[union-attr]
+    assert np.array_equal(again.sh, tree.sh)
+    assert np.array_equal(again.density_values, tree.density_values)
+    assert describe(tmp_path / "a.nerftree")["sh_groups"] == [3, 5]
+    save(again, tmp_path / "b.nerftree", "compact")
+    assert describe(tmp_path / "b.nerftree")["sh_groups"] == [1] * 8
+    save(again, tmp_path / "c.nerftree", "sparse")
+    assert np.array_equal(load(tmp_path / "c.nerftree").sh, tree.sh.astype(np.float16))
+
+
+def test_full_bricks_hold_what_was_stored_and_zero_density_beside_it(tmp_path: Path) -> None:
+    tree = random_tree(2, degree=1)
+    save(tree, tmp_path / "a.nerftree", "full32")
+    full = load(tmp_path / "a.nerftree")
+    assert (full.voxel_index >= 0).all()
+    stored = tree.voxel_index >= 0
+    assert np.array_equal(full.density_values[full.voxel_index[stored]], tree.density_values[tree.voxel_index[stored]])
+    assert np.array_equal(full.sh[full.voxel_index[stored]], tree.sh[tree.voxel_index[stored]])
+    assert not full.density_values[full.voxel_index[~stored]].any()
+    for brick in range(len(tree.voxel_index)):
+        inside = tree.sh[tree.voxel_index[brick][stored[brick]]]
+        filled = full.sh[full.voxel_index[brick][~stored[brick]]]
+        assert len(inside) == 0 or ((filled >= inside.min(0) - 1e-4) & (filled <= inside.max(0) + 1e-4)).all()
+    points = np.random.default_rng(0).uniform(tree.bounds_min, tree.bounds_max, (500, 3))
+    np.testing.assert_allclose(full.density(points), tree.density(points), atol=1e-4)
+
+
+@pytest.mark.parametrize("layout", WRITERS)
+def test_trees_of_nothing_have_every_layout(tmp_path: Path, layout: str) -> None:
+    empty = tree_from_voxels((2, 3, 1), 0.1, LOW, np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
+    hollow = replace(empty, brick_index=np.where(np.arange(6) == 2, 0, -1).astype(np.int32).reshape(2, 3, 1), voxel_index=np.full((1, 64), -1, np.int32))
+    single = tree_from_voxels((1, 1, 1), 0.1, LOW, np.array([[1, 2, 3]]), np.ones(1), np.ones((1, 1, 3)))
+    for tree in (empty, hollow, single):
+        save(tree, tmp_path / "a.nerftree", layout)
+        again = load(tmp_path / "a.nerftree")
+        assert (again.degree, again.shape) == (tree.degree, tree.shape)
+        assert again.density_values.sum() == tree.density_values.sum()
+        describe(tmp_path / "a.nerftree")
+
+
+def test_an_unknown_layout_is_refused() -> None:
+    with pytest.raises(ValueError, match="layout 'zip'; expected one of compact, small, sparse, full, full32"):
+        serialize(random_tree(0), "zip")
