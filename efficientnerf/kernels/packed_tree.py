@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 LANES = 16  # coefficients are padded to multiples of it: what the widest vectors hold
 LEVELS = 32767
+DECODED = 2**18  # voxels whose harmonics are floats at a time
 
 
 class Packed(NamedTuple):
@@ -100,7 +101,9 @@ def pack(tree: NerfTree) -> Packed:
     density = np.empty((len(cells), (brick + 2) ** 3), np.float32)
     voxel = np.empty(density.shape, np.int32)
     _fill(place, brick, tree.brick_index, tree.voxel_index, tree.density_values, density, voxel)
-    width = -(-3 * tree.sh.shape[1] // LANES) * LANES
+    width = -(-3 * tree.harmonics_count // LANES) * LANES
     sh, scale = np.zeros((count + 1, width), np.int16), np.zeros(count + 1, np.float32)
-    _quantise(tree.sh, sh[:count], scale[:count])
+    for begin in range(0, count, DECODED):  # floats of all voxels at once may be more than all the rest
+        block = slice(begin, min(count, begin + DECODED))
+        _quantise(tree.coefficients(block), sh[block], scale[block])
     return Packed(np.ascontiguousarray(cell, np.int32), density, voxel, sh, scale)

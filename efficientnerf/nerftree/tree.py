@@ -77,6 +77,10 @@ class NerfTree:
         """Coefficients (N, K, 3) float32; decoded, once, where `harmonics` are codes."""
         return self.harmonics.decoded() if isinstance(self.harmonics, PaletteHarmonics) else self.harmonics
 
+    def coefficients(self, voxels: np.ndarray | slice) -> np.ndarray:
+        """Coefficients (n, K, 3) float32 of some voxels; unlike `sh`, nothing is kept."""
+        return self.harmonics.decoded(voxels) if isinstance(self.harmonics, PaletteHarmonics) else self.harmonics[voxels]
+
     @property
     def harmonics_count(self) -> int:
         """K."""
