@@ -7,7 +7,7 @@ kernels do not reach.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,6 +40,30 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
 
 
 @dataclass(frozen=True)
+class SampleCounts:
+    """Samples of some rays; intervals: rays x N_c, between near and far (in contracted space, those that a ray passes)."""
+
+    rays: int = 0
+    intervals: float = 0.0
+    valid: int = 0
+    pivotal: int = 0
+    fine: int = 0
+
+    def __add__(self, other: SampleCounts) -> SampleCounts:
+        return SampleCounts(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+    @property
+    def valid_share(self) -> float:
+        """V of equation 5: valid samples over rays x N_c."""
+        return self.valid / max(self.intervals, 1e-9)
+
+    @property
+    def pivotal_share(self) -> float:
+        """P of equation 12: pivotal samples over rays x N_c."""
+        return self.pivotal / max(self.intervals, 1e-9)
+
+
+@dataclass(frozen=True)
 class FieldRendering:
     """What a camera sees of a field, and how much of it lies in the box.
 
@@ -49,6 +73,7 @@ class FieldRendering:
     before          (H, W, 4) premultiplied colour and opacity of what lies between the camera and the box
     behind          (H, W, 3) colour of what lies beyond the box, as if the box were empty
     inside_opacity  (H, W) of what lies in the box
+    counts          of the samples that it took
     """
 
     colour: np.ndarray
@@ -57,6 +82,7 @@ class FieldRendering:
     before: np.ndarray
     behind: np.ndarray
     inside_opacity: np.ndarray
+    counts: SampleCounts = SampleCounts()
 
 
 @dataclass(frozen=True)
@@ -72,20 +98,25 @@ class FieldRenderer:
         """The picture that a camera in the training frame takes of the field."""
         m = self.model
         count = camera.width * camera.height
-        parts = []
-        for begin in range(0, count, FIELD_RAYS_PER_BLOCK):
-            index = np.arange(begin, min(count, begin + FIELD_RAYS_PER_BLOCK))
+        parts, counts = [], SampleCounts()
+        # Where nothing is pruned a ray has as many samples as there are.
+        block = FIELD_RAYS_PER_BLOCK if m.prunes else min(FIELD_RAYS_PER_BLOCK, max(64, 2**19 // (m.settings.coarse_samples + m.settings.importance_samples)))
+        for begin in range(0, count, block):
+            index = np.arange(begin, min(count, begin + block))
             pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)
             origins, directions = (torch.as_tensor(a, dtype=torch.float32, device=m.device) for a in rays(camera, pixels))
             slant = (directions @ torch.as_tensor(camera.forward, dtype=torch.float32, device=m.device)).clamp(min=1e-3)
-            behind = m.behind(directions)
-            seen = look(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), behind)
-            parts.append([part.cpu().numpy() for part in split_by_box(m, origins, directions, slant, seen, behind)])
+            beyond = m.behind(directions)
+            seen = look(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), beyond)
+            intervals = seen.coarse.tried if m.space.contracted else len(index) * (self.far - self.near) / m.step
+            counts += SampleCounts(len(index), intervals, len(seen.coarse.start), int(seen.pivotal.sum()), len(seen.fine.start))
+            parts.append([part.cpu().numpy() for part in split_by_box(m, origins, directions, slant, seen, beyond)])
             if progress is not None:
                 progress(begin + len(index), count)
         shape = (camera.height, camera.width)
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        return FieldRendering(*(column.reshape(*shape, *column.shape[1:]) for column in columns))
+        colour, opacity, depth, before, behind, inside = (column.reshape(*shape, *column.shape[1:]) for column in columns)
+        return FieldRendering(colour, opacity, depth, before, behind, inside, counts)
 
 
 def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, seen: Look, behind: Tensor) -> tuple[Tensor, ...]:

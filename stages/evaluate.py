@@ -198,7 +198,7 @@ def measure(tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn:
         small = Truth(thinned(truth.colour, stride), *(None if m is None else thinned(m, stride) for m in (truth.mask, truth.inside)))
         inside = small.inside if scene.background is not None else rendering.inside_opacity >= 0.5
         network = _clean(rendering.colour, job, f"{view.name}: the network")
-        figures["network"] = {**compare(network, small, inside), "width": network.shape[1], "height": network.shape[0]}
+        figures["network"] = {**compare(network, small, inside), "width": network.shape[1], "height": network.shape[0], **shares(rendering.counts)}
         pictures += [eight_bits(small.colour), eight_bits(network), error_picture(network, small.colour)]
     asset, inside = asset_picture(tree, scene, view, rendering, stride)
     asset = _clean(asset, job, f"{view.name}: the asset")
@@ -208,6 +208,14 @@ def measure(tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn:
     if figures["asset"]["psnr"] is None:
         job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
     return figures, [*pictures, eight_bits(asset), error_picture(asset, truth.colour)]
+
+
+SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
+
+
+def shares(counts: Any) -> dict[str, float]:
+    """Valid and pivotal samples over rays x N_c (equations 5 and 12), counted between near and far, and fine samples a ray."""
+    return {"valid_share": counts.valid_share, "pivotal_share": counts.pivotal_share, "fine_per_ray": counts.fine / max(counts.rays, 1)}
 
 
 def asset_picture(tree: Any, scene: Scene, view: View, rendering: Any, stride: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -243,16 +251,16 @@ def summary(figures: Sequence[dict[str, Any]], *, split: str, stride: int, backg
     drawn = [view["network"] for view in figures if view["network"] is not None]
     assets = [view["asset"] for view in figures]
     same = [view["asset"] for view in figures if view["network"] is not None]
-    network: dict[str, Any] = {**_means(drawn), "views": len(drawn), "scale": 1.0 / stride}
+    network: dict[str, Any] = {**_means(drawn), **_means(drawn, SHARES), "views": len(drawn), "scale": 1.0 / stride}
     asset: dict[str, Any] = {**_means(assets), "views": len(assets), "scale": 1.0, "on_network_views": _means(same)}
     if background is not None:
         asset["background_scale"] = {"network_views": 1.0 / stride, "other_views": 1.0 / background}
     return {"format": FORMAT, "split": split, "network": network, "asset": asset, "views": list(figures)}
 
 
-def _means(figures: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+def _means(figures: Sequence[dict[str, Any]], names: Sequence[str] = ("psnr", "ssim", "psnr_in_box")) -> dict[str, float | None]:
     means: dict[str, float | None] = {}
-    for name in ("psnr", "ssim", "psnr_in_box"):
+    for name in names:
         values = [view[name] for view in figures if view[name] is not None]
         means[name] = math.fsum(values) / len(values) if values else None
     return means

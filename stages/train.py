@@ -68,27 +68,32 @@ def run(job: Job) -> None:
     lines: list[str] = []
     started, first, loss = clock(), t.step, 0.0
     held_back: float | None = None
+    working, logged, resumed = 0.0, first, clock()  # seconds of steps alone, since the last line of the log
     for done in training.train(t, pixels, anchors_of(folder, s)):
+        working += clock() - resumed
         loss = done.loss if done.step == first + 1 else 0.95 * loss + 0.05 * done.loss
         if budget is not None and m.settings.iterations == MOST and (fixed := budget.after(done.step)) is not None:
             m.settings = fixed
             job.say(f"{fixed.iterations} steps fit into the budget of {settings.budget:g} s")
         last = done.step == m.settings.iterations
+        drawn = _preview(renderer, watched, folder, job, done.step, settings)
+        held_back = drawn or held_back
         seconds = spent + clock() - started
-        if done.step % LOG_EVERY == 0 or last:
-            lines.append(json.dumps(_line(done, loss, m.voxels.occupied, seconds), sort_keys=True))
+        if done.step % LOG_EVERY == 0 or last or drawn is not None:
+            lines.append(json.dumps(_line(done, loss, m.voxels.occupied, seconds, working / (done.step - logged), drawn), sort_keys=True))
+            working, logged = 0.0, done.step
         facts = {"psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), "rays": done.rays}
         goal = settings.warm_up + TIMED if m.settings.iterations == MOST else m.settings.iterations
         job.progress(min(done.step, goal), goal, "training", **facts, **({} if held_back is None else {"held_back_psnr": held_back}))
         if done.step % settings.checkpoint_every == 0 and not last:
             _checkpoint(t, job, log, lines, seconds)
-        held_back = _preview(renderer, watched, folder, job, done.step, settings) or held_back
         try:
             job.safe_point()
         except BaseException:
             if not last:
                 _checkpoint(t, job, log, lines, seconds)
             raise
+        resumed = clock()
     _append(log, lines)
     field.save_model(m, near, far, job.out / field.FILE)
     _report(job, t, spent + clock() - started, held_back)
@@ -222,8 +227,11 @@ def _append(log: Path, lines: list[str]) -> None:
         file.writelines(line + "\n" for line in lines)
 
 
-def _line(done: Progress, loss: float, occupied: float, seconds: float) -> dict[str, Any]:
+def _line(done: Progress, loss: float, occupied: float, seconds: float, step_seconds: float, held_back: float | None) -> dict[str, Any]:
+    """seconds: of the stage, pictures and checkpoints included; step_seconds: of a step alone, the mean since the last line."""
     return {
+        "step_seconds": round(step_seconds, 6),
+        "held_back_psnr": held_back,
         "step": done.step,
         "loss": loss,
         "psnr": -10 * math.log10(max(loss, 1e-10)),

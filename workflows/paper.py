@@ -13,58 +13,23 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-PAPER = " (paper)"
+from workflows import paper_tables
+from workflows.paper_result import PAPER, Request, Result, Table
 
+__all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
 
-@dataclass(frozen=True)
-class Request:
-    """What was asked for.
-
-    data    folder of a scene, or of scenes
-    out     where tables and runs go
-    scale   1: as in the paper; less: iterations, resolution, networks and grids shrunk together
-    device  "cpu" or "cuda"
-    say     tells the user what is going on
-    """
-
-    data: Path | None
-    out: Path
-    scale: float = 1.0
-    device: str = "cpu"
-    say: Callable[[str], None] = print
-
-
-@dataclass(frozen=True)
-class Result:
-    """A measured table.
-
-    columns  in order; those that end in PAPER are the paper's figures
-    rows     column -> text, number or None
-    notes    what a reader must know to trust the figures
-    curves   name -> (seconds of training, PSNR in decibels), for the plot
-    """
-
-    columns: Sequence[str]
-    rows: Sequence[Mapping[str, Any]]
-    notes: Sequence[str] = ()
-    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Table:
-    """title as in the paper; `needs_data`: whether it is measured on scenes; measure does the work."""
-
-    title: str
-    needs_data: bool
-    measure: Callable[[Request], Result]
-
-
-TABLES: dict[str, Table] = {}
+TABLES: dict[str, Table] = {
+    "1": Table("Shares of valid and of pivotal samples", True, paper_tables.shares),
+    "2": Table("Quality and speed", True, paper_tables.quality),
+    "3": Table("Versions N1 to N4", True, paper_tables.versions),
+    "4": Table("Sizes of the coarse and of the fine network", True, paper_tables.networks),
+    "5": Table("The modules, one by one", True, paper_tables.modules),
+    "6": Table("Sampling strategies", True, paper_tables.strategies),
+}
 
 
 def make(number: str, request: Request) -> dict[str, Path]:

@@ -20,11 +20,19 @@ FREQUENCIES = 10
 def positional_encoding(points: Tensor, frequencies: int = FREQUENCIES) -> Tensor:
     """(N, 3) in [-1, 1] to (N, 3 + 6 frequencies): the point itself, then sines and cosines of 2^l x (Mildenhall et al. 2020, equation 4).
 
-    Without the factor pi of that equation, as in NeRF's code and in the authors' release.
+    Without the factor pi of that equation, as in NeRF's code and in the authors' release. Four octaves out of five follow from the one before by
+    the formulas of the double angle, which takes a third of the time; the error of float32 grows to about 1e-5 on the way.
     """
-    scales = 2.0 ** torch.arange(frequencies, device=points.device, dtype=points.dtype)
-    angles = (points[:, None] * scales[:, None]).reshape(len(points), 3 * frequencies)
-    return torch.cat([points, torch.sin(angles), torch.cos(angles)], dim=-1)
+    sines: list[Tensor] = []
+    cosines: list[Tensor] = []
+    for octave in range(frequencies):
+        if octave % 5 == 0:
+            sine, cosine = torch.sin(points * 2**octave), torch.cos(points * 2**octave)
+        else:
+            sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
+        sines.append(sine)
+        cosines.append(cosine)
+    return torch.cat([points, *sines, *cosines], dim=-1)
 
 
 def linear_layers(shapes: list[tuple[int, int]], generator: torch.Generator) -> tuple[nn.ParameterList, nn.ParameterList]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from efficientnerf.fields.mlp import MlpField
+from efficientnerf.fields.mlp import MlpField, positional_encoding
 from efficientnerf.fields.nerf import NerfField
 from efficientnerf.kernels import mlp
 from efficientnerf.kernels.mlp import chain, chain_reference, has_bfloat16, precision_of
@@ -112,3 +112,10 @@ def test_every_parameter_of_nerfs_network_has_a_gradient() -> None:
 @pytest.mark.parametrize("degree", range(5))
 def test_any_degree_of_harmonics(degree: int) -> None:
     assert MlpField(hidden=8, layers=2, degree=degree, generator=torch.Generator())(torch.rand(3, 3)).shape == (3, 1 + 3 * (degree + 1) ** 2)
+
+
+def test_positional_encoding_in_float32_is_close_to_its_closed_form() -> None:
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    angles = (points.double()[:, None] * 2.0 ** torch.arange(10)[:, None]).reshape(500, 30)
+    expected = torch.cat([points, angles.sin(), angles.cos()], dim=1)
+    torch.testing.assert_close(positional_encoding(points).double(), expected, rtol=0, atol=3e-5)

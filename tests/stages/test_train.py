@@ -57,7 +57,9 @@ def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Pat
         "curve.png", FILE, "log.jsonl", "previews/preview_000005.png", "previews/preview_000010.png", "report.json",
     ]  # fmt: skip
     lines = [json.loads(line) for line in (made.out / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [10, 13]
+    assert [line["step"] for line in lines] == [5, 10, 13]
+    assert [line["held_back_psnr"] is None for line in lines] == [False, False, True]
+    assert all(line["step_seconds"] > 0 for line in lines)
     assert all(0 < line["valid"] <= line["tried"] and 0 < line["occupied"] <= 1 for line in lines)
     assert checkpoints(made) == ["checkpoint_00000008.safetensors", "checkpoint_00000012.safetensors"]
     assert events[-1]["event"] == "progress"
@@ -77,7 +79,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, un
     assert run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop, events=events)) == undisturbed
     assert any("training goes on from step" in event.get("text", "") for event in events)
     lines = [json.loads(line)["step"] for line in (tmp_path / "out" / "log.jsonl").read_text().splitlines()]
-    assert lines == [10, 13]
+    assert lines == [5, 10, 13]
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "other", "flipped"])
