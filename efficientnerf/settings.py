@@ -58,6 +58,10 @@ class TrainSettings:
     explored: float = _setting(0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0)
     distortion: float = _setting(0.01, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog", minimum=0.0)
     anchors: float = _setting(0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0)
+    exposure: str = _setting(
+        "off", "gain: a factor for each colour and photograph is learned beside the field and left out of it, where surroundings are learned; off: none",
+        choices=("off", "gain"),
+    )  # fmt: skip
     initial_density: float = _setting(0.1, "hash: density that the fields start with, per world unit", minimum=1e-6, maximum=1e3)
     voxels: int = _setting(0, "D: side of the density voxels; 0 chooses 128, or 192 where surroundings are learned too", minimum=0, maximum=512)
     voxel_rule: str = _setting(

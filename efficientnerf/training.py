@@ -18,6 +18,7 @@ from torch import Tensor
 
 from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
+from efficientnerf.exposure import exposed, exposure_loss
 from efficientnerf.model import Look, Model, look
 from efficientnerf.pixels import Pixels
 
@@ -102,17 +103,26 @@ class Progress:
 
 @dataclass
 class Trainer:
-    """The state of a training run; `samples_per_ray` is the running average that sets the number of rays."""
+    """The state of a training run.
+
+    samples_per_ray  the running average that sets the number of rays
+    exposure         (C, 3) what is learned about each photograph's exposure (`efficientnerf.exposure`), or None
+    """
 
     model: Model
     adam: Adam
     step: int = 0
     samples_per_ray: float = 0.0
+    exposure: torch.nn.Parameter | None = None
 
 
-def trainer(m: Model) -> Trainer:
+def trainer(m: Model, views: int = 0) -> Trainer:
+    """A trainer at its beginning; `views` is the number of training images, needed where their exposure is learned."""
+    exposure = torch.nn.Parameter(torch.zeros(views, 3, device=m.device)) if m.settings.exposure == "gain" and m.background is None and views else None
+    parameters = m.parameters() + ([] if exposure is None else [("exposure", exposure)])
     # Until it is known better, every interval is sampled, and as many pivots as there may be.
-    return Trainer(m, Adam(m.parameters(), m.settings.adam_beta2, m.settings.adam_epsilon), 0, float(m.slots + m.settings.max_pivots * m.settings.fine_samples))
+    samples = float(m.slots + m.settings.max_pivots * m.settings.fine_samples)
+    return Trainer(m, Adam(parameters, m.settings.adam_beta2, m.settings.adam_epsilon), 0, samples, exposure)
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
@@ -121,7 +131,8 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
 
     moments = {f"adam.{k}.{name}": pair[k] for name, pair in t.adam.moments.items() for k in (0, 1)}
     progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
-    return model_state(t.model) | moments | {"progress": progress}
+    exposure = {} if t.exposure is None else {"exposure": t.exposure.detach()}
+    return model_state(t.model) | moments | exposure | {"progress": progress}
 
 
 def restore(t: Trainer, state: dict[str, Tensor]) -> None:
@@ -129,6 +140,8 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     from efficientnerf.model import restore as restore_model
 
     restore_model(t.model, state)
+    if t.exposure is not None:
+        t.exposure.data.copy_(state["exposure"])
     for name, pair in t.adam.moments.items():
         for k in (0, 1):
             pair[k].copy_(state[f"adam.{k}.{name}"])
@@ -173,8 +186,15 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
 
         # Both stages, both losses (weighted equally, as in the authors' release).
         seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up, rng=rng)
-        fine_loss = ((seen.fine_colour - colour) ** 2).mean()
-        loss = fine_loss if seen.coarse_colour is None else fine_loss + ((seen.coarse_colour - colour) ** 2).mean()
+        fine_colour, coarse_colour = seen.fine_colour, seen.coarse_colour
+        if t.exposure is not None:
+            view = torch.from_numpy(pixels.view_of(chosen)).to(device)
+            fine_colour = exposed(fine_colour, view, t.exposure)
+            coarse_colour = None if coarse_colour is None else exposed(coarse_colour, view, t.exposure)
+        fine_loss = ((fine_colour - colour) ** 2).mean()
+        loss = fine_loss if coarse_colour is None else fine_loss + ((coarse_colour - colour) ** 2).mean()
+        if t.exposure is not None:
+            loss = loss + exposure_loss(t.exposure)
         if m.space.contracted:
             loss = loss + settings.distortion * seen.distortion.mean()
             _quieten_near_cameras(m, origins, seen)

@@ -55,7 +55,7 @@ def run(job: Job) -> None:
         near, far = stated_range(s, settings)
         pixels.near[:], pixels.far[:] = near, far
     m = model(Space(s.bounds, contracted=s.background is None), settings, s.background, job.device, (near, far))
-    t = training.trainer(m)
+    t = training.trainer(m, len(views))
     log = job.work / "log.jsonl"
     spent = _resume(t, job, log)
     budget = Budget(settings, job.work, spent, clock) if settings.budget else None
