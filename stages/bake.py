@@ -34,6 +34,11 @@ class BakeSettings:
     pixels: int = setting(1_000_000, "training pixels that are looked at to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
     max_mib: int = setting(128, "how large the asset may get; a larger one keeps only voxels of greater weight", minimum=1, unit="MiB")
+    layout: str = setting(
+        "compact",
+        "how the voxels lie in the asset: compact (codes of 8 bits), small (a coarser palette, half the bytes) or sparse (16-bit floats)",
+        choices=("compact", "small", "sparse"),
+    )
     dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
     points: int = setting(8, "jittered points averaged in a voxel", minimum=1, maximum=256)
     seed: int = setting(0, "seed of the jitter", minimum=0)
@@ -67,7 +72,7 @@ def run(job: Job) -> None:
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
     density, sh = _values(job, m, indices, voxel, low)
     tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=metadata_of(s, settings, m))
-    format.save(tree, job.out / ASSET)
+    format.save(tree, job.out / ASSET, settings.layout)
     size = (job.out / ASSET).stat().st_size
     report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size}
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
@@ -82,13 +87,6 @@ def chosen_resolution(s: Scene, most: int) -> int:
         footprints.append(np.linalg.norm(view.camera.centre - centre) / focal)
     side = float((s.bounds[1] - s.bounds[0]).max())
     return int(np.clip(round(side / (0.75 * float(np.median(footprints)))), 32, most))
-
-
-def bytes_per_voxel(degree: int) -> int:
-    """On disk: halves for the density and for each coefficient of three colours."""
-    from efficientnerf.harmonics import harmonics_count
-
-    return 2 + 2 * 3 * harmonics_count(degree)
 
 
 def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
@@ -126,7 +124,7 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
 
 def _kept(job: Job, s: Scene, m: Any, shape: tuple[int, int, int], voxel: float, low: np.ndarray) -> np.ndarray:
     """Coordinates of the voxels to store, from scratch or from an earlier attempt."""
-    from efficientnerf.nerftree import baking
+    from efficientnerf.nerftree import baking, writing
     from stages import scene
     from stages.train import pixels_of
 
@@ -143,7 +141,7 @@ def _kept(job: Job, s: Scene, m: Any, shape: tuple[int, int, int], voxel: float,
     greatest = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked)
     threshold = settings.weight
     indices = baking.chosen_voxels(greatest, shape, settings.brick, threshold, settings.dilate)
-    most = settings.max_mib * 2**20 // bytes_per_voxel(m.fine.degree)
+    most = writing.most_voxels(settings.max_mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
     weights = np.sort(greatest[greatest > threshold])
     while len(indices) > most and len(weights) > 1:
         job.safe_point()

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.harmonics import harmonics_count
 from efficientnerf.nerftree.container import FormatError
 from efficientnerf.nerftree.layouts import LIMIT
 from efficientnerf.nerftree.palettes import PaletteHarmonics
@@ -42,6 +43,20 @@ def written_as(tree: NerfTree, writer: str | None) -> Written:
     if writer not in WRITERS:
         raise ValueError(f"layout {writer!r}; expected one of {', '.join(WRITERS)}")
     return WRITERS[writer](tree)
+
+
+def bytes_per_voxel(writer: str, degree: int) -> int:
+    """Of a stored voxel in `compact`, `small` or `sparse`, without the masks of the bricks."""
+    harmonics = harmonics_count(degree)
+    return {"compact": 4 + (harmonics - 1), "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
+
+
+def most_voxels(size: int, writer: str, degree: int, shape: tuple[int, int, int], brick: int) -> int:
+    """How many voxels a file of `size` bytes has room for, if a quarter of the voxels of its bricks are stored (usually more are)."""
+    palette = {"compact": 256, "small": SMALL_ENTRIES, "sparse": 0}[writer] * (harmonics_count(degree) - 1) * 6
+    fixed = 2**14 + math.prod(shape) // 8 + palette
+    mask = 8 * math.ceil(brick**3 / 64) / max(1.0, brick**3 / 4)
+    return max(0, int((size - fixed) / (bytes_per_voxel(writer, degree) + mask)))
 
 
 def order_of(tree: NerfTree) -> np.ndarray:

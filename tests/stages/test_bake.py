@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.nerftree import baking
+from efficientnerf.nerftree import baking, format
 from efficientnerf.nerftree.tree import NerfTree
 from pipeline.errors import Interrupted, StageFailed
 from pipeline.stage import Job
@@ -137,14 +137,16 @@ def test_the_resolution_follows_the_pixels(inputs: dict[str, Path]) -> None:
     assert chosen_resolution(dataclasses.replace(s, views=sharper), 64) == 64
 
 
-def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: dict[str, Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize("layout", ["compact", "sparse"])
+def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: dict[str, Path], tmp_path: Path, layout: str) -> None:
     sizes = {}
     for most in (1, 64):
         told: list[dict[str, Any]] = []
-        made = job(tmp_path / str(most), BakeSettings(resolution=64, points=1, max_mib=most), **inputs)
+        made = job(tmp_path / str(most), BakeSettings(resolution=80, points=1, max_mib=most, layout=layout), **inputs)
         made._report = told.append
         run(made)
         sizes[most] = (made.out / ASSET).stat().st_size
         assert any("bake.max_mib" in event.get("text", "") for event in told) == (most == 1)
-    assert sizes[1] <= 2**20 + 2**16  # the voxels, and what says where they are
+        assert format.describe(made.out / ASSET)["layout"] == layout
+    assert sizes[1] <= 2**20
     assert sizes[64] > sizes[1] > 2**16
