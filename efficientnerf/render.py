@@ -17,6 +17,7 @@ from torch import Tensor
 from efficientnerf.cameras import Camera, rays
 from efficientnerf.compositing import ray_of_sample
 from efficientnerf.harmonics import basis
+from efficientnerf.kernels import dispatch
 from efficientnerf.model import Look, Model, look
 
 if TYPE_CHECKING:
@@ -33,6 +34,10 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
 
     if supersample < 1:
         raise ValueError(f"supersample {supersample}: expected at least 1")
+    if tree.device != "cpu" and dispatch.triton_usable():
+        from efficientnerf.kernels.cuda_tree import draw
+
+        return Rendering(*(part.cpu().numpy() for part in draw(tree.on_device, camera, background=background, supersample=supersample)))
     behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
     if behind.shape != (3,):
         raise ValueError(f"background {background}: expected three numbers, red, green and blue")

@@ -19,6 +19,7 @@ from torch import Tensor
 from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
 from efficientnerf.exposure import exposed, exposure_loss
+from efficientnerf.kernels import dispatch
 from efficientnerf.model import Look, Model, look
 from efficientnerf.pixels import Pixels
 
@@ -66,6 +67,11 @@ class Adam:
 
                 flat = [t.detach().view(-1).numpy() for t in (p, p.grad.contiguous(), first, second)]
                 cpu_network.adam(*flat, *(np.float32(x) for x in (rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
+            elif dispatch.on_device(p, p.grad):
+                from efficientnerf.kernels import cuda
+
+                moments = (first, second, rate, BETA1, self.beta2, correction1, correction2, self.epsilon)
+                cuda.adam(p, p.grad, *moments, skip_zeros=sparse)
             else:
                 with torch.no_grad():
                     touched = (p.grad != 0) if sparse else torch.ones_like(p.grad, dtype=torch.bool)

@@ -68,7 +68,7 @@ def run(job: Job) -> None:
 
         return load_renderer(job.inputs["train"], job.device)
 
-    evaluate(NerfTree.load(job.inputs["bake"] / "asset.nerftree"), load_field, job)
+    evaluate(NerfTree.load(job.inputs["bake"] / "asset.nerftree").to(job.device), load_field, job)
 
 
 def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:

@@ -30,7 +30,7 @@ class TurntableSettings:
 def run(job: Job) -> None:
     from efficientnerf.nerftree.tree import NerfTree
 
-    draw_turntable(NerfTree.load(job.inputs["bake"] / "asset.nerftree"), job)
+    draw_turntable(NerfTree.load(job.inputs["bake"] / "asset.nerftree").to(job.device), job)
 
 
 def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # anything with the interface of a NerfTree

@@ -24,11 +24,14 @@ def _fast(*tensors: Tensor) -> bool:
 
 def on_device(*tensors: Tensor) -> bool:
     """Whether the Triton kernels take these tensors: float32 on CUDA, and they can be built here."""
-    return all(t.is_cuda and t.dtype == torch.float32 for t in tensors) and _triton_usable()
+    return all(t.is_cuda and t.dtype == torch.float32 for t in tensors) and triton_usable()
 
 
 @functools.cache
-def _triton_usable() -> bool:
+def triton_usable() -> bool:
+    """Whether Triton's kernels can be built and launched here; warns once, with the remedy, where there is CUDA and they cannot."""
+    if not torch.cuda.is_available():
+        return False
     try:
         from efficientnerf.kernels import cuda
     except ImportError as error:

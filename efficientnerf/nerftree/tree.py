@@ -21,6 +21,7 @@ from efficientnerf.nerftree.palettes import PaletteHarmonics
 
 if TYPE_CHECKING:
     from efficientnerf.cameras import Camera
+    from efficientnerf.kernels.cuda_tree import DeviceTree
     from efficientnerf.kernels.packed_tree import Packed
 
 
@@ -55,6 +56,7 @@ class NerfTree:
     harmonics    what the voxels' colours are made of, one of two:
                  (N, K, 3) float32, or PaletteHarmonics: codes into palettes, as files of the layout `compact` load
     background   sRGB colour that the training images lay on, or None for photographs with surroundings
+    device       where pictures are drawn, see `to`; not part of the asset
 
     For renderers: `sh` is always there as plain floats, but decoding a palette costs 12 K bytes a voxel and is remembered; a kernel
     that matters reads `harmonics` itself where it is a PaletteHarmonics, whose docstring states what its arrays mean. A kernel for codes
@@ -71,6 +73,7 @@ class NerfTree:
     harmonics: np.ndarray | PaletteHarmonics
     background: tuple[float, float, float] | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
 
     @cached_property
     def sh(self) -> np.ndarray:
@@ -120,6 +123,17 @@ class NerfTree:
         from efficientnerf.kernels.packed_tree import pack
 
         return pack(self)
+
+    @cached_property
+    def on_device(self) -> DeviceTree:
+        """The tree as the kernel on `device` reads it; sent at the first picture."""
+        from efficientnerf.kernels.cuda_tree import device_tree
+
+        return device_tree(self, self.device)
+
+    def to(self, device: str) -> NerfTree:
+        """The same tree with its pictures drawn on "cpu" or "cuda", the latter where its kernels can be built; rays and points are answered on the CPU."""
+        return replace(self, device=device)
 
     @staticmethod
     def load(path: str | Path) -> NerfTree:

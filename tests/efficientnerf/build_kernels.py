@@ -86,6 +86,20 @@ def training_step() -> None:
             out.colour.sum().backward()
 
 
+def pictures() -> None:
+    from efficientnerf.cameras import Camera
+    from efficientnerf.kernels import cuda_tree
+    from tests.efficientnerf.trees import random_tree
+
+    camera = Camera("view", 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), np.eye(4))
+    for degree in range(5):
+        tree = cuda_tree.device_tree(random_tree(0, degree=degree, brick=4), "cpu")
+        cuda_tree.draw(tree, camera, background=(1.0, 1.0, 1.0))
+        if degree == 2:
+            cuda_tree.draw_rays(tree, torch.zeros(8, 3), torch.ones(8, 3))
+
+
 if __name__ == "__main__":
     JITFunction.run = build
     training_step()
+    pictures()

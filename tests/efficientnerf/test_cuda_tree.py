@@ -1,0 +1,161 @@
+"""Pictures of trees by the CUDA kernel against the torch function and the CPU kernel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.cameras import Camera, rays
+from efficientnerf.nerftree.tree import NerfTree, Rendering, tree_from_voxels
+from efficientnerf.render import render_tree_reference
+from tests import reference
+from tests.efficientnerf.device import DEVICE
+from tests.efficientnerf.test_render import TREES, looking, tensors
+from tests.efficientnerf.trees import LOW, random_tree, rays_at, uniform_tree
+
+cuda = pytest.importorskip("efficientnerf.kernels.cuda_tree")
+
+
+def drawn_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> Rendering:
+    found = cuda.draw_rays(cuda.device_tree(tree, DEVICE), *(t.to(DEVICE) for t in tensors(origins, directions)))
+    return Rendering(*(t.cpu().numpy() for t in found))
+
+
+def drawn(tree: NerfTree, camera: Camera, **options: object) -> Rendering:
+    return Rendering(*(t.cpu().numpy() for t in cuda.draw(cuda.device_tree(tree, DEVICE), camera, **options)))
+
+
+def agree(ours: Rendering, theirs: Rendering, faces: float = 0.0) -> None:
+    """To 1e-3, but for a share `faces` of pixels whose ray runs along the face of a cell, where rounding decides on which side."""
+    for name in ("colour", "opacity"):
+        off = np.abs(getattr(ours, name) - getattr(theirs, name))
+        assert (off > 1e-3).mean() <= faces, (name, off.max())
+    decided = np.abs(theirs.opacity - 0.5) > 2e-3
+    assert (np.isfinite(ours.depth) != np.isfinite(theirs.depth))[decided].mean() <= faces
+    both = np.isfinite(ours.depth) & np.isfinite(theirs.depth) & decided
+    assert both.any()
+    assert (np.abs(ours.depth[both] - theirs.depth[both]) > 2e-3).mean() <= max(faces, 0.02)
+    turned = np.abs(ours.normal - theirs.normal).max(axis=-1)[both]
+    assert (turned > 0.05).mean() <= max(faces, 0.02)
+
+
+@pytest.mark.parametrize(("brick", "degree"), TREES)
+def test_rays_see_what_the_torch_function_says(brick: int, degree: int) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree)
+    origins, directions = rays_at(tree, 240)
+    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
+    seen = drawn_rays(tree, origins, directions)
+    # The kernel stops at 1e-3 of the light, and is in float32.
+    np.testing.assert_allclose(seen.opacity, opacity, atol=1.1e-3)
+    np.testing.assert_allclose(seen.colour, colour, atol=1.1e-3)
+    assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
+    agree(seen, tree.render_rays(origins, directions))
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1])
+def test_leaping_changes_no_value(share: float) -> None:
+    tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
+    origins, directions = rays_at(tree, 240)
+    agree(drawn_rays(tree, origins, directions), tree.render_rays(origins, directions), faces=0.004)
+
+
+@pytest.mark.parametrize(("model", "params"), [
+    ("SIMPLE_PINHOLE", (30.0, 10.0, 11.5)), ("PINHOLE", (30.0, 33.0, 9.0, 12.0)), ("OPENCV", (30.0, 33.0, 9.0, 12.0, 0.05, -0.02, 0.003, 0.002)),
+    ("OPENCV_FISHEYE", (24.0, 24.0, 10.0, 11.5, 0.02, 0.0, 0.0, 0.0)),
+])  # fmt: skip
+def test_cameras_see_what_the_cpu_shows(model: str, params: tuple[float, ...]) -> None:
+    tree = random_tree(0, share=0.7, degree=2)
+    camera = replace(looking(tree), width=18, model=model, params=params)
+    for background in (None, (1.0, 0.5, 0.0)) if model == "PINHOLE" else ((0.2, 0.5, 1.0),):
+        seen, expected = drawn(tree, camera, background=background), tree.render(camera, background=background)
+        assert seen.colour.shape == (camera.height, camera.width, 3)
+        agree(seen, expected, faces=0.01)
+        assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
+
+
+def test_supersampling() -> None:
+    supersample = 2
+    tree = random_tree(4, share=0.7, sigma=20.0)
+    camera = looking(tree, 9)
+    for background in ((1.0, 0.5, 0.0),):
+        seen = drawn(tree, camera, background=background, supersample=supersample)
+        agree(seen, tree.render(camera, background=background, supersample=supersample), faces=0.01)
+        assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
+    with pytest.raises(ValueError, match="expected at least 1"):
+        drawn(tree, camera, supersample=0)
+
+
+def test_one_colour_everywhere_gives_that_colour_however_thin() -> None:
+    for sigma in (0.02, 2.0):
+        tree = uniform_tree((6, 6, 6), brick=2, sigma=sigma, logit=0.7)
+        seen = drawn_rays(tree, *rays_at(tree, 40))
+        np.testing.assert_allclose(seen.colour, seen.opacity[:, None] * reference.sigmoid(0.7) * np.ones(3), atol=3e-4)
+
+
+def test_normals_face_the_ray() -> None:
+    tree = uniform_tree(sigma=60.0)
+    middle = (tree.bounds_min + tree.bounds_max) / 2
+    directions = np.concatenate([np.eye(3), -np.eye(3)])
+    seen = drawn_rays(tree, middle - 3 * directions, directions)
+    np.testing.assert_allclose(seen.normal, -directions, atol=2e-3)
+    np.testing.assert_allclose(seen.depth, 3 - 0.8, atol=0.05)
+
+
+def test_an_empty_tree_and_no_rays() -> None:
+    tree = tree_from_voxels((2, 3, 1), 0.1, LOW, np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
+    seen = drawn(tree, looking(tree), background=(0.2, 0.4, 0.6))
+    assert not seen.opacity.any()
+    assert np.isinf(seen.depth).all()
+    np.testing.assert_allclose(seen.colour, np.broadcast_to([0.2, 0.4, 0.6], seen.colour.shape), atol=1e-6)
+    assert drawn_rays(random_tree(0), np.zeros((0, 3)), np.zeros((0, 3))).colour.shape == (0, 3)
+
+
+def test_palettes_are_decoded() -> None:
+    from efficientnerf.nerftree.palettes import PaletteHarmonics
+
+    tree = random_tree(3, degree=1)
+    rng = np.random.default_rng(0)
+    count = len(tree.density_values)
+    codes = PaletteHarmonics(
+        rng.integers(0, 9, (count, 3), dtype=np.uint8), rng.normal(size=(9, 3)).astype(np.float32),
+        rng.integers(0, 7, (count, 2), dtype=np.uint8), rng.normal(size=(7, 3, 3)).astype(np.float32), (1, 2),
+    )  # fmt: skip
+    coded = replace(tree, harmonics=codes)
+    plain = replace(tree, harmonics=codes.decoded())
+    origins, directions = rays_at(tree, 40)
+    for name in ("colour", "opacity"):
+        assert np.array_equal(getattr(drawn_rays(coded, origins, directions), name), getattr(drawn_rays(plain, origins, directions), name))
+
+
+def test_bricks_carry_a_border_of_their_neighbours() -> None:
+    tree = random_tree(2, brick=3, share=0.6)
+    on_device = cuda.device_tree(tree, DEVICE)
+    edge = tree.brick + 2
+    for cell in np.argwhere(tree.brick_index >= 0):
+        low = cell * tree.brick - 1
+        block = tree.density_block(tuple(low), tuple(low + edge))
+        held = on_device.density[tree.brick_index[tuple(cell)]].reshape(edge, edge, edge).float().cpu().numpy()
+        np.testing.assert_allclose(held, block, rtol=1e-3)
+    assert on_device.bytes > 0
+    assert torch.equal(on_device.grid.cpu() < 0, torch.from_numpy(tree.brick_index < 0))
+
+
+def test_a_picture_is_its_rays() -> None:
+    tree = random_tree(0, share=0.7)
+    camera = looking(tree)
+    picture, flat = drawn(tree, camera), drawn_rays(tree, *rays(camera))
+    assert (np.abs(picture.colour.reshape(-1, 3) - flat.colour) < 1e-3).mean() > 0.99
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("supersample", [1, 2])
+def test_a_tree_on_the_device_renders_as_on_the_cpu(supersample: int) -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    tree = random_tree(4, shape=(20, 18, 22), brick=4, degree=2, share=0.3)
+    camera = looking(tree, 200)
+    seen = tree.to("cuda").render(camera, background=(1.0, 1.0, 1.0), supersample=supersample)
+    agree(seen, tree.render(camera, background=(1.0, 1.0, 1.0), supersample=supersample), faces=0.01)
