@@ -68,6 +68,7 @@ def run(job: Job) -> None:
     lines: list[str] = []
     started, first, loss = clock(), t.step, 0.0
     held_back: float | None = None
+    pace: dict[str, Any] = {}
     working, logged, resumed = 0.0, first, clock()  # seconds of steps alone, since the last line of the log
     for done in training.train(t, pixels, anchors_of(folder, s)):
         working += clock() - resumed
@@ -82,9 +83,13 @@ def run(job: Job) -> None:
         if done.step % LOG_EVERY == 0 or last or drawn is not None:
             lines.append(json.dumps(_line(done, loss, m.voxels.occupied, seconds, working / (done.step - logged), drawn), sort_keys=True))
             working, logged = 0.0, done.step
-        facts = {"psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), "rays": done.rays}
         goal = settings.warm_up + TIMED if m.settings.iterations == MOST else m.settings.iterations
-        job.progress(min(done.step, goal), goal, "training", **facts, **({} if held_back is None else {"held_back_psnr": held_back}))
+        if done.step % LOG_EVERY == 0 or last or not pace:
+            pace = _pace(done, m.voxels.occupied, seconds - spent, done.step - first, goal)
+        facts = {"loss": loss, "psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), **({} if held_back is None else {"held_back_psnr": held_back})}
+        job.progress(min(done.step, goal), goal, "training", **facts, **pace)
+        if drawn is not None:
+            _curve([*_lines(log), *map(json.loads, lines)], job.work / "curve.png")
         if done.step % settings.checkpoint_every == 0 and not last:
             _checkpoint(t, job, log, lines, seconds)
         try:
@@ -227,6 +232,12 @@ def _append(log: Path, lines: list[str]) -> None:
         file.writelines(line + "\n" for line in lines)
 
 
+def _pace(done: Progress, occupied: float, seconds: float, steps: int, goal: int) -> dict[str, Any]:
+    """How fast it goes, for the display: samples of this step at the mean pace so far, the share of valid voxels, and seconds left."""
+    each = max(seconds / max(steps, 1), 1e-9)
+    return {"samples_per_s": round((done.valid + done.fine) / each), "occupied": round(occupied, 4), "left": round(each * max(0, goal - done.step), 1)}
+
+
 def _line(done: Progress, loss: float, occupied: float, seconds: float, step_seconds: float, held_back: float | None) -> dict[str, Any]:
     """seconds: of the stage, pictures and checkpoints included; step_seconds: of a step alone, the mean since the last line."""
     return {
@@ -273,19 +284,22 @@ def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int
     return round(float(psnr(picture, truth)), 2)
 
 
+def _curve(lines: list[dict[str, Any]], path: Path) -> None:
+    """PSNR over steps, of the training rays and of the held-back view: while it trains in the scratch folder, beside the previews, then in the artifact."""
+    from stages.plots import curve
+
+    series = {"training rays, running mean": ([x["step"] for x in lines], [x["psnr"] for x in lines])}
+    held_back = [(x["step"], x["held_back_psnr"]) for x in lines if x.get("held_back_psnr") is not None]
+    if held_back:
+        series["held-back view"] = ([step for step, _ in held_back], [psnr for _, psnr in held_back])
+    curve(path, series, x_label="step", y_label="PSNR / dB")
+
+
 def _publish_log(log: Path, job: Job) -> None:
     import shutil
 
-    from stages.plots import curve
-
-    lines = _lines(log)
     shutil.copyfile(log, job.out / "log.jsonl")
-    curve(
-        job.out / "curve.png",
-        {"training PSNR": ([x["step"] for x in lines], [x["psnr"] for x in lines])},
-        x_label="step",
-        y_label="PSNR / dB",
-    )
+    _curve(_lines(log), job.out / "curve.png")
     previews = sorted(job.work.glob("preview_*.png"))
     if previews:
         (job.out / "previews").mkdir()

@@ -41,7 +41,7 @@ def size(count: float) -> str:
 
 def facts(event: Event) -> str:
     """What an event says beside its text, as `loss 0.0123, psnr 24.1`."""
-    known = {"event", "stage", "time", "done", "total", "text"}
+    known = {"event", "stage", "time", "done", "total", "text", "left"}
     shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in event.items() if name not in known]
     return ", ".join(shown)
 
@@ -103,7 +103,8 @@ class Lines:
         if waited < SECONDS_BETWEEN_LINES and (waited < SECONDS_BETWEEN_TENTHS or share - self.last_share < 0.1):
             return
         self.last_time, self.last_share = now, share
-        words = [f"{share:4.0%}" if total else "", str(event.get("text", "")), facts(event)]
+        left = f"{duration(event['left'])} left" if event.get("left") else ""
+        words = [f"{share:4.0%}" if total else "", str(event.get("text", "")), facts(event), left]
         self._line(stage, "  ".join(word for word in words if word))
 
 

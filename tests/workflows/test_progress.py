@@ -67,6 +67,14 @@ def test_quiet_and_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert [json.loads(line)["event"] for line in out.splitlines()] == ["warning", "stage_failed"]
 
 
+def test_a_line_says_what_time_is_left() -> None:
+    stream = io.StringIO()
+    lines = Lines(stream)
+    lines.last_time = -1e9
+    lines(event("progress", done=1, total=4, text="training", psnr=24.0, left=125.0))
+    assert stream.getvalue() == "train      25%  training  psnr 24  2 min 05 s left\n"
+
+
 def test_every_event_has_its_sentence() -> None:
     assert sentence(event("stage_failed", text="no")) == ""
     assert sentence(event("message", text="12 images")) == "12 images"

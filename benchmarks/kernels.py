@@ -1,0 +1,224 @@
+"""Samples per second of each CPU kernel of the hash field's training step, beside what the machine can load, gather and multiply.
+
+    python benchmarks/kernels.py [--json FILE] [--seconds 1.0] [--threads 1,2]
+
+Each kernel is timed alone, on the sizes of a step of the default preset in its steady state, with one thread and with all; each figure is the best of
+many repetitions within `--seconds`. The floor of a kernel is the larger of two times: what it must move over the measured bandwidth, and what it must
+multiply over the measured rate. Each number of threads is measured in a process of its own, for some libraries read it once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+RAYS, PER_RAY = 8192, 4  # coarse samples; fine ones are about as many
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def best(work: Callable[[], object], seconds: float) -> float:
+    """Shortest of the repetitions, in seconds."""
+    work()
+    shortest, until = float("inf"), time.perf_counter() + seconds
+    while time.perf_counter() < until:
+        began = time.perf_counter()
+        work()
+        shortest = min(shortest, time.perf_counter() - began)
+    return shortest
+
+
+def machine(seconds: float) -> dict[str, float]:
+    """Rates that nothing here can beat: copying, gathering 8-byte entries of a table of 1 MiB and of 12, products of matrices."""
+    import numba
+    import numpy as np
+    import torch
+
+    @numba.njit(parallel=True, error_model="numpy")
+    def gather(table, place, tasks):  # type: ignore[no-untyped-def]
+        total = np.zeros(tasks, np.int64)
+        share = len(place) // tasks
+        for task in numba.prange(tasks):
+            some = np.int64(0)
+            for n in range(task * share, (task + 1) * share):
+                some += table[place[n]]
+            total[task] = some
+        return total
+
+    threads = numba.get_num_threads()
+    large = torch.empty(2**26)  # 256 MiB
+    other = torch.empty_like(large)
+    out = {"copy_bytes": 2 * 4 * len(large) / best(lambda: other.copy_(large), seconds)}
+    place = np.random.default_rng(0).integers(0, 2**17, 2**21).astype(np.uint32)
+    for name, entries in (("gather_1_mib", 2**17), ("gather_12_mib", 12 * 2**17)):
+        table = np.arange(entries)
+        at = (place * np.uint32(entries // 2**17)).astype(np.uint32)
+        out[name] = len(at) / best(lambda table=table, at=at: gather(table, at, threads), seconds)  # type: ignore[misc]
+    for name, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16)):
+        a = torch.randn(1536, 1536).to(dtype)
+        b = torch.randn(1536, 1536).to(dtype)
+        out[f"multiply_{name}"] = 2 * 1536**3 / best(lambda a=a, b=b: a @ b, seconds)  # type: ignore[misc]
+    return out
+
+
+def kernels(seconds: float) -> dict[str, Any]:
+    """name -> samples, seconds, bytes that must be moved at least, multiplications and additions; of one call."""
+    import numpy as np
+    import torch
+
+    from efficientnerf.fields.hash import FEATURES, HashField
+    from efficientnerf.harmonics import basis
+    from efficientnerf.kernels import cpu, cpu_hash, cpu_network, dispatch
+    from efficientnerf.kernels.mlp import has_bfloat16
+    from efficientnerf.settings import TrainSettings
+
+    s = TrainSettings()
+    rng = np.random.default_rng(0)
+    field = HashField(
+        levels=s.levels, log2_table=s.log2_table, coarsest=16, finest=s.finest, hidden=s.hidden, layers=s.layers, degree=s.degree,
+        initial_density=s.initial_density, generator=torch.Generator().manual_seed(0), precision=s.precision,
+    )  # fmt: skip
+    # Samples lie one behind the other on rays that end on a sphere, as those of a trained scene do.
+    count = RAYS * PER_RAY
+    surface = rng.normal(size=(RAYS, 1, 3))
+    surface *= 0.3 / np.linalg.norm(surface, axis=2, keepdims=True)
+    points = torch.from_numpy((0.5 + surface * (1 + 0.01 * np.arange(PER_RAY)[:, None])).reshape(-1, 3).astype(np.float32))
+    across = points.t().contiguous().numpy()
+    features = np.empty((FEATURES * s.levels, count), np.float32)
+    pull = rng.normal(size=features.shape).astype(np.float32)
+    table = field.table.detach().numpy()
+    table_grad = np.zeros_like(table)
+    levels = (field.sides, field.dense, field.starts, field.mask)
+    out: dict[str, Any] = {}
+
+    def add(name: str, samples: int, work: Callable[[], object], moved: float, operations: float = 0.0) -> None:
+        out[name] = {"samples": samples, "seconds": best(work, seconds), "bytes": moved, "operations": operations}
+
+    corners = count * s.levels * 8
+    add("encode", count, lambda: cpu_hash.encode(across, table, *levels, features), corners * 8 + features.nbytes, corners * 4)
+    add("encode backward", count, lambda: cpu_hash.encode_backward(across, pull, *levels, table_grad), corners * 16 + features.nbytes, corners * 4)
+
+    outputs = field.weights[-1].shape[0]
+    towards = torch.randn(count, outputs)
+    products = 2 * count * sum(w.numel() for w in field.weights)
+
+    def passes() -> None:
+        field(points).backward(towards)
+
+    wide = 2 if has_bfloat16("cpu") and s.precision != "float32" else 4
+    activations = wide * count * sum(w.shape[1] for w in field.weights)
+    both = best(passes, seconds)
+    forth = out["encode"]["seconds"] + out["encode backward"]["seconds"]
+    out["network, forward and backward"] = {"samples": count, "seconds": max(both - forth, 0.0), "bytes": 6.0 * activations, "operations": 3.0 * products}
+    out["field, forward and backward"] = {"samples": count, "seconds": both, "bytes": corners * 24 + 6.0 * activations, "operations": 3.0 * products}
+
+    raw, length, first = torch.randn(count, outputs), torch.full((count,), 0.02), torch.arange(0, count + 1, PER_RAY)
+    harmonics = basis(torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1), s.degree)
+    behind = torch.rand(RAYS, 3)
+    packed = [t.numpy() for t in (raw, length, first, harmonics, behind)]
+    colour, opacity, spread = np.empty((RAYS, 3), np.float32), np.empty(RAYS, np.float32), np.empty(RAYS, np.float32)
+    weight, rgb = np.empty(count, np.float32), np.empty((count, 3), np.float32)
+    grad_raw, grad_behind, ones = np.empty(raw.shape, np.float32), np.empty((RAYS, 3), np.float32), np.ones(count, np.float32)
+    seen = (weight, rgb)
+    add("composite", count, lambda: cpu.composite(*packed, True, colour, opacity, spread, *seen), packed[0].nbytes + 16 * count)
+    add(
+        "composite backward", count,
+        lambda: cpu.composite_backward(*packed, True, *seen, colour, opacity, spread, ones, grad_raw, grad_behind), 2 * packed[0].nbytes + 16 * count,
+    )  # fmt: skip
+
+    side = s.voxels or 128
+    axis = (torch.arange(side) + 0.5) / side * 2 - 1
+    away = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
+    voxels = ((away - 0.6).abs() < 0.04).float()
+    from efficientnerf.grid import Space
+
+    space = Space(np.array([[-1.0] * 3, [1.0] * 3]), False)
+    origins = torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1) * 4
+    directions = torch.nn.functional.normalize(torch.rand(RAYS, 3) - 0.5 - origins, dim=1)
+    near, far, offset = torch.full((RAYS,), 2.0), torch.full((RAYS,), 6.0), torch.rand(RAYS)
+    step = 2 * 3**0.5 / s.coarse_samples
+    marched = (space, origins, directions, near, far, offset, step, s.coarse_samples + 1, voxels, 0.5)
+    samples = dispatch.valid_samples(*marched)
+    add("march (intervals)", samples.tried, lambda: dispatch.valid_samples(*marched), samples.tried * 4 + len(samples.start) * 24)
+
+    value, first_moment, second_moment = (np.zeros(table.size, np.float32) for _ in range(3))
+    kept = np.where(np.repeat(rng.random(table.size // 2) < 0.65, 2), 1.0, 0.0).astype(np.float32)
+    grad = kept.copy()
+    refill = best(lambda: np.copyto(grad, kept), seconds / 4)
+    numbers = [np.float32(x) for x in (0.01, 0.9, 0.99, 0.5, 0.5, 1e-15)]
+
+    def adam() -> None:
+        np.copyto(grad, kept)
+        cpu_network.adam(value, grad, first_moment, second_moment, *numbers, True)
+
+    out["Adam (entries of the table)"] = {"samples": len(table), "seconds": best(adam, seconds) - refill, "bytes": 7.0 * grad.nbytes, "operations": 0.0}
+    return out
+
+
+def measured(seconds: float) -> dict[str, Any]:
+    """Both, with the threads of this process."""
+    import torch
+
+    from efficientnerf.kernels.mlp import has_bfloat16
+
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+    rates = machine(seconds)
+    rate = rates["multiply_bfloat16" if has_bfloat16("cpu") else "multiply_float32"]
+    found = kernels(seconds)
+    for row in found.values():
+        row["samples_per_second"] = row["samples"] / row["seconds"]
+        row["floor_seconds"] = max(row["bytes"] / rates["copy_bytes"], row["operations"] / rate)
+        row["share_of_floor"] = row["floor_seconds"] / row["seconds"]
+    return {"machine": rates, "kernels": found}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="where to write the figures")
+    parser.add_argument("--seconds", type=float, default=1.0, help="for each kernel and number of threads")
+    parser.add_argument("--threads", default=f"1,{len(os.sched_getaffinity(0))}", help="numbers of threads, with commas")
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        print(json.dumps(measured(arguments.seconds)))
+        return
+    load = os.getloadavg()
+    found: dict[str, Any] = {}
+    for threads in dict.fromkeys(arguments.threads.split(",")):
+        environment = {**os.environ, "OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads, "OMP_WAIT_POLICY": "PASSIVE"}
+        command = [sys.executable, __file__, "--child", "--seconds", str(arguments.seconds)]
+        done = subprocess.run(command, env={**environment, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True, check=True)
+        found[threads] = json.loads(done.stdout.splitlines()[-1])
+    one, most = found[next(iter(found))], found[list(found)[-1]]
+    print(f"{'':32}{'Msamples/s':>12}{'of floor':>10}{'scaling':>9}")
+    for name, row in one["kernels"].items():
+        row["scaling"] = most["kernels"][name]["samples_per_second"] / row["samples_per_second"]
+        print(f"{name:32}{row['samples_per_second'] / 1e6:12.2f}{row['share_of_floor']:10.0%}{row['scaling']:9.2f}")
+    print("  ".join(f"{name} {rate / 1e9:.2f} G/s (x{most['machine'][name] / rate:.2f})" for name, rate in one["machine"].items()))
+    if arguments.json:
+        report = {
+            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+            "processor": _processor(), "cores": len(os.sched_getaffinity(0)), "load_before": load, "load_after": os.getloadavg(),
+            "python": platform.python_version(), "versions": {name: version(name) for name in ("torch", "numba", "numpy")}, "threads": found,
+        }  # fmt: skip
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+def _processor() -> str:
+    try:
+        return next(line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or "unknown"
+
+
+if __name__ == "__main__":
+    main()
