@@ -6,6 +6,9 @@ into a shell (Barron et al. 2022, "Mip-NeRF 360", equation 10, with the maximum 
     c(u) = u                             |u|_inf <= 1
     c(u) = (2 - 1 / |u|_inf) u / |u|_inf   otherwise
 
+Forward-facing captures lie in normalised device coordinates instead (`efficientnerf.ndc`): there the box is one of that frame, which reaches to
+infinity, and rays of the world are warped before anything else is asked. "The space's frame" is that one, and the world in all other spaces.
+
 Grid coordinates g run over [0, 1]^3: the box alone, or box and shell.
 """
 
@@ -13,22 +16,53 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from efficientnerf.ndc import Ndc, warped_distance, world_distance
+
+
+class FrameRays(NamedTuple):
+    """Rays in a space's own frame.
+
+    origins, directions, near, far  (R, 3), (R, 3) unit, (R,), (R,) in units of the frame
+    warp                            begin, pace, bend of `efficientnerf.ndc`, (R,) each; None where the frame is the world
+    """
+
+    origins: Tensor
+    directions: Tensor
+    near: Tensor
+    far: Tensor
+    warp: tuple[Tensor, Tensor, Tensor] | None
+
+    def world(self, along: Tensor, ray: Tensor) -> Tensor:
+        """Distances (N,) in the frame along the rays `ray` (N,) to distances in the world."""
+        return along if self.warp is None else world_distance(along, *(part[ray] for part in self.warp))
+
+    def frame(self, distance: Tensor) -> Tensor:
+        """World distances (R,), one to a ray, to distances in the frame."""
+        return distance if self.warp is None else warped_distance(distance, *self.warp)
 
 
 @dataclass(frozen=True, eq=False)
 class Space:
     """The volume that a field is asked about.
 
-    bounds      (2, 3) the box, world units
+    bounds      (2, 3) the box, in the space's frame
     contracted  whether space beyond the box belongs to it
+    ndc         the reference camera of a space in normalised device coordinates, which is never contracted; None: the frame is the world
     """
 
     bounds: np.ndarray
     contracted: bool
+    ndc: Ndc | None = None
+
+    def __post_init__(self) -> None:
+        if self.contracted and self.ndc is not None:
+            raise ValueError("a space in normalised device coordinates reaches to infinity by itself; it cannot be contracted")
 
     @cached_property
     def centre(self) -> np.ndarray:
@@ -44,21 +78,31 @@ class Space:
         """Largest contracted coordinate."""
         return 2.0 if self.contracted else 1.0
 
+    def rays(self, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> FrameRays:
+        """World rays (R, 3), unit directions, between distances near and far (R,), in the space's frame.
+
+        In normalised device coordinates they run from the near plane to infinity, whatever near and far say.
+        """
+        if self.ndc is None:
+            return FrameRays(origins, directions, near, far, None)
+        start, along, *warp = self.ndc.rays(origins, directions)
+        return FrameRays(start, along, torch.zeros_like(near), torch.full_like(far, 1e6), (warp[0], warp[1], warp[2]))
+
     def unit(self, points: Tensor) -> Tensor:
-        """World points (..., 3) to unit coordinates."""
+        """Points (..., 3) of the space's frame to unit coordinates."""
         centre = torch.as_tensor(self.centre, dtype=points.dtype, device=points.device)
         half = torch.as_tensor(self.half, dtype=points.dtype, device=points.device)
         return (points - centre) / half
 
     def grid(self, points: Tensor) -> Tensor:
-        """World points (..., 3) to grid coordinates, in [0, 1] wherever the space reaches."""
+        """Points (..., 3) of the space's frame to grid coordinates, in [0, 1] wherever the space reaches."""
         u = self.unit(points)
         if self.contracted:
             u = contract(u)
         return (u + self.reach) / (2 * self.reach)
 
     def world(self, grid: Tensor) -> Tensor:
-        """Grid coordinates (..., 3) to world points: the inverse of `grid`."""
+        """Grid coordinates (..., 3) to points of the space's frame: the inverse of `grid`."""
         c = grid * (2 * self.reach) - self.reach
         if self.contracted:
             c = uncontract(c)

@@ -15,7 +15,7 @@ from efficientnerf.density import DensityVoxels, density_voxels
 from efficientnerf.fields.hash import HashField
 from efficientnerf.fields.mlp import MlpField
 from efficientnerf.fields.nerf import NerfField
-from efficientnerf.grid import Space
+from efficientnerf.grid import FrameRays, Space
 from efficientnerf.harmonics import basis, harmonics_count
 from efficientnerf.kernels import dispatch
 from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples, united
@@ -23,6 +23,7 @@ from efficientnerf.settings import TrainSettings
 
 SKY_DEGREE = 2
 COARSEST = 16
+UNSEEN = 0.5  # grey: what is drawn behind a space that reaches to infinity, where nothing can lie
 
 AnyField = HashField | MlpField | NerfField
 
@@ -77,16 +78,17 @@ class Model:
     def behind(self, directions: Tensor) -> Tensor:
         """Colour (R, 3) beyond all samples."""
         if self.background is None:
-            return self.sky(directions)
+            return self.sky(directions) if self.space.ndc is None else torch.full_like(directions, UNSEEN)
         return torch.tensor(self.background, device=directions.device).expand(len(directions), 3)
 
 
 class Look(NamedTuple):
     """What one bundle of rays met: samples of both stages, what the fields said, and whether each coarse sample was pivotal.
 
-    Uniform sampling has no coarse stage: no coarse samples then, and no coarse colour.
+    Uniform sampling has no coarse stage: no coarse samples then, and no coarse colour. Samples lie on `rays`, in the frame of the space.
     """
 
+    rays: FrameRays
     coarse: Samples
     coarse_raw: Tensor
     coarse_weight: Tensor
@@ -111,7 +113,10 @@ def model(
     if settings.far > 0 and (span is None or space.contracted):
         raise ValueError("train.near and train.far need a scene on a constant background. Leave them 0.")
     span = span if settings.far > 0 else None
-    step = (diagonal if span is None else span[1] - span[0]) / settings.coarse_samples
+    reach = diagonal if span is None else span[1] - span[0]
+    if space.ndc is not None:  # of a cube as deep as the box: depth, not width, is what is sampled
+        reach = 2 * math.sqrt(3) * float(space.half[2])
+    step = reach / settings.coarse_samples
     slots = math.ceil(diagonal / step) + 1
     if space.contracted:
         # In front of the box and behind it: the contracted distance from the edge of space to the box and back, in steps, with some room
@@ -162,13 +167,14 @@ def look(
                          free to put matter where this ray has no pivot and another has one, and the baked asset, which has no coarse
                          stage to hide it, would show it.
     """
-    bundle = (origins, directions, near, far)
+    rays = m.space.rays(origins, directions, near, far)
+    bundle = (rays.origins, rays.directions, rays.near, rays.far)
     if m.settings.sampling == "uniform":
         samples, _ = _even_samples(m, *bundle, offset, m.settings.coarse_samples + m.settings.importance_samples, rng)
         raw, out = _seen(m.fine, directions, samples, behind)
         nothing = samples.start[:0]
         none = Samples(torch.zeros_like(samples.first), nothing, nothing, nothing, samples.point[:0], samples.tried)
-        return Look(none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
+        return Look(rays, none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
     if m.settings.sampling == "hierarchical":
         coarse, at = _even_samples(m, *bundle, offset, m.settings.coarse_samples, rng)
     else:
@@ -180,12 +186,12 @@ def look(
     if m.settings.sampling == "efficient":
         if rng is not None and m.settings.explored > 0:
             pivotal = pivotal | torch.from_numpy(rng.random(len(pivotal), np.float32) < m.settings.explored).to(pivotal.device)
-        fine = dispatch.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, m.settings.fine_samples)
+        fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, m.settings.fine_samples)
     else:
         quantile = _strata(len(origins), m.settings.importance_samples, rng, offset.device)
-        fine = importance_samples(m.space, origins, directions, coarse, at, weight, quantile)
+        fine = importance_samples(m.space, *bundle[:2], coarse, at, weight, quantile)
     fine_raw, out = _seen(m.fine, directions, fine, behind)
-    return Look(coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
+    return Look(rays, coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
 
 
 def _seen(field: AnyField, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:

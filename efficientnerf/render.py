@@ -34,14 +34,44 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
 
     if supersample < 1:
         raise ValueError(f"supersample {supersample}: expected at least 1")
+    behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
+    if behind.shape != (3,):
+        raise ValueError(f"background {background}: expected three numbers, red, green and blue")
+    if tree.ndc is not None:
+        return _render_by_rays(tree, camera, behind, supersample)
     if tree.device != "cpu" and dispatch.triton_usable():
         from efficientnerf.kernels.cuda_tree import draw
 
         return Rendering(*(part.cpu().numpy() for part in draw(tree.on_device, camera, background=background, supersample=supersample)))
-    behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
-    if behind.shape != (3,):
-        raise ValueError(f"background {background}: expected three numbers, red, green and blue")
     return Rendering(*render_picture(tree, camera, supersample, behind, normals=True, rays_per_band=RAYS_PER_BAND))
+
+
+def _render_by_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, supersample: int) -> Rendering:
+    """A picture of a tree whose frame is not the world, band by band of `NerfTree.render_rays`: rays of one camera part there."""
+    from efficientnerf.nerftree.tree import Rendering
+
+    height, width, n = camera.height, camera.width, supersample
+    bands = []
+    step = max(1, RAYS_PER_BAND // 4 // (width * n**2))
+    for top in range(0, height, step):
+        y, x = np.mgrid[top * n : min(height, top + step) * n, 0 : width * n]
+        origins, directions = rays(camera, (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) / n)
+        part = tree.render_rays(origins, directions)
+        along = (part.depth * (directions @ camera.forward)).astype(np.float32)
+        values = np.concatenate([part.colour, part.opacity[:, None], along[:, None], part.normal], axis=1, dtype=np.float32)
+        rows = len(y) // n
+        bands.append(values.reshape(rows, n, width, n, 8).swapaxes(1, 2).reshape(rows, width, n * n, 8))
+    samples = np.concatenate(bands)  # (H, W, n^2, 8)
+    colour, opacity = samples[..., :3].mean(axis=2), samples[..., 3].mean(axis=2)
+    # The nearest half of the samples decides; the mean of a near and a far surface would lie on neither.
+    near = np.sort(samples[..., 4], axis=2)
+    middle = np.clip(np.isfinite(near).sum(axis=2, keepdims=True) - 1, 0, (n * n - 1) // 2)  # less than half may do, where others are half transparent
+    depth = np.take_along_axis(near, middle, axis=2)[..., 0]
+    facing = samples[..., 5:].sum(axis=2)
+    normal = facing / np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-12)
+    depth[opacity < 0.5] = np.inf
+    normal[opacity < 0.5] = 0
+    return Rendering(colour + (1 - opacity[..., None]) * behind, opacity, depth, normal)
 
 
 @dataclass(frozen=True)
@@ -129,6 +159,7 @@ def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, s
     count = len(origins)
     ray = ray_of_sample(seen.fine.first, len(seen.fine.start))
     middle = seen.fine.start + seen.fine.extent / 2
+    origins, directions = seen.rays.origins, seen.rays.directions
     u = m.space.unit(origins)
     du = directions / torch.as_tensor(m.space.half, dtype=directions.dtype, device=directions.device)
     du = torch.where(du.abs() < 1e-12, torch.full_like(du, 1e-12), du)
@@ -156,7 +187,7 @@ def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, s
     # Depth: the first sample at which half of the light is gone.
     gone = torch.cumsum(seen.fine_weight.double(), dim=0)
     gone = gone - torch.cat([gone.new_zeros(1), gone])[seen.fine.first[:-1]][ray]
-    depth = torch.full_like(slant, torch.inf).scatter_reduce(0, ray, torch.where(gone >= 0.5, middle, torch.inf), reduce="amin")
+    depth = torch.full_like(slant, torch.inf).scatter_reduce(0, ray, torch.where(gone >= 0.5, seen.rays.world(middle, ray), torch.inf), reduce="amin")
     return seen.fine_colour, seen.fine_opacity, depth * slant, torch.cat([before, before_opacity[:, None]], dim=1), beyond_colour, inside.clamp(max=1)
 
 
@@ -200,6 +231,8 @@ def render_tree_reference(
     device, dtype = origins.device, origins.dtype
     density = torch.as_tensor(tree.density_values, device=device, dtype=dtype) if density is None else density
     sh = torch.as_tensor(tree.sh, device=device, dtype=dtype) if sh is None else sh
+    looking = directions
+    origins, directions, *_ = tree.frame_rays(origins, directions)
     start = (origins - torch.as_tensor(tree.bounds_min, device=device, dtype=dtype)) / tree.voxel
     size = torch.tensor(tree.resolution, device=device, dtype=dtype)
     to_low, to_high = -start / directions, (size - start) / directions
@@ -209,7 +242,7 @@ def render_tree_reference(
     count = max(0, int(torch.ceil((leave - enter).clamp(min=0).max() / step).item()) + 1) if len(enter) else 0
     light = torch.ones_like(enter)
     colour = torch.zeros(len(enter), 3, device=device, dtype=dtype)
-    harmonics = basis(directions, tree.degree)
+    harmonics = basis(looking, tree.degree)
     for k in range(count):
         t = enter + (k + 0.5) * step
         sigma, index, weight = tree_density(tree, start + t[:, None] * directions, density)

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from .frame import FrameTree
 from .mesh import Mesh, PointCloud, compact, decimate, face_areas, face_components, face_volumes, sample, separate, smooth, tidy, vertex_normals
 
 Progress = Callable[[int, int, str], None]
+Looking = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 BLOCK = 64  # voxels a side that are in memory at a time
 _CHUNK = 1 << 16  # points whose colours are looked up at a time
 
@@ -247,12 +249,13 @@ def _crossings(point: np.ndarray, triangles: np.ndarray) -> int:
     return int(((weight * (triangles[hit, :, 0] - point[0])).sum(1) > 0).sum())
 
 
-def surface_colours(tree: Any, positions: np.ndarray, normals: np.ndarray, progress: Progress = _silent) -> np.ndarray:
+def surface_colours(tree: Any, positions: np.ndarray, normals: np.ndarray, progress: Progress = _silent, looking: Looking | None = None) -> np.ndarray:
     """(N, 3) float32 sRGB of surface points, as seen from outside.
 
     Along the inward normal, from one voxel in front of the point to two behind it, colours are weighted as a ray would weigh them: a single
     sample on the surface mixes with the colour of empty voxels. Each is the median over six viewing directions, one head on and five at
-    45 degrees, so that neither a highlight nor a direction that no camera looked along decides.
+    45 degrees, so that neither a highlight nor a direction that no camera looked along decides; or over those that `looking` gives for
+    points and normals.
     """
     colours = np.empty((len(positions), 3), np.float32)
     steps = np.linspace(-1.0, 2.0, 7) * float(tree.voxel)  # (S,)
@@ -269,7 +272,7 @@ def surface_colours(tree: Any, positions: np.ndarray, normals: np.ndarray, progr
         share = np.take_along_axis(weight, best, 1)
         chosen = np.take_along_axis(samples, best[..., None], 1).reshape(-1, 3)
         seen = []
-        for direction in _looking_at(normal):
+        for direction in _looking_at(normal) if looking is None else looking(point, normal):
             along = np.repeat(direction, best.shape[1], 0)
             found = np.asarray(tree.colour(chosen, along), np.float64).reshape(-1, best.shape[1], 3)
             seen.append((found * share[..., None]).sum(1) / share.sum(1, keepdims=True))
@@ -325,14 +328,25 @@ def surface(
     viewpoints     (N, 3) where somebody may look from who is inside the volume: what can be seen from there is not filled
     progress       called with (done, total, text); what it raises stops the work
 
+    Of a forward-facing tree it is the surface in normalised device coordinates (budget, rounds and sizes of pieces count there), in the world.
+
     Raises NoSurface.
     """
+    if (frame := _frame_of(tree)) is not None:
+        tree, viewpoints = frame, _NOBODY  # the cameras stand before the near plane, outside of the volume
     vertices, triangles, facts = _shape(tree, threshold, min_component, rounds, viewpoints, progress)
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints)  # crumbs that had hung on by an edge
     normals = vertex_normals(vertices, triangles)
-    return Mesh(vertices, triangles, normals, surface_colours(tree, vertices, normals, progress), facts)
+    colours = surface_colours(tree, vertices, normals, progress, None if frame is None else frame.looking)
+    mesh = Mesh(vertices, triangles, normals, colours, facts)
+    return mesh if frame is None else frame.mesh(mesh)
+
+
+def _frame_of(tree: Any) -> FrameTree | None:
+    """The tree in its normalised device coordinates, if that is where it lies."""
+    return None if getattr(tree, "ndc", None) is None else FrameTree(tree)
 
 
 def points(
@@ -348,8 +362,11 @@ def points(
 ) -> PointCloud:
     """`count` points spread evenly over the tree's surface (before decimation), with normals and colours. Raises NoSurface.
 
-    The same for the same seed; the other arguments as for `surface`.
+    The same for the same seed; the other arguments as for `surface`. Of a forward-facing tree they are spread evenly in normalised device
+    coordinates, as pictures show them: sparser in the world the further they are.
     """
+    if (frame := _frame_of(tree)) is not None:
+        tree, viewpoints = frame, _NOBODY
     vertices, triangles, _ = _shape(tree, threshold, min_component, rounds, viewpoints, progress)
     face, weight = sample(vertices, triangles, count, seed)
     corners = triangles[face]  # (N, 3)
@@ -357,4 +374,5 @@ def points(
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), vertex_normals(vertices, triangles)[corners[:, 0]])
     positions = (vertices[corners] * weight[..., None]).sum(1)
-    return PointCloud(positions, normals, surface_colours(tree, positions, normals, progress))
+    cloud = PointCloud(positions, normals, surface_colours(tree, positions, normals, progress, None if frame is None else frame.looking))
+    return cloud if frame is None else frame.points(cloud)

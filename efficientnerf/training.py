@@ -184,6 +184,9 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         origins, directions, near, far, colour = (torch.from_numpy(a).to(device) for a in pixels.bundle(chosen))
         offset = torch.from_numpy(rng.random(count, np.float32)).to(device)
         behind = m.behind(directions)
+        if m.space.ndc is not None and m.background is None:
+            # Behind a space that reaches to infinity nothing lies: a new colour for each ray keeps the field from leaving it half transparent.
+            behind = torch.from_numpy(rng.random((count, 3), np.float32)).to(device)
         if transparent:
             if settings.backdrop == "random" or m.background is None:
                 # Behind an object cut out of its background anything may lie: a new colour for each ray keeps the field from learning one.
@@ -201,9 +204,12 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         loss = fine_loss if coarse_colour is None else fine_loss + ((coarse_colour - colour) ** 2).mean()
         if t.exposure is not None:
             loss = loss + exposure_loss(t.exposure)
-        if m.space.contracted:
-            loss = loss + settings.distortion * seen.distortion.mean()
-            _quieten_near_cameras(m, origins, seen)
+        if m.space.contracted or m.space.ndc is not None:
+            # In normalised device coordinates it grows from nothing: at first it would gather all matter on the near plane, where cameras overlap least.
+            share = 1.0 if m.space.contracted else share_of_fall(number, settings.iterations, settings.rate_hold)
+            loss = loss + share * settings.distortion * seen.distortion.mean()
+            if m.space.contracted:  # in normalised device coordinates rays do not crowd together before the cameras
+                _quieten_near_cameras(m, origins, seen)
             strength = settings.anchors * max(0.0, 1 - 2 * share_of_fall(number, settings.iterations, settings.rate_hold))
             if anchors is not None and strength > 0:
                 loss = loss + strength * anchor_loss(m, anchors, max(1, count // ANCHOR_SHARE), rng, prune=number > settings.warm_up)
@@ -240,6 +246,7 @@ def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator
     offset = torch.from_numpy(rng.random(count, np.float32)).to(m.device)
     near, far = 0.1 * distance, 4 * distance
     seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng)
+    distance = seen.rays.frame(distance)
     loss = origins.new_zeros(())
     for samples, weight, share in ((seen.coarse, seen.coarse_weight, 1), (seen.fine, seen.fine_weight, m.settings.fine_samples)):
         ray = ray_of_sample(samples.first, len(samples.start))

@@ -19,9 +19,11 @@ from pipeline.stage import Job, Stage
 from stages.settings import setting
 
 if TYPE_CHECKING:
+    from stages.forward import Forward
     from stages.scene import Scene
 
 ASSET = "asset.nerftree"
+FORWARD_ROOM = 2
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,9 @@ def run(job: Job) -> None:
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
     resolution = settings.resolution or chosen_resolution(s, settings.max_resolution)
-    shape, voxel = baking.grid_of(s.bounds, resolution, settings.brick)
-    low = np.asarray(s.bounds[0], np.float64)
+    bounds = m.space.bounds
+    shape, voxel = baking.grid_of(bounds, resolution, settings.brick)
+    low = np.asarray(bounds[0], np.float64)
 
     indices = _kept(job, s, m, shape, voxel, low)
     if not len(indices):
@@ -71,7 +74,8 @@ def run(job: Job) -> None:
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
     density, sh = _values(job, m, indices, voxel, low)
-    tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=metadata_of(s, settings, m))
+    facts = metadata_of(s, settings, m)
+    tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc)
     format.save(tree, job.out / ASSET, settings.layout)
     size = (job.out / ASSET).stat().st_size
     report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size}
@@ -79,7 +83,16 @@ def run(job: Job) -> None:
 
 
 def chosen_resolution(s: Scene, most: int) -> int:
-    """Voxels along the longest side of the box, so that a voxel covers about three quarters of a pixel at the box's centre, for the median camera."""
+    """Voxels along the longest side of the box, so that a voxel covers about three quarters of a pixel at the box's centre, for the median camera.
+
+    In normalised device coordinates a voxel is as wide as a pixel, and FORWARD_ROOM times as many voxels are let be: their box is as wide as
+    the surroundings, and nearly empty.
+    """
+    if s.forward is not None:
+        # In normalised device coordinates a pixel is as wide at any depth.
+        wide = s.forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
+        side = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
+        return int(np.clip(round(side / wide), 32, FORWARD_ROOM * most))
     centre = np.asarray(s.bounds, np.float64).mean(axis=0)
     footprints = []
     for view in s.views:
@@ -112,6 +125,7 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
             "heading": float(orbit.heading),
         },
         "metric": bool(s.metric),
+        **({} if s.forward is None else {"spiral": spiral_of(s.forward)}),
         "licence": settings.licence,
         "provenance": {
             "tool": f"efficientnerf {tool}",
@@ -119,6 +133,16 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
             "training_views": sum(v.split == "train" for v in s.views),
             "iterations": m.settings.iterations,
         },
+    }
+
+
+def spiral_of(forward: Forward) -> dict[str, Any]:
+    """What a camera path before a forward-facing scene has to know; see FORMAT.md."""
+    return {
+        "radii": [float(x) for x in forward.radii],
+        "focus": float(forward.focus),
+        "tangents": [float(x) for x in forward.tangents],
+        "far": float(forward.far),
     }
 
 

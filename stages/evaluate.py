@@ -95,7 +95,7 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
         job.progress(k, len(views), f"view {view.name}")
         done = job.work / f"view_{k:05d}.json"
         if not done.exists():
-            needs_field = k in drawn or scene.background is None
+            needs_field = k in drawn or behind_of(scene) is None
             field = field or (load_field() if needs_field else None)
             measured, pictures = measure(tree, field, scene, view, job, drawn=k in drawn, stride=stride if k in drawn else rest)
             if k in drawn:
@@ -103,7 +103,7 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
             _write_json(measured, done)
         figures.append(json.loads(done.read_text(encoding="utf-8")))
     job.progress(len(views), len(views))
-    metrics = summary(figures, split=split, stride=stride, background=rest if scene.background is None else None)
+    metrics = summary(figures, split=split, stride=stride, background=rest if behind_of(scene) is None else None)
     _write_json(metrics, job.out / "metrics.json")
     _write_sheet(metrics, sorted(drawn), job)
 
@@ -189,25 +189,33 @@ def measure(tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn:
     from stages.plots import eight_bits, error_picture
 
     truth = truth_of(job.inputs["poses"], view, scene.background)
+    plain = behind_of(scene)
     figures: dict[str, Any] = {"name": view.name, "network": None}
     pictures: list[np.ndarray] = []
     rendering = None
-    if drawn or scene.background is None:
+    if drawn or plain is None:
         rendering = field.render(thinned_camera(view.camera, stride), progress=lambda *_: job.safe_point())
     if drawn and rendering is not None:
         small = Truth(thinned(truth.colour, stride), *(None if m is None else thinned(m, stride) for m in (truth.mask, truth.inside)))
-        inside = small.inside if scene.background is not None else rendering.inside_opacity >= 0.5
+        inside = small.inside if plain is not None else rendering.inside_opacity >= 0.5
         network = _clean(rendering.colour, job, f"{view.name}: the network")
         figures["network"] = {**compare(network, small, inside), "width": network.shape[1], "height": network.shape[0], **shares(rendering.counts)}
         pictures += [eight_bits(small.colour), eight_bits(network), error_picture(network, small.colour)]
     asset, inside = asset_picture(tree, scene, view, rendering, stride)
     asset = _clean(asset, job, f"{view.name}: the asset")
     figures["asset"] = {**compare(asset, truth, truth.inside if inside is None else inside), "width": view.camera.width, "height": view.camera.height}
-    if scene.background is None:
+    if plain is None:
         figures["asset"]["background_scale"] = 1.0 / stride
     if figures["asset"]["psnr"] is None:
         job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
     return figures, [*pictures, eight_bits(asset), error_picture(asset, truth.colour)]
+
+
+def behind_of(scene: Scene) -> tuple[float, float, float] | None:
+    """The constant colour behind the asset, where all that the pictures show lies in it; None where the network knows what lies beyond."""
+    from efficientnerf.model import UNSEEN
+
+    return scene.background if scene.background is not None or scene.forward is None else (UNSEEN, UNSEEN, UNSEEN)
 
 
 SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
@@ -223,8 +231,8 @@ def asset_picture(tree: Any, scene: Scene, view: View, rendering: Any, stride: i
 
     On photographs: before + (1 - before's alpha) (asset + (1 - asset's alpha) behind), with the network's before and behind.
     """
-    if scene.background is not None:
-        return tree.render(view.camera, background=scene.background).colour, None
+    if (plain := behind_of(scene)) is not None:
+        return tree.render(view.camera, background=plain).colour, None
     seen = tree.render(view.camera)
     size = (stride, view.camera.width, view.camera.height)
     before, behind = thickened(rendering.before, *size), thickened(rendering.behind, *size)

@@ -18,8 +18,10 @@ from stages.exporters.aside import written_aside
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from efficientnerf.grid import Space
     from efficientnerf.model import Model
     from efficientnerf.render import FieldRenderer
+    from stages.scene import Scene
 
 FILE = "field.safetensors"
 FORMAT = 1
@@ -62,6 +64,13 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, about
 
 
+def space_of(s: Scene) -> Space:
+    """The space that a scene's field lives in."""
+    from efficientnerf.grid import Space
+
+    return Space(s.bounds, s.contracted) if s.forward is None else Space(s.forward.bounds, False, s.forward.ndc)
+
+
 def save_model(m: Model, near: float, far: float, path: Path) -> None:
     from efficientnerf.model import state_of
 
@@ -69,6 +78,7 @@ def save_model(m: Model, near: float, far: float, path: Path) -> None:
         "settings": dataclasses.asdict(m.settings),
         "bounds": m.space.bounds.tolist(),
         "contracted": m.space.contracted,
+        "ndc": None if m.space.ndc is None else m.space.ndc.to_json(),
         "background": m.background,
         "near": near,
         "far": far,
@@ -80,13 +90,15 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     """The trained model in the folder of the train stage, ready to draw."""
     from efficientnerf.grid import Space
     from efficientnerf.model import model, restore
+    from efficientnerf.ndc import Ndc
     from efficientnerf.render import FieldRenderer
 
     path = folder / FILE
     tensors, about = read_tensors(path)
     try:
         background = about["background"]
-        space = Space(np.asarray(about["bounds"], np.float64).reshape(2, 3), bool(about["contracted"]))
+        ndc = None if about.get("ndc") is None else Ndc.from_json(about["ndc"])
+        space = Space(np.asarray(about["bounds"], np.float64).reshape(2, 3), bool(about["contracted"]), ndc)
         span = (float(about["near"]), float(about["far"]))
         m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device, span)
         restore(m, tensors)

@@ -15,6 +15,7 @@ from efficientnerf.cameras import Camera, Similarity, project
 from pipeline.errors import BadInput
 from stages import extent
 from stages.capture import Capture
+from stages.forward import Forward, content_depths, forward_of
 from stages.scene import Orbit
 
 UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
@@ -30,6 +31,8 @@ class Framing:
     bounds              (2, 3) the box of interest in the training frame, centred on the origin, largest half extent 1
     orbit               how the cameras stand around the subject, training frame
     near_far            (C, 2) per photo, along the view axis, training frame
+    space               "box", "contracted" or "ndc"
+    forward             the reference camera and its box, with ndc alone
     facts               how it was found, for the report
     """
 
@@ -37,18 +40,21 @@ class Framing:
     bounds: np.ndarray
     orbit: Orbit
     near_far: np.ndarray
+    space: str
+    forward: Forward | None
     facts: dict[str, object]
 
 
-def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05) -> Framing:
+def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto") -> Framing:
     """Choose the training frame and the box of interest.
 
     up      "auto", or an axis of the capture's frame ("z", "-y", ...) that points up
     box     six numbers in the capture's frame, x y z of one corner and of the opposite one; None: estimated
     margin  room left on every side of the sparse points, as a fraction of their longest side: what they miss (bare rims) does not depend on
             the direction. Other boxes get none: silhouettes bound the subject from outside
+    space   "auto", or what the space of the field shall be
 
-    Raises BadInput for an empty box or an unknown axis.
+    Raises BadInput for an empty box or an unknown axis, and for ndc where the cameras do not all look the same way.
     """
     cameras = [photo.camera for photo in capture.photos]
     if not cameras:
@@ -81,7 +87,23 @@ def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = N
         "converging": converging,
         "scale": float(scale),
     }
-    return Framing(world, bounds, orbit, near_far(capture, placed, world, bounds), facts)
+    space, forward, facts["space_from"] = space_of(capture, placed, world, space)
+    facts["space"] = space
+    return Framing(world, bounds, orbit, near_far(capture, placed, world, bounds), space, forward, facts)
+
+
+def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choice: str) -> tuple[str, Forward | None, str]:
+    """The space of the field, the forward-facing capture where it is ndc, and how it was chosen."""
+    usual = "contracted" if capture.background is None else "box"
+    if choice in ("box", "contracted") or (choice == "auto" and (capture.kind != "llff" or capture.background is not None)):
+        return (usual, None, "usual for this kind of source") if choice == "auto" else (choice, None, "given")
+    points, observers = (None, ()) if capture.points is None else (world.points(capture.points.xyz), capture.points.observers)
+    found = forward_of(placed, content_depths(capture.photos, placed, world.scale, points, observers))
+    if isinstance(found, Forward):
+        return "ndc", found, "given" if choice == "ndc" else "all cameras look the same way"
+    if choice == "ndc":
+        raise BadInput(f"poses.space ndc: {found}. Choose contracted or box, or leave it out.")
+    return usual, None, found
 
 
 def up_vector(capture: Capture, choice: str) -> tuple[np.ndarray, bool]:

@@ -16,12 +16,15 @@ from pipeline.files import Unreadable, read_json
 from stages.scene import Orbit
 
 if TYPE_CHECKING:
+    from efficientnerf.ndc import Ndc
     from efficientnerf.nerftree.tree import NerfTree
 
 WIDEST_FIT = 50.0  # degrees: beyond it a picture is all perspective, so the camera steps back instead
 ROOM = 1.1  # air around what is shown
 STRAYS = 0.005  # share of the occupied cells that may leave the picture: specks at the edge of the box do not decide how large the subject is
 FIT_POINTS = 4000
+SPIRAL_TURNS = 2
+SPIRAL_VIEW = 0.95  # of the field of view that all pictures cover: what a spiral shows, so that it seldom leaves them
 LARGEST_FILE = 64 << 20
 LARGEST_SIDE = 16384
 LARGEST_COUNT = 100_000
@@ -96,13 +99,42 @@ def turntable_poses(orbit: Orbit, frames: int, *, sway: float) -> list[np.ndarra
     return [pose_on_sphere(orbit.centre, orbit.radius, azimuth, elevation) for azimuth, elevation in angles]
 
 
+def spiral_poses(middle: np.ndarray, radii: Sequence[float], focus: float, frames: int) -> list[np.ndarray]:
+    """The render path of LLFF and NeRF: twice round an ellipse across the view axis, once to and fro along it, always towards one point. It closes.
+
+    middle  (4, 4) pose of the reference camera
+    radii   extents along its axes; inside of those of the cameras nothing comes into view that none of them saw
+    focus   depth of the point before `middle` that is looked at
+    """
+    target = middle[:3, 3] + focus * middle[:3, 2]
+    poses = []
+    for turn in 2 * math.pi * SPIRAL_TURNS * np.arange(frames) / frames:
+        place = middle[:3, 3] + middle[:3, :3] @ (np.array([math.cos(turn), math.sin(turn), math.sin(turn / SPIRAL_TURNS)]) * radii)
+        forward = target - place
+        forward /= np.linalg.norm(forward)
+        right = np.cross(middle[:3, 1], forward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
+        pose[:3, 3] = place
+        poses.append(pose)
+    return poses
+
+
 def occupied_points(tree: NerfTree) -> np.ndarray:
-    """(N, 3) centres of the coarse cells that hold something, some thousands of them at most; of an empty asset the corners of its box."""
+    """(N, 3) centres of the coarse cells that hold something, some thousands of them at most; of an empty asset the corners of its box.
+
+    Of a forward-facing asset the nearer half of them.
+    """
     cells = np.argwhere(tree.brick_index >= 0)
-    if not len(cells):
+    if not len(cells) and tree.ndc is None:
         return np.stack(np.meshgrid(*np.stack([tree.bounds_min, tree.bounds_max]).T, indexing="ij"), -1).reshape(-1, 3)
     cells = cells[:: max(1, len(cells) // FIT_POINTS)]
-    return np.asarray(tree.bounds_min) + (cells + 0.5) * (tree.brick * tree.voxel)
+    points = np.asarray(tree.bounds_min) + (cells + 0.5) * (tree.brick * tree.voxel)
+    if tree.ndc is None:
+        return points
+    near = points[points[:, 2] <= np.quantile(points[:, 2], 0.5)]  # what lies further may lie at infinity
+    return np.asarray(tree.ndc.world(near))
 
 
 def half_extent_seen(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> float:
@@ -134,7 +166,11 @@ def turntable_cameras(
     radius     distance from the centre in the capture's units; None: as the capture's cameras stood, or further where the asset would not fit
     fov        vertical, degrees; None: so that the asset fits from everywhere
     sway       degrees; see turntable_poses
+
+    For a forward-facing asset the path is a spiral among the capture's cameras, unless an elevation or a radius is asked for.
     """
+    if tree.ndc is not None and elevation is None and radius is None:
+        return _spiral_cameras(tree, tree.ndc, frames, width, height, fov)
     orbit = orbit_of(tree)
     distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
     orbit = Orbit(orbit.centre, distance, orbit.elevation if elevation is None else elevation, orbit.forward_facing, orbit.heading)
@@ -154,6 +190,23 @@ def turntable_cameras(
             poses = turntable_poses(orbit, frames, sway=sway)
     half = min(widest, needed(poses)) if fov is None else math.tan(math.radians(fov / 2))
     focal = 0.5 * height / half
+    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]
+
+
+def _spiral_cameras(tree: NerfTree, ndc: Ndc, frames: int, width: int, height: int, fov: float | None) -> list[Camera]:
+    """The cameras of `spiral_poses` as the asset records it; for one that records none, the reference camera stands still."""
+    given: Any = tree.metadata.get("spiral") or {}
+    try:
+        radii = [float(x) for x in given.get("radii", (0.0, 0.0, 0.0))]
+        focus = float(given.get("focus", 4 * ndc.near))
+        across, down = (float(x) for x in given.get("tangents", (0.5, 0.5)))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise BadInput(f"asset: its spiral cannot be read ({error}). Bake it again.") from error
+    if len(radii) != 3 or not np.isfinite([*radii, focus, across, down]).all() or min(focus, across, down) <= 0:
+        raise BadInput(f"asset: its spiral is {str(given)[:200]}; expected three radii, a positive focus and two positive tangents. Bake it again.")
+    half = SPIRAL_VIEW * min(down, across * height / width) if fov is None else math.tan(math.radians(fov / 2))
+    focal = 0.5 * height / half
+    poses = spiral_poses(ndc.world_from_camera, radii, focus, frames)
     return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]
 
 

@@ -19,6 +19,7 @@ from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
 from stages import importers
 from stages.capture import Capture, Photo, SparsePoints
+from stages.forward import SPACES
 from stages.importers.source import FEWEST, Source, listed
 from stages.scene import SPLITS, Scene, View, save, save_points
 from stages.settings import setting
@@ -37,6 +38,12 @@ class PosesSettings:
         None, "Crop box in the capture's frame: x y z of one corner, then of the opposite one; none estimates it."
     )
     margin: float = setting(0.05, "Room left on each side of an estimated box, as a fraction of its longest side.", minimum=0.0, maximum=2.0)
+    space: str = setting(
+        "auto",
+        "Where the field lives: box (what lies beyond is a backdrop without depth), contracted (the box and all beyond), ndc (normalised device coordinates, "
+        "for captures that all look the same way); auto takes ndc for LLFF folders that do, contracted for other photographs, and the box for cut-out objects.",
+        choices=SPACES,
+    )
     alpha: str = setting(
         "auto",
         "What alpha means: composite (an object on a constant background, white) or mask (transparent pixels are left out).",
@@ -74,7 +81,7 @@ def run(job: Job) -> None:
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].module == "transforms")
     capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
-    framed = framing.frame(capture, up=settings.up, box=settings.box, margin=settings.margin)
+    framed = framing.frame(capture, up=settings.up, box=settings.box, margin=settings.margin, space=settings.space)
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = tuple(
@@ -100,6 +107,8 @@ def run(job: Job) -> None:
         orbit=framed.orbit,
         points=capture.points is not None,
         metric=capture.metric,
+        space=framed.space,
+        forward=framed.forward,
     )
     save(scene, job.out)
     _write_report(job.out / "report.json", capture, scene, framed.facts, notes)
@@ -107,7 +116,7 @@ def run(job: Job) -> None:
     write_contact_sheet(scene, job.out, capture.rejected, job.source)
 
 
-STAGE = Stage(name="poses", version=1, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
+STAGE = Stage(name="poses", version=2, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:

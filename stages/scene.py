@@ -4,6 +4,8 @@
     images/, masks/      at working size, 8 bits, sRGB; masks are 0 or 255, 255 = use
     points.safetensors   sparse points in the training frame, where there are any
 
+Format 2 says what space the field lives in, and holds the reference camera of a forward-facing capture; format 1, without, is read as well.
+
 Training frame: right-handed, z up, origin at the centre of the box, the largest half extent of the box 1.
 """
 
@@ -18,11 +20,13 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.cameras import Camera, Similarity
+from efficientnerf.ndc import Ndc
 from pipeline.errors import BadInput
 from pipeline.files import Unreadable, read_json
 from stages.capture import SparsePoints
+from stages.forward import SPACES, Forward
 
-FORMAT = 1
+FORMAT = 2
 SPLITS = ("train", "val", "test")
 LARGEST_FILE = 256 << 20  # bytes of scene.json; a hundred thousand views fit
 
@@ -77,6 +81,9 @@ class Scene:
     background  constant sRGB colour (0-1) that the RGBA images are composited on; None: photographs with real surroundings
     points      whether points.safetensors stands beside scene.json
     metric      whether a unit of the capture's frame is a metre
+    space       where the field lives: "box", "contracted" (the box and a shell for all beyond) or "ndc" (normalised device coordinates); "auto"
+                is contracted for photographs with surroundings, else the box
+    forward     the forward-facing capture; there for ndc, and only there
     """
 
     kind: str
@@ -87,6 +94,17 @@ class Scene:
     orbit: Orbit
     points: bool = False
     metric: bool = False
+    space: str = "auto"
+    forward: Forward | None = None
+
+    def __post_init__(self) -> None:
+        if self.space not in SPACES or (self.space == "ndc") != (self.forward is not None):
+            raise ValueError(f"space {self.space!r} with {'no' if self.forward is None else 'a'} reference camera; expected one of {', '.join(SPACES)}")
+
+    @property
+    def contracted(self) -> bool:
+        """Whether space beyond the box belongs to the field."""
+        return self.space == "contracted" or (self.space == "auto" and self.background is None)
 
     @property
     def up(self) -> tuple[float, float, float]:
@@ -135,6 +153,8 @@ def save(scene: Scene, folder: Path) -> None:
         },
         "points": scene.points,
         "metric": scene.metric,
+        "space": scene.space,
+        "forward": None if scene.forward is None else _forward_to_json(scene.forward),
         "views": views,
     }
     (folder / "scene.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -145,8 +165,8 @@ def load(folder: Path) -> Scene:
     path = folder / "scene.json"
     document = _Reader(_read_json(path), str(path))
     version = document.integer("format")  # also refuses what is not an object
-    if version != FORMAT:
-        raise BadInput(f"{path}: format version {version}; this build reads {FORMAT}. Upgrade efficientnerf, or run the poses stage again.")
+    if not 1 <= version <= FORMAT:
+        raise BadInput(f"{path}: format version {version}; this build reads 1 to {FORMAT}. Upgrade efficientnerf, or run the poses stage again.")
     background = document.value.get("background")
     transform, orbit = document.reader("world_from_capture"), document.reader("orbit")
     views = tuple(_view_from_json(_Reader(view, f"{path}: views[{i}]"), folder) for i, view in enumerate(document.items("views")))
@@ -165,6 +185,7 @@ def load(folder: Path) -> Scene:
         ),
         points=document.flag("points"),
         metric=document.flag("metric"),
+        **({} if version == 1 else _space_from_json(document, path)),
     )
     if not (scene.bounds[0] < scene.bounds[1]).all():
         raise BadInput(f"{path}: bounds are empty ({scene.bounds.tolist()}). Run the poses stage again.")
@@ -269,6 +290,7 @@ def describe(folder: Path) -> dict[str, Any]:
         "bounds": scene.bounds.tolist(),
         "bounds_in_capture": [in_capture.min(0).tolist(), in_capture.max(0).tolist()],
         "background": scene.background,
+        "space": scene.space,
         "masks": sum(view.mask is not None for view in scene.views),
         "points": len(read_points(folder).xyz) if scene.points else 0,
         "metric": scene.metric,
@@ -287,6 +309,36 @@ def _report_warnings(folder: Path) -> list[str]:
     report = _read_json(path) if path.is_file() else {}
     found = report.get("warnings", []) if isinstance(report, dict) else []
     return [str(sentence) for sentence in found]
+
+
+def _forward_to_json(forward: Forward) -> dict[str, Any]:
+    return {
+        **forward.ndc.to_json(),
+        "bounds": forward.bounds.tolist(),
+        "far": forward.far,
+        "radii": list(forward.radii),
+        "focus": forward.focus,
+        "tangents": list(forward.tangents),
+    }
+
+
+def _space_from_json(document: _Reader, path: Path) -> dict[str, Any]:
+    space = document.text("space")
+    if space not in SPACES or (space == "ndc") != (document.value.get("forward") is not None):
+        raise BadInput(f"{path}: space {space[:40]!r}; expected one of {', '.join(SPACES)}, and ndc with what is said of it. Run the poses stage again.")
+    if space != "ndc":
+        return {"space": space}
+    reader = document.reader("forward")
+    try:
+        ndc = Ndc.from_json(reader.value)
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(f"{path}: forward: {error}. Run the poses stage again.") from error
+    bounds, tangents = reader.numbers("bounds", (2, 3)), reader.numbers("tangents", (2,))
+    radii = _triple(reader.numbers("radii", (3,)))
+    forward = Forward(ndc, bounds, reader.number("far"), radii, reader.number("focus"), (float(tangents[0]), float(tangents[1])))
+    if min([forward.far - ndc.near, forward.focus, *tangents, *(bounds[1] - bounds[0])]) <= 0:
+        raise BadInput(f"{path}: forward: no box before the reference camera. Run the poses stage again.")
+    return {"space": space, "forward": forward}
 
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:

@@ -38,7 +38,6 @@ NOWHERE = 1e-9  # scene is 2 across: nearer to a camera than this, a point has n
 
 def run(job: Job) -> None:
     from efficientnerf import training
-    from efficientnerf.grid import Space
     from efficientnerf.model import model
     from efficientnerf.render import FieldRenderer
     from stages import field, scene
@@ -54,7 +53,7 @@ def run(job: Job) -> None:
     if settings.far > 0:
         near, far = stated_range(s, settings)
         pixels.near[:], pixels.far[:] = near, far
-    m = model(Space(s.bounds, contracted=s.background is None), settings, s.background, job.device, (near, far))
+    m = model(field.space_of(s), settings, s.background, job.device, (near, far))
     t = training.trainer(m, len(views))
     log = job.work / "log.jsonl"
     spent = _resume(t, job, log)

@@ -30,6 +30,7 @@ class BallTree:
     background: tuple[float, float, float] | None = WHITE
     similarity: Similarity = field(default_factory=Similarity.identity)
     forward_facing: bool = False
+    ndc: None = None
 
     @property
     def bounds_min(self) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 
 from efficientnerf.nerftree.container import METADATA_KEY, FormatError, Header
 from efficientnerf.nerftree.layouts import LAYOUTS
-from efficientnerf.nerftree.metadata import MAJOR, STRUCTURE, check_metadata
+from efficientnerf.nerftree.metadata import MAJOR, NDC_MINOR, NDC_PREFIX, STRUCTURE, check_metadata, layout_of, ndc_of
 from efficientnerf.nerftree.tree import NerfTree
 from efficientnerf.nerftree.writing import WRITERS, written_as
 
@@ -38,8 +38,9 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
     meta = {
         **tree.metadata,
         "format": "nerftree",
-        "format_version": f"{MAJOR}.{LAYOUTS[written.layout].minor}",
-        "layout": written.layout,
+        "format_version": f"{MAJOR}.{LAYOUTS[written.layout].minor if tree.ndc is None else NDC_MINOR}",
+        "layout": written.layout if tree.ndc is None else NDC_PREFIX + written.layout,
+        **({} if tree.ndc is None else {"ndc": tree.ndc.to_json()}),
         "shape": list(tree.shape),
         "brick": tree.brick,
         "voxel": tree.voxel,
@@ -78,7 +79,7 @@ def _open(path: str | Path) -> Header:
     header = Header(Path(path))
     name, meta = header.name, header.meta
     check_metadata(name, meta, tuple(LAYOUTS))
-    layout = LAYOUTS[meta["layout"]]
+    layout = LAYOUTS[layout_of(meta)]
     types = {OCCUPANCY: ("U8",), **layout.tensors}
     for tensor in header.tensors:
         if tensor not in types and not tensor.startswith("x."):
@@ -103,7 +104,7 @@ def load(path: str | Path) -> NerfTree:
     """
     header = _open(path)
     name, meta = header.name, header.meta
-    layout = LAYOUTS[meta["layout"]]
+    layout = LAYOUTS[layout_of(meta)]
     raw = {tensor: header.read_verified(tensor) for tensor in (OCCUPANCY, *layout.tensors)}
     shape = tuple(int(n) for n in meta["shape"])
     cells = math.prod(shape)
@@ -132,6 +133,7 @@ def load(path: str | Path) -> NerfTree:
         harmonics=harmonics,
         background=None if background is None else tuple(float(x) for x in background),  # type: ignore[arg-type]
         metadata={key: value for key, value in meta.items() if key not in STRUCTURE},
+        ndc=ndc_of(name, meta),
     )
 
 
@@ -142,7 +144,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     shape, brick, voxel = [int(n) for n in meta["shape"]], int(meta["brick"]), float(meta["voxel"])
     resolution = [n * brick for n in shape]
     low = [float(x) for x in meta["bounds_min"]]
-    full = meta["layout"] == "full"
+    full = layout_of(meta) == "full"
     voxels = math.prod(shapes["brick.density"]) if full else shapes["voxel.density"][0]
     sizes = {name: end - begin for name, (_, _, begin, end) in sorted(header.tensors.items())}
     per_voxel = sum(size for name, size in sizes.items() if name.startswith("brick." if full else "voxel."))
@@ -160,8 +162,9 @@ def describe(path: str | Path) -> dict[str, Any]:
         "voxels": voxels,
         "voxel_side": voxel,
         "sh_degree": meta["sh_degree"],
-        **({"sh_groups": meta["sh_groups"], "palette": shapes["sh.palette"][0]} if meta["layout"] == "compact" else {}),
+        **({"sh_groups": meta["sh_groups"], "palette": shapes["sh.palette"][0]} if layout_of(meta) == "compact" else {}),
         "bounds": {"min": low, "max": [a + n * voxel for a, n in zip(low, resolution, strict=True)]},
         "background": meta["background"],
+        **({} if ndc_of(header.name, meta) is None else {"ndc": meta["ndc"]}),
         **{key: meta[key] for key in sorted(meta) if key not in STRUCTURE},
     }

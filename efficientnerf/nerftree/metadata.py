@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.harmonics import MAX_DEGREE
+from efficientnerf.ndc import NUMBERS, Ndc
 from efficientnerf.nerftree.container import FormatError
 
 MAJOR = 1
 MAX_CELLS = 2**30
+NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not draw it
+NDC_MINOR = 2  # the version that brought them
 STRUCTURE = {
     "format", "format_version", "layout", "shape", "brick", "voxel", "bounds_min", "sh_degree", "sh_convention", "sh_groups", "colour_space",
-    "background", "sha256",
+    "background", "sha256", "ndc",
 }  # fmt: skip
 
 
@@ -59,6 +62,31 @@ def _check_frame(name: str, meta: dict[str, Any]) -> None:
             raise FormatError(f"{name}: metadata 'forward_facing' is {str(orbit.get('forward_facing'))[:60]}; expected true or false")
 
 
+def layout_of(meta: dict[str, Any]) -> str:
+    """Which tables of tensors hold, whatever frame the grid lies in."""
+    return str(meta.get("layout")).removeprefix(NDC_PREFIX)
+
+
+def ndc_of(name: str, meta: dict[str, Any]) -> Ndc | None:
+    """The reference camera of a file in normalised device coordinates, which must name one; None for a file in the world."""
+    if not str(meta.get("layout")).startswith(NDC_PREFIX):
+        return None
+    found = meta.get("ndc")
+    if not isinstance(found, dict):
+        raise FormatError(f"{name}: metadata 'ndc' is {str(found)[:60]}; expected an object")
+    for key in NUMBERS:
+        _number(name, found, key, 1e-30, 1e30, whole=False)
+    rows = found.get("world_from_camera")
+    if not (isinstance(rows, list) and len(rows) == 4):
+        raise FormatError(f"{name}: metadata 'world_from_camera' is {str(rows)[:60]}; expected four rows")
+    for row in rows:
+        _numbers(name, {"world_from_camera": row}, "world_from_camera", 4, -1e30, 1e30)
+    try:
+        return Ndc.from_json(found)
+    except ValueError as error:
+        raise FormatError(f"{name}: metadata 'ndc': {error}") from None
+
+
 def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) -> None:
     """Raises FormatError, naming the file `name`, at the first rule that is broken.
 
@@ -71,7 +99,7 @@ def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) ->
         raise FormatError(f"{name}: format version {str(meta.get('format_version'))[:60]}; expected MAJOR.MINOR")
     if int(version[0]) != MAJOR:
         raise FormatError(f"{name}: format version {'.'.join(version)}; this build reads {MAJOR}.x. Upgrade efficientnerf.")
-    if meta.get("layout") not in layouts:
+    if layout_of(meta) not in layouts:
         raise FormatError(f"{name}: layout {str(meta.get('layout'))[:60]}; this build reads {', '.join(layouts)}. Upgrade efficientnerf.")
     if meta.get("sh_convention") != "real-orthonormal-plenoctree" or meta.get("colour_space") != "srgb-sigmoid":
         found = f"harmonics {str(meta.get('sh_convention'))[:60]} in {str(meta.get('colour_space'))[:60]}"
@@ -88,3 +116,4 @@ def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) ->
     if meta["background"] is not None:
         _numbers(name, meta, "background", 3, 0, 1)
     _check_frame(name, meta)
+    ndc_of(name, meta)

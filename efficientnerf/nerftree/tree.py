@@ -4,6 +4,9 @@ The grid has shape * brick voxels a side, cubic, of `voxel` world units. A coars
 density whatever its neighbours hold, or it owns a brick of brick^3 voxels, of which those that matter are stored.
 Values sit at voxel centres and are interpolated linearly between the stored ones.
 
+The grid lies in the tree's *frame*: the world, or the normalised device coordinates of a reference camera (`efficientnerf.ndc`) where the scene is
+forward-facing. What users ask and are answered is always of the world, densities apart, which are per unit of the frame.
+
 B bricks, N stored voxels, K harmonics, R rays.
 """
 
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from efficientnerf.cameras import Camera
     from efficientnerf.kernels.cuda_tree import DeviceTree
     from efficientnerf.kernels.packed_tree import Packed
+    from efficientnerf.ndc import Ndc, WarpedRays
 
 
 @dataclass(frozen=True)
@@ -48,15 +52,16 @@ class NerfTree:
 
     shape        coarse cells along x, y, z
     brick        voxels along a side of a coarse cell (the paper's D_f)
-    voxel        side of a voxel, world units
-    bounds_min   (3,) float64, corner of the grid, world units
+    voxel        side of a voxel, units of the frame
+    bounds_min   (3,) float64, corner of the grid, in the frame
     brick_index  shape int32: which brick a coarse cell owns, -1 where it is empty
     voxel_index  (B, brick^3) int32: which stored voxel, -1 where none (x slowest, z fastest)
-    density_values  (N,) float32, per world unit, >= 0
+    density_values  (N,) float32, per unit of the frame, >= 0
     harmonics    what the voxels' colours are made of, one of two:
                  (N, K, 3) float32, or PaletteHarmonics: codes into palettes, as files of the layout `compact` load
     background   sRGB colour that the training images lay on, or None for photographs with surroundings
     device       where pictures are drawn, see `to`; not part of the asset
+    ndc          the reference camera whose normalised device coordinates are the frame, or None: the frame is the world
 
     For renderers: `sh` is always there as plain floats, but decoding a palette costs 12 K bytes a voxel and is remembered; a kernel
     that matters reads `harmonics` itself where it is a PaletteHarmonics, whose docstring states what its arrays mean. A kernel for codes
@@ -74,6 +79,7 @@ class NerfTree:
     background: tuple[float, float, float] | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     device: str = "cpu"
+    ndc: Ndc | None = None
 
     @cached_property
     def sh(self) -> np.ndarray:
@@ -162,19 +168,54 @@ class NerfTree:
         """What rays see: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray."""
         from efficientnerf.kernels.cpu_tree import render_rays
 
-        return Rendering(*render_rays(self, origins, directions))
+        if self.ndc is None:
+            return Rendering(*render_rays(self, origins, directions))
+        rays = self.frame_rays(origins, directions)
+        colour, opacity, along, normal = render_rays(self, rays.origins, rays.directions, looking=np.asarray(directions))
+        return Rendering(colour, opacity, *self._in_world(rays, along, normal))
+
+    def frame_rays(self, origins: Any, directions: Any) -> WarpedRays:
+        """World rays (R, 3), unit directions, as rays of the tree's frame: what anything that walks the grid itself has to do first.
+
+        `(result.origins - bounds_min) / voxel` are voxel coordinates and `result.directions` the unit directions there; a step of one voxel is
+        `voxel` units of the frame, which densities are per. Harmonics are looked up along the directions of the world, as they went in.
+        `efficientnerf.ndc.world_distance` turns distances along the result into those of the world. Numpy arrays and torch tensors alike.
+        """
+        from efficientnerf.ndc import WarpedRays
+
+        if self.ndc is not None:
+            return self.ndc.rays(origins, directions)
+        none = origins[..., 0] * 0
+        return WarpedRays(origins, directions, none, none + 1, none)
+
+    def _in_world(self, rays: WarpedRays, along: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances (R,) and normals (R, 3) of hits on rays of the frame, in the world."""
+        from efficientnerf.ndc import world_distance
+
+        assert self.ndc is not None
+        hit = np.isfinite(along)
+        s, distance, normals = np.where(hit, along, 0).astype(np.float64), np.full(len(along), np.inf), np.zeros_like(normal)
+        distance[hit] = world_distance(s, rays.begin, rays.pace, rays.bend)[hit]
+        at = (rays.origins + s[:, None] * rays.directions)[hit]
+        normals[hit] = self.ndc.world_normals(at, normal[hit].astype(np.float64))
+        return distance.astype(np.float32), normals
+
+    def _in_frame(self, points: np.ndarray) -> np.ndarray:
+        return points if self.ndc is None else self.ndc.points(np.asarray(points, np.float64))
 
     def density(self, points: np.ndarray) -> np.ndarray:
-        """Density at points (N, 3) of the world: (N,) float32, per world unit."""
+        """Density at points (N, 3) of the world: (N,) float32, per unit of the frame."""
         from efficientnerf.kernels.cpu_tree import density_at
 
-        return density_at(self, points)
+        return density_at(self, self._in_frame(points))
 
     def normal(self, points: np.ndarray) -> np.ndarray:
         """Unit vectors down the density's gradient at points (N, 3); zero where it is flat."""
         from efficientnerf.kernels.cpu_tree import normal_at
 
-        return normal_at(self, points)
+        at = self._in_frame(points)
+        normal = normal_at(self, at)
+        return normal if self.ndc is None else self.ndc.world_normals(at, normal.astype(np.float64)).astype(np.float32)
 
     def colour(self, points: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
         """sRGB colour at points (N, 3), seen along unit directions (N, 3), or its view-independent part: (N, 3) float32, 0 to 1.
@@ -183,7 +224,7 @@ class NerfTree:
         """
         from efficientnerf.kernels.cpu_tree import colour_at
 
-        return colour_at(self, points, directions)
+        return colour_at(self, self._in_frame(points), directions)
 
     def density_block(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
         """Density at the voxel centres low <= (i, j, k) < high: float32, zero outside of the grid and where nothing is stored."""
@@ -226,6 +267,7 @@ def tree_from_voxels(
     brick: int = 4,
     background: tuple[float, float, float] | None = None,
     metadata: dict[str, Any] | None = None,
+    ndc: Ndc | None = None,
 ) -> NerfTree:
     """Build a tree from a list of voxels.
 
@@ -265,4 +307,5 @@ def tree_from_voxels(
         harmonics=np.ascontiguousarray(sh[order], np.float32),
         background=background,
         metadata=dict(metadata or {}),
+        ndc=ndc,
     )

@@ -80,7 +80,7 @@ def set_in(*path: Any) -> Callable[[Any], None]:
 
 
 DAMAGE: dict[str, tuple[Callable[[Any], None], str]] = {
-    "newer": (set_in("format", 2), "format version 2; this build reads 1"),
+    "newer": (set_in("format", 3), "format version 3; this build reads 1 to 2"),
     "no views": (set_in("views", None), "views: expected a list"),
     "split": (set_in("views", 0, "split", "all"), r"views\[0\]: split 'all'"),
     "near": (set_in("views", 0, "near", 4.0), "near 4.0, far 3.0"),

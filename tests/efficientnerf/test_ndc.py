@@ -1,0 +1,139 @@
+"""Normalised device coordinates: the appendix's closed form, inverses, straight rays, distances and normals; numpy and torch alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.grid import Space
+from efficientnerf.ndc import BEYOND, Ndc, warped_distance, world_distance
+
+
+def some_pose(rng: np.random.Generator) -> np.ndarray:
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    pose = np.eye(4)
+    pose[:3, :3] = q * np.sign(np.linalg.det(q))
+    pose[:3, 3] = rng.normal(size=3)
+    return pose
+
+
+@pytest.fixture
+def ndc() -> Ndc:
+    return Ndc(some_pose(np.random.default_rng(3)), 400.0, 504.0, 378.0, 1.5)
+
+
+def before(ndc: Ndc, rng: np.random.Generator, count: int, low: float = 1.5, high: float = 100.0) -> np.ndarray:
+    """World points before the reference camera, at depths between low and high."""
+    z = np.exp(rng.uniform(np.log(low), np.log(high), count))
+    local = np.stack([rng.uniform(-1, 1, count) * z, rng.uniform(-1, 1, count) * z, z], -1)
+    return local @ ndc.world_from_camera[:3, :3].T + ndc.world_from_camera[:3, 3]
+
+
+def appendix(ndc: Ndc, points: np.ndarray) -> np.ndarray:
+    """Equation 21 of the NeRF paper, in its own axes (y up, looking along -z), turned to ours at the end."""
+    opengl = (points - ndc.world_from_camera[:3, 3]) @ ndc.world_from_camera[:3, :3] * [1, -1, -1]
+    ox, oy, oz = opengl.T
+    x = -ndc.focal / (ndc.width / 2) * ox / oz
+    y = -ndc.focal / (ndc.height / 2) * oy / oz
+    z = 1 + 2 * ndc.near / oz
+    return np.stack([x, -y, z], -1)
+
+
+def test_points_are_the_appendix_s_and_come_back(ndc: Ndc) -> None:
+    points = before(ndc, np.random.default_rng(0), 500)
+    warped = ndc.points(points)
+    np.testing.assert_allclose(warped, appendix(ndc, points), rtol=1e-12, atol=1e-12)
+    assert (warped[:, 2] >= -1 - 1e-9).all()
+    assert (warped[:, 2] < 1).all()
+    np.testing.assert_allclose(ndc.world(warped), points, rtol=1e-9)
+    torch.testing.assert_close(ndc.points(torch.from_numpy(points)), torch.from_numpy(warped))
+    torch.testing.assert_close(ndc.world(torch.from_numpy(warped)), torch.from_numpy(points))
+
+
+def test_what_lies_behind_the_camera_is_beyond_any_box(ndc: Ndc) -> None:
+    behind = ndc.world_from_camera[:3, 3] - 2 * ndc.world_from_camera[:3, 2]
+    assert ndc.points(behind[None])[0].tolist() == [0.0, 0.0, BEYOND]
+
+
+def rays_of(ndc: Ndc, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays from round the reference camera, and from beyond its near plane, forwards."""
+    places = rng.normal(size=(count, 3)) * 0.5
+    places[count // 2 :, 2] += 4.0
+    local = np.stack([rng.uniform(-0.8, 0.8, count), rng.uniform(-0.8, 0.8, count), np.ones(count)], -1)
+    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    rotation, centre = ndc.world_from_camera[:3, :3], ndc.world_from_camera[:3, 3]
+    return places @ rotation.T + centre, local @ rotation.T
+
+
+def test_rays_are_straight_and_distances_invert(ndc: Ndc) -> None:
+    rng = np.random.default_rng(1)
+    origins, directions = rays_of(ndc, rng, 200)
+    start, along, begin, pace, bend = ndc.rays(origins, directions)
+    np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)
+    t = begin + 10.0 ** rng.uniform(-2, 3, len(begin))
+    s = warped_distance(t, begin, pace, bend)
+    np.testing.assert_allclose(start + s[:, None] * along, ndc.points(origins + t[:, None] * directions), atol=1e-9)
+    np.testing.assert_allclose(world_distance(s, begin, pace, bend), t, rtol=1e-6)
+    assert (warped_distance(begin - 1.0, begin, pace, bend) == 0).all()
+
+
+def test_rays_are_the_appendix_s_and_end_at_infinity(ndc: Ndc) -> None:
+    """o' and o' + d' of equations 25 and 26: from the near plane to the far one."""
+    origins, directions = (a[:100] for a in rays_of(ndc, np.random.default_rng(2), 200))
+    start, along, begin, pace, bend = ndc.rays(origins, directions)
+    np.testing.assert_allclose(start[:, 2], -1, atol=1e-12)
+    moved = origins + begin[:, None] * directions
+    np.testing.assert_allclose(start, appendix(ndc, moved), atol=1e-12)
+    local_o = (moved - ndc.world_from_camera[:3, 3]) @ ndc.world_from_camera[:3, :3] * [1, -1, -1]
+    local_d = directions @ ndc.world_from_camera[:3, :3] * [1, -1, -1]
+    slopes = local_d[:, :2] / local_d[:, 2:] - local_o[:, :2] / local_o[:, 2:]
+    d = np.stack([-ndc.slopes[0] * slopes[:, 0], ndc.slopes[1] * slopes[:, 1], -2 * ndc.near / local_o[:, 2]], -1)
+    far = warped_distance(begin + 1e15, begin, pace, bend)
+    np.testing.assert_allclose(far[:, None] * along, d, atol=1e-6)
+    assert (world_distance(far * 1.001, begin, pace, bend) == np.inf).all()
+
+
+def test_rays_that_look_back_end_at_the_near_plane_or_nowhere(ndc: Ndc) -> None:
+    rotation, centre = ndc.world_from_camera[:3, :3], ndc.world_from_camera[:3, 3]
+    local = np.array([[0.3, 0.0, 6.0], [0.3, 0.0, 1.0], [0.0, 0.0, 6.0]])
+    direction = np.array([[0.6, 0.0, -0.8], [0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
+    start, along, begin, pace, bend = ndc.rays(local @ rotation.T + centre, direction @ rotation.T)
+    t = (6.0 - ndc.near) / 0.8
+    there = start[0] + warped_distance(np.array([t]), begin[:1], pace[:1], bend[:1]) * along[0]
+    np.testing.assert_allclose(there[2], -1, atol=1e-9)
+    assert start[1, 2] == BEYOND
+    assert along[1].tolist() == [0, 0, 1]
+    np.testing.assert_allclose(along[2], [1, 0, 0], atol=1e-12)
+
+
+def test_normals_are_those_of_the_warped_surface(ndc: Ndc) -> None:
+    """Of a plane of the world: its image's normal comes back as the plane's own."""
+    rng = np.random.default_rng(4)
+    points = before(ndc, rng, 50, 2.0, 20.0)
+    normal = rng.normal(size=(50, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    # Two directions in each plane, pushed through the map: their cross product is normal to its image; the map keeps the handedness.
+    first = np.cross(normal, np.roll(normal, 1, axis=1))
+    second = np.cross(normal, first)
+    step = 1e-6
+    u, v = ((ndc.points(points + step * each) - ndc.points(points - step * each)) / (2 * step) for each in (first, second))
+    image = np.cross(u, v)
+    np.testing.assert_allclose(ndc.world_normals(ndc.points(points), image), normal, atol=1e-5)
+    assert (ndc.world_normals(ndc.points(points), np.zeros_like(image)) == 0).all()
+
+
+def test_a_space_warps_rays_and_is_not_contracted(ndc: Ndc) -> None:
+    box = np.array([[-1.0, -1, -1], [1, 1, 1]])
+    with pytest.raises(ValueError, match="cannot be contracted"):
+        Space(box, True, ndc)
+    origins, directions = (torch.from_numpy(a) for a in rays_of(ndc, np.random.default_rng(5), 20))
+    zero, far = torch.zeros(20, dtype=torch.float64), torch.full((20,), 9.0, dtype=torch.float64)
+    rays = Space(box, False, ndc).rays(origins, directions, zero, far)
+    distance = torch.linspace(8, 20, 20, dtype=torch.float64)
+    back = rays.world(rays.frame(distance), torch.arange(20))
+    torch.testing.assert_close(back, distance, rtol=1e-6, atol=0)
+    same = Space(box, False).rays(origins, directions, zero, far)
+    assert same.warp is None
+    assert same.origins is origins
+    assert torch.equal(same.world(distance, torch.arange(20)), distance)

@@ -1,0 +1,164 @@
+"""Trees in normalised device coordinates: planes of the world at their depth, lookups by world points, harmonics along world directions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.cameras import Camera
+from efficientnerf.harmonics import harmonics_count
+from efficientnerf.ndc import Ndc
+from efficientnerf.nerftree import format
+from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.render import render_tree_reference
+
+NEAR = 2.0
+DEPTH = 6.0  # of the wall before the reference camera, world units
+
+
+def looking_along_y() -> np.ndarray:
+    """A reference camera that looks along the world's +y, with z up, off the origin."""
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = [1, 0, 0], [0, 0, -1], [0, 1, 0], [0.3, -1.0, 0.2]
+    return pose
+
+
+def wall(slant: float = 0.0, *, voxels: int = 96, hard: float = 1.0, degree: int = 1, seed: int = 0) -> NerfTree:
+    """A wall whose depth is DEPTH + slant x before the reference camera, twelve voxels thick, its density rising evenly from nothing, and of
+    random colours that depend on the direction."""
+    ndc = Ndc(looking_along_y(), 100.0, 100.0, 100.0, NEAR)
+    low, voxel = np.array([-1.5, -1.5, -1.0]), 3.0 / voxels
+    shape = (voxels // 4, voxels // 4, -(-int(2 / voxel) // 4))
+    index = np.stack(np.meshgrid(*(np.arange(4 * n) for n in shape), indexing="ij"), -1).reshape(-1, 3)
+    centre = low + (index + 0.5) * voxel
+    # z = D + s x with x = x' z / a: the front in NDC is z = D / (1 - s x' / a).
+    front = 1 - 2 * NEAR * (1 - slant * centre[:, 0] / ndc.slopes[0]) / DEPTH
+    deep = (centre[:, 2] - front) / voxel  # voxels behind the front
+    solid = (deep >= 0) & (deep < 12)
+    index = index[solid]
+    rng = np.random.default_rng(seed)
+    sh = np.repeat(rng.normal(size=(1, harmonics_count(degree), 3)), len(index), axis=0).astype(np.float32)
+    return tree_from_voxels(shape, voxel, low, index, (hard * deep[solid] / voxel).astype(np.float32), sh, ndc=ndc)
+
+
+def camera_at(x: float, y: float, z: float) -> Camera:
+    pose = looking_along_y()
+    pose[:3, 3] += [x, y, z]
+    return Camera("a", 40, 30, "SIMPLE_RADIAL", (60.0, 20.0, 15.0, -0.05), pose)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.8, -0.5, -0.4), (0.2, 2.5, 0.1)], ids=["reference", "beside and behind", "beyond the near plane"])
+def test_a_wall_is_seen_at_its_depth(place: tuple[float, float, float]) -> None:
+    tree = wall()
+    seen = tree.render(camera_at(*place))
+    expected = DEPTH - place[1]
+    assert (seen.opacity > 0.99).all()
+    # Half of the light is gone 1.2 voxels behind the front, where the density has risen to an integral of ln 2; z = 2 n / (1 - z').
+    assert tree.ndc is not None
+    behind = 2 * NEAR / (2 * NEAR / DEPTH - tree.voxel * np.sqrt(2 * np.log(2))) - DEPTH
+    np.testing.assert_allclose(seen.depth, expected + behind, atol=0.5 * DEPTH**2 / (2 * NEAR) * tree.voxel)
+    np.testing.assert_allclose(seen.normal, np.broadcast_to([0, -1, 0], seen.normal.shape), atol=0.05)
+
+
+def test_a_slanted_wall_has_its_own_normal() -> None:
+    seen = wall(0.5, voxels=192, hard=0.1).render(camera_at(0, 0, 0))
+    # Surfaces of equal density, behind the front by the same z', are planes that slant more: by as much as they are deeper.
+    slant = 0.5 * seen.depth[15, 20] / DEPTH
+    expected = np.array([slant, -1, 0]) / np.hypot(slant, 1)
+    middle = seen.normal[10:20, 12:28].reshape(-1, 3).mean(0)
+    np.testing.assert_allclose(middle / np.linalg.norm(middle), expected, atol=0.02)
+
+
+def test_supersampling_and_a_background_are_heeded() -> None:
+    tree = wall()
+    camera = camera_at(0, 0, 0)
+    once, often = tree.render(camera), tree.render(camera, supersample=2, background=(0.2, 0.4, 0.6))
+    assert often.colour.shape == once.colour.shape
+    np.testing.assert_allclose(often.colour, once.colour, atol=0.02)  # opaque: nothing of the background
+    away = tree.render(camera_at(0, 20.0, 0), background=(0.2, 0.4, 0.6))  # behind the wall
+    np.testing.assert_allclose(away.colour, np.broadcast_to([0.2, 0.4, 0.6], away.colour.shape), atol=1e-6)
+    assert np.isinf(away.depth).all()
+
+
+def test_lookups_take_points_of_the_world() -> None:
+    tree = wall()
+    at = np.array([[0.3, DEPTH - 1.0 + 0.5, 0.2], [0.3, DEPTH - 2.0, 0.2], [0.3, -5.0, 0.2]])  # in the wall, before it, behind the camera
+    density = tree.density(at)
+    assert density[0] > 0
+    assert density[1] == 0
+    assert density[2] == 0
+    np.testing.assert_allclose(tree.normal(at[:1])[0], [0, -1, 0], atol=0.05)
+    towards = np.array([[0.6, 0.8, 0.0]])
+    seen = tree.render_rays(at[:1] - 4 * towards, towards)
+    np.testing.assert_allclose(seen.colour[0] / seen.opacity[0], tree.colour(at[:1], towards)[0], atol=1e-3)
+    assert not np.allclose(tree.colour(at[:1], towards), tree.colour(at[:1], -towards), atol=1e-2)
+
+
+def test_the_kernel_is_the_reference() -> None:
+    tree = wall(0.4, voxels=48)
+    rng = np.random.default_rng(1)
+    origins = rng.uniform(-1, 1, (64, 3)) + np.array([0.3, -1.0, 0.2])
+    directions = rng.normal(size=(64, 3)) * 0.3 + [0, 1, 0]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    seen = tree.render_rays(origins, directions)
+    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    np.testing.assert_allclose(seen.opacity, opacity.numpy(), atol=1e-3)
+    np.testing.assert_allclose(seen.colour, colour.numpy(), atol=1e-3)
+
+
+def test_frame_rays_are_where_the_grid_is() -> None:
+    tree = wall()
+    origins, directions = np.array([[0.3, -1.0, 0.2]]), np.array([[0.1, 1.0, -0.05]]) / np.linalg.norm([0.1, 1.0, -0.05])
+    seen = tree.render_rays(origins, directions)
+    warped = tree.frame_rays(origins, directions)
+    assert tree.ndc is not None
+    point = tree.ndc.points(origins + seen.depth[:, None].astype(np.float64) * directions)
+    along = point - warped.origins
+    np.testing.assert_allclose(np.cross(along, warped.directions), 0, atol=1e-6)
+
+
+def test_saved_and_loaded_it_draws_the_same(tmp_path: Path) -> None:
+    tree = wall(0.3)
+    tree.save(tmp_path / "a.nerftree")
+    again = NerfTree.load(tmp_path / "a.nerftree")
+    assert again.ndc is not None
+    assert tree.ndc is not None
+    assert (again.ndc.world_from_camera == tree.ndc.world_from_camera).all()
+    assert again.ndc.slopes == tree.ndc.slopes
+    assert again.ndc.near == tree.ndc.near
+    camera = camera_at(0.1, 0, 0)
+    np.testing.assert_allclose(again.render(camera).colour, tree.render(camera).colour, atol=2e-3)
+    np.testing.assert_allclose(again.render(camera).depth, tree.render(camera).depth, rtol=2e-3)
+
+
+REFUSED = {
+    "none": (None, "'ndc' is None; expected an object"),
+    "no near plane": ({"near": 0}, "'near' is 0; expected a number"),
+    "a focal length of text": ({"focal": "wide"}, "'focal' is wide; expected a number"),
+    "a mirror": ({"world_from_camera": np.diag([1.0, 1, -1, 1]).tolist()}, "no rigid motion"),
+    "another last row": ({"world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0.5, 1]]}, "no rigid motion"),
+    "three rows": ({"world_from_camera": np.eye(4).tolist()[:3]}, "expected four rows"),
+    "a short row": ({"world_from_camera": [[1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "expected 4 numbers"),
+}
+
+
+@pytest.mark.parametrize("which", REFUSED)
+def test_a_file_without_a_sound_reference_camera_is_refused(which: str, tmp_path: Path) -> None:
+    change, message = REFUSED[which]
+    data = format.serialize(wall(voxels=24))
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    meta = json.loads(header["__metadata__"]["nerftree"])
+    assert meta["layout"] == "ndc-sparse"  # which readers of before refuse by name
+    meta["ndc"] = None if change is None else meta["ndc"] | change
+    header["__metadata__"]["nerftree"] = json.dumps(meta)
+    text = json.dumps(header).encode()
+    (tmp_path / "a.nerftree").write_bytes(len(text).to_bytes(8, "little") + text + data[8 + length :])
+    with pytest.raises(format.FormatError, match=message):
+        NerfTree.load(tmp_path / "a.nerftree")
+    with pytest.raises(format.FormatError, match=message):
+        format.describe(tmp_path / "a.nerftree")
