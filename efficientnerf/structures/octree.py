@@ -1,0 +1,175 @@
+"""Octree with the node arrays of svox, the library of PlenOctree (Yu et al. 2021).
+
+Two arrays of a row per node and a column per octant. `child` holds how many rows further the child node lies, 0 where the octant is a leaf;
+`data` holds the leaf's values, zeros where it is empty. As in svox every node has both rows, so the lowest nodes carry eight
+zeros in `child`, and the others `data` of empty octants. Unlike svox the look-up knows the depth, and so does not read the zeros of the lowest
+nodes; and it need not read the data of an empty octant above them, which is zero.
+
+svox refines level by level from the root, in Python. Here the nodes are numbered from bit masks in Morton order, one level after the other,
+so that the children of a node, and neighbours in space, lie together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from efficientnerf.structures.voxels import Voxels
+from efficientnerf.structures.words import CHUNK, ONE, TASK, ZERO, atomic_or, bits_below, fill, number_bits, whole, within
+
+THREE, SIX, SEVEN = np.uint64(3), np.uint64(6), np.uint64(7)
+NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
+
+
+@numba.njit(cache=True, inline="always")
+def _spread(x):  # type: ignore[no-untyped-def]
+    """Two zero bits between any two of the lowest 21 bits."""
+    x = (x | (x << np.uint64(32))) & np.uint64(0x1F00000000FFFF)
+    x = (x | (x << np.uint64(16))) & np.uint64(0x1F0000FF0000FF)
+    x = (x | (x << np.uint64(8))) & np.uint64(0x100F00F00F00F00F)
+    x = (x | (x << np.uint64(4))) & np.uint64(0x10C30C30C30C30C3)
+    return (x | (x << np.uint64(2))) & np.uint64(0x1249249249249249)
+
+
+@numba.njit(cache=True, inline="always")
+def _morton(x, y, z):  # type: ignore[no-untyped-def]
+    """Octants of voxel (x, y, z) from the root down, three bits each, x first."""
+    return (_spread(x) << np.uint64(2)) | (_spread(y) << ONE) | _spread(z)
+
+
+@numba.njit(cache=True, inline="always")
+def _rank(records, cell):  # type: ignore[no-untyped-def]
+    """Number of the node of an occupied cell of a level."""
+    record = (cell >> SIX) << ONE
+    return records[record | ONE] + bits_below(records[record], cell & np.uint64(63))
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _mark(coordinates, records):  # type: ignore[no-untyped-def]
+    """Sets the bits of the cells of 2^3 voxels that hold any."""
+    n = len(coordinates)
+    for task in numba.prange((n + TASK - 1) // TASK):
+        current, mask = NONE, ZERO
+        for i in range(task * TASK, min(n, (task + 1) * TASK)):
+            cell = _morton(whole(coordinates[i, 0]), whole(coordinates[i, 1]), whole(coordinates[i, 2])) >> THREE
+            if cell >> SIX != current:
+                if current != NONE:
+                    atomic_or(records, current << ONE, mask)
+                current, mask = cell >> SIX, ZERO
+            mask |= ONE << (cell & np.uint64(63))
+        atomic_or(records, current << ONE, mask)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _raise(below, above):  # type: ignore[no-untyped-def]
+    """A cell of the level above has a node where any of its eight children has one."""
+    for word in numba.prange(len(above) // 2):
+        mask = ZERO
+        for octet in range(min(8, len(below) // 2 - 8 * word)):
+            children = below[2 * (8 * word + octet)]
+            for byte in range(8):
+                if (children >> np.uint64(8 * byte)) & np.uint64(0xFF):
+                    mask |= ONE << np.uint64(8 * octet + byte)
+        above[2 * word] = mask
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _link(above, level, child):  # type: ignore[no-untyped-def]
+    """Writes how far each node of a level lies behind its parent."""
+    words = len(level) // 2
+    for task in numba.prange((words + 63) // 64):
+        for word in range(task * 64, min(words, (task + 1) * 64)):
+            mask, node = level[2 * word], level[2 * word + 1]
+            for bit in range(64):
+                if (mask >> np.uint64(bit)) & ONE:
+                    parent = _rank(above, np.uint64(64 * word + bit) >> THREE)
+                    child[(parent << THREE) | np.uint64(bit & 7)] = np.int32(node - parent)
+                    node += ONE
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _store(coordinates, words, lowest, data):  # type: ignore[no-untyped-def]
+    n = len(coordinates)
+    for task in numba.prange((n + TASK - 1) // TASK):
+        for i in range(task * TASK, min(n, (task + 1) * TASK)):
+            code = _morton(whole(coordinates[i, 0]), whole(coordinates[i, 1]), whole(coordinates[i, 2]))
+            data[(_rank(lowest, code >> THREE) << THREE) | (code & SEVEN)] = words[i]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _look_up(points, side, depth, child, data, words, found):  # type: ignore[no-untyped-def]
+    """Level by level for a chunk of points: those that come to a leaf are left out of the levels below."""
+    n, top = len(points), np.float32(side)
+    for task in numba.prange((n + TASK - 1) // TASK):
+        code, node, leaf, word = np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64)
+        active, still = np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64)
+        for begin in range(task * TASK, min(n, (task + 1) * TASK), CHUNK):
+            end = min(begin + CHUNK, n)
+            point, out, there = points[begin:end], words[begin:end], found[begin:end]
+            many, count = np.uint64(end - begin), ZERO
+            for i in range(many):
+                x, y, z = point[i, 0], point[i, 1], point[i, 2]
+                code[i], node[i], word[i] = _morton(whole(x), whole(y), whole(z)), ZERO, ZERO
+                active[count] = i
+                count += np.uint64(within(x, y, z, top))
+            for level in range(depth - 1):
+                shift, left = np.uint64(3 * (depth - 1 - level)), ZERO
+                for a in range(count):
+                    i = active[a]
+                    skip = np.uint64(child[(node[i] << THREE) | ((code[i] >> shift) & SEVEN)])
+                    node[i] += skip
+                    still[left] = i
+                    left += np.uint64(skip != ZERO)
+                active, still, count = still, active, left
+            for a in range(count):
+                i = active[a]
+                leaf[a] = (node[i] << THREE) | (code[i] & SEVEN)
+            for a in range(count):
+                word[active[a]] = data[leaf[a]]
+            for i in range(many):
+                out[i] = word[i]
+                there[i] = word[i] != ZERO
+
+
+@dataclass(frozen=True, eq=False)
+class Octree:
+    """side voxels along each side of the grid, inside a cube of 2^depth; B nodes.
+
+    child  (8 B,) int32
+    data   (8 B,) uint64
+    """
+
+    side: int
+    depth: int
+    child: np.ndarray
+    data: np.ndarray
+
+    @staticmethod
+    def cache(voxels: Voxels) -> Octree:
+        depth = max((voxels.side - 1).bit_length(), 1)
+        levels = [np.zeros(2 * max(8**level // 64, 1), np.uint64) for level in range(depth)]  # masks and numbers of the nodes
+        if len(voxels.words):
+            _mark(voxels.coordinates, levels[-1])
+        for level in range(depth - 1, 0, -1):
+            _raise(levels[level], levels[level - 1])
+        levels[0][0] = 1  # the root, also of an empty tree
+        nodes = 0
+        for records in levels:
+            nodes = int(number_bits(records, np.uint64(nodes)))
+        child, data = np.empty(8 * nodes, np.int32), np.empty(8 * nodes, np.uint64)
+        fill(child, np.int32(0))
+        fill(data, ZERO)
+        for above, level_records in zip(levels, levels[1:], strict=False):
+            _link(above, level_records, child)
+        _store(voxels.coordinates, voxels.words, levels[-1], data)
+        return Octree(voxels.side, depth, child, data)
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"child": self.child, "data": self.data}
+
+    def query(self, points: np.ndarray, words: np.ndarray, found: np.ndarray) -> None:
+        """See `efficientnerf.structures.dense.DenseVoxels.query`."""
+        _look_up(points, self.side, self.depth, self.child, self.data, words, found)
