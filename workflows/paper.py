@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from workflows import paper_tables
+from workflows import paper_structures, paper_tables
 from workflows.paper_result import PAPER, Request, Result, Table
 
 __all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
@@ -29,6 +29,7 @@ TABLES: dict[str, Table] = {
     "4": Table("Sizes of the coarse and of the fine network", True, paper_tables.networks),
     "5": Table("The modules, one by one", True, paper_tables.modules),
     "6": Table("Sampling strategies", True, paper_tables.strategies),
+    "7": Table("Structures that cache a scene: dense voxels, sparse tensor, octree, NerfTree", False, paper_structures.structures),
 }
 
 

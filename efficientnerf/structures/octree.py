@@ -12,6 +12,7 @@ so that the children of a node, and neighbours in space, lie together.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numba
 import numpy as np
@@ -149,11 +150,11 @@ class Octree:
     @staticmethod
     def cache(voxels: Voxels) -> Octree:
         depth = max((voxels.side - 1).bit_length(), 1)
-        levels = [np.zeros(2 * max(8**level // 64, 1), np.uint64) for level in range(depth)]  # masks and numbers of the nodes
+        levels = [np.zeros(2 * max(8**number // 64, 1), np.uint64) for number in range(depth)]  # masks and numbers of the nodes
         if len(voxels.words):
             _mark(voxels.coordinates, levels[-1])
-        for level in range(depth - 1, 0, -1):
-            _raise(levels[level], levels[level - 1])
+        for number in range(depth - 1, 0, -1):
+            _raise(levels[number], levels[number - 1])
         levels[0][0] = 1  # the root, also of an empty tree
         nodes = 0
         for records in levels:
@@ -161,8 +162,8 @@ class Octree:
         child, data = np.empty(8 * nodes, np.int32), np.empty(8 * nodes, np.uint64)
         fill(child, np.int32(0))
         fill(data, ZERO)
-        for above, level_records in zip(levels, levels[1:], strict=False):
-            _link(above, level_records, child)
+        for above, level in pairwise(levels):
+            _link(above, level, child)
         _store(voxels.coordinates, voxels.words, levels[-1], data)
         return Octree(voxels.side, depth, child, data)
 

@@ -108,3 +108,12 @@ def number_bits(records, first):  # type: ignore[no-untyped-def]
             records[2 * i + 1] = at
             at += population(records[2 * i])
     return begins[tasks]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def gather(table, where, words):  # type: ignore[no-untyped-def]
+    """words[i] = table[where[i]] and nothing else: the least that a look-up of a value can take."""
+    n = len(where)
+    for task in numba.prange((n + TASK - 1) // TASK):
+        for i in range(task * TASK, min(n, (task + 1) * TASK)):
+            words[i] = table[where[i]]

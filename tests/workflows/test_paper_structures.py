@@ -1,0 +1,34 @@
+"""Table 7 at a small scale: all rows, and what holds on any machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from workflows.cli import main
+from workflows.paper_structures import COLUMNS, NAMES
+
+
+def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workflows.paper_structures.CACHINGS", 1)
+    monkeypatch.setattr("workflows.paper_structures.QUERIES", 1)
+    assert main(["paper", "7", "--out", str(tmp_path), "--scale", "0.12", "--device", "cpu", "--quiet"]) == 0
+    table = json.loads((tmp_path / "table_7.json").read_text())
+    assert table["columns"] == list(COLUMNS)
+    cases = {row["voxels"] for row in table["rows"]}
+    assert {name.partition(",")[0] for name in cases} == {"32³", "64³"}
+    assert len(cases) == 9
+    assert len(table["rows"]) == len(cases) * len(NAMES)
+    for row in table["rows"]:
+        assert row["memory / MiB"] > 0
+        assert all(row[column] > 0 for column in ("caching / ms", "random query / ms", "query along rays / ms"))
+    tree = {row["voxels"]: row["memory of dense"] for row in table["rows"] if row["structure"] == "NerfTree"}
+    assert all(share < 0.25 for share in tree.values())
+    paper = [row for row in table["rows"] if row["caching / ms (paper)"] is not None]
+    assert {row["voxels"] for row in paper} == {"32³, 20% clustered", "64³, 20% clustered"}
+    assert {row["structure"] for row in table["rows"]} - {row["structure"] for row in paper} == {"NerfTree, full bricks as printed"}
+    text = (tmp_path / "table_7.md").read_text()
+    assert "Scaled by 0.12" in text
+    assert "threads" in text
