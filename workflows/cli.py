@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 import click
 
-from workflows import cli_files, cli_paper, cli_presets, cli_run, cli_state
+from workflows import cli_assets, cli_files, cli_paper, cli_presets, cli_run, cli_state
 from workflows.failures import report_failure
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog="Exit codes: 0 done; 2 usage or bad input; "
-    "3 a stage failed; 4 corrupt artifact; 5 run locked; 130, 143 interrupted.")
+    "3 a stage failed; 4 corrupt artifact; 5 run locked; 6 assets differ; 130, 143 interrupted.")
 @click.version_option(package_name="efficientnerf", prog_name="enerf")
 def enerf() -> None:
     """Photographs or posed data sets in, a baked 3D asset out.
@@ -36,6 +36,8 @@ for command in (
     cli_files.export,
     cli_files.render,
     cli_files.inspect,
+    cli_assets.diff,
+    cli_assets.convert,
     cli_presets.presets,
     cli_paper.paper,
 ):

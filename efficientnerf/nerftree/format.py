@@ -21,7 +21,7 @@ from efficientnerf.nerftree.metadata import MAJOR, NDC_MINOR, NDC_PREFIX, STRUCT
 from efficientnerf.nerftree.tree import NerfTree
 from efficientnerf.nerftree.writing import WRITERS, written_as
 
-__all__ = ["LAYOUTS", "WRITERS", "FormatError", "describe", "load", "save", "serialize"]
+__all__ = ["LAYOUTS", "WRITERS", "FormatError", "contents", "describe", "load", "save", "serialize"]
 
 OCCUPANCY = "coarse.occupancy"
 
@@ -137,6 +137,16 @@ def load(path: str | Path) -> NerfTree:
     )
 
 
+def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Metadata but for the digests, and type, shape and digest of each tensor of the layout; from the header alone, so that they are what it claims."""
+    header = _open(path)
+    digests = header.meta.get("sha256")
+    digests = digests if isinstance(digests, dict) else {}
+    names = (OCCUPANCY, *LAYOUTS[layout_of(header.meta)].tensors)
+    tensors = {name: {"dtype": header.tensors[name][0], "shape": list(header.tensors[name][1]), "sha256": digests.get(name)} for name in names}
+    return {key: value for key, value in header.meta.items() if key != "sha256"}, tensors
+
+
 def describe(path: str | Path) -> dict[str, Any]:
     """What an asset file says of itself, from its header alone."""
     header = _open(path)
@@ -162,6 +172,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "voxels": voxels,
         "voxel_side": voxel,
         "sh_degree": meta["sh_degree"],
+        **({"values": header.tensors["brick.sh"][0]} if full else {}),
         **({"sh_groups": meta["sh_groups"], "palette": shapes["sh.palette"][0]} if layout_of(meta) == "compact" else {}),
         "bounds": {"min": low, "max": [a + n * voxel for a, n in zip(low, resolution, strict=True)]},
         "background": meta["background"],

@@ -1,0 +1,104 @@
+"""Trees made smaller."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from efficientnerf.nerftree.converting import coordinates, lookup, pruned, with_degree, with_resolution
+from efficientnerf.nerftree.quantising import compacted
+from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+
+
+def same_pictures(a: NerfTree, b: NerfTree, tolerance: float = 1e-5) -> None:
+    origins, directions = rays_at(a, 200)
+    for name in ("colour", "opacity"):
+        np.testing.assert_allclose(getattr(a.render_rays(origins, directions), name), getattr(b.render_rays(origins, directions), name), atol=tolerance)
+
+
+@pytest.mark.parametrize("brick", [1, 3, 4])
+def test_coordinates_and_their_voxels(brick: int) -> None:
+    tree = random_tree(brick, brick=brick)
+    at = coordinates(tree)
+    assert np.array_equal(lookup(tree, at), np.arange(len(tree.density_values)))
+    there = {tuple(row) for row in at.tolist()}
+    every = np.argwhere(np.ones(np.array(tree.resolution) + 2, bool)) - 1
+    for place, voxel in zip(every.tolist(), lookup(tree, every), strict=True):
+        assert (voxel >= 0) == (tuple(place) in there)
+        assert voxel < 0 or at[voxel].tolist() == place
+
+
+def test_fewer_harmonics_are_the_first_ones() -> None:
+    tree = random_tree(1, degree=3)
+    assert np.array_equal(with_degree(tree, 1).sh, tree.sh[:, :4])
+    with pytest.raises(ValueError, match="degree 4 from an asset of degree 3; expected 0 to 3"):
+        with_degree(tree, 4)
+
+
+@pytest.mark.parametrize(("groups", "cut"), [((1,) * 8, (1, 1, 1)), ((8,), (3,)), ((3, 5), (3,)), ((2, 6), (2, 1)), ((1, 1, 4, 2), (1, 1, 1))])
+def test_codes_stay_codes_when_harmonics_go(groups: tuple[int, ...], cut: tuple[int, ...]) -> None:
+    tree = compacted(random_tree(1, degree=2), 16, groups)
+    for degree, left in ((2, groups), (1, cut), (0, ())):
+        fewer = with_degree(tree, degree)
+        assert fewer.harmonics.groups == left  # type: ignore[union-attr]
+        assert np.array_equal(fewer.sh, tree.sh[:, : (degree + 1) ** 2])
+
+
+@pytest.mark.parametrize("resolution", [16, 12, 8, 5, 4, 1])
+def test_an_even_block_stays_what_it_is_in_any_resolution(resolution: int) -> None:
+    tree = uniform_tree(sigma=3.0)
+    fewer = with_resolution(tree, resolution)
+    assert fewer.voxel == pytest.approx(tree.voxel * 16 / resolution)
+    at = coordinates(fewer)
+    assert ((at >= 0) & (at < resolution)).all()
+    assert len(at) == resolution**3
+    np.testing.assert_allclose(fewer.density_values, 3.0, rtol=1e-5)
+    np.testing.assert_allclose(fewer.sh, tree.sh[0, 0, 0], rtol=1e-5)
+
+
+def test_a_thin_wall_lets_as_much_light_through() -> None:
+    """Every second column of an opaque sheet missing: half of the light passes, which no average of densities would tell."""
+    at = np.argwhere(np.ones((8, 8, 8), bool))
+    kept = at[(at[:, 0] == 3) & (at[:, 1] % 2 == 0)]
+    tree = tree_from_voxels((2, 2, 2), 0.1, np.zeros(3), kept, np.full(len(kept), 1e4, np.float32), np.ones((len(kept), 1, 3)))
+    fewer = with_resolution(tree, 4)
+    assert len(fewer.density_values) == 16
+    along_x = np.exp(-fewer.density_values * 0.2)
+    # Half is let through along x, half along y (the sheet is one of two layers), and half along z: so is the mean of them.
+    np.testing.assert_allclose(along_x, (0.5 + 0.5 + 0.75) / 3, rtol=1e-4)
+
+
+def test_colours_are_averaged_by_opacity() -> None:
+    at = np.array([[0, 0, 0], [1, 0, 0]])
+    sh = np.array([1.0, -1.0], np.float32)[:, None, None] * np.ones((2, 1, 3), np.float32)
+    tree = tree_from_voxels((1, 1, 1), 0.1, np.zeros(3), at, np.array([1e3, 1e-6], np.float32), sh)
+    np.testing.assert_allclose(with_resolution(tree, 2).sh, 1.0, atol=1e-4)
+
+
+def test_no_finer_resolution() -> None:
+    with pytest.raises(ValueError, match="resolution 17 from an asset of 16 voxels along its longest side"):
+        with_resolution(uniform_tree(), 17)
+
+
+def test_pruning_changes_no_picture() -> None:
+    tree = random_tree(4, shape=(5, 4, 6), share=0.6)
+    values = np.where(np.random.default_rng(0).random(len(tree.density_values)) < 0.9, 0, tree.density_values).astype(np.float32)
+    tree = replace(tree, density_values=values)
+    fewer = pruned(tree)
+    assert 0 < len(fewer.density_values) < len(tree.density_values)
+    assert fewer.metadata == tree.metadata
+    same_pictures(tree, fewer)
+    coded = compacted(tree, 16)
+    same_pictures(coded, pruned(coded))
+    full = uniform_tree()
+    assert pruned(full) is full
+
+
+def test_trees_of_nothing_stay_so() -> None:
+    empty = tree_from_voxels((2, 3, 1), 0.1, np.zeros(3), np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
+    assert not len(with_resolution(empty, 5).density_values)
+    assert pruned(empty) is empty
+    assert with_degree(empty, 0).degree == 0
