@@ -1,4 +1,4 @@
-"""The evaluate stage: PSNR and SSIM of the network and of the baked asset on the views that training never saw.
+"""The evaluate stage: PSNR, SSIM and, where asked for, LPIPS of the network and of the baked asset on the views that training never saw.
 
     metrics.json       network and asset: means over the views; views[]: the figures of each
     contact_sheet.png  truth, network and asset with their errors
@@ -14,23 +14,30 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from efficientnerf.cameras import MODELS, Camera
 from pipeline.stage import Job, Stage
+from stages.lpips_weights import load_lpips
 from stages.scene import Scene, View
 from stages.settings import setting
+
+if TYPE_CHECKING:
+    from efficientnerf.perceptual import Lpips
 
 FORMAT = 1
 NETWORK_SIDE = 400  # pixels: the longest side of what the network draws where evaluate.scale does not say
 PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal images get this
 SHEET_ROWS = 8
 SHEET_SIDE = 320
+
+
+NETWORKS = ("alex", "vgg")  # of LPIPS
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,8 @@ class EvaluateSettings:
     background_pixels: int = setting(
         500_000, "On photographs, pixels in all that the network draws as background for the asset on other views (then enlarged).", minimum=1
     )
+    lpips: str = setting("none", "Whether LPIPS is measured too, by which networks; their weights are files of their own.", choices=("none", *NETWORKS, "both"))
+    lpips_weights: str = setting("", "Folder with the weights of LPIPS; besides it, torch's cache and the package torchmetrics are looked at.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +97,8 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     stride = max(1, math.ceil(longest / NETWORK_SIDE if settings.scale is None else 1.0 / settings.scale - 1e-6))
     rest = background_stride([view for k, view in enumerate(views) if k not in drawn], settings.background_pixels)
+    wanted = {"none": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
+    perceptual = {f"lpips_{network}": load_lpips(network, settings.lpips_weights) for network in wanted}
     field: Any = None
     figures = []
     for k, view in enumerate(views):
@@ -97,13 +108,14 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
         if not done.exists():
             needs_field = k in drawn or behind_of(scene) is None
             field = field or (load_field() if needs_field else None)
-            measured, pictures = measure(tree, field, scene, view, job, drawn=k in drawn, stride=stride if k in drawn else rest)
+            thinning = stride if k in drawn else rest
+            measured, pictures = measure(tree, field, scene, view, job, drawn=k in drawn, stride=thinning, perceptual=perceptual)
             if k in drawn:
                 _keep_pictures(pictures, job.work, k)
             _write_json(measured, done)
         figures.append(json.loads(done.read_text(encoding="utf-8")))
     job.progress(len(views), len(views))
-    metrics = summary(figures, split=split, stride=stride, background=rest if behind_of(scene) is None else None)
+    metrics = summary(figures, split=split, stride=stride, background=rest if behind_of(scene) is None else None, perceptual=tuple(perceptual))
     _write_json(metrics, job.out / "metrics.json")
     _write_sheet(metrics, sorted(drawn), job)
 
@@ -180,11 +192,14 @@ def thickened(values: np.ndarray, stride: int, width: int, height: int) -> np.nd
     return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def measure(tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn: bool, stride: int) -> tuple[dict[str, Any], list[np.ndarray]]:
+def measure(
+    tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn: bool, stride: int, perceptual: Mapping[str, Lpips] | None = None
+) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The figures of one view, and, where the network is drawn, its pictures: truth, network, its error, asset, its error.
 
-    drawn   whether the network is measured; else it is asked only for the background of the asset, and not at all on a constant one
-    stride  thinning of what the network draws
+    drawn       whether the network is measured; else it is asked only for the background of the asset, and not at all on a constant one
+    stride      thinning of what the network draws
+    perceptual  LPIPS by the names of their figures
     """
     from stages.plots import eight_bits, error_picture
 
@@ -200,15 +215,25 @@ def measure(tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn:
         inside = small.inside if plain is not None else rendering.inside_opacity >= 0.5
         network = _clean(rendering.colour, job, f"{view.name}: the network")
         figures["network"] = {**compare(network, small, inside), "width": network.shape[1], "height": network.shape[0], **shares(rendering.counts)}
+        figures["network"] |= perceived(perceptual or {}, network, small)
         pictures += [eight_bits(small.colour), eight_bits(network), error_picture(network, small.colour)]
     asset, inside = asset_picture(tree, scene, view, rendering, stride)
     asset = _clean(asset, job, f"{view.name}: the asset")
     figures["asset"] = {**compare(asset, truth, truth.inside if inside is None else inside), "width": view.camera.width, "height": view.camera.height}
+    figures["asset"] |= perceived(perceptual or {}, asset, truth)
     if plain is None:
         figures["asset"]["background_scale"] = 1.0 / stride
     if figures["asset"]["psnr"] is None:
         job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
     return figures, [*pictures, eight_bits(asset), error_picture(asset, truth.colour)]
+
+
+def perceived(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: Truth) -> dict[str, float | None]:
+    """LPIPS by name; None for images too small for the networks."""
+    from efficientnerf.perceptual import SMALLEST
+
+    large = min(image.shape[:2]) >= SMALLEST
+    return {name: metric(image, truth.colour, truth.mask) if large else None for name, metric in perceptual.items()}
 
 
 def behind_of(scene: Scene) -> tuple[float, float, float] | None:
@@ -254,13 +279,13 @@ def compare(image: np.ndarray, truth: Truth, inside: np.ndarray | None) -> dict[
     }
 
 
-def summary(figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None) -> dict[str, Any]:
+def summary(figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, perceptual: Sequence[str] = ()) -> dict[str, Any]:
     """metrics.json: the means over the views (of PSNR in decibels, as published), how they were taken, and the figures of each."""
     drawn = [view["network"] for view in figures if view["network"] is not None]
     assets = [view["asset"] for view in figures]
     same = [view["asset"] for view in figures if view["network"] is not None]
-    network: dict[str, Any] = {**_means(drawn), **_means(drawn, SHARES), "views": len(drawn), "scale": 1.0 / stride}
-    asset: dict[str, Any] = {**_means(assets), "views": len(assets), "scale": 1.0, "on_network_views": _means(same)}
+    network: dict[str, Any] = {**_means(drawn), **_means(drawn, perceptual), **_means(drawn, SHARES), "views": len(drawn), "scale": 1.0 / stride}
+    asset: dict[str, Any] = {**_means(assets), **_means(assets, perceptual), "views": len(assets), "scale": 1.0, "on_network_views": _means(same)}
     if background is not None:
         asset["background_scale"] = {"network_views": 1.0 / stride, "other_views": 1.0 / background}
     return {"format": FORMAT, "split": split, "network": network, "asset": asset, "views": list(figures)}

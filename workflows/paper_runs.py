@@ -83,8 +83,9 @@ def scenes(data: Path) -> list[Path]:
 def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
     """Settings shrunk together: iterations by `scale`, image sides and voxels by its 0.3rd power, batch and widths by its 0.2nd, depths by its 0.1st.
 
-    Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises as networks shrink; the warm-up
-    becomes a larger share of the run, since pruning must wait until the coarse network knows where matter is, however short the run.
+    Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
+    and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
+    matter is.
     """
     if scale == 1:
         return stages
@@ -101,8 +102,8 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
     for name in ("layers", "coarse_layers"):
         train[name] = max(2, round(train[name] * scale**0.1))
     train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.3 / 8))
-    train["learning_rate"] = train["learning_rate"] / fifth
-    train["rate_steps"] = max(1, round(train["rate_steps"] * scale))
+    train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
+    train["rate_steps"] = max(1, round(train["rate_steps"] * scale**0.9))
     train["warm_up"] = round(train["iterations"] * min(0.3, train["warm_up"] / 1e6 * scale**-0.6))
     train["crop_steps"] = min(train["crop_steps"], train["iterations"] // 10)
     train["checkpoint_every"] = max(50, train["iterations"] // 4)

@@ -1,0 +1,57 @@
+"""Where the weights of LPIPS come from: a folder that is given, torch's cache of downloads, and the package torchmetrics, which ships the heads."""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import BadInput, UsageError
+
+if TYPE_CHECKING:
+    from efficientnerf.perceptual import Lpips
+
+BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
+SITE = "https://download.pytorch.org/models/"
+
+
+def load_lpips(network: str, folder: str) -> Lpips:
+    """The metric by "alex" or "vgg"; UsageError says what is missing and where to get it."""
+    from efficientnerf.perceptual import Lpips
+
+    places = [Path(folder)] if folder else []
+    hub = Path(os.environ.get("TORCH_HOME", Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")).expanduser() / "hub" / "checkpoints"
+    backbone = _found(BACKBONES[network], [*places, hub], f"Download {SITE}{BACKBONES[network]} into one of them, or name its folder: evaluate.lpips_weights.")
+    heads = _found(f"{network}.pth", [*places, *_shipped()], "Install the extra that brings it: pip install 'efficientnerf[lpips]'.")
+    try:
+        return Lpips(network, _state(backbone), _state(heads))
+    except ValueError as error:
+        raise BadInput(f"LPIPS, {backbone.name} with {heads}: {error}. Get the files again.") from None
+
+
+def _shipped() -> list[Path]:
+    """The folder of the heads in torchmetrics, which need not be imported for it."""
+    spec = find_spec("torchmetrics")
+    return [Path(place) / "functional" / "image" / "lpips_models" for place in (spec.submodule_search_locations or [])] if spec is not None else []
+
+
+def _found(name: str, places: list[Path], remedy: str) -> Path:
+    for place in places:
+        if (place / name).is_file():
+            return place / name
+    looked = ", ".join(str(place) for place in places) or "nowhere"
+    raise UsageError(f"evaluate.lpips: the weights {name} were not found (looked in {looked}). {remedy} Or leave it out: evaluate.lpips=none.")
+
+
+def _state(path: Path) -> dict[str, Any]:
+    """Tensors of a file of torch's, read without running anything in it."""
+    import torch
+
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # what torch.load raises for a damaged file is not told
+        raise BadInput(f"{path}: not a readable file of weights ({str(error).splitlines()[0][:80] if str(error) else type(error).__name__}).") from None
+    if not isinstance(state, dict):
+        raise BadInput(f"{path}: holds {type(state).__name__}; expected named tensors.")
+    return state
