@@ -126,6 +126,10 @@ def box_seen_together(
     centres = np.array([camera.centre for camera in cameras])
     reach = float(np.linalg.norm(focus - centres, axis=1).max())
     limits = [_depth_limits(near, far) for near, far in ranges]
+    if converging:
+        # Cameras that look at one point from around it show as much of the subject behind that point as before it.
+        ahead = [float((focus - camera.centre) @ camera.forward) for camera in cameras]
+        limits = [(near, max(far, 2 * at - near)) if np.isfinite(far) and at > near else (near, far) for (near, far), at in zip(limits, ahead, strict=True)]
     deepest = max((far for _, far in limits if np.isfinite(far)), default=0.0)
     reach = max(reach, deepest) if not converging else reach
     low, high = focus - reach, focus + reach
