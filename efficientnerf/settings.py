@@ -78,7 +78,7 @@ class TrainSettings:
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     warm_up: int = _setting(256, "steps in which no voxel is pruned", minimum=0)
-    learning_rate: float = _setting(1e-2, "Adam's rate after the first steps (the paper: 5e-4, with field mlp)", minimum=0.0)
+    learning_rate: float = _setting(2e-2, "Adam's rate after the first steps (the paper: 5e-4, with field mlp)", minimum=0.0)
     final_rate: float = _setting(0.05, "what is left of the rate after rate_steps; it falls exponentially", minimum=0.0, maximum=1.0)
     rate_steps: int = _setting(0, "steps in which the rate falls to final_rate of itself (the paper: 0.1 every 500,000); 0: all of them", minimum=0)
     rate_hold: int = _setting(0, "first steps in which the rate does not fall; 0: none, or with a budget those that are timed", minimum=0)
