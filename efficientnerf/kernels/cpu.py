@@ -17,8 +17,8 @@ PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Mueller et al.
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=False)
-def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, write, start, extent, length, point):  # type: ignore[no-untyped-def]
-    """One ray: counts its valid samples, and writes them where `write` >= 0. Returns (valid, tried)."""
+def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, begins):  # type: ignore[no-untyped-def]
+    """One ray: where its valid intervals begin, into `begins` (slots,). Returns (valid, tried, where the ray leaves)."""
     side = voxels.shape[0]
     ux, uy, uz = (ox - centre[0]) / half[0], (oy - centre[1]) / half[1], (oz - centre[2]) / half[2]
     vx, vy, vz = dx / half[0], dy / half[1], dz / half[2]
@@ -60,48 +60,62 @@ def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, s
         j = min(max(int(gy * side), 0), side - 1)
         k = min(max(int(gz * side), 0), side - 1)
         if voxels[i, j, k] > threshold:
-            if write >= 0:
-                n = write + valid
-                start[n], extent[n], length[n] = t, size, size / stretch
-                point[n, 0], point[n, 1], point[n, 2] = gx, gy, gz
+            begins[valid] = t
             valid += 1
         t = t + step * stretch
-    return valid, tried
+    return valid, tried, leave
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _count_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, counts, tried, start, extent, length, point):  # type: ignore[no-untyped-def]
+def _find_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, counts, tried, leave, begins):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
-            counts[r], tried[r] = _walk(
+            counts[r], tried[r], leave[r] = _walk(
                 origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r], offset[r],
-                centre, half, contracted, step, slots, voxels, threshold, -1, start, extent, length, point,
+                centre, half, contracted, step, slots, voxels, threshold, begins[r],
             )  # fmt: skip
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _write_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, first, start, extent, length, point):  # type: ignore[no-untyped-def]
+def _write_valid(origins, directions, offset, centre, half, contracted, step, leave, begins, first, start, extent, length, point):  # type: ignore[no-untyped-def]
+    one, two = np.float32(1), np.float32(2)
+    scale = np.float32(0.25) if contracted else np.float32(0.5)
+    shift = two if contracted else one
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
-            if first[r + 1] > first[r]:
-                _walk(
-                    origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r], offset[r],
-                    centre, half, contracted, step, slots, voxels, threshold, first[r], start, extent, length, point,
-                )  # fmt: skip
+            if first[r + 1] == first[r]:
+                continue
+            ux, uy, uz = (origins[r, 0] - centre[0]) / half[0], (origins[r, 1] - centre[1]) / half[1], (origins[r, 2] - centre[2]) / half[2]
+            vx, vy, vz = directions[r, 0] / half[0], directions[r, 1] / half[1], directions[r, 2] / half[2]
+            for n in range(first[r], first[r + 1]):
+                t = begins[r, n - first[r]]
+                stretch = one
+                if contracted:
+                    reach = max(max(abs(ux + t * vx), abs(uy + t * vy)), max(abs(uz + t * vz), one))
+                    stretch = reach * reach
+                size = min(step * stretch, leave[r] - t)
+                at = t + offset[r] * size
+                px, py, pz = ux + at * vx, uy + at * vy, uz + at * vz
+                if contracted:
+                    m = max(max(abs(px), abs(py)), max(abs(pz), one))
+                    f = (two - one / m) / m
+                    px, py, pz = px * f, py * f, pz * f
+                start[n], extent[n], length[n] = t, size, size / stretch
+                point[n, 0], point[n, 1], point[n, 2] = (px + shift) * scale, (py + shift) * scale, (pz + shift) * scale
 
 
 def valid_samples(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold):  # type: ignore[no-untyped-def]
     """`efficientnerf.sampling.valid_samples` on float32 arrays: (first, start, extent, length, point, tried)."""
     rays = len(origins)
-    counts, tried = np.zeros(rays, np.int64), np.zeros(rays, np.int64)
-    empty, no_point = np.empty(0, np.float32), np.empty((0, 3), np.float32)
-    args = (origins, directions, near, far, offset, centre, half, contracted, np.float32(step), slots, voxels, np.float32(threshold))
-    _count_valid(*args, counts, tried, empty, empty, empty, no_point)
+    counts, tried, leave = np.zeros(rays, np.int64), np.zeros(rays, np.int64), np.empty(rays, np.float32)
+    begins = np.empty((rays, slots), np.float32)  # of a row only as much is touched as the ray has valid samples
+    step = np.float32(step)
+    _find_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, np.float32(threshold), counts, tried, leave, begins)
     first = np.zeros(rays + 1, np.int64)
     np.cumsum(counts, out=first[1:])
     n = int(first[-1])
     start, extent, length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
-    _write_valid(*args, first, start, extent, length, point)
+    _write_valid(origins, directions, offset, centre, half, contracted, step, leave, begins, first, start, extent, length, point)
     return first, start, extent, length, point, int(tried.sum())
 
 
