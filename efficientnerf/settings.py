@@ -88,7 +88,7 @@ class TrainSettings:
         0, "first steps that see only the middle half of each picture's sides, so that thin scenes on white don't collapse to white (NeRF: 500)", minimum=0
     )
     backdrop: str = _setting(
-        "random", "behind cut-out objects in training; random: a colour for each ray, so that no background is learned; scene: the scene's (NeRF: white)",
+        "random", "behind cut-out objects in training; random: a colour for each ray, so that none is learned; scene: its own (NeRF; the paper doesn't say)",
         choices=("random", "scene"),
     )  # fmt: skip
     checkpoint_every: int = _setting(250, "steps between checkpoints", minimum=1)

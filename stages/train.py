@@ -217,7 +217,9 @@ def _resume(t: Trainer, job: Job, log: Path) -> float:
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
-    out = []
+    out: list[dict[str, Any]] = []
+    if not log.exists():  # nothing has been written before the first checkpoint
+        return out
     for text in log.read_text(encoding="utf-8").splitlines():
         try:
             out.append(json.loads(text))

@@ -81,7 +81,7 @@ def scenes(data: Path) -> list[Path]:
 
 
 def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
-    """Settings shrunk together: iterations by `scale`, image sides and voxels by its 0.3rd power, batch and widths by its 0.2nd, depths by its 0.1st.
+    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides and voxels 0.3, batch 0.2, widths 0.15, depths 0.05.
 
     Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
     and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
@@ -93,14 +93,14 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
     train, fifth = out["train"], scale**0.2
 
     def width(units: int) -> int:
-        return max(16, 16 * round(units * fifth / 16))
+        return max(16, 16 * round(units * scale**0.15 / 16))
 
     train["iterations"] = max(60, round(train["iterations"] * scale))
     train["rays"] = max(64, 32 * round(train["rays"] * fifth / 32))
     for name in ("hidden", "coarse_hidden"):
         train[name] = width(train[name])
     for name in ("layers", "coarse_layers"):
-        train[name] = max(2, round(train[name] * scale**0.1))
+        train[name] = max(2, round(train[name] * scale**0.05))
     train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.3 / 8))
     train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
     train["rate_steps"] = max(1, round(train["rate_steps"] * scale**0.9))

@@ -1,0 +1,128 @@
+"""Tables that train: what a scale makes of the settings, what a log says of the pace, what the tables make of figures, and one table from end to end."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import BadInput
+from tests.efficientnerf.balls import cameras, picture
+from tests.stages.captures import write_picture
+from workflows import paper, paper_tables
+from workflows.cli import main
+from workflows.paper import PAPER, Request
+from workflows.paper_runs import Figures, Row, _pace, scenes, settings_of
+
+
+def ball(folder: Path) -> Path:
+    """A Blender data set of the analytic ball: 8 views to train on, 2 to test on."""
+    for split, some in (("train", cameras(8, 48)), ("test", cameras(10, 48)[8:])):
+        frames = []
+        for n, camera in enumerate(some):
+            write_picture(folder / split / f"{n}.png", picture(camera))
+            pose = camera.world_from_camera.copy()
+            pose[:3, 1:3] *= -1  # Blender's cameras look along -z
+            frames.append({"file_path": f"./{split}/{n}", "transform_matrix": pose.tolist()})
+        import math
+
+        document = {"camera_angle_x": 2 * math.atan(24 / (1.3 * 48)), "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(document))
+    return folder
+
+
+def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
+    whole, small = (settings_of(Row("n4"), scale) for scale in (1.0, 0.001))
+    assert whole["train"]["iterations"] == 1_000_000
+    assert (whole["train"]["hidden"], whole["train"]["voxels"], whole["poses"]["max_side"]) == (256, 384, 800)
+    assert small["train"]["iterations"] == 1000
+    for name in ("rays", "hidden", "coarse_hidden", "layers", "voxels"):
+        assert small["train"][name] < whole["train"][name], name
+    assert small["poses"]["max_side"] < 800
+    assert small["bake"]["resolution"] < whole["bake"]["resolution"]
+    for name in ("coarse_samples", "fine_samples", "near", "far", "degree", "pivotal_weight", "voxel_beta", "voxel_initial", "sampling", "max_pivots"):
+        assert small["train"][name] == whole["train"][name], name
+    light, standard = settings_of(Row("n4"), 0.001)["train"], settings_of(Row("nerf", paper_tables.NERF), 0.001)["train"]
+    assert light["coarse_hidden"] < standard["coarse_hidden"] == standard["hidden"]
+    differ = {name for name in light if light[name] != standard[name]}
+    assert differ == {"field", "sampling", "coarse_samples", "coarse_hidden", "coarse_layers"}  # so the rest is shared
+
+
+def test_the_pace_is_that_of_the_log() -> None:
+    lines = [
+        {"step": step, "step_seconds": 2.0 if step <= 50 else 1.0, "held_back_psnr": None if step % 50 else 20.0 + step, "rays": 10, "valid": 30, "fine": 50}
+        for step in range(10, 101, 10)
+    ]
+    pace = _pace(lines)
+    assert pace["step"] == pytest.approx(1.5)
+    assert pace["steady"] == 1.0
+    assert pace["hours"] == pytest.approx(150 / 3600)
+    assert (pace["coarse"], pace["fine"]) == (3.0, 5.0)
+    assert pace["curve"] == ([100.0, 150.0], [70.0, 120.0])
+
+
+def made_up(steady: float, psnr: float) -> Figures:
+    tree = {"psnr": psnr - 0.5, "ssim": 0.9, "fps": 20.0, "frame": "100x100", "mib": 3.0}
+    return Figures(psnr, 0.95, 2 * steady, steady, 1.0, 12.0, 24.0, 0.1, 0.04, ([1.0, 2.0], [20.0, psnr]), tree)
+
+
+@pytest.mark.parametrize("number", ["1", "2", "3", "4", "5", "6"])
+def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def measured(request: Request, scene: Path, row: Row) -> Figures:
+        settings_of(row, request.scale)  # its settings exist
+        asked.append(row.name)
+        return made_up(0.184 if row.name == "nerf" else 0.021, 21.0 if row.name == "valid" else 30.0)
+
+    monkeypatch.setattr(paper_tables, "measured", measured)
+    request = Request(ball(tmp_path / "chair"), tmp_path / "out", 0.001)
+    paper.make(number, request)
+    document = json.loads((tmp_path / "out" / f"table_{number}.json").read_text())
+    assert document["rows"]
+    assert any(column.endswith(PAPER) for column in document["columns"])
+    for row in document["rows"]:
+        assert set(row) <= set(document["columns"])
+    assert (tmp_path / "out" / f"table_{number}.png").exists()
+    notes = " ".join(document["notes"])
+    if number == "5":
+        assert document["rows"][0]["method"] == "NeRF"
+        assert "8.8 times as fast as NeRF per iteration" in notes
+        assert document["rows"][-1]["less time %"] == pytest.approx(88.6, abs=0.1)
+        assert document["rows"][-1]["less time %" + PAPER] == pytest.approx(88.6, abs=0.1)
+        assert "do not count: valid on chair" in notes
+    else:
+        assert "All rows are pictures" in notes
+    if number == "1":
+        assert document["rows"][0]["valid %" + PAPER] == 9.58
+
+
+def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path) -> None:
+    data, out = ball(tmp_path / "ball"), tmp_path / "out"
+    command = ["paper", "1", "--data", str(data), "--out", str(out), "--scale", "0.00001", "--device", "cpu", "--quiet"]
+    assert main(command) == 0
+    row = json.loads((out / "table_1.json").read_text())["rows"][0]
+    assert 0 < row["pivotal %"] <= row["valid %"] < 100
+    assert row["PSNR"] > 10
+    field = out / "runs/ball/n4/train/field.safetensors"
+    made = field.stat().st_mtime_ns
+    assert main(command) == 0
+    assert field.stat().st_mtime_ns == made
+
+
+def test_scenes_are_found_and_their_absence_is_told(tmp_path: Path) -> None:
+    one = ball(tmp_path / "all" / "one")
+    assert scenes(one) == [one]
+    assert scenes(tmp_path / "all") == [one]
+    (tmp_path / "none").mkdir()
+    with pytest.raises(BadInput, match="holds no data set"):
+        scenes(tmp_path / "none")
+
+
+def test_figures_say_whether_they_are_a_picture() -> None:
+    some: Any = made_up(0.1, 21.9)
+    assert not some.counts
+    assert dataclasses.replace(some, psnr=22.0).counts
