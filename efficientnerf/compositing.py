@@ -28,7 +28,10 @@ def activate(raw: Tensor, activation: str) -> Tensor:
 
 
 def ray_of_sample(first: Tensor, samples: int) -> Tensor:
-    """(N,) which ray each packed sample belongs to; first (R + 1,) offsets."""
+    """(N,) which ray each packed sample belongs to; first (R + 1,) offsets. Padding, beyond the last offset, is told to belong to the last ray."""
+    if first.is_cuda or int(first[-1]) != samples:
+        at = torch.arange(samples, device=first.device)
+        return (torch.searchsorted(first, at, right=True) - 1).clamp(max=len(first) - 2)
     counts = first[1:] - first[:-1]
     return torch.repeat_interleave(torch.arange(len(counts), device=first.device), counts, output_size=samples)
 

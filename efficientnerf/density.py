@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from efficientnerf.transfer import sent
+
 
 @dataclass
 class DensityVoxels:
@@ -69,6 +71,11 @@ def update(voxels: DensityVoxels, cell: Tensor, density: Tensor) -> None:
     if voxels.rule == "maximum":
         flat.scatter_reduce_(0, cell, density, reduce="amax", include_self=True)
         return
+    if flat.is_cuda:  # finding out how many voxels were seen would make the host wait
+        counts = torch.zeros_like(flat).index_add_(0, cell, torch.ones_like(density))
+        mean = torch.zeros_like(flat).index_add_(0, cell, density) / counts.clamp(min=1)
+        flat.copy_(torch.where(counts > 0, (1 - voxels.beta) * flat + voxels.beta * mean, flat))
+        return
     seen, index, counts = torch.unique(cell, return_inverse=True, return_counts=True)
     mean = torch.zeros(len(seen), dtype=flat.dtype, device=flat.device).index_add_(0, index, density) / counts
     flat[seen] = (1 - voxels.beta) * flat[seen] + voxels.beta * mean
@@ -88,12 +95,25 @@ def sweep_cells(voxels: DensityVoxels, part: int, parts: int, generator: torch.G
 
 def _point_in(cell: Tensor, side: int, generator: torch.Generator) -> Tensor:
     corner = torch.stack([cell // (side * side), cell // side % side, cell % side], dim=1)
-    return (corner + torch.rand(len(cell), 3, generator=generator).to(cell.device)) / side
+    return (corner + sent(torch.rand(len(cell), 3, generator=generator), cell.device)) / side
+
+
+def _chosen_on_device(valid: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """(count,) cells, half anywhere and half among the valid (D^3,), wherever there are any; how many there are stays on the device."""
+    chance = sent(torch.rand(count, generator=generator, dtype=torch.float64), valid.device)
+    anywhere = (chance * len(valid)).long()
+    before = torch.cumsum(valid, dim=0)
+    among = torch.searchsorted(before, (chance * before[-1]).long(), right=True).clamp(max=len(valid) - 1)
+    turn = torch.arange(count, device=valid.device) % 2 == 0
+    return torch.where(turn | (before[-1] == 0), anywhere, among)
 
 
 def refresh_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Cells to ask about anew, half anywhere and half among the valid, and a random point in each: (count,), (count, 3) grid coordinates."""
     flat = voxels.values.view(-1)
+    if flat.is_cuda:
+        cell = _chosen_on_device(flat > voxels.threshold, count, generator)
+        return cell, _point_in(cell, voxels.side, generator)
     anywhere = torch.randint(len(flat), (count - count // 2,), generator=generator).to(flat.device)
     valid = torch.nonzero(flat > voxels.threshold).squeeze(1)
     pick = torch.randint(max(len(valid), 1), (count // 2,), generator=generator).to(flat.device)

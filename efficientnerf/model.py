@@ -18,6 +18,7 @@ from efficientnerf.fields.nerf import NerfField
 from efficientnerf.grid import FrameRays, Space
 from efficientnerf.harmonics import basis, harmonics_count
 from efficientnerf.kernels import dispatch
+from efficientnerf.late import Room
 from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples, united
 from efficientnerf.settings import TrainSettings
 
@@ -79,7 +80,7 @@ class Model:
         """Colour (R, 3) beyond all samples."""
         if self.background is None:
             return self.sky(directions) if self.space.ndc is None else torch.full_like(directions, UNSEEN)
-        return torch.tensor(self.background, device=directions.device).expand(len(directions), 3)
+        return torch.stack([torch.full((len(directions),), value, device=directions.device) for value in self.background], dim=1)
 
 
 class Look(NamedTuple):
@@ -154,7 +155,7 @@ def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField, Any
 
 def look(
     m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, behind: Tensor, *,
-    prune: bool = True, rng: np.random.Generator | None = None,
+    prune: bool = True, rng: np.random.Generator | None = None, room: Room | None = None,
 ) -> Look:  # fmt: skip
     """Both stages along a bundle of rays: valid samples through the coarse field, pivotal ones through the fine one, or as `settings.sampling` says.
 
@@ -166,6 +167,7 @@ def look(
                          share of the valid intervals is looked at by the fine field too. Without that the fine field would be
                          free to put matter where this ray has no pivot and another has one, and the baked asset, which has no coarse
                          stage to hide it, would show it.
+    room                 on CUDA, with sampling "efficient": samples are padded to this many, and their number is not waited for
     """
     rays = m.space.rays(origins, directions, near, far)
     bundle = (rays.origins, rays.directions, rays.near, rays.far)
@@ -178,20 +180,29 @@ def look(
     if m.settings.sampling == "hierarchical":
         coarse, at = _even_samples(m, *bundle, offset, m.settings.coarse_samples, rng)
     else:
-        coarse = _valid_samples(m, *bundle, offset, prune=prune, rng=rng)
+        coarse = _valid_samples(m, *bundle, offset, prune=prune, rng=rng, capacity=None if room is None else room.coarse)
         at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent
     coarse_raw, seen = _seen(m.coarse, directions, coarse, behind)
     weight = seen.weight.detach()
     pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
     if m.settings.sampling == "efficient":
         if rng is not None and m.settings.explored > 0:
-            pivotal = pivotal | torch.from_numpy(rng.random(len(pivotal), np.float32) < m.settings.explored).to(pivotal.device)
-        fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, m.settings.fine_samples)
+            pivotal = pivotal | _chance(len(pivotal), m.settings.explored, rng, pivotal.device)
+        capacity = None if room is None else room.fine
+        fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, m.settings.fine_samples, capacity)
     else:
         quantile = _strata(len(origins), m.settings.importance_samples, rng, offset.device)
         fine = importance_samples(m.space, *bundle[:2], coarse, at, weight, quantile)
     fine_raw, out = _seen(m.fine, directions, fine, behind)
     return Look(rays, coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
+
+
+def _chance(count: int, share: float, rng: np.random.Generator, device: torch.device) -> Tensor:
+    """(count,) bool, about `share` of them; drawn on the device where there is one, since sending them takes longer."""
+    if device.type == "cuda":
+        generator = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
+        return torch.rand(count, generator=generator, device=device) < share
+    return torch.from_numpy(rng.random(count, np.float32) < share)
 
 
 def _seen(field: AnyField, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:
@@ -210,13 +221,14 @@ def _summed(out: Composite, coarse_distortion: Tensor | float) -> tuple[Tensor, 
 
 
 def _valid_samples(
-    m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, *, prune: bool, rng: np.random.Generator | None
-) -> Samples:
+    m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, *, prune: bool, rng: np.random.Generator | None,
+    capacity: int | None,
+) -> Samples:  # fmt: skip
     """Coarse samples where the voxels say that something is; of the first rays, which are as random as any, all, where the settings say so."""
 
     def of(rays: slice, threshold: float) -> Samples:
         return dispatch.valid_samples(
-            m.space, origins[rays], directions[rays], near[rays], far[rays], offset[rays], m.step, m.slots, m.voxels.values, threshold
+            m.space, origins[rays], directions[rays], near[rays], far[rays], offset[rays], m.step, m.slots, m.voxels.values, threshold, capacity
         )
 
     if not prune:

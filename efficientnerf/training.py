@@ -20,8 +20,10 @@ from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
 from efficientnerf.exposure import exposed, exposure_loss
 from efficientnerf.kernels import dispatch
+from efficientnerf.late import Counted, Late, mean_over, whole_rays
 from efficientnerf.model import Look, Model, look
 from efficientnerf.pixels import Pixels
+from efficientnerf.transfer import sent
 
 RATE_WARM_UP = 100  # steps in which the rate rises, or the first tenth of a shorter run
 BETA1 = 0.9
@@ -88,7 +90,7 @@ class Progress:
     """What one step did.
 
     step        from 1
-    loss        mean squared error of the fine colours
+    loss        mean squared error of the fine colours; this and the counts are those of some steps before on CUDA (`efficientnerf.late`)
     rays        in the step
     tried       coarse intervals, valid or not
     valid, pivotal, fine   how many samples of each kind
@@ -174,6 +176,8 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
     m = t.model
     device = m.device
     transparent = pixels.images.shape[1] == 4
+    # On CUDA nothing waits for the device; see `efficientnerf.late`.
+    late = Late() if dispatch.on_device(m.voxels.values) and m.settings.sampling == "efficient" and m.settings.refresh_rays == 0 else None
     while t.step < m.settings.iterations:
         number, settings = t.step + 1, m.settings
         rng = np.random.Generator(np.random.Philox(key=settings.seed, counter=[0, 0, 0, number]))
@@ -181,27 +185,29 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         # A bundle of rays of about as many samples as the settings ask for.
         count = int(min(settings.rays, max(FEWEST_RAYS, settings.samples / t.samples_per_ray))) if settings.samples else settings.rays
         chosen = pixels.choose(count, rng, middle=number <= settings.crop_steps)
-        origins, directions, near, far, colour = (torch.from_numpy(a).to(device) for a in pixels.bundle(chosen))
-        offset = torch.from_numpy(rng.random(count, np.float32)).to(device)
+        origins, directions, near, far, colour = (sent(torch.from_numpy(a), device) for a in pixels.bundle(chosen))
+        offset = sent(torch.from_numpy(rng.random(count, np.float32)), device)
         behind = m.behind(directions)
         if m.space.ndc is not None and m.background is None:
             # Behind a space that reaches to infinity nothing lies: a new colour for each ray keeps the field from leaving it half transparent.
-            behind = torch.from_numpy(rng.random((count, 3), np.float32)).to(device)
+            behind = sent(torch.from_numpy(rng.random((count, 3), np.float32)), device)
         if transparent:
             if settings.backdrop == "random" or m.background is None:
                 # Behind an object cut out of its background anything may lie: a new colour for each ray keeps the field from learning one.
-                behind = torch.from_numpy(rng.random((count, 3), np.float32)).to(device)
+                behind = sent(torch.from_numpy(rng.random((count, 3), np.float32)), device)
             colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
 
         # Both stages, both losses (weighted equally, as in the authors' release).
-        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up, rng=rng)
+        room = None if late is None else late.room(count)
+        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up, rng=rng, room=room)
+        whole = None if room is None else whole_rays(seen.coarse, seen.fine, room)
         fine_colour, coarse_colour = seen.fine_colour, seen.coarse_colour
         if t.exposure is not None:
-            view = torch.from_numpy(pixels.view_of(chosen)).to(device)
+            view = sent(torch.from_numpy(pixels.view_of(chosen)), device)
             fine_colour = exposed(fine_colour, view, t.exposure)
             coarse_colour = None if coarse_colour is None else exposed(coarse_colour, view, t.exposure)
-        fine_loss = ((fine_colour - colour) ** 2).mean()
-        loss = fine_loss if coarse_colour is None else fine_loss + ((coarse_colour - colour) ** 2).mean()
+        fine_loss = mean_over((fine_colour - colour) ** 2, whole)
+        loss = fine_loss if coarse_colour is None else fine_loss + mean_over((coarse_colour - colour) ** 2, whole)
         if t.exposure is not None:
             loss = loss + exposure_loss(t.exposure)
         if m.space.contracted or m.space.ndc is not None:
@@ -212,7 +218,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
                 _quieten_near_cameras(m, origins, seen)
             strength = settings.anchors * max(0.0, 1 - 2 * share_of_fall(number, settings.iterations, settings.rate_hold))
             if anchors is not None and strength > 0:
-                loss = loss + strength * anchor_loss(m, anchors, max(1, count // ANCHOR_SHARE), rng, prune=number > settings.warm_up)
+                loss = loss + strength * anchor_loss(m, anchors, max(1, count // ANCHOR_SHARE), rng, late, prune=number > settings.warm_up)
         loss.backward()
         rate = learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations, settings.rate_steps, settings.rate_hold)
         t.adam.step(number, rate)
@@ -223,17 +229,23 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
                 remember(m, seen.coarse.point, seen.coarse_raw[:, 0].detach())
             if m.prunes and number % settings.refresh_every == 0:
                 refresh(m, number, rng)
-            if m.prunes and len(seen.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
-                # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
+            # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
+            if m.prunes and late is not None and number % settings.refresh_every == 0:
+                m.voxels.values.copy_(torch.where((m.voxels.values > m.voxels.threshold).any(), m.voxels.values, m.voxels.start))
+            elif m.prunes and late is None and len(seen.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
                 m.voxels.values.fill_(m.voxels.start)
 
-        fine, valid = len(seen.fine.start), len(seen.coarse.start)
-        t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((fine + valid) / count, 1.0)
         t.step = number
-        yield Progress(number, float(fine_loss.detach()), count, seen.coarse.tried, valid, int(seen.pivotal.sum()), fine)
+        if late is not None:
+            counted = late.note(count, fine_loss, seen.coarse, seen.pivotal, seen.fine)
+            t.samples_per_ray = max(late.valid_per_ray + late.fine_per_ray, 1.0)
+        else:
+            counted = Counted(float(fine_loss.detach()), seen.coarse.tried, len(seen.coarse.start), int(seen.pivotal.sum()), len(seen.fine.start))
+            t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((counted.fine + counted.valid) / count, 1.0)
+        yield Progress(number, counted.loss, count, counted.tried, counted.valid, counted.pivotal, counted.fine)
 
 
-def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator, *, prune: bool) -> Tensor:
+def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator, late: Late | None = None, *, prune: bool) -> Tensor:
     """How much of the light on some rays is not absorbed close to the point that was seen there, for both stages: 0 to 2.
 
         1 - sum_i w_i max(0, 1 - |t_i - d| / (ANCHOR_WIDTH e_i))
@@ -242,16 +254,22 @@ def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator
     point is cleared away by it, which photographs alone take long to do: they look as well explained by fog of the right colour.
     """
     pick = rng.integers(len(anchors), size=count)
-    origins, directions, distance = (torch.from_numpy(a[pick]).to(m.device) for a in (anchors.origins, anchors.directions, anchors.distance))
-    offset = torch.from_numpy(rng.random(count, np.float32)).to(m.device)
+    origins, directions, distance = (sent(torch.from_numpy(a[pick]), m.device) for a in (anchors.origins, anchors.directions, anchors.distance))
+    offset = sent(torch.from_numpy(rng.random(count, np.float32)), m.device)
     near, far = 0.1 * distance, 4 * distance
-    seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng)
+    room = None if late is None else late.room(2 * count)  # they begin closer to the camera, and end farther away
+    seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng, room=room)
+    whole = None if room is None else whole_rays(seen.coarse, seen.fine, room)
     distance = seen.rays.frame(distance)
     loss = origins.new_zeros(())
     for samples, weight, share in ((seen.coarse, seen.coarse_weight, 1), (seen.fine, seen.fine_weight, m.settings.fine_samples)):
         ray = ray_of_sample(samples.first, len(samples.start))
-        off = (samples.start + samples.extent / 2 - distance[ray]).abs() / (ANCHOR_WIDTH * share * samples.extent)
-        loss = loss + 1 - (weight * (1 - off).clamp(min=0)).sum() / count
+        off = (samples.start + samples.extent / 2 - distance[ray]).abs() / (ANCHOR_WIDTH * share * samples.extent).clamp(min=1e-12)
+        held = weight * (1 - off).clamp(min=0)
+        if whole is None:
+            loss = loss + 1 - held.sum() / count
+        else:
+            loss = loss + mean_over(1 - held.new_zeros(count).index_add(0, ray, held), whole)
     return loss
 
 
@@ -261,7 +279,7 @@ def _quieten_near_cameras(m: Model, origins: Tensor, seen: Look) -> None:
     Close to a camera rays crowd together, so that samples there are pulled far more often than those on the subject, and matter hangs before
     the lens. Philip and Deschaintre 2023, "Floaters no more: radiance field gradient scaling for improved near-camera training".
     """
-    subject = (origins - torch.as_tensor(m.space.centre, dtype=origins.dtype, device=origins.device)).norm(dim=-1)
+    subject = (origins - sent(torch.as_tensor(m.space.centre, dtype=origins.dtype), origins.device)).norm(dim=-1)
     for samples, raw in ((seen.coarse, seen.coarse_raw), (seen.fine, seen.fine_raw)):
         if not raw.requires_grad:  # uniform sampling has no coarse stage
             continue

@@ -68,10 +68,11 @@ class HashField(nn.Module):
         if _by_kernel(points, self):
             precision = precision_of(self.precision, "cpu") if torch.is_grad_enabled() else torch.float32
             return _Network.apply(points, self.table, self, precision, *weights)
-        x = encode(points, self)
+        precision = precision_of(self.precision, points.device.type) if on_device(points, self.table) and torch.is_grad_enabled() else points.dtype
+        x = encode(points, self).to(precision)
         for weight in weights[:-1]:
-            x = torch.relu(x @ weight.t())
-        return x @ last.t()
+            x = torch.relu(x @ weight.to(precision).t())
+        return (x @ last.to(precision).t()).to(points.dtype)
 
 
 def _by_kernel(points: Tensor, field: HashField) -> bool:

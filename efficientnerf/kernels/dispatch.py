@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,6 +16,9 @@ from efficientnerf import compositing, sampling
 from efficientnerf.compositing import Composite
 from efficientnerf.grid import Space
 from efficientnerf.sampling import Samples
+
+if TYPE_CHECKING:
+    from efficientnerf.nerftree.tree import NerfTree
 
 
 def _fast(*tensors: Tensor) -> bool:
@@ -40,6 +43,11 @@ def triton_usable() -> bool:
     return cuda.usable()
 
 
+def _refuse(capacity: int | None) -> None:
+    if capacity is not None:
+        raise ValueError(f"capacity {capacity}: only the kernels on CUDA pad their samples; elsewhere their number is known")
+
+
 def _array(t: Tensor) -> np.ndarray:
     return t.detach().contiguous().numpy()
 
@@ -49,13 +57,15 @@ def _box(space: Space) -> tuple[np.ndarray, np.ndarray, bool]:
 
 
 def valid_samples(
-    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float
-) -> Samples:
-    """See `efficientnerf.sampling.valid_samples`."""
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
+    capacity: int | None = None,
+) -> Samples:  # fmt: skip
+    """See `efficientnerf.sampling.valid_samples`; `capacity` is for the Triton kernels alone, see `efficientnerf.kernels.cuda_sampling`."""
     if on_device(origins, directions, near, far, offset, voxels):
         from efficientnerf.kernels import cuda_sampling
 
-        return cuda_sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold)
+        return cuda_sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, capacity)
+    _refuse(capacity)
     if not _fast(origins, directions, near, far, offset, voxels):
         return sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold)
     from efficientnerf.kernels import cpu
@@ -81,12 +91,15 @@ def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor
     return out
 
 
-def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
-    """See `efficientnerf.sampling.pivotal_samples`."""
+def pivotal_samples(
+    space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int, capacity: int | None = None
+) -> Samples:
+    """See `efficientnerf.sampling.pivotal_samples`; `capacity` as for `valid_samples`."""
     if on_device(origins, directions, offset, coarse.start):
         from efficientnerf.kernels import cuda_sampling
 
-        return cuda_sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
+        return cuda_sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot, capacity)
+    _refuse(capacity)
     if not _fast(origins, directions, offset, coarse.start):
         return sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
     from efficientnerf.kernels import cpu
@@ -96,6 +109,19 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
         _array(coarse.first), _array(coarse.start), _array(coarse.extent), _array(coarse.length), _array(pivotal), per_pivot,
     )  # fmt: skip
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried])
+
+
+def tree_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, looking: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+    """Colour, opacity, distance and normal of rays of a tree's frame, where the tree is to be drawn; see `efficientnerf.kernels.cpu_tree.render_rays`."""
+    if tree.device != "cpu" and triton_usable():
+        from efficientnerf.kernels import cuda_tree
+
+        given = (origins, directions) if looking is None else (origins, directions, looking)
+        there = [torch.from_numpy(np.ascontiguousarray(a, np.float64)).to(tree.device) for a in given]
+        return tuple(part.cpu().numpy() for part in cuda_tree.draw_rays(tree.on_device, *there))
+    from efficientnerf.kernels.cpu_tree import render_rays
+
+    return render_rays(tree, origins, directions, looking)
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:

@@ -138,7 +138,7 @@ class NerfTree:
         return device_tree(self, self.device)
 
     def to(self, device: str) -> NerfTree:
-        """The same tree with its pictures drawn on "cpu" or "cuda", the latter where its kernels can be built; rays and points are answered on the CPU."""
+        """The same tree, drawn on "cpu" or "cuda", the latter where its kernels can be built; points are answered on the CPU."""
         return replace(self, device=device)
 
     @staticmethod
@@ -166,12 +166,12 @@ class NerfTree:
 
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
         """What rays see: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray."""
-        from efficientnerf.kernels.cpu_tree import render_rays
+        from efficientnerf.kernels.dispatch import tree_rays
 
         if self.ndc is None:
-            return Rendering(*render_rays(self, origins, directions))
+            return Rendering(*tree_rays(self, origins, directions))
         rays = self.frame_rays(origins, directions)
-        colour, opacity, along, normal = render_rays(self, rays.origins, rays.directions, looking=np.asarray(directions))
+        colour, opacity, along, normal = tree_rays(self, rays.origins, rays.directions, looking=np.asarray(directions))
         return Rendering(colour, opacity, *self._in_world(rays, along, normal))
 
     def frame_rays(self, origins: Any, directions: Any) -> WarpedRays:

@@ -150,6 +150,16 @@ def test_a_picture_is_its_rays() -> None:
     assert (np.abs(picture.colour.reshape(-1, 3) - flat.colour) < 1e-3).mean() > 0.99
 
 
+def test_rays_of_another_frame_are_looked_at_along_those_of_the_world() -> None:
+    tree = random_tree(3, degree=2)
+    origins, directions = rays_at(tree, 60)
+    looking = np.roll(directions, 1, axis=0)
+    found = cuda.draw_rays(cuda.device_tree(tree, DEVICE), *(t.to(DEVICE) for t in tensors(origins, directions, looking)))
+    from efficientnerf.kernels.cpu_tree import render_rays
+
+    agree(Rendering(*(t.cpu().numpy() for t in found)), Rendering(*render_rays(tree, origins, directions, looking)), faces=0.02)
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("supersample", [1, 2])
 def test_a_tree_on_the_device_renders_as_on_the_cpu(supersample: int) -> None:
