@@ -1,8 +1,9 @@
-"""Write docs/settings.md and docs/commands.md from the code; with --check, say whether they are up to date."""
+"""Write docs/settings.md, docs/commands.md and docs/hostile.md from the code; with --check, say whether they are up to date."""
 
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 
 import click
@@ -13,6 +14,7 @@ from workflows.cli import enerf
 from workflows.resolve import meaning, preset_names, read_preset, shown
 
 FOLDER = Path(__file__).parent
+sys.path.insert(0, str(FOLDER.parent))  # the tests are not installed
 NOTE = "<!-- Made from the code by `make docs`; changes belong there. -->"
 
 
@@ -71,7 +73,35 @@ def commands_page() -> str:
     return "\n".join(lines) + "\n"
 
 
-PAGES = {"settings.md": settings_page, "commands.md": commands_page}
+def hostile_page() -> str:
+    from efficientnerf.nerftree.format import FormatError, load
+    from tests.efficientnerf.hostile import HOSTILE
+
+    lines = [
+        NOTE,
+        "# Hostile asset files",
+        "",
+        "A file for each rule of [FORMAT.md](../efficientnerf/nerftree/FORMAT.md), and what is said of it; `enerf` ends with exit code 4. The files are",
+        "made by `tests/efficientnerf/hostile.py`. A file cut short at any byte, or with any bit of its tensors changed, is refused as well; files changed",
+        "at random are refused or read, and nothing else happens (`benchmarks/fuzz_format.py`).",
+        "",
+        "| file | message |",
+        "|---|---|",
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "asset.nerftree"
+        for name, (make, _) in HOSTILE.items():
+            path.write_bytes(make())
+            try:
+                load(path)
+            except FormatError as error:
+                lines.append(f"| {cell(name)} | {cell(str(error))} |")
+            else:
+                raise SystemExit(f"hostile file '{name}' was read")
+    return "\n".join(lines) + "\n"
+
+
+PAGES = {"settings.md": settings_page, "commands.md": commands_page, "hostile.md": hostile_page}
 
 
 def main() -> int:

@@ -33,7 +33,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _json(name: str, text: bytes | str) -> dict[str, Any]:
     def refuse(token: str) -> float:
-        raise FormatError(f"{name}: JSON holds {token[:60]}, which is no finite number")
+        raise FormatError(f"JSON holds {token[:60]}, which is no finite number")
 
     def finite(token: str) -> float:
         return float(token) if math.isfinite(float(token)) else refuse(token)

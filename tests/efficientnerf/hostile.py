@@ -122,6 +122,11 @@ def rotated(**changes: Any) -> bytes:
     return meta_with(world_from_capture={**SIMILARITY, **changes})
 
 
+def reference(**changes: Any) -> bytes:
+    eye = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    return meta_with(layout="ndc-sparse", ndc={"world_from_camera": eye, "focal": 400, "width": 504, "height": 378, "near": 1, **changes})
+
+
 def orbiting(**changes: Any) -> bytes:
     return meta_with(orbit={**ORBIT, **changes})
 
@@ -237,6 +242,13 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a base that is no number": (lambda: with_tensor("base.table", nan("base.table", "compact"), "compact"), "harmonics finite"),
     "an infinite palette": (lambda: with_tensor("sh.palette", negative("sh.palette", "compact"), "compact"), "harmonics finite"),
     "masks of no voxel but codes": (lambda: with_tensor("brick.mask", tensor("brick.mask", "compact") * np.uint64(0), "compact"), "masks name 0 voxels but"),
+    # normalised device coordinates
+    "no reference camera": (lambda: meta_with(layout="ndc-sparse"), "'ndc' is None; expected an object"),
+    "a reference camera of text": (lambda: meta_with(layout="ndc-sparse", ndc="pinhole"), "'ndc' is pinhole; expected an object"),
+    "a reference camera without focal length": (lambda: reference(focal=0), "'focal' is 0"),
+    "a reference camera of three rows": (lambda: reference(world_from_camera=[[1, 0, 0, 0]] * 3), "expected four rows"),
+    "a reference camera of short rows": (lambda: reference(world_from_camera=[[1, 0, 0]] * 4), "expected 4 numbers"),
+    "a reference camera that shears": (lambda: reference(world_from_camera=[[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "'ndc': "),
     # full
     **{f"full, no {name}": (lambda name=name: without(name, "full"), f"tensor '{re.escape(name)}' is missing") for name in LAYOUTS["full"].tensors},  # type: ignore[misc]
     "masks beside full bricks": (lambda: added("brick.mask", of="full"), r"unknown tensor 'brick\.mask'"),

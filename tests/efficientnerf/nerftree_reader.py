@@ -27,23 +27,23 @@ class Tree:
             raw = data[8 + length + begin : 8 + length + end]
             assert hashlib.sha256(raw).hexdigest() == digest
             tensors[name] = np.frombuffer(raw, KINDS[header[name]["dtype"]]).reshape(header[name]["shape"])
-        self.meta, self.brick, self.voxel = meta, meta["brick"], meta["voxel"]
+        self.meta, self.brick, self.voxel, layout = meta, meta["brick"], meta["voxel"], meta["layout"].removeprefix("ndc-")
         self.low, self.shape = np.array(meta["bounds_min"]), meta["shape"]
         occupancy = [int(byte) for byte in tensors["coarse.occupancy"]]
         self.occupied = [cell for c, cell in enumerate(np.ndindex(*self.shape)) if occupancy[c // 8] >> c % 8 & 1]
         self.stored: dict[tuple[int, ...], int] = {}
         for row, (x, y, z) in enumerate(self.occupied):
             for v, (p, q, r) in enumerate(np.ndindex(self.brick, self.brick, self.brick)):
-                if meta["layout"] == "full" or int(tensors["brick.mask"][row, v // 64]) >> (v % 64) & 1:
+                if layout == "full" or int(tensors["brick.mask"][row, v // 64]) >> (v % 64) & 1:
                     self.stored[x * self.brick + p, y * self.brick + q, z * self.brick + r] = len(self.stored)
-        if meta["layout"] == "compact":
+        if layout == "compact":
             densities, sh = tensors["density.table"][tensors["voxel.density"]], np.empty((len(self.stored), (meta["sh_degree"] + 1) ** 2, 3))
             groups = [g for g, size in enumerate(meta["sh_groups"]) for _ in range(size)]
             for c in range(3):
                 sh[:, 0, c] = tensors["base.table"][tensors["voxel.base"][:, c], c]
                 for k in range(1, sh.shape[1]):
                     sh[:, k, c] = tensors["sh.palette"][tensors["voxel.sh"][:, groups[k - 1]], k - 1, c]
-        elif meta["layout"] == "full":
+        elif layout == "full":
             densities, sh = tensors["brick.density"].reshape(-1), tensors["brick.sh"].reshape(len(self.stored), -1, 3)
         else:
             densities, sh = tensors["voxel.density"], tensors["voxel.sh"]
