@@ -95,11 +95,17 @@ class Pixels:
         while len(found) < count:
             tried = rng.integers(len(self), size=2 * count)
             if self.usable is not None:
-                tried = tried[(self.usable[tried >> 3] >> (7 - (tried & 7)) & 1).astype(bool)]
+                tried = tried[self.usable_at(tried)]
             if middle:
                 tried = tried[self._in_middle(tried)] if self._in_middle(tried).any() else tried
             found = np.concatenate([found, tried])
         return found[:count]
+
+    def usable_at(self, index: np.ndarray) -> np.ndarray:
+        """(R,) bool: whether masks leave these pixels in."""
+        if self.usable is None:
+            return np.ones(len(index), bool)
+        return (self.usable[index >> 3] >> (7 - (index & 7)) & 1).astype(bool)
 
     def view_of(self, index: np.ndarray) -> np.ndarray:
         """(R,) the view of each pixel."""

@@ -1,9 +1,9 @@
 """The bake stage: a trained field in, the asset out.
 
     asset.nerftree  see efficientnerf/nerftree/FORMAT.md
-    report.json     resolution, voxels, bytes
+    report.json     resolution, voxels, bytes; PSNR of a sample of the training pixels before and after the optimisation
 
-What takes long is kept in the scratch folder: the voxels' greatest weights, and each block of baked values.
+What takes long is kept in the scratch folder: what the network shows of the voxels, each block of baked values, and the state of the optimisation.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from pipeline.stage import Job, Stage
 from stages.settings import setting
 
 if TYPE_CHECKING:
+    from efficientnerf.nerftree.baking import Visible
+    from efficientnerf.pixels import Pixels
     from stages.forward import Forward
     from stages.scene import Scene
 
@@ -33,7 +35,7 @@ class BakeSettings:
     resolution: int = setting(0, "voxels along the longest side of the box; 0 chooses from what a pixel covers, up to max_resolution", minimum=0, maximum=4096)
     max_resolution: int = setting(384, "the most voxels along the longest side that are chosen by themselves", minimum=8, maximum=4096)
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
-    pixels: int = setting(1_000_000, "training pixels that are looked at to see which voxels matter", minimum=1000)
+    pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
     max_mib: int = setting(128, "how large the asset may get; a larger one keeps only voxels of greater weight", minimum=1, unit="MiB")
     layout: str = setting(
@@ -43,16 +45,24 @@ class BakeSettings:
     )
     dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
     points: int = setting(8, "jittered points averaged in a voxel", minimum=1, maximum=256)
-    seed: int = setting(0, "seed of the jitter", minimum=0)
+    seed: int = setting(0, "seed of the jitter, and of the pixels of the optimisation", minimum=0)
+    optimise: int = setting(160, "steps in which the baked values are fitted to the training images; 0: they stay as the network says", minimum=0)
+    optimise_rays: int = setting(32768, "training pixels of a step of the optimisation", minimum=1, maximum=1 << 22)
+    density_rate: float = setting(0.3, "optimisation: rate of RMSprop for the logarithm of a voxel's optical thickness", minimum=0.0)
+    colour_rate: float = setting(0.03, "optimisation: rate of RMSprop for the harmonics", minimum=0.0)
+    final_rate: float = setting(0.3, "optimisation: what is left of the rates at the last step; they fall exponentially", minimum=0.0, maximum=1.0)
     licence: str = setting("", "licence text to write into the asset")
 
 
 def run(job: Job) -> None:
-    from efficientnerf.nerftree import baking, format
+    from efficientnerf.nerftree import baking, format, writing
+    from efficientnerf.nerftree.optimising import Targets
     from efficientnerf.nerftree.tree import tree_from_voxels
     from stages import scene
+    from stages.evaluate import behind_of
     from stages.field import load_renderer
-    from stages.train import use_all_cores
+    from stages.optimisation import optimised
+    from stages.train import pixels_of, use_all_cores
 
     settings: BakeSettings = job.settings
     use_all_cores()
@@ -67,7 +77,9 @@ def run(job: Job) -> None:
     shape, voxel = baking.grid_of(bounds, resolution, settings.brick)
     low = np.asarray(bounds[0], np.float64)
 
-    indices = _kept(job, s, m, shape, voxel, low)
+    pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
+    seen = _seen(job, m, pixels, shape, voxel, low)
+    indices = _kept(job, seen, shape, m.fine.degree)
     if not len(indices):
         from pipeline.errors import StageFailed
 
@@ -76,9 +88,12 @@ def run(job: Job) -> None:
     density, sh = _values(job, m, indices, voxel, low)
     facts = metadata_of(s, settings, m)
     tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc)
+    plain = behind_of(s)
+    targets = Targets(pixels, plain, *((seen.chosen, seen.before, seen.behind) if plain is None else ()))
+    tree, fitted = optimised(job, tree, targets, writing.most_voxels(settings.max_mib * 2**20, settings.layout, tree.degree, shape, settings.brick))
     format.save(tree, job.out / ASSET, settings.layout)
     size = (job.out / ASSET).stat().st_size
-    report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size}
+    report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size, "optimisation": fitted}
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
@@ -146,36 +161,45 @@ def spiral_of(forward: Forward) -> dict[str, Any]:
     }
 
 
-def _kept(job: Job, s: Scene, m: Any, shape: tuple[int, int, int], voxel: float, low: np.ndarray) -> np.ndarray:
-    """Coordinates of the voxels to store, from scratch or from an earlier attempt."""
-    from efficientnerf.nerftree import baking, writing
-    from stages import scene
-    from stages.train import pixels_of
+SPARE = 2  # so many times the voxels that there is room for are baked: the tree itself then shows which of them matter
+
+
+def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray) -> Visible:
+    """What the network shows of the voxels, from scratch or from an earlier attempt."""
+    from efficientnerf.nerftree import baking
 
     settings: BakeSettings = job.settings
-    stored = job.work / "voxels.npy"
-    if (found := _read_npy(stored)) is not None:
-        return found
+    names = ("cells", "greatest", "chosen", "before", "behind")
+    stored = {name: part for name in names if (part := _read_npy(job.work / f"seen_{name}.npy")) is not None}
+    if len(stored) == len(names):
+        # What is not known of a space that ends with the box is kept as an empty array.
+        return baking.Visible(**{name: None if name in ("before", "behind") and not len(part) else part for name, part in stored.items()})  # type: ignore[arg-type]
 
     def looked(done: int, total: int) -> None:
         job.progress(done, total, "finding the voxels that matter")
         job.safe_point()
 
-    pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
-    greatest = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked)
+    seen = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked)
+    for name in names:
+        part = getattr(seen, name)
+        _write_npy(np.empty(0, np.float16) if part is None else part, job.work / f"seen_{name}.npy")
+    return seen
+
+
+def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], degree: int) -> np.ndarray:
+    """Coordinates of the voxels to bake."""
+    from efficientnerf.nerftree import baking, writing
+
+    settings: BakeSettings = job.settings
     threshold = settings.weight
-    indices = baking.chosen_voxels(greatest, shape, settings.brick, threshold, settings.dilate)
-    most = writing.most_voxels(settings.max_mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
-    weights = np.sort(greatest[greatest > threshold])
+    indices = baking.chosen_voxels(seen, shape, settings.brick, threshold, settings.dilate)
+    most = SPARE * writing.most_voxels(settings.max_mib * 2**20, settings.layout, degree, shape, settings.brick)
+    weights = np.sort(seen.greatest[seen.greatest > threshold])
     while len(indices) > most and len(weights) > 1:
         job.safe_point()
         # Grown voxels are about in proportion to the kept ones; a little less, so that this ends soon.
         weights = weights[-max(1, int(0.95 * len(weights) * most / len(indices))) :]
-        threshold = float(weights[0])
-        indices = baking.chosen_voxels(greatest, shape, settings.brick, threshold, settings.dilate)
-    if threshold > settings.weight:
-        job.say(f"voxels that never weigh more than {threshold:.3g} in a pixel are left out, to keep the asset within {settings.max_mib} MiB (bake.max_mib)")
-    _write_npy(indices, stored)
+        indices = baking.chosen_voxels(seen, shape, settings.brick, float(weights[0]), settings.dilate)
     return indices
 
 
@@ -215,4 +239,4 @@ def _read_npy(path: Path) -> np.ndarray | None:
         return None
 
 
-STAGE = Stage(name="bake", version=1, settings=BakeSettings, needs=("poses", "train"), run=run)
+STAGE = Stage(name="bake", version=2, settings=BakeSettings, needs=("poses", "train"), run=run)

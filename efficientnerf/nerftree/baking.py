@@ -1,16 +1,19 @@
 """From a trained model to a NerfTree (EfficientNeRF, section 3.5; the choice and averaging of voxels after PlenOctree).
 
-1. `visible_voxels`: every voxel's greatest fine weight over the training pixels, both stages run as in training.
+1. `visible_voxels`: every voxel's greatest fine weight over the training pixels, both stages run as in training; and, for photographs, what these
+   pixels show before and behind the box.
 2. `chosen_voxels`: those above a threshold, dilated by one voxel so that linear interpolation has all its corners.
 3. `voxel_values`: density and harmonics averaged over several jittered points of each voxel, in blocks.
+4. `efficientnerf.nerftree.optimising` makes the tree of these look like the photographs, and drops what does not show.
 
-M pixels, N voxels.
+B coarse cells, P pixels, N voxels.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,7 +21,9 @@ import torch
 from efficientnerf.compositing import activate
 from efficientnerf.density import cell_of
 from efficientnerf.model import Model, look
+from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
 from efficientnerf.pixels import Pixels
+from efficientnerf.render import split_by_box
 
 RAYS_PER_BLOCK = 8192
 POINTS_PER_BLOCK = 2**17
@@ -32,45 +37,91 @@ def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int,
     return (x, y, z), voxel
 
 
+@dataclass(frozen=True, eq=False)
+class Visible:
+    """What the network showed of the voxels, and of what lies outside of the box.
+
+    cells     (B,) int64 flat coarse cells (x slowest) in which any sample fell, ascending
+    greatest  (B, brick^3) float32, each voxel's greatest weight
+    chosen    (P,) int64 pixels that were looked at
+    before    (P, 4) float16 premultiplied colour and opacity between camera and box; None where space ends with the box, as the next
+    behind    (P, 3) float16 colour beyond the box
+    """
+
+    cells: np.ndarray
+    greatest: np.ndarray
+    chosen: np.ndarray
+    before: np.ndarray | None
+    behind: np.ndarray | None
+
+
 @torch.no_grad()
 def visible_voxels(
     m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, bounds_min: np.ndarray, brick: int, count: int, done: Callable[[int, int], None]
-) -> np.ndarray:
-    """Greatest weight of each voxel over about `count` training pixels, evenly spread: flat float32 (x slowest).
+) -> Visible:
+    """Greatest weight of each voxel over about `count` training pixels, evenly spread. Memory grows with the cells that are met, not with the grid.
 
     done  called with pixels looked at and their number
     """
-    size = np.asarray(shape, np.int64) * brick
-    greatest = torch.zeros(int(size.prod()))
+    size = torch.tensor(shape) * brick
+    row_of = torch.full((math.prod(shape),), -1, dtype=torch.int32)
+    greatest = torch.zeros(1024, brick**3)
+    rows = 0
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
-    total = len(pixels)
-    # One pixel of each stretch of `stride`, at random: always the same one would visit a few columns alone where the stride divides the width.
-    stride = max(1, total // max(count, 1))
-    stretches = np.arange(0, total, stride)
-    chosen = np.minimum(stretches + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(stretches)), total - 1)
-    if pixels.usable is not None:
-        chosen = chosen[pixels.usable[chosen]]
+    chosen = spread_pixels(pixels, count)
+    surroundings = []
     for begin in range(0, len(chosen), RAYS_PER_BLOCK):
         bundle = pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])
         origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
-        seen = look(m, origins, directions, near, far, torch.full_like(near, 0.5), m.behind(directions))
-        point = m.space.world(seen.fine.point).cpu()
-        cell = torch.floor((point - low) / voxel).long()
-        inside = ((cell >= 0) & (cell < torch.from_numpy(size))).all(dim=1)
-        flat = (cell[:, 0] * int(size[1]) + cell[:, 1]) * int(size[2]) + cell[:, 2]
-        greatest.scatter_reduce_(0, flat[inside], seen.fine_weight.cpu()[inside], reduce="amax")
+        behind = m.behind(directions)
+        seen = look(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
+        if m.space.contracted:
+            parts = split_by_box(m, origins, directions, torch.ones_like(near), seen, behind)
+            surroundings.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
+        at = torch.floor((m.space.world(seen.fine.point).cpu() - low) / voxel).long()
+        inside = ((at >= 0) & (at < size)).all(dim=1)
+        at, weight = at[inside], seen.fine_weight.cpu()[inside]
+        cell = at // brick
+        local, flat = at - cell * brick, (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+        new = torch.unique(flat[row_of[flat] < 0])
+        row_of[new] = torch.arange(rows, rows + len(new), dtype=torch.int32)
+        rows += len(new)
+        if rows > len(greatest):
+            greatest = torch.cat([greatest, greatest.new_zeros(2 * rows - len(greatest), brick**3)])
+        slot = row_of[flat].long() * brick**3 + (local[:, 0] * brick + local[:, 1]) * brick + local[:, 2]
+        greatest.view(-1).scatter_reduce_(0, slot, weight, reduce="amax")
         done(min(len(chosen), begin + RAYS_PER_BLOCK), len(chosen))
-    return greatest.numpy()
+    cells = torch.nonzero(row_of >= 0).squeeze(1)
+    before, beyond = (np.concatenate(part) for part in zip(*surroundings, strict=True)) if surroundings else (None, None)
+    return Visible(cells.numpy(), greatest[row_of[cells].long()].numpy(), chosen, before, beyond)
 
 
-def chosen_voxels(greatest: np.ndarray, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
-    """Coordinates (N, 3) of the voxels whose greatest weight exceeds `threshold`, and of those around them."""
-    from scipy.ndimage import binary_dilation
+def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
+    """About `count` usable pixels, one of each stretch of so many, at random: always the same one would visit a few columns alone where the stretch
+    divides the width."""
+    total = len(pixels)
+    stride = max(1, total // max(count, 1))
+    stretches = np.arange(0, total, stride)
+    chosen = np.minimum(stretches + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(stretches)), total - 1)
+    return chosen[pixels.usable_at(chosen)]
 
-    kept = (greatest > threshold).reshape([n * brick for n in shape])
-    if dilate:
-        kept = binary_dilation(kept, np.ones((3, 3, 3), bool), iterations=dilate)
-    return np.argwhere(kept).astype(np.int32)
+
+def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
+    """Coordinates (N, 3) of the voxels whose greatest weight exceeds `threshold`, and of those around them, in the order of the grid."""
+    row, local = np.nonzero(seen.greatest > threshold)
+    cell = np.stack(np.unravel_index(seen.cells[row], shape), axis=-1)
+    index = cell * brick + np.stack(np.unravel_index(local, (brick,) * 3), axis=-1)
+    size = [n * brick for n in shape]
+    # One axis after the other: a cube round each voxel at the cost of three segments.
+    for axis in range(3):
+        parts = []
+        for shift in range(-dilate, dilate + 1):
+            moved = index.copy()
+            moved[:, axis] += shift
+            parts.append(moved[(moved[:, axis] >= 0) & (moved[:, axis] < size[axis])])
+        flat = np.unique(np.ravel_multi_index(tuple(np.concatenate(parts).T), size))
+        index = np.stack(np.unravel_index(flat, size), axis=-1)
+    return index.astype(np.int32)
 
 
 @torch.no_grad()
@@ -103,3 +154,24 @@ def voxel_values(
 def blocks_of(count: int, points: int) -> int:
     """How many blocks `voxel_values` yields for so many voxels."""
     return math.ceil(count / max(1, POINTS_PER_BLOCK // points))
+
+
+def voxel_coordinates(tree: NerfTree) -> np.ndarray:
+    """Coordinates (N, 3) int32 of the stored voxels, in their order."""
+    owner = np.full(len(tree.voxel_index), 0, np.int64)
+    cells = np.flatnonzero(tree.brick_index.reshape(-1) >= 0)
+    owner[tree.brick_index.reshape(-1)[cells]] = cells
+    brick, local = np.nonzero(tree.voxel_index >= 0)
+    cell = np.stack(np.unravel_index(owner[brick], tree.shape), axis=-1)
+    index = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
+    out = np.empty((len(tree.density_values), 3), np.int32)
+    out[tree.voxel_index[brick, local]] = index
+    return out
+
+
+def with_voxels(tree: NerfTree, keep: np.ndarray) -> NerfTree:
+    """The tree with some of its voxels, (N,) bool, alone; they keep their order."""
+    return tree_from_voxels(
+        tree.shape, tree.voxel, tree.bounds_min, voxel_coordinates(tree)[keep], tree.density_values[keep], tree.sh[keep],
+        brick=tree.brick, background=tree.background, metadata=tree.metadata,
+    )  # fmt: skip

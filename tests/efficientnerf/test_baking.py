@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from efficientnerf.grid import Space
 from efficientnerf.model import Model
 from efficientnerf.nerftree import baking
-from efficientnerf.nerftree.baking import blocks_of, chosen_voxels, grid_of, visible_voxels, voxel_values
+from efficientnerf.nerftree.baking import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
 
@@ -34,8 +35,22 @@ def model_of_a_ball(**changes: Any) -> Model:
 
 def greatest(count: int = 10**6, resolution: int = 16, **changes: Any) -> np.ndarray:
     shape, voxel = grid_of(BOUNDS, resolution, 4)
-    flat = visible_voxels(model_of_a_ball(**changes), pixels(8, 24), shape, voxel, BOUNDS[0], 4, count, lambda done, total: None)
-    return flat.reshape(16, 16, 16)
+    return dense(visible_voxels(model_of_a_ball(**changes), pixels(8, 24), shape, voxel, BOUNDS[0], 4, count, lambda done, total: None), shape, 4)
+
+
+def dense(seen: Visible, shape: tuple[int, int, int], brick: int) -> np.ndarray:
+    """The greatest weights as a plain grid."""
+    out = np.zeros((*shape, brick, brick, brick), np.float32)
+    out.reshape(-1, brick**3)[seen.cells] = seen.greatest
+    return out.transpose(0, 3, 1, 4, 2, 5).reshape([n * brick for n in shape])
+
+
+def sparse(weight: np.ndarray, brick: int) -> Visible:
+    """The inverse of `dense`, cells without any weight left out."""
+    x, y, z = (n // brick for n in weight.shape)
+    rows = weight.reshape(x, brick, y, brick, z, brick).transpose(0, 2, 4, 1, 3, 5).reshape(-1, brick**3)
+    cells = np.flatnonzero(rows.any(axis=1))
+    return Visible(cells, rows[cells], np.zeros(0, np.int64), None, None)
 
 
 @pytest.mark.parametrize(("extent", "resolution", "brick"), [((2, 2, 2), 64, 4), ((2, 1, 0.3), 100, 4), ((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])
@@ -68,38 +83,70 @@ def test_more_pixels_never_make_a_voxel_less_visible() -> None:
 
 def test_masked_pixels_are_not_looked_at_and_progress_ends_at_its_total() -> None:
     some = pixels(8, 24)
-    some.usable = np.zeros(len(some), bool)
-    some.usable[:7] = True
+    some.usable = np.packbits(np.arange(len(some)) < 7)
     shape, voxel = grid_of(BOUNDS, 16, 4)
     calls: list[tuple[int, int]] = []
     weight = visible_voxels(model_of_a_ball(), some, shape, voxel, BOUNDS[0], 4, 10**6, lambda done, total: calls.append((done, total)))
-    assert not weight.any()  # a corner of one picture
+    assert not weight.greatest.any()  # a corner of one picture
     assert calls[-1] == (7, 7)
 
 
-def test_looked_at_pixels_are_spread_over_columns_and_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    some, seen = pixels(10, 25), []
-    bundle = some.bundle
-    monkeypatch.setattr(some, "bundle", lambda index: (seen.append(index), bundle(index))[1])
-    shape, voxel = grid_of(BOUNDS, 16, 4)
-    visible_voxels(model_of_a_ball(), some, shape, voxel, BOUNDS[0], 4, 10 * 25 * 25 // 5, lambda done, total: None)
-    index = np.concatenate(seen)
+def test_looked_at_pixels_are_spread_over_columns_and_rows() -> None:
+    index = spread_pixels(pixels(10, 25), 10 * 25 * 25 // 5)
     assert 1000 <= len(index) <= 1500
     assert len(np.unique(index)) == len(index)
     assert len(np.unique(index % 25)) == 25
     assert len(np.unique(index // 25)) > 240
 
 
+def test_of_photographs_it_is_kept_what_lies_before_and_behind_the_box() -> None:
+    """A ball within the box over a sky: before is nothing, behind is the sky, for each pixel that was looked at."""
+    m = model_of_a_ball()
+    m.space = Space(BOUNDS, contracted=True)
+    some = pixels(6, 16)
+    shape, voxel = grid_of(BOUNDS, 16, 4)
+    seen = visible_voxels(m, some, shape, voxel, BOUNDS[0], 4, 10**6, lambda done, total: None)
+    assert seen.before is not None
+    assert seen.behind is not None
+    assert len(seen.chosen) == len(seen.before) == len(seen.behind) == len(some)
+    assert seen.before.dtype == seen.behind.dtype == np.float16
+    assert np.abs(seen.before).max() < 1e-3
+    directions = torch.from_numpy(some.bundle(seen.chosen)[1])
+    np.testing.assert_allclose(seen.behind, m.behind(directions).detach(), atol=2e-3)
+    assert (dense(seen, shape, 4) > 1e-3).any()
+
+
 def test_chosen_voxels_are_those_above_the_threshold_and_their_neighbours() -> None:
     weight = np.zeros((8, 4, 4), np.float32)
     weight[5, 1, 2], weight[0, 0, 0], weight[3, 3, 3] = 0.5, 1e-3, 2e-3
-    plain = chosen_voxels(weight.reshape(-1), (2, 1, 1), 4, 1e-3, 0)
+    seen = sparse(weight, 4)
+    plain = chosen_voxels(seen, (2, 1, 1), 4, 1e-3, 0)
     assert plain.tolist() == [[3, 3, 3], [5, 1, 2]]  # in the order of the grid; at the threshold is not above it
-    grown = chosen_voxels(weight.reshape(-1), (2, 1, 1), 4, 1e-3, 1)
+    grown = chosen_voxels(seen, (2, 1, 1), 4, 1e-3, 1)
     distance = np.abs(grown[:, None] - plain).max(2).min(1)
     assert distance.max() == 1
     assert len(np.unique(grown, axis=0)) == len(grown) == 27 + 12 - 2  # cut by the border, and two voxels belong to both
-    assert not len(chosen_voxels(np.zeros(128, np.float32), (2, 1, 1), 4, 1e-3, 2))
+    assert not len(chosen_voxels(sparse(np.zeros((8, 4, 4), np.float32), 4), (2, 1, 1), 4, 1e-3, 2))
+
+
+@pytest.mark.parametrize("dilate", [0, 1, 2])
+def test_growing_is_that_of_a_plain_grid(dilate: int) -> None:
+    from scipy.ndimage import binary_dilation
+
+    weight = np.random.default_rng(3).random((12, 9, 6)).astype(np.float32)
+    kept = weight > 0.97
+    wanted = np.argwhere(binary_dilation(kept, np.ones((3, 3, 3), bool), iterations=dilate) if dilate else kept)
+    np.testing.assert_array_equal(chosen_voxels(sparse(weight, 3), (4, 3, 2), 3, 0.97, dilate), wanted)
+
+
+def test_coordinates_of_a_tree_are_those_it_was_built_from() -> None:
+    from tests.efficientnerf.trees import random_tree
+
+    tree = random_tree(3, brick=3)
+    at = voxel_coordinates(tree)
+    for n in range(0, len(at), 17):
+        low = tuple(int(x) for x in at[n])
+        assert tree.density_block(low, tuple(x + 1 for x in low)).item() == tree.density_values[n]
 
 
 def test_values_are_means_over_the_voxel() -> None:

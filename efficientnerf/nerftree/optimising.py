@@ -1,0 +1,184 @@
+"""From a raw tree to one that looks like the training images: its values descend on the error of its own pictures.
+
+The structure of the tree stays; what is fitted is the optical thickness of each voxel (by its logarithm, so that it stays positive and matter that
+nobody needs fades away) and its harmonics. The loss of a ray is that of `cpu_tree_grad.Seen`: photographs are compared through what the network puts
+before and behind the box; objects that were cut out are compared over every background at once.
+
+Every random choice of step n is drawn from a generator seeded by (seed, n), as in training; the kernels sum in a fixed order. So the same
+steps give the same bytes, on any number of threads and whether or not they were interrupted.
+
+PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2022) optimise trees and grids this way. N voxels, K harmonics,
+R rays, P pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from efficientnerf.harmonics import basis_numpy
+from efficientnerf.kernels import cpu_tree_grad as kernels
+from efficientnerf.kernels.cpu_tree_grad import Grid, Records, Seen
+from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.pixels import Pixels
+
+DECAY, EPSILON = 0.99, 1e-10
+GREY, MATTE = 0.5, 0.25  # mean of a channel of a background of any colour, and three times the variance: see `Targets`
+WEIGHED_RAYS = 2**16  # in a bundle
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Training pixels, and what the tree is seen through and against.
+
+    pixels      of the training views
+    background  constant sRGB colour behind the scene, or None: photographs with surroundings, and the next three say what they are
+    chosen      (P,) indices of pixels that may be drawn
+    before      (P, 4) premultiplied colour and opacity of what lies between the camera and the box
+    behind      (P, 3) colour of what lies beyond the box
+
+    Where the photographs have alpha the object was cut out, and anything may lie behind it. With a background of random colour, each channel even over
+    0 to 1, the expected error is that over grey plus the channels' summed variance, 3 / 12, times the squared error of the opacity: taken as it
+    is, without the noise of drawing colours.
+    """
+
+    pixels: Pixels
+    background: tuple[float, float, float] | None
+    chosen: np.ndarray | None = None
+    before: np.ndarray | None = None
+    behind: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        if self.background is None and (self.chosen is None or self.before is None or self.behind is None):
+            raise ValueError("photographs with surroundings: the targets need to know what lies before and behind the box")
+
+    def draw(self, count: int, rng: np.random.Generator, *, declared: bool = False) -> tuple[np.ndarray, np.ndarray, Seen]:
+        """Origins (R, 3) and unit directions (R, 3) of `count` random pixels, world frame, and what they should show.
+
+        declared  objects are seen on the background of the scene alone
+        """
+        if self.chosen is None:
+            return self.of(self.pixels.choose(count, rng), None, declared=declared)
+        at = rng.integers(len(self.chosen), size=count)
+        return self.of(self.chosen[at], at, declared=declared)
+
+    def of(self, index: np.ndarray, at: np.ndarray | None, *, declared: bool = False) -> tuple[np.ndarray, np.ndarray, Seen]:
+        """`draw` for pixels `index`; `at` are their places in `chosen`."""
+        origins, directions, _, _, colour = self.pixels.bundle(index)
+        rays = len(index)
+        gain, opacity = np.ones(rays, np.float32), np.ones(rays, np.float32)
+        truth = colour[:, :3]
+        if self.background is None:
+            assert self.before is not None and self.behind is not None and at is not None  # noqa: PT018
+            before, behind = self.before[at].astype(np.float32), self.behind[at].astype(np.float32)
+            return origins, directions, Seen(truth - before[:, :3], behind, 1 - before[:, 3], opacity, 0.0)
+        matted = colour.shape[1] == 4
+        ground = (GREY,) * 3 if matted and not declared else self.background
+        behind = np.broadcast_to(np.asarray(ground, np.float32), (rays, 3)).copy()
+        if matted:
+            opacity = np.ascontiguousarray(colour[:, 3])
+            truth = truth * opacity[:, None] + behind * (1 - opacity[:, None])
+        return origins, directions, Seen(np.ascontiguousarray(truth), behind, gain, opacity, MATTE if matted and not declared else 0.0)
+
+
+@dataclass
+class Optimiser:
+    """A tree whose values are being fitted.
+
+    density, sh          (N,), (N, 3 K) float32, the tree's own to begin with
+    square_*             (N,) running means of the squared gradients by the logarithm of a voxel's optical thickness, and by its harmonics
+    visits               (N,) in how many steps a voxel was seen
+    """
+
+    tree: NerfTree
+    density: np.ndarray
+    sh: np.ndarray
+    square_density: np.ndarray
+    square_sh: np.ndarray
+    visits: np.ndarray
+    step: int = 0
+
+    def result(self) -> NerfTree:
+        """The tree as it is now."""
+        return replace(self.tree, density_values=self.density.copy(), harmonics=self.sh.reshape(len(self.sh), -1, 3).copy())
+
+
+STATE = ("density", "sh", "square_density", "square_sh", "visits")
+
+
+def optimiser(tree: NerfTree) -> Optimiser:
+    count = len(tree.density_values)
+    sh = np.array(tree.sh, np.float32).reshape(count, tree.harmonics_count * 3)
+    density = np.array(tree.density_values, np.float32)
+    return Optimiser(tree, density, sh, np.zeros_like(density), np.zeros_like(density), np.zeros(count, np.int32))
+
+
+def kept(o: Optimiser, keep: np.ndarray, tree: NerfTree) -> Optimiser:
+    """The optimiser of a tree of some of the voxels, (N,) bool, in their order."""
+    return Optimiser(tree, step=o.step, **{name: getattr(o, name)[keep] for name in STATE})
+
+
+def grid_of(tree: NerfTree) -> Grid:
+    return Grid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, kernels.STEP * tree.voxel)
+
+
+def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays of the world in voxel coordinates, and the harmonics along them (R, K)."""
+    start = np.ascontiguousarray((np.asarray(origins, np.float64) - tree.bounds_min) / tree.voxel)
+    bases = np.ascontiguousarray(basis_numpy(np.asarray(directions, np.float32), tree.degree))
+    return start, np.ascontiguousarray(directions, np.float64), bases
+
+
+def optimise(
+    o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int
+) -> Iterator[float]:
+    """Go on to step `until`, yielding the mean squared error of a channel after each step.
+
+    steps         in all; the rates fall exponentially, to `final` of themselves at the last of them
+    rays          in a step
+    density_rate  for the logarithm of the optical thickness
+    colour_rate   for the harmonics
+    """
+    grid, records = grid_of(o.tree), Records()
+    by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
+    stamp = np.zeros(len(o.density), np.int32)
+    rates = np.full(o.sh.shape[1], colour_rate, np.float32)
+    while o.step < until:
+        number = o.step + 1
+        rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 2, number]))
+        origins, directions, seen = targets.draw(rays, rng)
+        start, along, bases = in_voxels(o.tree, origins, directions)
+        loss, counts = kernels.look(grid, start, along, bases, o.density, o.sh, seen, records)
+        fall = final ** (number / steps)
+        kernels.descend(
+            records, counts, bases, (o.density, o.sh), (by_density, by_sh), (o.square_density, o.square_sh), o.visits, stamp,
+            number=number, thickness=o.tree.voxel, density_rate=density_rate * fall, sh_rates=rates * np.float32(fall), decay=DECAY, epsilon=EPSILON,
+        )  # fmt: skip
+        o.step = number
+        yield float(loss.mean()) / 3
+
+
+def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
+    """Mean squared error of a channel over a sample of the training pixels that depends on `count` and `seed` alone, objects on their declared background."""
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
+    o, total = optimiser(tree), 0.0
+    for begin in range(0, count, WEIGHED_RAYS):
+        origins, directions, seen = targets.draw(min(WEIGHED_RAYS, count - begin), rng, declared=True)
+        loss, _ = kernels.look(grid_of(tree), *in_voxels(tree, origins, directions), o.density, o.sh, seen, Records())
+        total += float(loss.sum())
+    return total / (3 * count)
+
+
+def greatest_weights(tree: NerfTree, targets: Targets, count: int, seed: int) -> Iterator[tuple[int, np.ndarray]]:
+    """How much each voxel contributes at most to one of `count` random training pixels, through what interpolation leaves it: yields
+    the pixels looked at so far and the weights (N,) so far."""
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 4, 0]))
+    o, records, grid = optimiser(tree), Records(), grid_of(tree)
+    greatest = np.zeros_like(o.density)
+    for begin in range(0, count, WEIGHED_RAYS):
+        origins, directions, seen = targets.draw(min(WEIGHED_RAYS, count - begin), rng)
+        _, counts = kernels.look(grid, *in_voxels(tree, origins, directions), o.density, o.sh, seen, records, weighing=True)
+        kernels.greatest(records, counts, seen.gain, greatest)
+        yield begin + len(origins), greatest

@@ -1,0 +1,144 @@
+"""The part of the bake stage that fits the baked values to the training images and drops what does not show; goes on where it was stopped.
+
+Half of the steps are spent on all voxels that were baked. Then the tree is drawn for many training pixels: voxels that hardly contribute to any of
+them are dropped (floaters have faded by then), and as many of the least more as the asset's size asks for. The other half of the
+steps makes up for what is missing.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.stage import Job
+
+if TYPE_CHECKING:
+    from efficientnerf.nerftree.optimising import Optimiser, Targets
+    from efficientnerf.nerftree.tree import NerfTree
+
+CHECKPOINT = "optimisation.safetensors"
+CHECKPOINT_SECONDS = 30.0
+SAMPLE = 2**16  # training pixels that the report's figures are taken from
+WEIGHED = 4  # training pixels per voxel that are looked at to see which voxels show; not fewer than bake.pixels
+
+
+def optimised(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[NerfTree, dict[str, Any]]:
+    """The fitted tree with at most `most` voxels, and figures for the report."""
+    from efficientnerf.nerftree import optimising
+
+    settings = job.settings
+    facts: dict[str, Any] = {"steps": settings.optimise, "psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
+    sample = min(SAMPLE, 4 * len(targets.pixels))
+    before = optimising.error(tree, targets, sample, settings.seed)
+    o, pruned = _restored(job, tree) or (optimising.optimiser(tree), False)
+    half = settings.optimise // 2
+    if not pruned:
+        _fit(job, o, targets, half, pruned)
+        o = _without_unseen(job, o, targets, most)
+        _checkpoint(job, o, True)
+    _fit(job, o, targets, settings.optimise, True)
+    tree = o.result()
+    facts["psnr_before"], facts["psnr_after"] = _decibels(before), _decibels(optimising.error(tree, targets, sample, settings.seed))
+    return tree, facts
+
+
+def _decibels(error: float) -> float:
+    return round(-10 * math.log10(max(error, 1e-10)), 3)
+
+
+def _fit(job: Job, o: Optimiser, targets: Targets, until: int, pruned: bool) -> None:
+    """Steps up to `until`, with a checkpoint now and then, and where it is stopped."""
+    from efficientnerf.nerftree import optimising
+
+    settings = job.settings
+    written, smooth = time.monotonic(), 0.0
+    run = optimising.optimise(
+        o, targets, until=until, steps=settings.optimise, rays=settings.optimise_rays, density_rate=settings.density_rate,
+        colour_rate=settings.colour_rate, final=settings.final_rate, seed=settings.seed,
+    )  # fmt: skip
+    for error in run:
+        smooth = error if not smooth else 0.9 * smooth + 0.1 * error
+        job.progress(o.step, settings.optimise, "fitting to the images", psnr=round(_decibels(smooth), 2), voxels=len(o.density))
+        if time.monotonic() - written > CHECKPOINT_SECONDS:
+            _checkpoint(job, o, pruned)
+            written = time.monotonic()
+        try:
+            job.safe_point()
+        except BaseException:
+            _checkpoint(job, o, pruned)
+            raise
+
+
+def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Optimiser:
+    """Only the voxels that contribute more than bake.weight to a pixel, and of these at most `most`, those that contribute most."""
+    from efficientnerf.nerftree import baking, optimising
+
+    settings = job.settings
+    tree = o.result()
+    count = min(max(settings.pixels, WEIGHED * len(o.density)), 4 * len(targets.pixels))
+    greatest = np.zeros(len(o.density), np.float32)
+    for done, weights in optimising.greatest_weights(tree, targets, count, settings.seed):
+        greatest = weights
+        job.progress(done, count, "dropping what does not show")
+        job.safe_point()
+    keep = greatest > settings.weight
+    if keep.sum() > most:
+        order = np.argsort(-greatest, kind="stable")
+        keep = np.zeros(len(keep), bool)
+        keep[order[:most]] = True
+        left_out = float(greatest[order[most]])
+        job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out, to keep the asset within {settings.max_mib} MiB (bake.max_mib)")
+    if not keep.any():
+        return o
+    return optimising.kept(o, keep, baking.with_voxels(tree, keep))
+
+
+def _checkpoint(job: Job, o: Optimiser, pruned: bool) -> None:
+    """Whole or not at all; it need not be on the disk yet, for what is lost is done again."""
+    from safetensors.numpy import save_file
+
+    from efficientnerf.nerftree import baking, optimising
+
+    tensors = {name: np.ascontiguousarray(getattr(o, name)) for name in optimising.STATE}
+    tensors["coordinates"] = baking.voxel_coordinates(o.tree)
+    tensors["progress"] = np.array([o.step, pruned], np.int64)
+    aside = job.work / (CHECKPOINT + ".part")
+    save_file(tensors, str(aside))
+    os.replace(aside, job.work / CHECKPOINT)
+
+
+def _restored(job: Job, tree: NerfTree) -> tuple[Optimiser, bool] | None:
+    """The optimiser as the last checkpoint has it, and whether voxels were dropped by then; None where there is none that can be read."""
+    from efficientnerf.nerftree import optimising
+    from efficientnerf.nerftree.tree import tree_from_voxels
+
+    found = _read(job.work / CHECKPOINT)
+    if found is None:
+        return None
+    try:
+        step, pruned = (int(x) for x in found["progress"])
+        fitted = tree_from_voxels(
+            tree.shape, tree.voxel, tree.bounds_min, found["coordinates"], found["density"], found["sh"].reshape(len(found["sh"]), -1, 3),
+            brick=tree.brick, background=tree.background, metadata=tree.metadata,
+        )  # fmt: skip
+        o = optimising.Optimiser(fitted, step=step, **{name: np.array(found[name]) for name in optimising.STATE})
+    except (KeyError, ValueError) as error:
+        job.warn(f"{CHECKPOINT} can't be used ({error}); the optimisation begins again")
+        return None
+    job.say(f"the optimisation goes on from step {o.step}")
+    return o, bool(pruned)
+
+
+def _read(path: Path) -> dict[str, np.ndarray] | None:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    try:
+        return load_file(str(path))
+    except (OSError, SafetensorError, ValueError):
+        return None

@@ -1,0 +1,255 @@
+"""Fitting a tree to images: gradients against autograd and finite differences, steps against their formula, and what it is for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.kernels import cpu_tree_grad as kernels
+from efficientnerf.kernels.cpu_tree_grad import Records, Seen
+from efficientnerf.nerftree import optimising
+from efficientnerf.nerftree.baking import voxel_coordinates, with_voxels
+from efficientnerf.nerftree.optimising import Targets, error, greatest_weights, grid_of, in_voxels, optimise, optimiser
+from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.render import render_tree_reference
+from tests.efficientnerf.balls import BOUNDS, pixels
+from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+
+TREES = [(1, 0), (3, 1), (4, 2), (2, 3)]
+
+
+def seen_at_random(count: int, matte: float, dtype: Any = np.float64) -> Seen:
+    rng = np.random.default_rng(5)
+    shapes: tuple[Any, ...] = ((count, 3), (count, 3), count, count)
+    return Seen(*(rng.random(shape).astype(dtype) for shape in shapes), matte)
+
+
+def loss_by_torch(colour: torch.Tensor, opacity: torch.Tensor, seen: Seen) -> torch.Tensor:
+    truth, behind, gain, matte = (torch.from_numpy(a).double() for a in (seen.colour, seen.behind, seen.gain, seen.opacity))
+    off = gain[:, None] * (colour + (1 - opacity)[:, None] * behind) - truth
+    return (off**2).sum(dim=1) + seen.matte * (opacity - matte) ** 2
+
+
+def gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: Seen, dtype: Any = np.float64, stop: float = 0.0) -> tuple[np.ndarray, ...]:
+    """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels."""
+    start, along, bases = in_voxels(tree, origins, directions)
+    density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
+    records = Records(dtype)
+    loss, counts = kernels.look(grid_of(tree), start, along, bases.astype(dtype), density, sh, seen, records, stop=stop)
+    by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)
+    kernels.gradients(records, counts, bases.astype(dtype), by_density, by_sh)
+    return loss, by_density, by_sh.reshape(tree.sh.shape)
+
+
+@pytest.mark.parametrize("matte", [0.0, 0.7])
+@pytest.mark.parametrize(("brick", "degree"), TREES)
+def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, matte: float) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree)
+    origins, directions = rays_at(tree, 300)
+    seen = seen_at_random(300, matte)
+    loss, by_density, by_sh = gradients(tree, origins, directions, seen)
+    density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
+    wanted = loss_by_torch(*render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
+    wanted.sum().backward()
+    assert density.grad is not None
+    assert sh.grad is not None
+    np.testing.assert_allclose(loss, wanted.detach(), atol=2e-6)  # the kernel's harmonics are of float32 directions
+    np.testing.assert_allclose(by_density, density.grad, atol=2e-5 * float(density.grad.abs().max()))
+    np.testing.assert_allclose(by_sh, sh.grad, atol=2e-5 * float(sh.grad.abs().max()))
+    assert (by_density != 0).mean() > 0.5
+
+
+def test_float32_and_the_early_stop_change_little() -> None:
+    tree = random_tree(3, brick=4, degree=2)
+    rays = rays_at(tree, 500)
+    exact = gradients(tree, *rays, seen_at_random(500, 0.3))
+    usual = gradients(tree, *rays, seen_at_random(500, 0.3, np.float32), np.float32, kernels.STOP)
+    for a, b in zip(exact, usual, strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-3 * np.abs(a).max())
+
+
+def test_gradients_are_finite_differences() -> None:
+    tree = random_tree(1, shape=(2, 2, 2), brick=2, degree=1, share=0.8, sigma=8.0)
+    rays = rays_at(tree, 40)
+    tree = replace(tree, density_values=tree.density_values + np.float32(0.1))  # at 0 the slope has two sides
+    seen = seen_at_random(40, 0.5)
+    _, by_density, by_sh = gradients(tree, *rays, seen)
+    step = 1e-3
+
+    def total(density: np.ndarray, sh: np.ndarray) -> float:
+        return float(gradients(replace(tree, density_values=density, harmonics=sh), *rays, seen)[0].sum())
+
+    density, sh = tree.density_values.astype(np.float64), tree.sh.astype(np.float64)
+    for n in range(0, len(density), 3):
+        change = np.zeros_like(density)
+        change[n] = step
+        slope = (total(density + change, sh) - total(density - change, sh)) / (2 * step)
+        assert slope == pytest.approx(by_density[n], rel=1e-3, abs=1e-6)
+        bend = np.zeros_like(sh)
+        bend[n, n % 4, n % 3] = step
+        slope = (total(density, sh + bend) - total(density, sh - bend)) / (2 * step)
+        assert slope == pytest.approx(by_sh[n, n % 4, n % 3], rel=1e-3, abs=1e-6)
+
+
+def test_the_pictures_are_those_of_the_renderer() -> None:
+    """The loss against black, nothing behind, is the square of the colour that `render_rays` gives."""
+    tree = random_tree(2, brick=4, degree=2, share=0.6)
+    origins, directions = rays_at(tree, 400)
+    black = Seen(*(np.zeros(shape, np.float32) for shape in ((400, 3), (400, 3))), np.ones(400, np.float32), np.zeros(400, np.float32), 0.0)
+    loss = gradients(tree, origins, directions, black, np.float32, kernels.STOP)[0]
+    np.testing.assert_allclose(loss, (tree.render_rays(origins, directions).colour ** 2).sum(axis=1), atol=2e-3)
+
+
+def test_records_grow_until_all_samples_fit() -> None:
+    tree = uniform_tree((12, 12, 12), brick=2, sigma=0.05)
+    origins, directions = rays_at(tree, 300)
+    records = Records()
+    records.room = 7
+    start, along, bases = in_voxels(tree, origins, directions)
+    o = optimiser(tree)
+    seen = seen_at_random(300, 0.0, np.float32)
+    _, counts = kernels.look(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
+    assert 7 < counts.max() <= records.room
+    by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
+    kernels.gradients(records, counts, bases, by_density, by_sh)
+    expected = gradients(tree, origins, directions, seen, np.float32, kernels.STOP)
+    np.testing.assert_array_equal(by_density, expected[1])
+
+
+def ball_tree(side: int = 20) -> NerfTree:
+    """Fog of one grey all over the box of the ball's pictures."""
+    tree = uniform_tree((side // 4,) * 3, voxel=2 / side, sigma=0.5, logit=0.0)
+    sh = np.zeros((len(tree.density_values), 4, 3), np.float32)
+    return replace(tree, bounds_min=BOUNDS[0], harmonics=sh, background=(1.0, 1.0, 1.0))
+
+
+def fitted(tree: NerfTree, targets: Targets, steps: int, **more: Any) -> tuple[NerfTree, list[float]]:
+    o = optimiser(tree)
+    told = {"until": steps, "steps": steps, "rays": 512, "density_rate": 0.3, "colour_rate": 0.05, "final": 0.1, "seed": 1, **more}
+    errors = list(optimise(o, targets, **told))
+    return o.result(), errors
+
+
+def test_fog_becomes_the_ball_of_the_pictures() -> None:
+    targets = Targets(pixels(10, 24), (1.0, 1.0, 1.0))
+    tree, errors = fitted(ball_tree(), targets, 80)
+    assert error(tree, targets, 2000, 0) < 0.05 * error(ball_tree(), targets, 2000, 0)
+    assert len(errors) == 80
+    assert tree.density(np.array([[0.6, -0.05, 0.0]]))[0] > 5
+    assert tree.density(np.array([[0.85, 0.8, 0.8]]))[0] < 0.3
+    assert (tree.density_values >= 0).all()
+
+
+def test_photographs_are_compared_through_what_lies_before_and_behind() -> None:
+    """A pixel that the network's foreground hides pulls at nothing; elsewhere the right background leaves nothing for the tree to do."""
+    some = pixels(4, 12)
+    some.images = np.full((len(some), 3), 51, np.uint8)
+    chosen = np.arange(len(some))
+    hidden = np.tile(np.float16([0.2, 0.2, 0.2, 1.0]), (len(some), 1))
+    clear = np.zeros((len(some), 4), np.float16)
+    sky = np.full((len(some), 3), 0.2, np.float16)
+    tree = ball_tree()
+    same, _ = fitted(tree, Targets(some, None, chosen, hidden, 0 * sky), 3)
+    np.testing.assert_allclose(same.density_values, tree.density_values, rtol=1e-2)
+    assert error(tree, Targets(some, None, chosen, hidden, sky), 100, 0) < 1e-6
+    cleared, _ = fitted(replace(tree, harmonics=tree.harmonics + 3), Targets(some, None, chosen, clear, sky), 40)
+    assert np.median(cleared.density_values) < 0.3 * tree.density_values[0]  # no ray sees the corners
+    with pytest.raises(ValueError, match="before and behind"):
+        Targets(some, None)
+
+
+def test_any_background_is_the_mean_over_random_ones() -> None:
+    some = pixels(6, 16)
+    tree = ball_tree()
+    targets = Targets(some, (1.0, 1.0, 1.0))
+    index = np.arange(600, 700)
+    origins, directions, seen = targets.of(index, None)
+    loss = gradients(tree, origins, directions, seen, np.float32)[0]
+    rng = np.random.default_rng(0)
+    seen_as = tree.render_rays(origins, directions)
+    rgba = some.images[index] / 255
+    behind = rng.random((20000, 1, 3))
+    truth = rgba[:, :3] * rgba[:, 3:] + behind * (1 - rgba[:, 3:])
+    drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - truth) ** 2).sum(axis=2).mean(axis=0)
+    np.testing.assert_allclose(loss, drawn, atol=0.02)
+    white = targets.of(index, None, declared=True)[2]
+    assert white.matte == 0
+    np.testing.assert_array_equal(white.behind, 1)
+
+
+def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
+    targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
+    whole, _ = fitted(ball_tree(), targets, 12)
+    again = optimiser(ball_tree())
+    told: dict[str, Any] = {"steps": 12, "rays": 512, "density_rate": 0.3, "colour_rate": 0.05, "final": 0.1, "seed": 1}
+    list(optimise(again, targets, until=5, **told))
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        list(optimise(again, targets, until=12, **told))
+    finally:
+        numba.set_num_threads(threads)
+    np.testing.assert_array_equal(again.result().density_values, whole.density_values)
+    np.testing.assert_array_equal(again.result().sh, whole.sh)
+    other, _ = fitted(ball_tree(), targets, 12, seed=2)
+    assert not np.array_equal(other.sh, whole.sh)
+
+
+def test_weights_are_what_voxels_contribute() -> None:
+    """One voxel before another: the greatest weight of each, through what interpolation leaves it, against sums by hand."""
+    tree = uniform_tree((2, 2, 2), brick=4, voxel=0.25, sigma=4.0)
+    tree = replace(tree, bounds_min=BOUNDS[0], background=(1.0, 1.0, 1.0))
+    *_, (looked, weights) = greatest_weights(tree, Targets(pixels(8, 24), (1.0, 1.0, 1.0)), 4000, 0)
+    assert looked == 4000
+    at = voxel_coordinates(tree)
+    skin = ((at == 0) | (at == 7)).any(axis=1)
+    assert weights.min() > 0
+    assert weights.max() <= 1 - np.exp(-4 * 0.125) + 1e-6  # of a single sample
+    assert weights[skin].mean() > 2 * weights[~skin].mean()
+    without = with_voxels(tree, weights > np.median(weights))
+    assert len(without.density_values) == (weights > np.median(weights)).sum()
+    np.testing.assert_array_equal(voxel_coordinates(without), at[weights > np.median(weights)])
+
+
+def test_steps_are_those_of_the_formula() -> None:
+    tree = random_tree(4, brick=2, degree=1)
+    o, records = optimiser(tree), Records()
+    sums, stamp = (np.zeros_like(o.density), np.zeros_like(o.sh)), np.zeros(len(o.density), np.int32)
+    rates = np.linspace(0.01, 0.02, o.sh.shape[1]).astype(np.float32)
+    density, sh = o.density.astype(np.float64), o.sh.astype(np.float64)
+    square_density, square_sh, visits = np.zeros(len(density)), np.zeros(len(density)), np.zeros(len(density))
+    for number in (1, 2, 3):
+        origins, directions = rays_at(tree, 100, seed=number)
+        seen = seen_at_random(100, 0.2, np.float32)
+        start, along, bases = in_voxels(tree, origins, directions)
+        _, by_density, by_sh = gradients(o.result(), origins, directions, seen, np.float32, kernels.STOP)
+        _, counts = kernels.look(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
+        kernels.descend(
+            records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp,
+            number=number, thickness=tree.voxel, density_rate=0.1, sh_rates=rates, decay=0.9, epsilon=1e-12,
+        )  # fmt: skip
+        named = np.unique(records.index[np.concatenate([np.arange(c) + b * records.room for b, c in enumerate(counts)])])
+        met = np.isin(np.arange(len(density)), named)
+        visits += met
+        slope, flat = by_density * np.maximum(density, kernels.LEAST / tree.voxel), by_sh.reshape(sh.shape)
+        square_density = np.where(met, 0.9 * square_density + 0.1 * slope**2, square_density)
+        square_sh = np.where(met, 0.9 * square_sh + 0.1 * (flat**2).mean(axis=1), square_sh)
+        right = np.maximum(1 - 0.9**visits, 1e-30)
+        density = np.where(met, density * np.exp(-0.1 * slope / (np.sqrt(square_density / right) + 1e-12)), density)
+        sh = sh - met[:, None] * rates * flat / (np.sqrt(square_sh / right) + 1e-12)[:, None]
+        np.testing.assert_array_equal(o.visits, visits)
+        np.testing.assert_allclose(o.density, density, rtol=2e-3, atol=1e-5)
+        np.testing.assert_allclose(o.sh, sh, atol=2e-3)
+    assert 0 < (visits == 0).sum() < len(visits)
+    assert not sums[0].any()
+    assert not sums[1].any()
+
+
+def test_state_names_every_array_of_an_optimiser() -> None:
+    o = optimiser(random_tree(2))
+    assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(optimising.STATE)
