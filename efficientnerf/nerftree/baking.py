@@ -44,7 +44,7 @@ class Visible:
     cells     (B,) int64 flat coarse cells (x slowest) in which any sample fell, ascending
     greatest  (B, brick^3) float32, each voxel's greatest weight
     chosen    (P,) int64 pixels that were looked at
-    before    (P, 4) float16 premultiplied colour and opacity between camera and box; None where space ends with the box, as the next
+    before    (P, 4) float16 premultiplied colour and opacity between camera and box; None on a constant background, as the next
     behind    (P, 3) float16 colour beyond the box
     """
 
@@ -75,7 +75,7 @@ def visible_voxels(
         origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
         behind = m.behind(directions)
         seen = look(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
-        if m.space.contracted:
+        if m.background is None:
             parts = split_by_box(m, origins, directions, torch.ones_like(near), seen, behind)
             surroundings.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
         at = torch.floor((m.space.world(seen.fine.point).cpu() - low) / voxel).long()
@@ -173,5 +173,5 @@ def with_voxels(tree: NerfTree, keep: np.ndarray) -> NerfTree:
     """The tree with some of its voxels, (N,) bool, alone; they keep their order."""
     return tree_from_voxels(
         tree.shape, tree.voxel, tree.bounds_min, voxel_coordinates(tree)[keep], tree.density_values[keep], tree.sh[keep],
-        brick=tree.brick, background=tree.background, metadata=tree.metadata,
+        brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc,
     )  # fmt: skip

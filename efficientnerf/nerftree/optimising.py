@@ -126,9 +126,10 @@ def grid_of(tree: NerfTree) -> Grid:
 
 def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rays of the world in voxel coordinates, and the harmonics along them (R, K)."""
-    start = np.ascontiguousarray((np.asarray(origins, np.float64) - tree.bounds_min) / tree.voxel)
+    rays = tree.frame_rays(np.asarray(origins, np.float64), np.asarray(directions, np.float64))
+    start = np.ascontiguousarray((rays.origins - tree.bounds_min) / tree.voxel)
     bases = np.ascontiguousarray(basis_numpy(np.asarray(directions, np.float32), tree.degree))
-    return start, np.ascontiguousarray(directions, np.float64), bases
+    return start, np.ascontiguousarray(rays.directions, np.float64), bases
 
 
 def optimise(

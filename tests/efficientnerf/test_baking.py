@@ -102,7 +102,7 @@ def test_looked_at_pixels_are_spread_over_columns_and_rows() -> None:
 def test_of_photographs_it_is_kept_what_lies_before_and_behind_the_box() -> None:
     """A ball within the box over a sky: before is nothing, behind is the sky, for each pixel that was looked at."""
     m = model_of_a_ball()
-    m.space = Space(BOUNDS, contracted=True)
+    m.space, m.background = Space(BOUNDS, contracted=True), None
     some = pixels(6, 16)
     shape, voxel = grid_of(BOUNDS, 16, 4)
     seen = visible_voxels(m, some, shape, voxel, BOUNDS[0], 4, 10**6, lambda done, total: None)
