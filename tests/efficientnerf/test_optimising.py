@@ -245,7 +245,7 @@ def test_steps_are_those_of_the_formula() -> None:
         np.testing.assert_array_equal(o.visits, visits)
         np.testing.assert_allclose(o.density, density, rtol=2e-3, atol=1e-5)
         np.testing.assert_allclose(o.sh, sh, atol=2e-3)
-    assert 0 < (visits == 0).sum() < len(visits)
+    assert len(np.unique(visits)) > 1  # some were not met by every bundle
     assert not sums[0].any()
     assert not sums[1].any()
 
