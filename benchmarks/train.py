@@ -65,14 +65,12 @@ def settings_of(preset: str) -> Any:
 
 
 def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contender:
-    import numpy as np
-
-    from efficientnerf.grid import Space
     from efficientnerf.model import model
     from efficientnerf.render import FieldRenderer
     from efficientnerf.training import train, trainer
     from stages import scene
     from stages.budget import MOST, TIMED
+    from stages.field import space_of
     from stages.train import anchors_of, pixels_of, stated_range
 
     s, settings = scene.load(poses), settings_of(preset)
@@ -85,7 +83,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     hold = settings.warm_up + TIMED
     if whole:
         settings = dataclasses.replace(settings, iterations=MOST, rate_hold=hold)
-    m = model(Space(np.asarray(s.bounds), contracted=s.background is None), settings, s.background, "cpu", (near, far))
+    m = model(space_of(s), settings, s.background, "cpu", (near, far))
     t = trainer(m, len(views))
     warmed: list[tuple[int, float]] = []
 

@@ -3,6 +3,10 @@
 Every random choice of step n is drawn from a generator seeded by (seed, n), so a resumed run makes the choices of an uninterrupted one without
 any state to restore. What is restored: parameters, Adam's moments, density voxels, the running average that sets the number of rays.
 
+On a CPU the same seed gives the same bytes again with the same number of threads of torch. Our own kernels do not depend on the number; matrix products
+(oneDNN, MKL) may sum in another order with another one, and are in bfloat16 only where the processor has it, so that another machine's result is another
+one of the same quality.
+
 R rays, C views.
 """
 

@@ -37,7 +37,7 @@ class Budget:
     spent: float = 0.0
     clock: Callable[[], float] = time.monotonic
     started: float = field(init=False)
-    warmed: float | None = field(init=False, default=None)
+    warmed: tuple[int, float] | None = field(init=False, default=None)  # step and seconds from which on steps are timed
 
     def __post_init__(self) -> None:
         self.started = self.clock()
@@ -60,13 +60,13 @@ class Budget:
     def after(self, step: int) -> TrainSettings | None:
         """What is fixed after a step: the settings with the number of steps, or None where it is too early. Writes the plan."""
         if self.warmed is None and step >= min(self.settings.warm_up, self.hold - 1):
-            self.warmed, self._from = self.seconds, step
+            self.warmed = step, self.seconds
         over = self.seconds >= self.settings.budget
         if not over and step < self.hold:
             return None
         iterations = step
-        if not over and self.warmed is not None and step > self._from:
-            each = (self.seconds - self.warmed) / (step - self._from)
+        if not over and self.warmed is not None and step > self.warmed[0]:
+            each = (self.seconds - self.warmed[1]) / (step - self.warmed[0])
             left = (1 - RESERVE) * self.settings.budget - self.seconds
             iterations += max(0, int(left / max(each, 1e-6)))
         with written_aside(self.work / FILE) as aside:

@@ -25,6 +25,7 @@ from pipeline.stage import Job, Stage
 from stages.budget import MOST, TIMED, Budget
 
 if TYPE_CHECKING:
+    from efficientnerf.model import Model
     from efficientnerf.pixels import Pixels
     from efficientnerf.training import Anchors, Progress, Trainer
     from stages.scene import Scene, View
@@ -49,10 +50,7 @@ def run(job: Job) -> None:
     views = scene.views_of(s, "train")
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views)
-    near, far = min(view.near for view in s.views), max(view.far for view in s.views)
-    if settings.far > 0:
-        near, far = stated_range(s, settings)
-        pixels.near[:], pixels.far[:] = near, far
+    near, far = _range(s, pixels, settings)
     m = model(field.space_of(s), settings, s.background, job.device, (near, far))
     t = training.trainer(m, len(views))
     log = job.work / "log.jsonl"
@@ -72,9 +70,8 @@ def run(job: Job) -> None:
     for done in training.train(t, pixels, anchors_of(folder, s)):
         working += clock() - resumed
         loss = done.loss if done.step == first + 1 else 0.95 * loss + 0.05 * done.loss
-        if budget is not None and m.settings.iterations == MOST and (fixed := budget.after(done.step)) is not None:
-            m.settings = fixed
-            job.say(f"{fixed.iterations} steps fit into the budget of {settings.budget:g} s")
+        if budget is not None and m.settings.iterations == MOST:
+            _fix_steps(job, m, budget, done.step)
         last = done.step == m.settings.iterations
         drawn = _preview(renderer, watched, folder, job, done.step, settings)
         held_back = drawn or held_back
@@ -104,6 +101,13 @@ def run(job: Job) -> None:
     _publish_log(log, job)
 
 
+def _fix_steps(job: Job, m: Model, budget: Budget, step: int) -> None:
+    """Once enough steps have been timed, settle how many there will be."""
+    if (fixed := budget.after(step)) is not None:
+        m.settings = fixed
+        job.say(f"{fixed.iterations} steps fit into the budget of {job.settings.budget:g} s")
+
+
 def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> None:
     """What was reached, and how to make the same field again; seconds make it differ from run to run."""
     reached = t.model.settings
@@ -117,6 +121,15 @@ def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> No
         "again": f"--set train.budget=0 --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}",
     }
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _range(s: Scene, pixels: Pixels, settings: TrainSettings) -> tuple[float, float]:
+    """Nearest and farthest of all views along their axes; where the settings state them, of the pixels too."""
+    if settings.far > 0:
+        near, far = stated_range(s, settings)
+        pixels.near[:], pixels.far[:] = near, far
+        return near, far
+    return min(view.near for view in s.views), max(view.far for view in s.views)
 
 
 def stated_range(s: Scene, settings: TrainSettings) -> tuple[float, float]:
