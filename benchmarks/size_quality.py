@@ -1,0 +1,96 @@
+"""How good an asset is at what size: a run's field baked to several budgets, its pictures measured on the held-back views.
+
+    python benchmarks/size_quality.py RUN [--sizes 8,16,32,64,128] [--out benchmarks/results] [--set STAGE.NAME=VALUE]
+
+RUN has to be trained; it is not changed. Each budget (bake.max_mib) is baked and evaluated in a copy beside it by the stages themselves, with the run's other
+settings. Writes size_quality_NAME.json, .md and .png; the network's PSNR, of one view drawn by the evaluate stage, stands beside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from stage_runs import linked_copy, made, read_json
+
+from workflows.paper import hardware, versions
+
+
+def row_of(run: Path, size: int, settings: dict[str, str]) -> dict[str, Any]:
+    """Bake to at most `size` MiB, evaluate, and read what came of it."""
+    took = made(run, "bake", {**settings, "bake.max_mib": size})
+    made(run, "evaluate", {"evaluate.views": 1})
+    report, metrics = read_json(run / "bake" / "report.json"), read_json(run / "evaluate" / "metrics.json")
+    stored = (run / "bake" / "asset.nerftree").stat().st_size / 2**20
+    if stored > size:
+        raise SystemExit(f"bake.max_mib={size}: the asset has {stored:.1f} MiB")
+    return {
+        "max_mib": size,
+        "mib": stored,
+        "voxels": report["voxels"],
+        "resolution": report["resolution"],
+        "psnr": metrics["asset"]["psnr"],
+        "ssim": metrics["asset"]["ssim"],
+        "views": metrics["asset"]["views"],
+        "baking": took,
+    }
+
+
+def in_markdown(name: str, rows: list[dict[str, Any]], network: float | None) -> str:
+    columns = ("budget / MiB", "file / MiB", "voxels", "grid", "PSNR / dB", "SSIM", "baking / s")
+    lines = [f"# Size and quality of the asset: {name}", "", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    for row in rows:
+        grid = " x ".join(str(n) for n in row["resolution"])
+        figures = f"{row['psnr']:.2f} | {row['ssim']:.4f} | {row['baking']['seconds']:.0f}"
+        lines.append(f"| {row['max_mib']} | {row['mib']:.1f} | {row['voxels']:,} | {grid} | {figures} |")
+    lines += ["", f"PSNR over {rows[0]['views']} held-back views at full working size." + (f" The network: {network:.2f} dB." if network else "")]
+    return "\n".join(lines) + "\n"
+
+
+def plot(path: Path, rows: list[dict[str, Any]], network: float | None, name: str) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.plot([row["mib"] for row in rows], [row["psnr"] for row in rows], "o-", label="asset")
+    if network:
+        axes.axhline(network, color="grey", linestyle="--", label="network")
+    axes.set_xscale("log", base=2)
+    axes.set_xticks([row["max_mib"] for row in rows], [str(row["max_mib"]) for row in rows])
+    axes.set(xlabel="asset file / MiB", ylabel="PSNR of held-back views / dB", title=name)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, metadata={"Software": None})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--sizes", default="8,16,32,64,128", help="budgets in MiB")
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
+    parser.add_argument("--set", action="append", default=[], dest="sets", metavar="STAGE.NAME=VALUE")
+    given = parser.parse_args()
+    settings = dict(text.split("=", 1) for text in given.sets)
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="sizes-", dir=given.run.resolve().parent) as folder:
+        work = linked_copy(given.run, Path(folder) / "run")
+        for size in sorted(int(word) for word in given.sizes.split(",")):
+            rows.append(row_of(work, size, settings))
+            print(f"{size:5} MiB: {rows[-1]['mib']:.1f} MiB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
+        measured = given.run / "evaluate" / "metrics.json"  # of more views than one, where the run has been evaluated
+        network = read_json(measured if measured.exists() else work / "evaluate" / "metrics.json")["network"]
+    name = given.run.resolve().name
+    document = {"run": name, "settings": settings, "rows": rows, "network": network, "hardware": hardware("cpu"), "versions": versions()}
+    given.out.mkdir(parents=True, exist_ok=True)
+    (given.out / f"size_quality_{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    (given.out / f"size_quality_{name}.md").write_text(in_markdown(name, rows, network["psnr"]), encoding="utf-8")
+    plot(given.out / f"size_quality_{name}.png", rows, network["psnr"], name)
+
+
+if __name__ == "__main__":
+    main()
