@@ -85,7 +85,7 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
 
     Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
     and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
-    matter is.
+    matter is, and more rays are looked at whole, since what was pruned by mistake has less time to return.
     """
     if scale == 1:
         return stages
@@ -104,7 +104,8 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
     train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.3 / 8))
     train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
     train["rate_steps"] = max(1, round(train["rate_steps"] * scale**0.9))
-    train["warm_up"] = round(train["iterations"] * min(0.3, train["warm_up"] / 1e6 * scale**-0.6))
+    train["warm_up"] = round(train["iterations"] * min(0.35, train["warm_up"] / 1e6 * scale**-0.6))
+    train["refresh_rays"] = min(max(0.05, train["refresh_rays"]), train["refresh_rays"] * scale**-0.3)
     train["crop_steps"] = min(train["crop_steps"], train["iterations"] // 10)
     train["checkpoint_every"] = max(50, train["iterations"] // 4)
     train["preview_every"] = max(10, train["iterations"] // 8)

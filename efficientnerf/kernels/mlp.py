@@ -126,7 +126,7 @@ class _Chain(torch.autograd.Function):
             for layer in reversed(range(layers)):
                 y = kept[layer]
                 weight_grads[layer] += outer(g, y)
-                bias_grads[layer] += g.sum(0, dtype=torch.float32)
+                bias_grads[layer] += g.sum(0)  # summed in float32, and rounded once
                 if layer:
                     hidden = len(weights[layer - 1])  # what x adds at the skip needs no gradient
                     g = product(g, transposed[layer][:hidden], None, False)
