@@ -91,7 +91,8 @@ def run(job: Job) -> None:
     plain = behind_of(s)
     targets = Targets(pixels, plain, *((seen.chosen, seen.before, seen.behind) if plain is None else ()))
     tree, fitted = optimised(job, tree, targets, writing.most_voxels(settings.max_mib * 2**20, settings.layout, tree.degree, shape, settings.brick))
-    format.save(tree, job.out / ASSET, settings.layout)
+    provenance = {**facts["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": fitted["psnr_after"]}}
+    format.save(tree.with_metadata(provenance=provenance), job.out / ASSET, settings.layout)
     size = (job.out / ASSET).stat().st_size
     report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size, "optimisation": fitted}
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
@@ -115,6 +116,14 @@ def chosen_resolution(s: Scene, most: int) -> int:
         footprints.append(np.linalg.norm(view.camera.centre - centre) / focal)
     side = float((s.bounds[1] - s.bounds[0]).max())
     return int(np.clip(round(side / (0.75 * float(np.median(footprints)))), 32, most))
+
+
+def sources_of(job: Job) -> dict[str, str]:
+    """SHA-256 of what the asset was made from: the cameras, and the network."""
+    from pipeline.hashes import sha256_of
+    from stages.field import FILE
+
+    return {path.name: sha256_of(path) for path in (job.inputs["poses"] / "scene.json", job.inputs["train"] / FILE)}
 
 
 def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:

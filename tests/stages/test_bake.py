@@ -100,6 +100,9 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
     assert about["provenance"]["kind"] == "ball"
     assert about["provenance"]["training_views"] == 7
     assert about["provenance"]["iterations"] == 30
+    field = hashlib.sha256((inputs["train"] / FILE).read_bytes()).hexdigest()
+    assert about["provenance"]["sources"] == {"scene.json": hashlib.sha256((inputs["poses"] / "scene.json").read_bytes()).hexdigest(), FILE: field}
+    assert 5 < about["provenance"]["metrics"]["training_psnr"] <= 100
     assert tree.background == (1.0, 1.0, 1.0)
     assert tree.resolution == (24, 24, 24)
     assert tree.degree == 1
