@@ -76,7 +76,7 @@ def structures(request: Request) -> Result:
     if not cuda:
         cases.append(Case(sides[0], 0.2, shuffled=True))
     points = max(round(POINTS * request.scale * (8 if cuda else 1)), 1000)
-    bench, busy = (_on_cuda() if cuda else _on_cpu()), _Others()
+    bench, busy = (_in_torch(request.device) if cuda else _in_numba()), _Others()
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     for case in cases:
@@ -143,7 +143,7 @@ def _row(case: Case, name: str, size: Mapping[str, int], middle: Mapping[tuple[s
     }
 
 
-def _on_cpu() -> Bench:
+def _in_numba() -> Bench:
     import numpy as np
 
     from efficientnerf.structures.bricks import BrickTree, FullBricks
@@ -168,20 +168,24 @@ def _on_cpu() -> Bench:
     return Bench(prepare, lambda structure: sum(array.nbytes for array in structure.arrays.values()))
 
 
-def _on_cuda() -> Bench:
+def _in_torch(device: str) -> Bench:
     import numpy as np
     import torch
 
     from efficientnerf.structures import on_device
+    from pipeline.errors import StageFailed
 
     def prepare(voxels: Voxels, sets: Mapping[str, np.ndarray]) -> tuple[Callable[[str], Any], Callable[[Any, str], None], Callable[[], None]]:
-        coordinates, words = torch.from_numpy(voxels.coordinates).cuda(), torch.from_numpy(voxels.words.view(np.int64)).cuda()
-        points = {what: torch.from_numpy(array).cuda() for what, array in sets.items()}
-        return (
-            lambda name: getattr(on_device, name).cache(voxels.side, coordinates, words),
-            lambda structure, what: structure.query(points[what]),
-            torch.cuda.synchronize,
-        )
+        coordinates, words = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.words.view(np.int64)).to(device)
+        points = {what: torch.from_numpy(array).to(device) for what, array in sets.items()}
+
+        def cache(name: str) -> Any:
+            try:
+                return getattr(on_device, name).cache(voxels.side, coordinates, words)
+            except torch.OutOfMemoryError as error:
+                raise StageFailed(f"table 7: {NAMES[name]} of {voxels.side}³ voxels: the device has too little memory. Give --scale 0.5.") from error
+
+        return cache, lambda structure, what: structure.query(points[what]), torch.cuda.synchronize if device == "cuda" else lambda: None
 
     return Bench(prepare, lambda structure: sum(tensor.nbytes for tensor in structure.tensors.values()))
 

@@ -29,10 +29,10 @@ def asked(structure: type, voxels: Voxels, points: np.ndarray) -> tuple[np.ndarr
     return words, found
 
 
-def asked_in_torch(structure: type, voxels: Voxels, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    built = structure.cache(voxels.side, torch.from_numpy(voxels.coordinates), torch.from_numpy(voxels.words.view(np.int64)))
-    words, found = built.query(torch.from_numpy(points))
-    return words.numpy().view(np.uint64), found.numpy()
+def asked_in_torch(structure: type, voxels: Voxels, points: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
+    coordinates, words = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.words.view(np.int64)).to(device)
+    words, found = structure.cache(voxels.side, coordinates, words).query(torch.from_numpy(points).to(device))
+    return words.cpu().numpy().view(np.uint64), found.cpu().numpy()
 
 
 def of_a_dict(voxels: Voxels, points: np.ndarray) -> np.ndarray:
@@ -80,6 +80,15 @@ def test_structures_agree_along_rays_of_a_larger_grid(make) -> None:  # type: ig
             np.testing.assert_array_equal(asked(structure, listed, points)[0], expected, err_msg=str(structure))
     for structure in TORCH:
         np.testing.assert_array_equal(asked_in_torch(structure, voxels, points)[0], expected, err_msg=str(structure))
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("structure", TORCH)
+def test_structures_agree_on_cuda(structure: type) -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device that torch can use")
+    voxels, points = clustered(70, 0.2, 3), random_points(70, 20_000, 2)
+    np.testing.assert_array_equal(asked_in_torch(structure, voxels, points, "cuda")[0], asked(DenseVoxels, voxels, points)[0])
 
 
 def test_more_points_than_one_part(monkeypatch: pytest.MonkeyPatch) -> None:

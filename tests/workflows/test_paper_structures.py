@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from workflows.cli import main
-from workflows.paper_structures import COLUMNS, NAMES
+from workflows.paper_structures import COLUMNS, NAMES, Case
 
 
 def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -32,3 +32,27 @@ def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.Mon
     text = (tmp_path / "table_7.md").read_text()
     assert "Scaled by 0.12" in text
     assert "threads" in text
+
+
+def test_the_torch_versions_fill_the_same_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    from workflows import paper_structures
+
+    monkeypatch.setattr(paper_structures, "CACHINGS", 1)
+    monkeypatch.setattr(paper_structures, "QUERIES", 1)
+    rows, note = paper_structures._measure(Case(32, 0.2), 1000, paper_structures._in_torch("cpu"))
+    assert [row["structure"] for row in rows] == list(NAMES.values())
+    kernels, _ = paper_structures._measure(Case(32, 0.2), 1000, paper_structures._in_numba())
+    for row, kernel in zip(rows, kernels, strict=True):
+        assert row["memory of dense"] == pytest.approx(kernel["memory of dense"], rel=0.05, abs=0.01), row["structure"]
+    assert "6,554 voxels" in note
+
+
+@pytest.mark.gpu
+def test_table_7_on_cuda(tmp_path: Path) -> None:
+    import torch
+
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device that torch can use")
+    assert main(["paper", "7", "--out", str(tmp_path), "--scale", "0.06", "--device", "cuda", "--quiet"]) == 0
+    table = json.loads((tmp_path / "table_7.json").read_text())
+    assert {row["voxels"] for row in table["rows"]} == {"64³, 20% clustered", "64³, 20% scattered"}
