@@ -23,7 +23,8 @@ torture: $(INSTALLED)
 
 gpu: $(INSTALLED)
 	@if $(BIN)/python -c "import sys, torch; sys.exit(not torch.cuda.is_available())"; then \
-		$(BIN)/python -m pytest -m gpu && $(BIN)/python benchmarks/gpu.py; \
+		$(BIN)/python -m pytest -m gpu && $(BIN)/python -m pytest tests/efficientnerf/test_cuda*.py tests/efficientnerf/test_late.py \
+		&& $(BIN)/python benchmarks/gpu.py; \
 	else \
 		echo "make gpu: no CUDA device that torch can use; nothing was run."; \
 	fi

@@ -1,0 +1,207 @@
+"""What benchmarks/gpu.py measures of single kernels, pictures and training steps. Sizes are arguments, so that the code can be tried without a device."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from efficientnerf.cameras import Camera, rays
+from efficientnerf.grid import Space
+from efficientnerf.model import model
+from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.pixels import Pixels
+from efficientnerf.settings import TrainSettings
+
+BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])
+
+
+def milliseconds(run: Callable[[], Any], device: str, repeats: int) -> float:
+    """Median time of a call on the device, after three calls that build and warm up."""
+    for _ in range(3):
+        run()
+    taken = []
+    for _ in range(repeats):
+        if device == "cuda":
+            begin, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+            begin.record()
+            run()
+            end.record()
+            end.synchronize()
+            taken.append(begin.elapsed_time(end))
+        else:
+            started = time.perf_counter()
+            run()
+            taken.append(1e3 * (time.perf_counter() - started))
+    return float(np.median(taken))
+
+
+def copy_rate(device: str, mebibytes: int, repeats: int) -> float:
+    """GB/s read and written by a copy within the device's memory."""
+    source = torch.zeros(mebibytes * 2**18, device=device)
+    target = torch.empty_like(source)
+    return 2 * source.numel() * 4 / 1e6 / milliseconds(lambda: target.copy_(source), device, repeats)
+
+
+def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict[str, dict[str, float]]:
+    """Each kernel of a step at the sizes of a bundle of `rays_` rays: milliseconds, samples a second, and the bytes that it cannot avoid over that time."""
+    from efficientnerf.harmonics import basis
+    from efficientnerf.kernels import cuda, cuda_compositing, cuda_sampling
+
+    generator = torch.Generator().manual_seed(0)
+    m = model(Space(BOUNDS, False), TrainSettings(levels=16, log2_table=log2_table, finest=2048), (1.0, 1.0, 1.0), device)
+    side = m.voxels.side
+    centre = (torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1) + 0.5) / side * 2 - 1
+    voxels = ((centre.norm(dim=-1) - 0.7).abs() < 0.08).float().to(device)  # a shell
+    away = torch.nn.functional.normalize(torch.randn(rays_, 3, generator=generator), dim=-1)
+    target = torch.rand(rays_, 3, generator=generator) * 1.6 - 0.8
+    directions = torch.nn.functional.normalize(target - 3 * away, dim=-1).to(device)
+    origins = (3 * away).to(device)
+    near, far, offset = (torch.full((rays_,), x, device=device) for x in (1.0, 6.0, 0.5))
+    march = (m.space, origins, directions, near, far, offset, m.step, m.slots, voxels, 0.5)
+    coarse = cuda_sampling.valid_samples(*march)
+    count = len(coarse.start)
+    weight = torch.rand(count, generator=generator).to(device)
+    pivotal = cuda_sampling.pivots(weight, coarse.first, 1e-4, 8)
+    fine = cuda_sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2)
+    samples = len(fine.start)
+    field: Any = m.fine
+    table, levels = field.table, len(field.sides)
+    encode = lambda: cuda.Encode.apply(fine.point, table, field.sides, field.dense, field.starts, int(field.mask))  # noqa: E731
+    features = encode()
+    pull = torch.randn(features.shape, generator=generator).to(device)
+    raw = torch.randn(samples, 28, generator=generator).to(device).requires_grad_()
+    harmonics, behind = basis(directions, 2), torch.ones(rays_, 3, device=device)
+    composite = lambda: cuda_compositing.composite(raw, fine.length, fine.first, harmonics, behind, "exp")  # noqa: E731
+    colour = composite().colour
+    grad, first, second = (torch.randn(table.shape, generator=generator).to(device) for _ in range(3))
+    grad[torch.rand(len(table), generator=generator).to(device) < 0.5] = 0
+    second = second.abs()
+    value = table.detach().clone()
+    corner = 8 * levels * 8.0  # bytes of the table that a sample reads, two features of 4 bytes at 8 corners of each level
+    room = math.ceil(1.3 * count / 4096) * 4096
+    jobs: list[tuple[str, Callable[[], Any], int, float]] = [
+        ("march", lambda: cuda_sampling.valid_samples(*march, capacity=room), count, 32.0),
+        ("pivots", lambda: cuda_sampling.pivots(weight, coarse.first, 1e-4, 8), count, 5.0),
+        ("pivotal_samples", lambda: cuda_sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2, 2 * room), samples, 32.0),
+        ("encode", encode, samples, 12 + corner + 8 * levels),
+        ("encode_backward", lambda: torch.autograd.grad(features, table, pull, retain_graph=True), samples, 12 + 2 * corner + 8 * levels),
+        ("composite", composite, samples, 28 * 4 + 4 + 16.0),
+        ("composite_backward", lambda: torch.autograd.grad(colour.sum(), raw, retain_graph=True), samples, 2 * 28 * 4 + 4 + 16.0),
+        ("adam", lambda: cuda.adam(value, grad, first, second, 0.01, 0.9, 0.99, 0.5, 0.5, 1e-15, skip_zeros=True), table.numel(), 4 + 24 / 2.0),
+    ]
+    out = {}
+    for name, run, items, each in jobs:
+        took = milliseconds(run, device, repeats)
+        out[name] = {"ms": round(took, 4), "items": items, "items_per_second": items / took * 1e3, "gb_per_second": round(items * each / took / 1e6, 1)}
+    return out
+
+
+def shell(resolution: int) -> NerfTree:
+    """A bumpy shell with soft edges, degree 2: about as many voxels as an object of that size has."""
+    side = resolution // 4 * 4
+    kept = []
+    for x in range(side):
+        y, z = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
+        p = (np.stack([np.full_like(y, x), y, z], -1) + 0.5) / side * 2 - 1
+        radius = np.linalg.norm(p, axis=-1)
+        off = np.abs(radius - 0.7 - 0.05 * np.sin(9 * p).prod(-1)) * side / 2
+        at = np.argwhere(off < 2.5)
+        kept.append(np.concatenate([np.full((len(at), 1), x), at, off[tuple(at.T)][:, None]], axis=1))
+    found = np.concatenate(kept)
+    density = (60.0 * np.exp(-(found[:, 3] ** 2) / 2)).astype(np.float32)
+    sh = np.random.default_rng(0).normal(size=(len(found), 9, 3)).astype(np.float32)
+    return tree_from_voxels((side // 4,) * 3, 2.0 / side, np.full(3, -1.0), found[:, :3].astype(np.int64), density, sh)
+
+
+def orbit(side: int, frames: int) -> list[Camera]:
+    out = []
+    for n in range(frames):
+        azimuth, elevation = 2 * math.pi * n / frames, 0.4
+        back = np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
+        right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+        pose = np.eye(4)
+        pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = right, -np.cross(back, right), -back, 3 * back
+        out.append(Camera(f"v{n:03}", side, side, "SIMPLE_PINHOLE", (1.4 * side, side / 2, side / 2), pose))
+    return out
+
+
+def frame_rates(device: str, tree: NerfTree, side: int, repeats: int, variants: list[tuple[tuple[int, int], int]]) -> dict[str, Any]:
+    """Milliseconds of a picture of side x side pixels, mean over an orbit, for tiles of pixels and warps to a program; and how far it is from the CPU's."""
+    from efficientnerf.kernels import cuda_tree
+
+    sent = cuda_tree.device_tree(tree, device)
+    cameras = orbit(side, 8)
+    row = sent.sh.shape[1]
+    usual = (cuda_tree.TILE, cuda_tree.WARPS[row])
+    timed = []
+    for tile, warps in [usual, *variants]:
+        cuda_tree.TILE = tile
+        cuda_tree.WARPS[row] = warps
+        took = milliseconds(lambda: [cuda_tree.draw(sent, camera, background=(1.0, 1.0, 1.0)) for camera in cameras], device, repeats) / len(cameras)
+        timed.append({"tile": list(tile), "warps": warps, "ms": round(took, 4), "frames_per_second": round(1e3 / took, 1)})
+    cuda_tree.TILE, cuda_tree.WARPS[row] = usual
+    ours = cuda_tree.draw(sent, cameras[0]).colour.cpu().numpy()
+    off = np.abs(ours - tree.render(cameras[0]).colour).max(axis=-1)
+    return {
+        "pixels": [side, side], "voxels": len(tree.density_values), "bytes_on_device": sent.bytes, "runs": timed,
+        "difference_from_cpu": {"mean": float(off.mean()), "share_above_1e-3": float((off > 1e-3).mean()), "largest": float(off.max())},
+    }  # fmt: skip
+
+
+def ball(cameras: list[Camera]) -> Pixels:
+    """Pictures of a chequered ball, transparent round it."""
+    images = []
+    for camera in cameras:
+        origins, directions = rays(camera)
+        middle = -(origins * directions).sum(-1)
+        chord = np.sqrt(np.maximum(0.49 - (origins**2).sum(-1) + middle**2, 0))
+        hit = origins + (middle - chord)[:, None] * directions
+        chequer = ((np.floor(hit * 8).sum(-1) % 2) * 0.4 + 0.3)[:, None] + 0.3 * hit
+        rgba = np.concatenate([np.clip(chequer, 0, 1), (chord > 0)[:, None]], axis=1)
+        images.append(np.round(255 * rgba).astype(np.uint8).reshape(camera.height, camera.width, 4))
+    count = len(cameras)
+    return Pixels(cameras, images, [None] * count, np.full(count, 1.5), np.full(count, 4.5))
+
+
+def training_rates(device: str, steps: int, side: int, views: int, **settings: Any) -> dict[str, Any]:
+    """Steps and samples a second on the ball, the second half of the steps timed; and which lines still waited for the device in 32 steps more."""
+    from efficientnerf.training import train, trainer
+
+    s = TrainSettings(iterations=steps + 32, **settings)
+    t = trainer(model(Space(BOUNDS, False), s, (1.0, 1.0, 1.0), device))
+    running = train(t, ball(orbit(side, views)))
+    samples, started, done = 0, 0.0, None
+    for number in range(steps):
+        done = next(running)
+        if number == steps // 2:
+            if device == "cuda":
+                torch.cuda.synchronize()
+            started, samples = time.perf_counter(), 0
+        samples += done.fine + done.valid
+    if device == "cuda":
+        torch.cuda.synchronize()
+    took = time.perf_counter() - started
+    waits: Counter[str] = Counter()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("warn")
+        for _ in range(32):
+            next(running)
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("default")
+    waits.update(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message))
+    timed = steps - steps // 2 - 1
+    assert done is not None
+    return {
+        "steps_per_second": round(timed / took, 1), "samples_per_second": round(samples / took), "psnr": round(done.psnr, 2), "rays": done.rays,
+        "waits_in_32_steps": dict(waits),
+    }  # fmt: skip
