@@ -4,6 +4,9 @@
 
 With the mean fixed, the field is the scene as it was exposed on average, and held-back views are compared without any factor (as peers do). Factors act on
 sRGB values: there a change of exposure is nearly a factor, too, for the curve is nearly a power.
+
+Off by default, for photographs that were exposed alike lose by it: on 36 of a still life, after 1000 steps, held-back views came to 25.8 dB without, 25.0
+with a pull of 0.01 and 25.6 with one of 0.5; on 15 of bananas, after 600 steps, to 25.1 without and 24.7 with a pull of 0.01.
 """
 
 from __future__ import annotations
@@ -12,7 +15,8 @@ import torch
 from torch import Tensor
 
 SCALE = 0.1  # of what is learned: with the field's learning rate a factor moves by at most a thousandth in a step
-PULL = 0.01  # weight of the mean square of the factors' logarithms in the loss: without a reason they stay at 1
+# Weight of the mean square of the factors' logarithms in the loss: without a reason they stay at 1. At mid grey about 0.7 of a true difference is found.
+PULL = 0.1
 
 
 def log_gains(learned: Tensor) -> Tensor:
