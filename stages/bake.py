@@ -89,7 +89,10 @@ def run(job: Job) -> None:
     facts = metadata_of(s, settings, m)
     tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc)
     plain = behind_of(s)
-    targets = Targets(pixels, plain, *((seen.chosen, seen.before, seen.behind) if plain is None else ()))
+    if plain is None:
+        targets = Targets(pixels, None, seen.chosen, seen.before, seen.behind)
+    else:
+        targets = Targets(pixels, plain, infinite=s.background is None)
     tree, fitted = optimised(job, tree, targets, writing.most_voxels(settings.max_mib * 2**20, settings.layout, tree.degree, shape, settings.brick))
     provenance = {**facts["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": fitted["psnr_after"]}}
     format.save(tree.with_metadata(provenance=provenance), job.out / ASSET, settings.layout)

@@ -38,10 +38,11 @@ class Targets:
     chosen      (P,) indices of pixels that may be drawn
     before      (P, 4) premultiplied colour and opacity of what lies between the camera and the box
     behind      (P, 3) colour of what lies beyond the box
+    infinite    whether the tree holds all that the photographs show, out to infinity; on a background that then is only where it fails to
 
-    Where the photographs have alpha the object was cut out, and anything may lie behind it. With a background of random colour, each channel even over
-    0 to 1, the expected error is that over grey plus the channels' summed variance, 3 / 12, times the squared error of the opacity: taken as it
-    is, without the noise of drawing colours.
+    Where the photographs have alpha the object was cut out, and anything may lie behind it; behind what reaches to infinity nothing lies, and it
+    should be opaque whatever there were. With a background of random colour, each channel even over 0 to 1, the expected error is that over grey plus
+    the channels' summed variance, 3 / 12, times the squared error of the opacity: taken as it is, without the noise of drawing colours.
     """
 
     pixels: Pixels
@@ -49,6 +50,7 @@ class Targets:
     chosen: np.ndarray | None = None
     before: np.ndarray | None = None
     behind: np.ndarray | None = None
+    infinite: bool = False
 
     def __post_init__(self) -> None:
         if self.background is None and (self.chosen is None or self.before is None or self.behind is None):
@@ -75,12 +77,13 @@ class Targets:
             before, behind = self.before[at].astype(np.float32), self.behind[at].astype(np.float32)
             return origins, directions, Seen(truth - before[:, :3], behind, 1 - before[:, 3], opacity, 0.0)
         matted = colour.shape[1] == 4
-        ground = (GREY,) * 3 if matted and not declared else self.background
+        anything = (matted or self.infinite) and not declared
+        ground = (GREY,) * 3 if anything else self.background
         behind = np.broadcast_to(np.asarray(ground, np.float32), (rays, 3)).copy()
         if matted:
             opacity = np.ascontiguousarray(colour[:, 3])
             truth = truth * opacity[:, None] + behind * (1 - opacity[:, None])
-        return origins, directions, Seen(np.ascontiguousarray(truth), behind, gain, opacity, MATTE if matted and not declared else 0.0)
+        return origins, directions, Seen(np.ascontiguousarray(truth), behind, gain, opacity, MATTE if anything else 0.0)
 
 
 @dataclass

@@ -182,6 +182,23 @@ def test_any_background_is_the_mean_over_random_ones() -> None:
     np.testing.assert_array_equal(white.behind, 1)
 
 
+def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> None:
+    some = pixels(6, 16)
+    some.images = np.ascontiguousarray(some.images[:, :3])
+    tree = ball_tree()
+    targets = Targets(some, (0.5, 0.5, 0.5), infinite=True)
+    index = np.arange(600, 700)
+    origins, directions, seen = targets.of(index, None)
+    loss = gradients(tree, origins, directions, seen, np.float32)[0]
+    seen_as = tree.render_rays(origins, directions)
+    behind = np.random.default_rng(0).random((20000, 1, 3))
+    drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - some.images[index] / 255) ** 2).sum(axis=2).mean(axis=0)
+    np.testing.assert_allclose(loss, drawn, atol=0.02)
+    declared = targets.of(index, None, declared=True)[2]
+    assert declared.matte == 0
+    np.testing.assert_array_equal(declared.behind, 0.5)
+
+
 def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     whole, _ = fitted(ball_tree(), targets, 12)
