@@ -14,7 +14,8 @@ from stages import importers
 from stages.capture import Capture, Photo
 from stages.forward import content_depths, forward_of, mean_pose
 from stages.framing import frame
-from stages.paths import spiral_poses
+from stages.paths import spiral_poses, turntable_cameras
+from tests.efficientnerf.test_ndc_tree import wall
 from tests.stages import captures
 from tests.stages.test_framing import looking, some_rotation
 
@@ -188,3 +189,23 @@ def test_llff_captures_from_all_around_are_centred_on_what_they_look_at(tmp_path
     assert not found.orbit.forward_facing
     assert found.orbit.radius == pytest.approx(4.3 * unit, rel=0.1)
     assert (found.near_far[:, 0] < found.near_far[:, 1]).all()
+
+
+def test_the_turntable_of_a_forward_facing_asset_is_its_spiral() -> None:
+    tree = wall(voxels=24)
+    assert tree.ndc is not None
+    still = turntable_cameras(tree, frames=4, width=64, height=48)
+    assert all(np.allclose(camera.centre, tree.ndc.world_from_camera[:3, 3]) for camera in still)
+    spiral = {"radii": [0.5, 0.3, 0.1], "focus": 6.0, "tangents": [0.4, 0.5], "far": 40.0}
+    cameras = turntable_cameras(replace(tree, metadata={"spiral": spiral}), frames=8, width=64, height=48)
+    expected = spiral_poses(tree.ndc.world_from_camera, spiral["radii"], 6.0, 8)  # type: ignore[arg-type]
+    for camera, pose in zip(cameras, expected, strict=True):
+        np.testing.assert_array_equal(camera.world_from_camera, pose)
+        # No more is shown than all pictures cover, a twentieth less: across decides here.
+        assert camera.width / 2 / camera.params[0] == pytest.approx(0.95 * 0.4)
+        assert camera.height / 2 / camera.params[0] < 0.5
+    for odd in ({"radii": [1.0]}, {"focus": -1.0}, {"tangents": "wide"}, {"radii": [float("nan"), 0, 0]}):
+        with pytest.raises(BadInput, match="spiral"):
+            turntable_cameras(replace(tree, metadata={"spiral": spiral | odd}), frames=2, width=64, height=48)
+    turned = turntable_cameras(replace(tree, metadata={"spiral": spiral}), frames=4, width=64, height=48, radius=5.0, elevation=10.0)
+    assert np.ptp([camera.centre for camera in turned], axis=0).max() > 1  # asked for, it goes round
