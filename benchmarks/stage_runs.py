@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 LATER = ("bake", "evaluate", "turntable", "mesh", "points")
+OWN = (".lock", ".work", ".cache")  # a lock belongs to a file, whichever name it is opened by
 
 
 def linked_copy(run: Path, copy: Path) -> Path:
@@ -26,7 +27,7 @@ def linked_copy(run: Path, copy: Path) -> Path:
 
     if not (run / "train").is_dir():
         raise SystemExit(f"{run}: holds no trained field (train/). Run: enerf run SOURCE --out {run} --until train")
-    shutil.copytree(run, copy, copy_function=link, ignore=lambda folder, names: [n for n in names if Path(folder) == run and n in LATER])
+    shutil.copytree(run, copy, copy_function=link, ignore=lambda folder, names: [n for n in names if Path(folder) == run and n in (*LATER, *OWN)])
     settings = copy / "run.json"  # is written again with other settings: not the link
     text = settings.read_bytes()
     settings.unlink()
