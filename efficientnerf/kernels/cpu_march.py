@@ -1,5 +1,8 @@
 """Marching rays through a packed tree (numba): what a ray sees, and what a picture's pixels see.
 
+numba's cache looks at the file of the kernel that is called, not at those of the functions written into it: whoever changes this file deletes
+`__pycache__` beside it, or sees the old march.
+
 Every ray samples at t = t_enter + (k + 1/2) * step, step = half a voxel, whatever it skips, so that skipping empty space changes no value.
 """
 
@@ -73,10 +76,12 @@ def _harmonics(x, y, z, degree, out):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
 def _trilinear(block, at, j, i, fx, fy, fz):  # type: ignore[no-untyped-def]
     """Interpolates the eight values from `at`; j and i are the strides of y and x."""
-    a = block[at] + fz * (block[at + 1] - block[at])
-    b = block[at + j] + fz * (block[at + j + 1] - block[at + j])
-    c = block[at + i] + fz * (block[at + i + 1] - block[at + i])
-    d = block[at + i + j] + fz * (block[at + i + j + 1] - block[at + i + j])
+    # Unsigned, for a signed index might be one that counts from the end, which would be tested at every read.
+    at, i, j, one = np.uint64(at), np.uint64(i), np.uint64(j), np.uint64(1)
+    a = block[at] + fz * (block[at + one] - block[at])
+    b = block[at + j] + fz * (block[at + j + one] - block[at + j])
+    c = block[at + i] + fz * (block[at + i + one] - block[at + i])
+    d = block[at + i + j] + fz * (block[at + i + j + one] - block[at + i + j])
     e = a + fy * (b - a)
     return e + fx * (c + fy * (d - c) - e)
 
@@ -90,8 +95,11 @@ def _logistic(x):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _colour(voxel, at, j, i, fx, fy, fz, sh, scale, basis):  # type: ignore[no-untyped-def]
-    """Red, green, blue at a point: coefficients interpolated over the voxels that are stored."""
+def _colour_of_rows(voxel, at, j, i, fx, fy, fz, sh, scale, basis):  # type: ignore[no-untyped-def]
+    """Red, green, blue at a point: coefficients interpolated over the voxels that are stored.
+
+    voxel, at, j, i  rows of a brick's block, the low corner in it, strides of y and x
+    """
     none = sh.shape[0] - 1
     n0, n1, n2, n3 = voxel[at], voxel[at + 1], voxel[at + j], voxel[at + j + 1]
     n4, n5, n6, n7 = voxel[at + i], voxel[at + i + 1], voxel[at + i + j], voxel[at + i + j + 1]
@@ -115,6 +123,70 @@ def _colour(voxel, at, j, i, fx, fy, fz, sh, scale, basis):  # type: ignore[no-u
     if total > 0:
         share = _ONE / total
         r, g, b = r * share, g * share, b * share
+    return _logistic(r), _logistic(g), _logistic(b)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
+def _corner(around, neighbour, voxel, at, share):  # type: ignore[no-untyped-def]
+    """A voxel and its weight: 0 and 0 where none is stored."""
+    there = around[np.uint64(neighbour)]
+    stored = voxel[np.uint64(max(there, 0)), np.uint64(at)]
+    known = (there | stored) >= 0
+    return np.uint64(stored if known else 0), share if known else np.float32(0)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
+def _corners(i, j, k, fx, fy, fz, brick, around, voxel):  # type: ignore[no-untyped-def]
+    """The eight voxels of an interpolation and their weights, which add up to 1 over those that are stored; others have weight 0.
+
+    i, j, k  low corner in the block of a brick, 0 to b
+    around   (27,) the bricks around it
+    """
+    # Along each axis: which neighbour, and which voxel of it, for the low corner and the high one.
+    x0, x1 = np.int32(9 if i > 0 else 0), np.int32(18 if i == brick else 9)
+    y0, y1 = np.int32(3 if j > 0 else 0), np.int32(6 if j == brick else 3)
+    z0, z1 = np.int32(1 if k > 0 else 0), np.int32(2 if k == brick else 1)
+    plane = brick * brick
+    i0, i1 = (i - 1 if i > 0 else brick - 1) * plane, (0 if i == brick else i) * plane
+    j0, j1 = (j - 1 if j > 0 else brick - 1) * brick, (0 if j == brick else j) * brick
+    k0, k1 = k - 1 if k > 0 else brick - 1, 0 if k == brick else k
+    gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
+    n0, w0 = _corner(around, x0 + y0 + z0, voxel, i0 + j0 + k0, gx * gy * gz)
+    n1, w1 = _corner(around, x0 + y0 + z1, voxel, i0 + j0 + k1, gx * gy * fz)
+    n2, w2 = _corner(around, x0 + y1 + z0, voxel, i0 + j1 + k0, gx * fy * gz)
+    n3, w3 = _corner(around, x0 + y1 + z1, voxel, i0 + j1 + k1, gx * fy * fz)
+    n4, w4 = _corner(around, x1 + y0 + z0, voxel, i1 + j0 + k0, fx * gy * gz)
+    n5, w5 = _corner(around, x1 + y0 + z1, voxel, i1 + j0 + k1, fx * gy * fz)
+    n6, w6 = _corner(around, x1 + y1 + z0, voxel, i1 + j1 + k0, fx * fy * gz)
+    n7, w7 = _corner(around, x1 + y1 + z1, voxel, i1 + j1 + k1, fx * fy * fz)
+    total = ((w0 + w1) + (w2 + w3)) + ((w4 + w5) + (w6 + w7))
+    share = _ONE / total if total > 0 else _ONE
+    return (n0, n1, n2, n3, n4, n5, n6, n7), (w0 * share, w1 * share, w2 * share, w3 * share, w4 * share, w5 * share, w6 * share, w7 * share)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
+def _colour_of_codes(i, j, k, fx, fy, fz, brick, around, voxel, base, table, codes, palette, column, basis):  # type: ignore[no-untyped-def]
+    """The same where voxels are codes into palettes; i, j, k: low corner in the block."""
+    index, weight = _corners(i, j, k, fx, fy, fz, brick, around, voxel)
+    n0, n1, n2, n3, n4, n5, n6, n7 = index
+    w0, w1, w2, w3, w4, w5, w6, w7 = weight
+    r = w0 * table[base[n0, 0], 0] + w1 * table[base[n1, 0], 0] + w2 * table[base[n2, 0], 0] + w3 * table[base[n3, 0], 0]
+    r += w4 * table[base[n4, 0], 0] + w5 * table[base[n5, 0], 0] + w6 * table[base[n6, 0], 0] + w7 * table[base[n7, 0], 0]
+    g = w0 * table[base[n0, 1], 1] + w1 * table[base[n1, 1], 1] + w2 * table[base[n2, 1], 1] + w3 * table[base[n3, 1], 1]
+    g += w4 * table[base[n4, 1], 1] + w5 * table[base[n5, 1], 1] + w6 * table[base[n6, 1], 1] + w7 * table[base[n7, 1], 1]
+    b = w0 * table[base[n0, 2], 2] + w1 * table[base[n1, 2], 2] + w2 * table[base[n2, 2], 2] + w3 * table[base[n3, 2], 2]
+    b += w4 * table[base[n4, 2], 2] + w5 * table[base[n5, 2], 2] + w6 * table[base[n6, 2], 2] + w7 * table[base[n7, 2], 2]
+    r, g, b = r * basis[0, 0], g * basis[0, 0], b * basis[0, 0]
+    for k in range(len(column)):
+        at, y = np.uint64(column[k]), basis[0, 3 * k + 3]
+        e0, e1, e2, e3 = codes[n0, at], codes[n1, at], codes[n2, at], codes[n3, at]
+        e4, e5, e6, e7 = codes[n4, at], codes[n5, at], codes[n6, at], codes[n7, at]
+        x = w0 * palette[e0, k, 0] + w1 * palette[e1, k, 0] + w2 * palette[e2, k, 0] + w3 * palette[e3, k, 0]
+        r += y * (x + w4 * palette[e4, k, 0] + w5 * palette[e5, k, 0] + w6 * palette[e6, k, 0] + w7 * palette[e7, k, 0])
+        x = w0 * palette[e0, k, 1] + w1 * palette[e1, k, 1] + w2 * palette[e2, k, 1] + w3 * palette[e3, k, 1]
+        g += y * (x + w4 * palette[e4, k, 1] + w5 * palette[e5, k, 1] + w6 * palette[e6, k, 1] + w7 * palette[e7, k, 1])
+        x = w0 * palette[e0, k, 2] + w1 * palette[e1, k, 2] + w2 * palette[e2, k, 2] + w3 * palette[e3, k, 2]
+        b += y * (x + w4 * palette[e4, k, 2] + w5 * palette[e5, k, 2] + w6 * palette[e6, k, 2] + w7 * palette[e7, k, 2])
     return _logistic(r), _logistic(g), _logistic(b)
 
 
@@ -153,20 +225,22 @@ def march(ex, ey, ez, dx, dy, dz, k, last, reach, brick, grid, looking, degree, 
     ex, ey, ez, dx, dy, dz  float32: where it enters the box, voxel coordinates, and its unit direction
     reach                   float32: length of a step, world units
     looking                 (3,) float32: the direction that the harmonics are asked for
-    basis                   (3, P) float32, room for the harmonics
-    out                     (6,) float32: red, green, blue, opacity; where half of the light is gone, voxels from the entry, or infinity; density there
+    basis                   (3, P) float32, room for the harmonics: zeros where they never are
+    out                     (9,) float32: red, green, blue, opacity; where half of the light is gone, voxels from the entry, or infinity; and what it took:
+                            cells looked at, samples tested, samples interpolated, colours looked up
     """
-    cell, density, voxel, sh, scale = grid.cell, grid.density, grid.voxel, grid.sh, grid.scale
+    cell, density = grid.cell, grid.density
     side = brick + 2
     plane = side * side
     step, width, per_brick = np.float32(STEP), np.float32(brick), np.float32(1 / brick)
     big = np.float32(1e30)
     # The parameter at which a face at x is crossed: x * slope + shift; never, along an axis that the ray does not move on.
     slope_x, slope_y, slope_z = (_ONE / dx if dx != 0 else 0), (_ONE / dy if dy != 0 else 0), (_ONE / dz if dz != 0 else 0)
+    coded = len(grid.codes) > 0
     light, owed = _ONE, np.float32(0)
     red = green = blue = np.float32(0)
     hit = np.float32(np.inf)
-    asked = False
+    cells = tested = mixed = colours = 0
     while k < last:
         s = (np.float32(k) + _HALF) * step
         u, v, w = ex + s * dx, ey + s * dy, ez + s * dz
@@ -174,6 +248,7 @@ def march(ex, ey, ez, dx, dy, dz, k, last, reach, brick, grid, looking, degree, 
         e = min(max(int(v * per_brick), 0), cell.shape[1] - 1)
         c = min(max(int(w * per_brick), 0), cell.shape[2] - 1)
         owner = cell[a, e, c]
+        cells += 1
         far = 1 if owner >= 0 else -1 - owner
         # To the end of the cell, or of the empty cube round it: the nearest of its three far faces.
         x = np.float32(a + far if dx > 0 else a - far + 1) * width
@@ -187,7 +262,8 @@ def march(ex, ey, ez, dx, dy, dz, k, last, reach, brick, grid, looking, degree, 
         if owner < 0:
             k = until
             continue
-        block, index = density[owner], voxel[owner]
+        block = density[owner]
+        tested -= k
         bx, by, bz = ex - np.float32(a) * width + _HALF, ey - np.float32(e) * width + _HALF, ez - np.float32(c) * width + _HALF
         while k < until:
             s = (np.float32(k) + _HALF) * step
@@ -195,8 +271,9 @@ def march(ex, ey, ez, dx, dy, dz, k, last, reach, brick, grid, looking, degree, 
             i, j, l = int(x), int(y), int(z)
             at = i * plane + j * side + l
             k += 1
-            if np.float32(block[at]).view(np.int32) < 0:
+            if np.float32(block[np.uint64(at)]).view(np.int32) < 0:
                 continue
+            mixed += 1
             fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(l)
             sigma = _trilinear(block, at, side, plane, fx, fy, fz)
             if sigma <= 0:
@@ -204,10 +281,15 @@ def march(ex, ey, ez, dx, dy, dz, k, last, reach, brick, grid, looking, degree, 
             left = light * _exp_minus(sigma * reach)
             owed += light - left
             if owed > np.float32(FAINT):
-                if not asked:
+                if colours == 0:
                     _harmonics(looking[0], looking[1], looking[2], degree, basis)
-                    asked = True
-                r, g, b = _colour(index, at, side, plane, fx, fy, fz, sh, scale, basis)
+                colours += 1
+                if coded:
+                    r, g, b = _colour_of_codes(
+                        i, j, l, fx, fy, fz, brick, grid.around[owner], grid.voxel, grid.base, grid.base_table, grid.codes, grid.palette, grid.column, basis
+                    )
+                else:
+                    r, g, b = _colour_of_rows(grid.voxel[owner], at, side, plane, fx, fy, fz, grid.sh, grid.scale, basis)
                 red += owed * r
                 green += owed * g
                 blue += owed * b
@@ -216,6 +298,8 @@ def march(ex, ey, ez, dx, dy, dz, k, last, reach, brick, grid, looking, degree, 
                 hit = s - _HALF * step + np.log(2 * light) / (sigma * reach) * step
             light = left
             if light < np.float32(STOP):
-                k = last
+                last = k
                 break
+        tested += k
     out[0], out[1], out[2], out[3], out[4] = red, green, blue, _ONE - light, hit
+    out[5], out[6], out[7], out[8] = cells, tested, mixed, colours

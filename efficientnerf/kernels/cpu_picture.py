@@ -188,12 +188,13 @@ def _ray(row, column, shot):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def trace(shot, behind, brick, grid, degree, units, tile, threads, colour, opacity, depth, normal):  # type: ignore[no-untyped-def]
+def trace(shot, behind, brick, grid, degree, units, tile, threads, colour, opacity, depth, normal, work):  # type: ignore[no-untyped-def]
     """What rays in rows and columns see, into colour (H, W, 3), opacity (H, W), depth (H, W), normal (H, W, 3) or (0, 0, 3) where none is wanted.
 
     behind  (3,) float32 colour to composite over
     units   world units per voxel
     tile    (rows, columns) of a tile
+    work    (H, W, 4) int32, or (0, 0, 4) where it is of no interest: cells looked at, samples tested, samples interpolated, colours looked up
 
     Depth is along the view axis for a camera and along the ray for rays as they come, world units.
     """
@@ -206,7 +207,7 @@ def trace(shot, behind, brick, grid, degree, units, tile, threads, colour, opaci
         top = (part % share * threads + part // share) * tile[0]
         low = min(top + tile[0], height)
         basis = np.zeros((3, grid.sh.shape[1]), np.float32)
-        look, out = np.empty(3, np.float32), np.empty(5, np.float32)
+        look, out = np.empty(3, np.float32), np.empty(9, np.float32)
         for left in range(0, width if top < height else 0, tile[1]):
             right = min(left + tile[1], width)
             clear = _tile(top, low, left, right, shot, brick, grid.cell)
@@ -233,6 +234,9 @@ def trace(shot, behind, brick, grid, degree, units, tile, threads, colour, opaci
                         colour[row, column, c] = out[c] + through * behind[c]
                     opacity[row, column] = out[3]
                     depth[row, column] = (t0 + out[4]) * slant * units
+                    if len(work) > 0:
+                        for n in range(4):
+                            work[row, column, n] = out[5 + n]
                     if len(normal) > 0:
                         if out[4] < np.inf:
                             normal_into(ex + out[4] * ax, ey + out[4] * ay, ez + out[4] * az, brick, grid.cell, grid.density, normal[row, column])

@@ -166,8 +166,9 @@ def _pixels(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np.n
     return np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32), normal
 
 
-def _trace(tree: NerfTree, shot: Shot, behind: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...]) -> None:
-    trace(shot, behind, tree.brick, tree.packed, tree.degree, float(tree.voxel), tile, numba.get_num_threads(), *out)
+def _trace(tree: NerfTree, shot: Shot, behind: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...], work: np.ndarray | None = None) -> None:
+    work = np.zeros((0, 0, 4), np.int32) if work is None else work
+    trace(shot, behind, tree.brick, tree.packed, tree.degree, float(tree.voxel), tile, numba.get_num_threads(), *out, work)
 
 
 def render_rays(
@@ -199,31 +200,56 @@ def _sights(model: str, params: tuple[float, ...], width: int, height: int, supe
     return rays(camera, pixels)[1].astype(np.float32).reshape(*x.shape, 3)
 
 
+def _shot(tree: NerfTree, camera: Camera, supersample: int, top: int, low: int) -> Shot:
+    """The rays through rows top to low of a camera's picture."""
+    k, none = camera.intrinsics, np.zeros((0, 0, 3), np.float32)
+    return Shot(
+        lens=np.array([k["fx"], k["fy"], k["cx"], k["cy"]]),
+        pitch=1 / supersample,
+        first=top * supersample,
+        turn=np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64),
+        centre=(np.asarray(camera.centre, np.float64) - tree.bounds_min) / tree.voxel,
+        sights=none if camera.model in PINHOLES else _sights(camera.model, camera.params, camera.width, camera.height, supersample, top, low),
+        starts=none.astype(np.float64),
+        alongs=none.astype(np.float64),
+        looking=none,
+    )
+
+
 def render_picture(
     tree: NerfTree, camera: Camera, supersample: int, behind: np.ndarray, *, normals: bool, rays_per_band: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Colour (H, W, 3) over `behind`, opacity (H, W), depth (H, W) along the view axis, normal (H, W, 3) of a camera's pixels."""
-    k, height, width = camera.intrinsics, camera.height, camera.width
-    lens, turn = np.array([k["fx"], k["fy"], k["cx"], k["cy"]]), np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64)
-    centre = (np.asarray(camera.centre, np.float64) - tree.bounds_min) / tree.voxel
-    nothing = np.zeros((0, 0, 3), np.float32)
+    """Colour (H, W, 3) over `behind`, opacity (H, W), depth (H, W) along the view axis, normal (H, W, 3) of a camera's pixels.
+
+    normals        whether they are wanted; else they come back as (0, 0, 3)
+    rays_per_band  of supersampled pictures, whose rays are kept until they are merged
+    """
+    height, width = camera.height, camera.width
     behind = np.ascontiguousarray(behind, np.float32)
     picture = _pixels(height, width, normals=normals)
-    step = height if supersample == 1 else max(1, rays_per_band // (width * supersample**2))
+    most = rays_per_band if supersample > 1 else height * width
     if camera.model not in PINHOLES:
-        step = min(height, max(1, SIGHTS_PER_BAND // (width * supersample**2)))
+        most = min(most, SIGHTS_PER_BAND)
+    step = max(1, most // max(1, width * supersample**2))
     for top in range(0, height, step):
         low = min(top + step, height)
-        sights = nothing if camera.model in PINHOLES else _sights(camera.model, camera.params, width, height, supersample, top, low)
-        shot = Shot(lens, 1 / supersample, top * supersample, turn, centre, sights, nothing.astype(np.float64), nothing.astype(np.float64), nothing)
         part = tuple(whole[top:low] if len(whole) else whole for whole in picture)
+        shot = _shot(tree, camera, supersample, top, low)
         if supersample == 1:
             _trace(tree, shot, behind, (TILE, TILE), part)
-            continue
-        fine = _pixels((low - top) * supersample, width * supersample, normals=normals)
-        _trace(tree, shot, behind, (TILE, TILE), fine)
-        merge(supersample, *fine, *part)
+        else:
+            fine = _pixels((low - top) * supersample, width * supersample, normals=normals)
+            _trace(tree, shot, behind, (TILE, TILE), fine)
+            merge(supersample, *fine, *part)
     return picture
+
+
+def picture_work(tree: NerfTree, camera: Camera) -> np.ndarray:
+    """What each pixel's ray takes: cells looked at, samples tested, samples interpolated, colours looked up; (H, W, 4) int32."""
+    work = np.zeros((camera.height, camera.width, 4), np.int32)
+    out = _pixels(camera.height, camera.width, normals=False)
+    _trace(tree, _shot(tree, camera, 1, 0, camera.height), np.zeros(3, np.float32), (TILE, TILE), out, work)
+    return work
 
 
 def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:

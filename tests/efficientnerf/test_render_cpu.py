@@ -90,7 +90,64 @@ def test_harmonics_of_the_packed_tree_are_the_trees_to_a_part_in_65534_of_the_la
     assert (np.abs(close - sh.reshape(len(sh), -1)) <= np.abs(sh).max(axis=(1, 2))[:, None] * (0.505 / 32767)).all()
     assert not packed.sh[:, count:].any()
     assert not packed.sh[-1].any()
-    assert packed.nbytes == sum(part.nbytes for part in packed)
+    assert packed.nbytes > packed.sh.nbytes + packed.density.nbytes
+
+
+def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTree:
+    """The tree with random codes in place of its harmonics."""
+    from efficientnerf.nerftree.palettes import PaletteHarmonics
+
+    rng, count = np.random.default_rng(0), len(tree.density_values)
+    codes = rng.integers(entries, size=(count, len(groups))).astype(np.uint8 if entries <= 256 else np.uint16)
+    palette = rng.normal(size=(entries, sum(groups), 3)).astype(np.float32)
+    base, table = rng.integers(256, size=(count, 3)).astype(np.uint8), rng.normal(size=(256, 3)).astype(np.float32)
+    return replace(tree, harmonics=PaletteHarmonics(base, table, codes, palette, groups))
+
+
+@pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((8,), 1000), ((3, 5), 17), ((), 1)])
+def test_codes_into_palettes_are_drawn_as_what_they_decode_to(groups: tuple[int, ...], entries: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    from efficientnerf.kernels import packed_tree
+
+    tree = in_palettes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
+    origins, directions = rays_at(tree, 300)
+    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    rows = tree.render_rays(origins, directions)
+    assert not len(tree.packed.codes)
+    monkeypatch.setattr(packed_tree, "ROWS_LIMIT", 0)
+    large = replace(tree)
+    coded = large.render_rays(origins, directions)
+    assert large.packed.codes is tree.harmonics.codes  # type: ignore[union-attr]
+    assert large.packed.nbytes < tree.packed.nbytes
+    for seen in (rows, coded):
+        np.testing.assert_allclose(seen.opacity, opacity, atol=1.01e-3)
+        np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
+    assert coded.opacity.max() > 0.5
+
+
+@pytest.mark.parametrize("brick", [1, 2, 4, 5])
+def test_codes_are_found_across_bricks_of_any_size(brick: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    from efficientnerf.kernels import packed_tree
+
+    monkeypatch.setattr(packed_tree, "ROWS_LIMIT", 0)
+    tree = in_palettes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
+    origins, directions = rays_at(tree, 300)
+    colour, _ = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    np.testing.assert_allclose(tree.render_rays(origins, directions).colour, colour, atol=1e-3)
+
+
+def test_the_work_of_a_picture_is_counted() -> None:
+    from efficientnerf.kernels.cpu_tree import picture_work
+
+    tree = uniform_tree(sigma=0.5)
+    camera = camera_of(tree)
+    cells, tested, mixed, colours = np.moveaxis(picture_work(tree, camera), -1, 0)
+    seen = tree.render(camera).opacity > 0
+    assert ((mixed > 0) == seen).all()
+    assert (tested >= mixed).all()
+    assert (mixed >= colours).all()
+    assert (cells[seen] > 0).all()
+    # A chord of the box in half voxels, at most its diagonal.
+    assert tested.max() <= 2 * np.linalg.norm(tree.resolution) + 1
 
 
 @pytest.mark.parametrize(("sigma", "share", "stop"), [(0.3, 0.9, 0.0), (3.0, 0.6, 0.0), (300.0, 0.6, 1e-3)])

@@ -1,0 +1,172 @@
+"""How fast a baked asset is drawn on the CPU, and what bounds it: written to benchmarks/results/render_cpu.json.
+
+    python benchmarks/render.py ASSET [--width 800 --height 800] [--frames 24] [--threads N] [--json FILE]
+
+Cameras stand on the asset's orbit, evenly round it. Beside frames a second stand samples and colours a ray, the bytes that they read, and the
+bandwidth that the machine's memory was measured to have, so that it can be told what is near its limit. Seconds mean nothing on a busy machine:
+the load average is written down too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+TRIAD_BYTES = 512 * 2**20  # far more than any cache holds
+
+
+def processor() -> str:
+    """The processor's name, as the system tells it."""
+    info = Path("/proc/cpuinfo")
+    names = [line.split(":", 1)[1].strip() for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")] if info.exists() else []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def bandwidth() -> dict[str, float]:
+    """Gigabytes a second that all threads together read and write: a = b + s * c over arrays far larger than the caches."""
+    import numba
+    import numpy as np
+
+    @numba.njit(parallel=True)
+    def triad(a, b, c, s):  # type: ignore[no-untyped-def]
+        for i in numba.prange(len(a)):
+            a[i] = b[i] + s * c[i]
+
+    @numba.njit(parallel=True, fastmath=True)
+    def total(a):  # type: ignore[no-untyped-def]
+        out = np.float32(0)
+        for i in numba.prange(len(a)):
+            out += a[i]
+        return out
+
+    a, b, c = (np.full(TRIAD_BYTES // 12, 0.5, np.float32) for _ in range(3))
+    triad(a, b, c, np.float32(2))
+    total(a)
+    copying = min(_seconds(lambda: triad(a, b, c, np.float32(2))) for _ in range(5))
+    reading = min(_seconds(lambda: total(a)) for _ in range(5))
+    return {"triad_gb_per_s": round(3 * a.nbytes / copying / 1e9, 1), "read_gb_per_s": round(a.nbytes / reading / 1e9, 1)}
+
+
+def _seconds(what: Any) -> float:
+    begin = time.perf_counter()
+    what()
+    return time.perf_counter() - begin
+
+
+def cameras(tree: Any, width: int, height: int, count: int, fov: float) -> list[Any]:
+    """`count` cameras on the asset's orbit."""
+    from stages.paths import turntable_cameras
+
+    return list(turntable_cameras(tree, frames=count, width=width, height=height, fov=fov))
+
+
+def measure(tree: Any, views: list[Any], supersample: int) -> dict[str, Any]:
+    """Seconds of each picture, after one that compiles and packs; `processor_ms` is what all cores together spend on one."""
+    first = _seconds(lambda: tree.render(views[0], supersample=supersample))
+    spent = time.process_time()
+    took = [_seconds(lambda view=view: tree.render(view, supersample=supersample)) for view in views]
+    again = [_seconds(lambda view=view: tree.render(view, supersample=supersample)) for view in views]
+    spent = time.process_time() - spent
+    best = [min(pair) for pair in zip(took, again, strict=True)]
+    rays = views[0].width * views[0].height * supersample**2
+    mean = sum(best) / len(best)
+    return {
+        "first_picture_s": round(first, 3),
+        "mean_ms": round(mean * 1e3, 2),
+        "slowest_ms": round(max(best) * 1e3, 2),
+        "all_passes_mean_ms": round((sum(took) + sum(again)) / (2 * len(views)) * 1e3, 2),
+        "processor_ms": round(spent / (2 * len(views)) * 1e3, 2),
+        "frames_per_s": round(1 / mean, 2),
+        "rays_per_s": round(rays / mean),
+    }
+
+
+def counts(tree: Any, views: list[Any]) -> dict[str, float]:
+    """Means over the rays of some pictures: what the kernel looks up, and the bytes that it asks for, most of which lie in caches."""
+    import numpy as np
+
+    from efficientnerf.kernels.cpu_tree import picture_work
+
+    work = np.concatenate([picture_work(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
+    cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
+    # A cell is 4 bytes; a tested sample reads one density, an interpolated one seven more; a colour reads eight neighbours, indices and harmonics.
+    asked = 4 * cells + 4 * tested + 28 * mixed + 8 * (8 + tree.packed.colour_bytes) * colours
+    return {
+        "cells_per_ray": round(cells, 3),
+        "samples_per_ray": round(tested, 3),
+        "samples_with_density_per_ray": round(mixed, 3),
+        "colours_per_ray": round(colours, 3),
+        "bytes_per_ray": round(asked, 1),
+        "rays_that_hit": round(float((work[:, 3] > 0).mean()), 4),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("asset", type=Path)
+    parser.add_argument("--width", type=int, default=800)
+    parser.add_argument("--height", type=int, default=800)
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--fov", type=float, default=39.6, help="vertical, degrees; by default that of the Realistic Synthetic scenes")
+    parser.add_argument("--supersample", type=int, default=1)
+    parser.add_argument("--threads", type=int, help="of numba; all cores by default")
+    parser.add_argument("--json", type=Path, default=HERE / "results" / "render_cpu.json")
+    given = parser.parse_args()
+    if given.threads is not None:
+        os.environ["NUMBA_NUM_THREADS"] = str(given.threads)
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    sys.path.insert(0, str(HERE.parent))
+
+    import numba
+
+    from efficientnerf.nerftree.tree import NerfTree
+
+    before = os.getloadavg()
+    begin = time.perf_counter()
+    tree = NerfTree.load(given.asset)
+    loading = time.perf_counter() - begin
+    views = cameras(tree, given.width, given.height, given.frames, given.fov)
+    result = {
+        "date": datetime.date.today().isoformat(),
+        "asset": {
+            "name": given.asset.name,
+            "bytes": given.asset.stat().st_size,
+            "voxels": len(tree.density_values),
+            "resolution": list(tree.resolution),
+            "sh_degree": tree.degree,
+            "load_s": round(loading, 3),
+        },
+        "picture": {"width": given.width, "height": given.height, "supersample": given.supersample, "frames": given.frames},
+        "speed": measure(tree, views, given.supersample),
+        "work": counts(tree, views),
+        "packed_bytes": tree.packed.nbytes,
+        "machine": {
+            "processor": processor(),
+            "cores": os.cpu_count(),
+            "threads": numba.get_num_threads(),
+            "platform": platform.platform(),
+            "memory": bandwidth(),
+            "load": {"before": before, "after": os.getloadavg()},
+        },
+        "versions": {name: version(name) for name in ("numba", "numpy", "llvmlite")} | {"python": platform.python_version()},
+    }
+    asked = result["work"]["bytes_per_ray"] * result["speed"]["rays_per_s"] / 1e9
+    result["speed"]["asked_gb_per_s"] = round(asked, 1)
+    given.json.parent.mkdir(parents=True, exist_ok=True)
+    given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(result, indent=1))
+    print(f"written to {given.json}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
