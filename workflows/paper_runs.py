@@ -81,11 +81,12 @@ def scenes(data: Path) -> list[Path]:
 
 
 def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
-    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides and voxels 0.3, batch 0.2, widths 0.15, depths 0.05.
+    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, voxels 0.25, batch 0.2, widths 0.15, depths 0.05.
 
     Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
     and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
-    matter is, and more rays are looked at whole, since what was pruned by mistake has less time to return.
+    matter is, and the voxels are asked about densely besides (reading notes 3): rays alone visit too few of them to prune, or to
+    bring back what was pruned by mistake.
     """
     if scale == 1:
         return stages
@@ -101,7 +102,8 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
         train[name] = width(train[name])
     for name in ("layers", "coarse_layers"):
         train[name] = max(2, round(train[name] * scale**0.05))
-    train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.3 / 8))
+    train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.25 / 8))
+    train["refresh_share"], train["refresh_every"] = 0.03125, 4
     train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
     train["rate_steps"] = max(1, round(train["rate_steps"] * scale**0.9))
     train["warm_up"] = round(train["iterations"] * min(0.35, train["warm_up"] / 1e6 * scale**-0.6))
