@@ -138,7 +138,8 @@ def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.nd
 
     if not len(sample):
         return np.zeros((0, sample.shape[1]), np.float32)
-    few = sample[rng.permutation(len(sample))[: max(SAMPLES // 4, 4 * entries)]] if len(sample) > SAMPLES else sample
+    most = max(SAMPLES // 4, 4 * entries)
+    few = sample if len(sample) <= most else sample[rng.permutation(len(sample))[:most]]
     turned = np.ascontiguousarray(few.T)
     chosen = [few[int(rng.integers(len(few)))]]
     distance = np.full(len(few), np.inf, np.float32)
