@@ -35,7 +35,7 @@ def optimised(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[Ne
     facts: dict[str, Any] = {"steps": settings.optimise, "psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(SAMPLE, 4 * len(targets.pixels))
     before = optimising.error(tree, targets, sample, settings.seed)
-    o, pruned = _restored(job, tree) or (optimising.optimiser(tree), False)
+    o, pruned = _restored(job, tree) or (optimising.optimiser(tree, optimising.OPAQUE if settings.optimise else math.inf), False)
     half = settings.optimise // 2
     if not pruned:
         _fit(job, o, targets, half, pruned)

@@ -25,6 +25,7 @@ from efficientnerf.nerftree.tree import NerfTree
 from efficientnerf.pixels import Pixels
 
 DECAY, EPSILON = 0.99, 1e-10
+OPAQUE = 2.0  # optical thickness of a voxel to begin with at most: networks say hundreds, behind which nothing would have a gradient
 GREY, MATTE = 0.5, 0.25  # mean of a channel of a background of any colour, and three times the variance: see `Targets`
 WEIGHED_RAYS = 2**16  # in a bundle
 
@@ -111,10 +112,11 @@ class Optimiser:
 STATE = ("density", "sh", "square_density", "square_sh", "visits")
 
 
-def optimiser(tree: NerfTree) -> Optimiser:
+def optimiser(tree: NerfTree, thickest: float = np.inf) -> Optimiser:
+    """At the beginning; no voxel of more optical thickness than `thickest`, so that what lies behind a floater pulls at it from the first step on."""
     count = len(tree.density_values)
     sh = np.array(tree.sh, np.float32).reshape(count, tree.harmonics_count * 3)
-    density = np.array(tree.density_values, np.float32)
+    density = np.minimum(tree.density_values, np.float32(thickest / tree.voxel))
     return Optimiser(tree, density, sh, np.zeros_like(density), np.zeros_like(density), np.zeros(count, np.int32))
 
 

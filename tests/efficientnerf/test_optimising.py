@@ -267,6 +267,18 @@ def test_steps_are_those_of_the_formula() -> None:
     assert not sums[1].any()
 
 
+def test_what_hides_behind_an_opaque_wall_is_reached() -> None:
+    """A wall of the wrong colour before a ball: from a capped start it gives way in steps in which it otherwise stays."""
+    targets = Targets(pixels(10, 24), (1.0, 1.0, 1.0))
+    wall = replace(ball_tree(), density_values=np.full(8000, 3000.0, np.float32))
+    assert optimiser(wall, optimising.OPAQUE).density.max() == pytest.approx(optimising.OPAQUE / wall.voxel)
+    errors = {}
+    for thickest in (optimising.OPAQUE, np.inf):
+        o = optimiser(wall, thickest)
+        *_, errors[thickest] = optimise(o, targets, until=30, steps=30, rays=512, density_rate=0.3, colour_rate=0.05, final=0.1, seed=1)
+    assert errors[optimising.OPAQUE] < 0.75 * errors[np.inf]
+
+
 def test_state_names_every_array_of_an_optimiser() -> None:
     o = optimiser(random_tree(2))
     assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(optimising.STATE)
