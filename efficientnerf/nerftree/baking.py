@@ -133,7 +133,7 @@ def voxel_values(
     points  jittered points to a voxel: one in each of so many slices along a diagonal permutation, averaged; densities as they are,
             harmonics weighted by density
 
-    Where the density voxels say that space is empty the density is zero: the fine field was never asked there and may say anything.
+    Where the density voxels or the coarse field say that space is empty the density is zero: the fine field is hardly asked there and may say anything.
     """
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
     per_block = max(1, POINTS_PER_BLOCK // points)
@@ -146,9 +146,22 @@ def voxel_values(
         raw = m.fine(point).cpu()
         valid = (m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold).cpu()
         density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
+        density = density * _looked_into(m, (block + 0.5) * voxel + low)[:, None]
         share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
         yield density.mean(dim=1).numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().numpy()
+
+
+def _looked_into(m: Model, world: torch.Tensor) -> torch.Tensor:
+    """(n,) bool: whether the coarse field at these points absorbs as much over an interval as a valid density voxel has to.
+
+    Where it says less a pivot is among the lightest of its ray and dropped before the subject, but not before the sky: the network hides what
+    the fine field has there just where it would be seen, and nothing in the asset could.
+    """
+    if m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
+        return torch.ones(len(world), dtype=torch.bool)
+    raw = m.coarse(m.space.grid(world.float()).to(m.device))[:, 0].cpu()
+    return activate(raw, m.coarse.activation) > m.voxels.threshold
 
 
 def blocks_of(count: int, points: int) -> int:

@@ -156,7 +156,7 @@ def test_values_are_means_over_the_voxel() -> None:
     assert density.dtype == sh.dtype == np.float32
     assert sh.shape == (4, 4, 3)
     assert density[0] == pytest.approx(np.exp(5), rel=1e-5)
-    assert density[1] == pytest.approx(np.exp(-12), rel=1e-5)
+    assert density[1] == 0  # the coarse field says that there is nothing
     assert 0.5 * np.exp(5) < density[2] < np.exp(5)  # the surface passes through it
     # Coefficient k of channel c is raw[1 + 4c + k]; the network gives (x, y, z) over and over.
     centre = BOUNDS[0] + (indices[0] + 0.5) / 8
@@ -180,6 +180,17 @@ def test_blocks_do_not_depend_on_where_one_begins(monkeypatch: pytest.MonkeyPatc
         assert np.array_equal(b, d)
     other = next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 8)))
     assert not np.array_equal(other[1], next(iter(voxel_values(untrained(), indices, 1 / 8, BOUNDS[0], 4, 7)))[1])
+
+
+def test_nothing_is_baked_that_the_coarse_field_hides() -> None:
+    m = model_of_a_ball()
+    indices = np.array([[8, 8, 8], [7, 7, 7]], np.int32)
+    ((before, _),) = voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 0)
+    assert (before > 1).all()
+    field = m.coarse
+    m.coarse = type("Half", (nn.Module,), {"activation": "exp", "forward": lambda self, p: field(p) - 20.0 * (p[:, :1] > 0.5)})()
+    ((after, _),) = voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 0)
+    assert after.tolist() == [0, before[1]]
 
 
 def test_nothing_is_baked_where_the_voxels_are_empty() -> None:
