@@ -20,7 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-VALID, SIDE, VIEWS = 6.0, 200, 20
+VALID, SIDE, VIEWS = 6.1, 200, 20  # a little more than 6, for it varies from step to step
 
 
 def settings() -> Any:
@@ -83,14 +83,14 @@ def rate(kind: str, size: int = 256, rows: int = 32768) -> float:
     """GFLOP/s of products (rows x size) (size x size), the shape of the networks' layers; the best of several."""
     import torch
 
-    from efficientnerf.kernels.mlp import _product
+    from efficientnerf.kernels.mlp import product
 
     a, b = (torch.randn(n, size, generator=torch.Generator().manual_seed(n)).to(getattr(torch, kind)) for n in (rows, size))
     seconds = []
     for _ in range(12):
         begun = time.perf_counter()
         for part in range(0, rows, 4096):
-            _product(a[part : part + 4096], b, None, False)
+            product(a[part : part + 4096], b, None, False)
         seconds.append(time.perf_counter() - begun)
     return 2 * rows * size * size / min(seconds) / 1e9
 
