@@ -83,7 +83,7 @@ def hostile_page() -> str:
         "",
         "A file for each rule of [FORMAT.md](../efficientnerf/nerftree/FORMAT.md), and what is said of it; `enerf` ends with exit code 4. The files are",
         "made by `tests/efficientnerf/hostile.py`. A file cut short at any byte, or with any bit of its tensors changed, is refused as well; files changed",
-        "at random are refused or read, and nothing else happens (`benchmarks/fuzz_format.py`).",
+        "at random are refused or read, and nothing else happens: [100,000 of them](../benchmarks/results/fuzz_format.json).",
         "",
         "| file | message |",
         "|---|---|",
