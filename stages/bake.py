@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stages.scene import Scene
 
 ASSET = "asset.nerftree"
-FORWARD_ROOM = 2
+FORWARD_ROOM = 4 / 3
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class BakeSettings:
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
     pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
-    max_mib: int = setting(128, "how large the asset may get; a larger one keeps only voxels of greater weight", minimum=1, unit="MiB")
+    max_mib: int = setting(64, "how large the asset may get; a larger one keeps only voxels of greater weight", minimum=1, unit="MiB")
     layout: str = setting(
         "compact",
         "how the voxels lie in the asset: compact (codes of 8 bits), small (a coarser palette, half the bytes) or sparse (16-bit floats)",
@@ -111,7 +111,7 @@ def chosen_resolution(s: Scene, most: int) -> int:
         # In normalised device coordinates a pixel is as wide at any depth.
         wide = s.forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
         side = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
-        return int(np.clip(round(side / wide), 32, FORWARD_ROOM * most))
+        return int(np.clip(round(side / wide), 32, round(FORWARD_ROOM * most)))
     centre = np.asarray(s.bounds, np.float64).mean(axis=0)
     footprints = []
     for view in s.views:
