@@ -94,7 +94,7 @@ def run(job: Job) -> None:
     from efficientnerf.nerftree.format import load
     from stages.exporters import MESH_EXPORTERS
     from stages.exporters.writing import source_frame
-    from stages.shading import draw_sides
+    from stages.shading import IN_FRONT, draw_sides
 
     def progress(done: int, total: int, text: str) -> None:
         job.safe_point()
@@ -106,7 +106,9 @@ def run(job: Job) -> None:
     job.safe_point()
     orbit = tree.metadata.get("orbit", {})
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
-    Image.fromarray(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=elevation)).save(job.out / "preview.png")
+    forward = bool(orbit.get("forward_facing", False))
+    sides: dict[str, Any] = {"turns": IN_FRONT, "shown": 0.8} if forward else {}
+    Image.fromarray(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides)).save(job.out / "preview.png")
     job.safe_point()
     mesh = in_capture(found, frame)
     for extension in (".ply", ".glb"):
