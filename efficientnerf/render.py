@@ -37,7 +37,7 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
     behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
     if behind.shape != (3,):
         raise ValueError(f"background {background}: expected three numbers, red, green and blue")
-    if tree.ndc is not None:
+    if tree.ndc is not None or tree.lookup == "nearest":
         return _render_by_rays(tree, camera, behind, supersample)
     if tree.device != "cpu" and dispatch.triton_usable():
         from efficientnerf.kernels.cuda_tree import draw
@@ -47,7 +47,7 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
 
 
 def _render_by_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, supersample: int) -> Rendering:
-    """A picture of a tree whose frame is not the world, band by band of `NerfTree.render_rays`: rays of one camera part there."""
+    """A picture band by band of `NerfTree.render_rays`: of a tree whose frame is not the world, where rays of one camera part, or that is not interpolated."""
     from efficientnerf.nerftree.tree import Rendering
 
     height, width, n = camera.height, camera.width, supersample
@@ -197,7 +197,11 @@ def tree_density(tree: NerfTree, points: Tensor, values: Tensor) -> tuple[Tensor
     points  (N, 3) voxel coordinates
     values  (V,) density of the stored voxels
     returns density (N,), corner index (N, 8) with -1 where nothing is stored, trilinear weight (N, 8)
+
+    Where the tree's lookup is nearest the point is taken to the centre of its voxel, whose weight there is 1.
     """
+    if tree.lookup == "nearest":
+        points = torch.floor(points) + 0.5
     device = points.device
     brick_index = torch.as_tensor(tree.brick_index, device=device).long()
     voxel_index = torch.as_tensor(tree.voxel_index, device=device).long()

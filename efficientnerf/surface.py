@@ -8,6 +8,7 @@ Everything is in the training frame. A tree is anything with `shape`, `brick`, `
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -332,6 +333,7 @@ def surface(
 
     Raises NoSurface.
     """
+    tree = _interpolated(tree)
     if (frame := _frame_of(tree)) is not None:
         tree, viewpoints = frame, _NOBODY  # the cameras stand before the near plane, outside of the volume
     vertices, triangles, facts = _shape(tree, threshold, min_component, rounds, viewpoints, progress)
@@ -342,6 +344,11 @@ def surface(
     colours = surface_colours(tree, vertices, normals, progress, None if frame is None else frame.looking)
     mesh = Mesh(vertices, triangles, normals, colours, facts)
     return mesh if frame is None else frame.mesh(mesh)
+
+
+def _interpolated(tree: Any) -> Any:
+    """The tree with trilinear lookup: a surface lies between voxels, where those that hold its points may not be stored and have no colour."""
+    return replace(tree, lookup="trilinear") if getattr(tree, "lookup", "trilinear") != "trilinear" else tree
 
 
 def _frame_of(tree: Any) -> FrameTree | None:
@@ -365,6 +372,7 @@ def points(
     The same for the same seed; the other arguments as for `surface`. Of a forward-facing tree they are spread evenly in normalised device
     coordinates, as pictures show them: sparser in the world the further they are.
     """
+    tree = _interpolated(tree)
     if (frame := _frame_of(tree)) is not None:
         tree, viewpoints = frame, _NOBODY
     vertices, triangles, _ = _shape(tree, threshold, min_component, rounds, viewpoints, progress)

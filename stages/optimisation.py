@@ -124,7 +124,7 @@ def _restored(job: Job, tree: NerfTree) -> tuple[Optimiser, bool] | None:
         step, pruned = (int(x) for x in found["progress"])
         fitted = tree_from_voxels(
             tree.shape, tree.voxel, tree.bounds_min, found["coordinates"], found["density"], found["sh"].reshape(len(found["sh"]), -1, 3),
-            brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc,
+            brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup,
         )  # fmt: skip
         o = optimising.Optimiser(fitted, step=step, **{name: np.array(found[name]) for name in optimising.STATE})
     except (KeyError, ValueError) as error:

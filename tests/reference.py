@@ -177,7 +177,9 @@ def march(
 
 
 def corners(tree: Any, point: np.ndarray) -> list[tuple[int, float]]:
-    """The stored voxels among the eight round a point in voxel coordinates, and their trilinear weights."""
+    """The stored voxels among the eight round a point in voxel coordinates, and their trilinear weights; of the one that holds it, if so the lookup is."""
+    if tree.lookup == "nearest":
+        point = np.floor(point) + 0.5
     low = [math.floor(x - 0.5) for x in point]
     found = []
     for corner in np.ndindex(2, 2, 2):

@@ -1,6 +1,7 @@
 """Rendering and querying a NerfTree on the CPU (numba, all cores): from trees and cameras to the kernels' arrays.
 
-Pictures and rays go through `cpu_picture` and `cpu_march` over the tree's `packed` form; single points are looked up in the tree as it lies.
+Pictures and rays go through `cpu_picture` and `cpu_march` over the tree's `packed` form; single points are looked up in the tree as it lies. Rays through
+trees that are not interpolated have a kernel of their own, `cpu_nearest`.
 The torch reference is `efficientnerf.render.render_tree_reference`.
 """
 
@@ -155,8 +156,9 @@ def _colour_at(points, bases, brick, brick_index, voxel_index, sh, out):  # type
 
 
 def _grid_points(tree: NerfTree, points: np.ndarray) -> np.ndarray:
-    """World points to voxel coordinates, float32."""
-    return np.ascontiguousarray((np.asarray(points, np.float64) - tree.bounds_min) / tree.voxel, np.float32)
+    """World points to voxel coordinates, float32; to the centres of their voxels, where interpolation leaves these alone, if the lookup is nearest."""
+    at = np.ascontiguousarray((np.asarray(points, np.float64) - tree.bounds_min) / tree.voxel, np.float32)
+    return np.floor(at) + np.float32(0.5) if tree.lookup == "nearest" else at
 
 
 def _pixels(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -57,10 +57,11 @@ def _share(n, fx, fy, fz):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _march(origin, direction, brick, brick_index, voxel_index, density, leap, length, stop, index, frac, alpha, light):  # type: ignore[no-untyped-def]
+def _march(origin, direction, brick, brick_index, voxel_index, density, leap, length, nearest, stop, index, frac, alpha, light):  # type: ignore[no-untyped-def]
     """Samples of one ray that have density, into the buffers: corners, place between them, opacity, light that arrives. Their number and the light left.
 
-    length  of a step, world units
+    length   of a step, world units
+    nearest  the voxel that holds a sample is the only corner, of share 1
     """
     nx, ny, nz = brick_index.shape[0] * brick, brick_index.shape[1] * brick, brick_index.shape[2] * brick
     ox, oy, oz = origin[0], origin[1], origin[2]
@@ -100,7 +101,12 @@ def _march(origin, direction, brick, brick_index, voxel_index, density, leap, le
         x, y, z = np.floor(u - 0.5), np.floor(v - 0.5), np.floor(w - 0.5)
         fx, fy, fz = u - 0.5 - x, v - 0.5 - y, w - 0.5 - z
         row = index[count]
-        _corners(int(x), int(y), int(z), brick, brick_index, voxel_index, row)
+        if nearest:
+            fx = fy = fz = 0.0
+            row[:] = -1
+            row[0] = _voxel(int(u), int(v), int(w), brick, brick_index, voxel_index)
+        else:
+            _corners(int(x), int(y), int(z), brick, brick_index, voxel_index, row)
         sigma = 0.0
         for n in range(8):
             if row[n] >= 0:
@@ -160,7 +166,7 @@ class Seen(NamedTuple):
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _look(  # type: ignore[no-untyped-def]
-    origins, directions, bases, brick, brick_index, voxel_index, density, sh, leap, length, stop, most,
+    origins, directions, bases, brick, brick_index, voxel_index, density, sh, leap, length, nearest, stop, most,
     seen_colour, seen_behind, seen_gain, seen_opacity, matte, weighing, room, index, frac, gradient, ray_of, counts, loss,
 ):  # fmt: skip
     """Forward and backward. Block b writes its records from b * room on, and to counts[b] how many there are (more than `room`: they did not fit).
@@ -175,7 +181,7 @@ def _look(  # type: ignore[no-untyped-def]
         written = 0
         for ray in range(block * BLOCK, min(rays, block * BLOCK + BLOCK)):
             count, left = _march(
-                origins[ray], directions[ray], brick, brick_index, voxel_index, density, leap, length, stop, b_index, b_frac, b_alpha, b_light,
+                origins[ray], directions[ray], brick, brick_index, voxel_index, density, leap, length, nearest, stop, b_index, b_frac, b_alpha, b_light,
             )  # fmt: skip
             fits = written + count <= room
             at = block * room + written
@@ -334,13 +340,14 @@ class Records:
 
 
 class Grid(NamedTuple):
-    """Where the voxels of a tree lie; see `NerfTree`. `length` of half a voxel, world units."""
+    """Where the voxels of a tree lie; see `NerfTree`. `length` of half a voxel, world units; `nearest` if the tree is not interpolated."""
 
     brick: int
     brick_index: np.ndarray
     voxel_index: np.ndarray
     leap: np.ndarray
     length: float
+    nearest: bool = False
 
     @property
     def most(self) -> int:
@@ -368,7 +375,7 @@ def look(
     records.hold(len(counts))
     while True:
         _look(
-            origins, directions, bases, grid.brick, grid.brick_index, grid.voxel_index, density, sh, grid.leap, grid.length, stop, grid.most,
+            origins, directions, bases, grid.brick, grid.brick_index, grid.voxel_index, density, sh, grid.leap, grid.length, grid.nearest, stop, grid.most,
             seen.colour, seen.behind, seen.gain, seen.opacity, seen.matte, weighing, records.room, *records.arrays, counts, loss,
         )  # fmt: skip
         if not len(counts) or counts.max() <= records.room:

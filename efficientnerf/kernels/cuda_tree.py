@@ -68,7 +68,12 @@ class Drawing(NamedTuple):
 
 
 def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTree:
-    """Send a tree to the device; takes its bricks in blocks, so that little more than the result is needed."""
+    """Send a tree to the device; takes its bricks in blocks, so that little more than the result is needed.
+
+    ValueError where the tree is not interpolated, as the kernel does.
+    """
+    if tree.lookup != "trilinear":
+        raise ValueError(f"a tree of lookup {tree.lookup}: the kernel on CUDA interpolates; draw it on the CPU")
     brick_index = torch.from_numpy(tree.brick_index).to(device)
     leap = torch.from_numpy(tree.leap.astype(np.int32)).to(device)
     voxel_index = torch.from_numpy(np.ascontiguousarray(tree.voxel_index, np.int32)).to(device)

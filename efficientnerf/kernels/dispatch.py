@@ -112,7 +112,14 @@ def pivotal_samples(
 
 
 def tree_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, looking: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-    """Colour, opacity, distance and normal of rays of a tree's frame, where the tree is to be drawn; see `efficientnerf.kernels.cpu_tree.render_rays`."""
+    """Colour, opacity, distance and normal of rays of a tree's frame, where the tree is to be drawn; see `efficientnerf.kernels.cpu_tree.render_rays`.
+
+    Trees that are not interpolated are drawn on the CPU whatever their device: the kernel on CUDA interpolates.
+    """
+    if tree.lookup == "nearest":
+        from efficientnerf.kernels import cpu_nearest
+
+        return cpu_nearest.render_rays(tree, origins, directions, looking)
     if tree.device != "cpu" and triton_usable():
         from efficientnerf.kernels import cuda_tree
 

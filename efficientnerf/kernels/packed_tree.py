@@ -120,8 +120,11 @@ def _quantise(values, sh, scale):  # type: ignore[no-untyped-def]
 
 
 def pack(tree: NerfTree) -> Packed:
-    """The packed form of a tree; see the module."""
+    """The packed form of a tree; see the module. ValueError where the tree is not interpolated, as the kernel that reads it does."""
     from efficientnerf.nerftree.palettes import PaletteHarmonics
+
+    if tree.lookup != "trilinear":
+        raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; draw it by `efficientnerf.kernels.cpu_nearest`")
 
     brick = tree.brick
     cells = np.argwhere(tree.brick_index >= 0)

@@ -186,5 +186,5 @@ def with_voxels(tree: NerfTree, keep: np.ndarray) -> NerfTree:
     """The tree with some of its voxels, (N,) bool, alone; they keep their order."""
     return tree_from_voxels(
         tree.shape, tree.voxel, tree.bounds_min, voxel_coordinates(tree)[keep], tree.density_values[keep], tree.sh[keep],
-        brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc,
+        brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup,
     )  # fmt: skip

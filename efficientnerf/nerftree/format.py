@@ -17,7 +17,7 @@ import numpy as np
 
 from efficientnerf.nerftree.container import METADATA_KEY, FormatError, Header
 from efficientnerf.nerftree.layouts import LAYOUTS
-from efficientnerf.nerftree.metadata import MAJOR, NDC_MINOR, NDC_PREFIX, STRUCTURE, check_metadata, layout_of, ndc_of
+from efficientnerf.nerftree.metadata import MAJOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of
 from efficientnerf.nerftree.tree import NerfTree
 from efficientnerf.nerftree.writing import WRITERS, written_as
 
@@ -35,11 +35,13 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
 
     written = written_as(tree, layout)
     tensors = {OCCUPANCY: np.packbits(tree.brick_index.reshape(-1) >= 0, bitorder="little"), **written.tensors}
+    name, minor = layout_name(written.layout, ndc=tree.ndc is not None, lookup=tree.lookup)
     meta = {
-        **tree.metadata,
+        **{key: value for key, value in tree.metadata.items() if key not in STRUCTURE},
         "format": "nerftree",
-        "format_version": f"{MAJOR}.{LAYOUTS[written.layout].minor if tree.ndc is None else NDC_MINOR}",
-        "layout": written.layout if tree.ndc is None else NDC_PREFIX + written.layout,
+        "format_version": f"{MAJOR}.{minor or LAYOUTS[written.layout].minor}",
+        "layout": name,
+        **({} if tree.lookup == "trilinear" else {"lookup": tree.lookup}),
         **({} if tree.ndc is None else {"ndc": tree.ndc.to_json()}),
         "shape": list(tree.shape),
         "brick": tree.brick,
@@ -134,6 +136,7 @@ def load(path: str | Path) -> NerfTree:
         background=None if background is None else tuple(float(x) for x in background),  # type: ignore[arg-type]
         metadata={key: value for key, value in meta.items() if key not in STRUCTURE},
         ndc=ndc_of(name, meta),
+        lookup=lookup_of(name, meta),
     )
 
 
@@ -176,6 +179,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         **({"sh_groups": meta["sh_groups"], "palette": shapes["sh.palette"][0]} if layout_of(meta) == "compact" else {}),
         "bounds": {"min": low, "max": [a + n * voxel for a, n in zip(low, resolution, strict=True)]},
         "background": meta["background"],
+        "lookup": lookup_of(header.name, meta),
         **({} if ndc_of(header.name, meta) is None else {"ndc": meta["ndc"]}),
         **{key: meta[key] for key in sorted(meta) if key not in STRUCTURE},
     }

@@ -15,9 +15,11 @@ MAJOR = 1
 MAX_CELLS = 2**30
 NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not draw it
 NDC_MINOR = 2  # the version that brought them
+NEAREST_PREFIX = "nearest-"  # of layouts whose voxels are not interpolated; before the other prefix where both hold
+NEAREST_MINOR = 3
 STRUCTURE = {
     "format", "format_version", "layout", "shape", "brick", "voxel", "bounds_min", "sh_degree", "sh_convention", "sh_groups", "colour_space",
-    "background", "sha256", "ndc",
+    "background", "sha256", "ndc", "lookup",
 }  # fmt: skip
 
 
@@ -63,13 +65,28 @@ def _check_frame(name: str, meta: dict[str, Any]) -> None:
 
 
 def layout_of(meta: dict[str, Any]) -> str:
-    """Which tables of tensors hold, whatever frame the grid lies in."""
-    return str(meta.get("layout")).removeprefix(NDC_PREFIX)
+    """Which tables of tensors hold, whatever frame the grid lies in and however it is looked up."""
+    return str(meta.get("layout")).removeprefix(NEAREST_PREFIX).removeprefix(NDC_PREFIX)
+
+
+def layout_name(layout: str, *, ndc: bool, lookup: str) -> tuple[str, int]:
+    """What a file of these tables calls its layout, and the minor version that knows the name; 0 where no prefix is needed."""
+    name, minor = (NDC_PREFIX + layout, NDC_MINOR) if ndc else (layout, 0)
+    return (NEAREST_PREFIX + name, NEAREST_MINOR) if lookup == "nearest" else (name, minor)
+
+
+def lookup_of(name: str, meta: dict[str, Any]) -> str:
+    """How the voxels are looked up; the layout's name and the key `lookup` must say the same."""
+    nearest = str(meta.get("layout")).startswith(NEAREST_PREFIX)
+    found, expected = meta.get("lookup", None if nearest else "trilinear"), "nearest" if nearest else "trilinear"
+    if found != expected:
+        raise FormatError(f"{name}: metadata 'lookup' is {str(found)[:60]}; expected {expected} in layout {str(meta.get('layout'))[:60]}")
+    return expected
 
 
 def ndc_of(name: str, meta: dict[str, Any]) -> Ndc | None:
     """The reference camera of a file in normalised device coordinates, which must name one; None for a file in the world."""
-    if not str(meta.get("layout")).startswith(NDC_PREFIX):
+    if not str(meta.get("layout")).removeprefix(NEAREST_PREFIX).startswith(NDC_PREFIX):
         return None
     found = meta.get("ndc")
     if not isinstance(found, dict):
@@ -116,4 +133,5 @@ def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) ->
     if meta["background"] is not None:
         _numbers(name, meta, "background", 3, 0, 1)
     _check_frame(name, meta)
+    lookup_of(name, meta)
     ndc_of(name, meta)

@@ -126,7 +126,7 @@ def kept(o: Optimiser, keep: np.ndarray, tree: NerfTree) -> Optimiser:
 
 
 def grid_of(tree: NerfTree) -> Grid:
-    return Grid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, kernels.STEP * tree.voxel)
+    return Grid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, kernels.STEP * tree.voxel, tree.lookup == "nearest")
 
 
 def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 The grid has shape * brick voxels a side, cubic, of `voxel` world units. A coarse cell is either empty, and then space in it has no
 density whatever its neighbours hold, or it owns a brick of brick^3 voxels, of which those that matter are stored.
-Values sit at voxel centres and are interpolated linearly between the stored ones.
+Values sit at voxel centres and are interpolated linearly between the stored ones, or hold all over their voxels: `lookup` says which.
 
 The grid lies in the tree's *frame*: the world, or the normalised device coordinates of a reference camera (`efficientnerf.ndc`) where the scene is
 forward-facing. What users ask and are answered is always of the world, densities apart, which are per unit of the frame.
@@ -12,6 +12,7 @@ B bricks, N stored voxels, K harmonics, R rays.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from efficientnerf.kernels.cuda_tree import DeviceTree
     from efficientnerf.kernels.packed_tree import Packed
     from efficientnerf.ndc import Ndc, WarpedRays
+
+
+LOOKUPS = ("trilinear", "nearest")
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class NerfTree:
     background   sRGB colour that the training images lay on, or None for photographs with surroundings
     device       where pictures are drawn, see `to`; not part of the asset
     ndc          the reference camera whose normalised device coordinates are the frame, or None: the frame is the world
+    lookup       what a point gets: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
+                 where that one is not stored (EfficientNeRF, section 4.1, has the field trained on such coordinates)
 
     For renderers: `sh` is always there as plain floats, but decoding a palette costs 12 K bytes a voxel and is remembered; a kernel
     that matters reads `harmonics` itself where it is a PaletteHarmonics, whose docstring states what its arrays mean. A kernel for codes
@@ -80,6 +86,11 @@ class NerfTree:
     metadata: dict[str, Any] = field(default_factory=dict)
     device: str = "cpu"
     ndc: Ndc | None = None
+    lookup: str = "trilinear"
+
+    def __post_init__(self) -> None:
+        if self.lookup not in LOOKUPS:
+            raise ValueError(f"lookup {self.lookup!r}; expected one of {', '.join(LOOKUPS)}")
 
     @cached_property
     def sh(self) -> np.ndarray:
@@ -138,7 +149,9 @@ class NerfTree:
         return device_tree(self, self.device)
 
     def to(self, device: str) -> NerfTree:
-        """The same tree, drawn on "cpu" or "cuda", the latter where its kernels can be built; points are answered on the CPU."""
+        """The same tree, drawn on "cpu" or "cuda", the latter where its kernels can be built and `lookup` is trilinear; points are answered on the CPU."""
+        if device != "cpu" and self.lookup != "trilinear":
+            warnings.warn(f"a tree of lookup {self.lookup} is drawn on the CPU: the kernel on {device} interpolates", RuntimeWarning, stacklevel=2)
         return replace(self, device=device)
 
     @staticmethod
@@ -268,6 +281,7 @@ def tree_from_voxels(
     background: tuple[float, float, float] | None = None,
     metadata: dict[str, Any] | None = None,
     ndc: Ndc | None = None,
+    lookup: str = "trilinear",
 ) -> NerfTree:
     """Build a tree from a list of voxels.
 
@@ -308,4 +322,5 @@ def tree_from_voxels(
         background=background,
         metadata=dict(metadata or {}),
         ndc=ndc,
+        lookup=lookup,
     )

@@ -249,6 +249,14 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a reference camera of three rows": (lambda: reference(world_from_camera=[[1, 0, 0, 0]] * 3), "expected four rows"),
     "a reference camera of short rows": (lambda: reference(world_from_camera=[[1, 0, 0]] * 4), "expected 4 numbers"),
     "a reference camera that shears": (lambda: reference(world_from_camera=[[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "'ndc': "),
+    # nearest lookup
+    "nearest by its layout alone": (lambda: meta_with(layout="nearest-sparse"), "'lookup' is None; expected nearest in layout nearest-sparse"),
+    "nearest by its layout, trilinear by its word": (lambda: meta_with(layout="nearest-sparse", lookup="trilinear"), "'lookup' is trilinear; expected nearest"),
+    "nearest by its word alone": (lambda: meta_with(lookup="nearest"), "'lookup' is nearest; expected trilinear in layout sparse"),
+    "a lookup of no name": (lambda: meta_with(lookup="cubic"), "'lookup' is cubic; expected trilinear"),
+    "a lookup of numbers": (lambda: meta_with(layout="nearest-sparse", lookup=[1]), r"'lookup' is \[1\]; expected nearest"),
+    "prefixes the wrong way round": (lambda: meta_with(layout="ndc-nearest-sparse", lookup="nearest"), "layout ndc-nearest-sparse; this build reads"),
+    "nearest, but no reference camera": (lambda: meta_with(layout="nearest-ndc-sparse", lookup="nearest"), "'ndc' is None; expected an object"),
     # full
     **{f"full, no {name}": (lambda name=name: without(name, "full"), f"tensor '{re.escape(name)}' is missing") for name in LAYOUTS["full"].tensors},  # type: ignore[misc]
     "masks beside full bricks": (lambda: added("brick.mask", of="full"), r"unknown tensor 'brick\.mask'"),

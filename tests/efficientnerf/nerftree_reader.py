@@ -27,7 +27,7 @@ class Tree:
             raw = data[8 + length + begin : 8 + length + end]
             assert hashlib.sha256(raw).hexdigest() == digest
             tensors[name] = np.frombuffer(raw, KINDS[header[name]["dtype"]]).reshape(header[name]["shape"])
-        self.meta, self.brick, self.voxel, layout = meta, meta["brick"], meta["voxel"], meta["layout"].removeprefix("ndc-")
+        self.meta, self.brick, self.voxel, layout = meta, meta["brick"], meta["voxel"], meta["layout"].removeprefix("nearest-").removeprefix("ndc-")
         self.low, self.shape = np.array(meta["bounds_min"]), meta["shape"]
         occupancy = [int(byte) for byte in tensors["coarse.occupancy"]]
         self.occupied = [cell for c, cell in enumerate(np.ndindex(*self.shape)) if occupancy[c // 8] >> c % 8 & 1]
@@ -51,6 +51,7 @@ class Tree:
         assert len(self.stored) == len(self.densities) == len(self.sh)
 
     def around(self, u: np.ndarray) -> list[tuple[int, float]]:
+        u = np.floor(u) + 0.5 if self.meta.get("lookup") == "nearest" else u
         low = np.floor(u - 0.5).astype(int)
         f = u - 0.5 - low
         found = []

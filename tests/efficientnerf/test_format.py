@@ -193,8 +193,8 @@ def test_a_reader_written_from_the_text_alone_decodes_golden_files_to_the_same_v
 
 def test_there_is_a_golden_file_for_each_layout_and_released_version() -> None:
     found = {(about["layout"], about["format_version"]) for about in map(describe, GOLDEN.glob("*.nerftree"))}
-    assert found == {("sparse", "1.0"), ("compact", "1.1"), ("full", "1.1"), ("ndc-compact", "1.2")}
-    assert {layout.removeprefix("ndc-") for layout, _ in found} == set(LAYOUTS)
+    assert found == {("sparse", "1.0"), ("compact", "1.1"), ("full", "1.1"), ("ndc-compact", "1.2"), ("nearest-compact", "1.3")}
+    assert {layout.removeprefix("nearest-").removeprefix("ndc-") for layout, _ in found} == set(LAYOUTS)
 
 
 @pytest.mark.parametrize(
@@ -205,6 +205,7 @@ def test_there_is_a_golden_file_for_each_layout_and_released_version() -> None:
         ("compact-1.1", "compact"),
         ("groups-1.1", None),
         ("ndc-1.2", None),
+        ("nearest-1.3", None),
         ("full-1.1", "full"),
         ("floats-1.1", "full32"),
     ],

@@ -1,0 +1,206 @@
+"""Nearest lookup: the values of the voxel that holds a point, in the loop, in torch, in the kernels, in files and in the fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.harmonics import basis_numpy
+from efficientnerf.nerftree.converting import lookup, pruned, with_degree, with_resolution
+from efficientnerf.nerftree.format import describe, load, save
+from efficientnerf.nerftree.optimising import optimiser
+from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.render import render_tree_reference
+from efficientnerf.surface import surface
+from tests import reference
+from tests.efficientnerf.nerftree_reader import Tree
+from tests.efficientnerf.test_ndc_tree import camera_at, wall
+from tests.efficientnerf.test_optimising import gradients, loss_by_torch, seen_at_random
+from tests.efficientnerf.test_render import TREES, looking, tensors
+from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+
+
+def nearest(brick: int, degree: int = 1, **more: object) -> NerfTree:
+    return random_tree(brick, brick=brick, degree=degree, lookup="nearest", **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("brick", "degree"), TREES)
+def test_points_get_what_their_voxel_holds(brick: int, degree: int) -> None:
+    tree = nearest(brick, degree)
+    rng = np.random.default_rng(0)
+    points = rng.uniform(tree.bounds_min - 0.1, tree.bounds_max + 0.1, (800, 3))
+    directions = rays_at(tree, 800)[1]
+    voxel = lookup(tree, np.floor((points - tree.bounds_min) / tree.voxel).astype(np.int64))
+    stored = voxel >= 0
+    assert 0.02 < stored.mean() < 0.6
+    assert np.array_equal(tree.density(points), np.where(stored, tree.density_values[voxel], 0))
+    logit = np.einsum("nk,nkc->nc", basis_numpy(directions.astype(np.float32), degree), tree.sh[voxel])
+    np.testing.assert_allclose(tree.colour(points, directions), np.where(stored[:, None], 1 / (1 + np.exp(-logit)), 0.5), atol=1e-5)
+    other = replace(tree, lookup="trilinear")
+    assert np.abs(tree.density(points) - other.density(points)).max() > 1
+
+
+def test_normals_are_those_of_the_voxels_centre() -> None:
+    tree = nearest(4)
+    rng = np.random.default_rng(0)
+    centre = np.floor(rng.uniform(0, tree.resolution, (300, 3))) + 0.5
+    away = rng.uniform(-0.49, 0.49, centre.shape)
+    at = (tree.bounds_min + part * tree.voxel for part in (centre, centre + away))
+    middle, elsewhere = (tree.normal(points) for points in at)
+    assert np.array_equal(middle, elsewhere)
+    np.testing.assert_allclose(middle, replace(tree, lookup="trilinear").normal(tree.bounds_min + centre * tree.voxel), atol=1e-5)
+    assert (np.abs(middle).sum(axis=1) > 0).mean() > 0.2
+
+
+@pytest.mark.parametrize(("brick", "degree"), TREES)
+def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
+    tree = nearest(brick, degree)
+    origins, directions = rays_at(tree, 400)
+    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
+    seen = tree.render_rays(origins, directions)
+    np.testing.assert_allclose(seen.opacity, opacity, atol=1e-3)
+    np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
+    assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
+    other = replace(tree, lookup="trilinear").render_rays(origins, directions)
+    assert np.abs(other.colour - seen.colour).max() > 0.05
+
+
+@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
+def test_the_torch_function_is_the_loop(brick: int, degree: int) -> None:
+    tree = nearest(brick, degree)
+    origins, directions = rays_at(tree, 24)
+    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
+    depth = tree.render_rays(origins, directions).depth
+    for r in range(24):
+        wanted_colour, wanted_opacity, wanted_depth = reference.tree_ray(tree, origins[r], directions[r])
+        np.testing.assert_allclose(colour[r], wanted_colour, atol=1e-6)
+        assert float(opacity[r]) == pytest.approx(wanted_opacity, abs=1e-6)
+        if abs(wanted_opacity - 0.5) > 1e-3:
+            assert depth[r] == pytest.approx(wanted_depth, abs=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3])
+def test_leaping_changes_no_value(share: float) -> None:
+    tree = nearest(2, share=share, shape=(7, 6, 8))
+    origins, directions = rays_at(tree, 400)
+    usual, timid = tree.render_rays(origins, directions), replace(tree)
+    timid.__dict__["leap"] = np.minimum(tree.leap, 1)
+    other = timid.render_rays(origins, directions)
+    for name in ("colour", "opacity", "depth", "normal"):
+        assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
+def test_a_uniform_box_has_its_closed_form_to_its_very_face() -> None:
+    tree = replace(uniform_tree(sigma=2.0), lookup="nearest")
+    middle = (tree.bounds_min + tree.bounds_max) / 2
+    seen = tree.render_rays((middle - [4, 0, 0])[None], np.array([[1.0, 0, 0]]))
+    width = float(tree.bounds_max[0] - tree.bounds_min[0])
+    assert float(seen.opacity[0]) == pytest.approx(1 - math.exp(-2 * width), abs=1e-3)
+    assert float(seen.depth[0]) == pytest.approx(4 - width / 2 + math.log(2) / 2, abs=1e-4)
+    np.testing.assert_allclose(seen.colour[0], seen.opacity[0] * reference.sigmoid(0.7), atol=1e-3)
+
+
+def test_pictures_are_their_rays() -> None:
+    from efficientnerf.cameras import rays
+
+    tree = nearest(3, share=0.7)
+    camera = looking(tree)
+    picture, flat = tree.render(camera, background=(1.0, 0.5, 0.0)), tree.render_rays(*rays(camera))
+    over = flat.colour + (1 - flat.opacity[:, None]) * [1.0, 0.5, 0.0]
+    np.testing.assert_allclose(picture.colour.reshape(-1, 3), over, atol=1e-6)
+    assert np.array_equal(picture.opacity.reshape(-1), flat.opacity)
+    assert np.array_equal(np.isinf(picture.depth), picture.opacity < 0.5)
+    assert tree.render(camera, supersample=2).colour.shape == picture.colour.shape
+
+
+def test_in_normalised_device_coordinates_too() -> None:
+    tree = replace(wall(), lookup="nearest")
+    camera = camera_at(0, 0, 0)
+    seen, other = tree.render(camera), wall().render(camera)
+    np.testing.assert_allclose(seen.opacity, other.opacity, atol=0.01)
+    assert not np.array_equal(seen.colour, other.colour)
+    from efficientnerf.cameras import rays
+
+    colour, opacity = render_tree_reference(tree, *tensors(*rays(camera)))
+    np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour, atol=1e-3)
+    np.testing.assert_allclose(seen.opacity.reshape(-1), opacity, atol=1e-3)
+
+
+@pytest.mark.parametrize(("layout", "name"), [(None, "nearest-sparse"), ("compact", "nearest-compact"), ("full32", "nearest-full")])
+def test_a_file_keeps_the_lookup_and_the_short_reader_sees_the_same(tmp_path: Path, layout: str | None, name: str) -> None:
+    path = tmp_path / "a.nerftree"
+    save(nearest(3, share=0.6), path, layout)
+    about, ours, theirs = describe(path), load(path), Tree(path)
+    assert (about["layout"], about["format_version"], about["lookup"]) == (name, "1.3", "nearest")
+    assert ours.lookup == "nearest"
+    assert "lookup" not in ours.metadata
+    points = np.random.default_rng(0).uniform(ours.bounds_min - 0.1, ours.bounds_max + 0.1, (100, 3))
+    origins, directions = rays_at(ours, 100)
+    np.testing.assert_allclose(ours.density(points), [theirs.density(p) for p in points], atol=2e-3)
+    np.testing.assert_allclose(ours.colour(points, directions), [theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], atol=1e-3)
+    seen = ours.render_rays(origins[:12], directions[:12])
+    for r in range(12):
+        colour, opacity = theirs.ray(origins[r], directions[r])
+        np.testing.assert_allclose(seen.colour[r], colour, atol=1.5e-3)
+        assert float(seen.opacity[r]) == pytest.approx(opacity, abs=1.5e-3)
+
+
+def test_trilinear_files_are_as_they_were(tmp_path: Path) -> None:
+    """The lookup is no word of theirs, whatever a tree's own metadata say."""
+    path = tmp_path / "a.nerftree"
+    save(random_tree(3), path)
+    plain = path.read_bytes()
+    assert b"lookup" not in plain
+    assert describe(path)["lookup"] == "trilinear"
+    save(random_tree(3).with_metadata(lookup="nearest"), path)
+    assert path.read_bytes() == plain
+
+
+def test_trees_made_of_it_keep_the_lookup() -> None:
+    tree = nearest(4, 2)
+    made = [with_degree(tree, 1), with_resolution(tree, 10), pruned(tree), tree.with_values(tree.density_values, tree.sh), optimiser(tree).result()]
+    assert [each.lookup for each in made] == ["nearest"] * 5
+
+
+def test_unknown_lookups_are_refused() -> None:
+    with pytest.raises(ValueError, match="lookup 'cubic'; expected one of trilinear, nearest"):
+        random_tree(3, lookup="cubic")
+
+
+def test_what_interpolates_refuses_or_says_so() -> None:
+    tree = nearest(3)
+    with pytest.raises(ValueError, match="has no packed form"):
+        _ = tree.packed
+    with pytest.warns(RuntimeWarning, match="drawn on the CPU"):
+        there = tree.to("cuda")
+    origins, directions = rays_at(tree, 20)
+    assert np.array_equal(there.render_rays(origins, directions).colour, tree.render_rays(origins, directions).colour)
+
+
+def test_a_surface_has_colours_where_no_voxel_is_stored() -> None:
+    tree = uniform_tree(sigma=60.0, logit=2.0)
+    wanted, found = (surface(each, 20.0, faces=2000) for each in (tree, replace(tree, lookup="nearest")))
+    assert np.array_equal(found.vertices, wanted.vertices)
+    assert np.array_equal(found.colours, wanted.colours)
+
+
+@pytest.mark.parametrize(("brick", "degree"), [(1, 0), (4, 2)])
+def test_the_fits_gradients_are_those_of_autograd(brick: int, degree: int) -> None:
+    tree = nearest(brick, degree)
+    origins, directions = rays_at(tree, 200)
+    seen = seen_at_random(200, 0.7)
+    loss, by_density, by_sh = gradients(tree, origins, directions, seen)
+    density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
+    wanted = loss_by_torch(*render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
+    wanted.sum().backward()
+    assert density.grad is not None
+    assert sh.grad is not None
+    np.testing.assert_allclose(loss, wanted.detach(), atol=1e-6)
+    np.testing.assert_allclose(by_density, density.grad, atol=1e-6)
+    np.testing.assert_allclose(by_sh, sh.grad, atol=1e-6)
+    assert np.abs(by_density).max() > 1e-3
