@@ -15,7 +15,7 @@ from efficientnerf.density import DensityVoxels, density_voxels
 from efficientnerf.fields.hash import HashField
 from efficientnerf.fields.mlp import MlpField
 from efficientnerf.fields.nerf import NerfField
-from efficientnerf.grid import FrameRays, Space
+from efficientnerf.grid import FrameRays, Space, voxel_centres
 from efficientnerf.harmonics import basis, harmonics_count
 from efficientnerf.kernels import dispatch
 from efficientnerf.late import Room
@@ -70,6 +70,10 @@ class Model:
     @property
     def device(self) -> torch.device:
         return self.voxels.values.device
+
+    def asked(self, points: Tensor) -> Tensor:
+        """Where the fields are asked for what lies at points (N, 3) in grid coordinates: there, or at the centres of voxels where the settings say so."""
+        return voxel_centres(self.space, points, self.settings.discretise) if self.settings.discretise else points
 
     def parameters(self) -> list[tuple[str, nn.Parameter]]:
         """Everything that is learned, by name, in a fixed order."""
@@ -173,7 +177,7 @@ def look(
     bundle = (rays.origins, rays.directions, rays.near, rays.far)
     if m.settings.sampling == "uniform":
         samples, _ = _even_samples(m, *bundle, offset, m.settings.coarse_samples + m.settings.importance_samples, rng)
-        raw, out = _seen(m.fine, directions, samples, behind)
+        raw, out = _seen(m, m.fine, directions, samples, behind)
         nothing = samples.start[:0]
         none = Samples(torch.zeros_like(samples.first), nothing, nothing, nothing, samples.point[:0], samples.tried)
         return Look(rays, none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
@@ -182,7 +186,7 @@ def look(
     else:
         coarse = _valid_samples(m, *bundle, offset, prune=prune, rng=rng, capacity=None if room is None else room.coarse)
         at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent
-    coarse_raw, seen = _seen(m.coarse, directions, coarse, behind)
+    coarse_raw, seen = _seen(m, m.coarse, directions, coarse, behind)
     weight = seen.weight.detach()
     pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
     if m.settings.sampling == "efficient":
@@ -193,7 +197,7 @@ def look(
     else:
         quantile = _strata(len(origins), m.settings.importance_samples, rng, offset.device)
         fine = importance_samples(m.space, *bundle[:2], coarse, at, weight, quantile)
-    fine_raw, out = _seen(m.fine, directions, fine, behind)
+    fine_raw, out = _seen(m, m.fine, directions, fine, behind)
     return Look(rays, coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
 
 
@@ -205,13 +209,14 @@ def _chance(count: int, share: float, rng: np.random.Generator, device: torch.de
     return torch.from_numpy(rng.random(count, np.float32) < share)
 
 
-def _seen(field: AnyField, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:
+def _seen(m: Model, field: AnyField, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:
     """What a field says at samples (N, 1 + 3K), and how it looks along their rays."""
+    point = m.asked(samples.point)
     if isinstance(field, NerfField):
-        raw = field(samples.point, directions[ray_of_sample(samples.first, len(samples.start))])
+        raw = field(point, directions[ray_of_sample(samples.first, len(samples.start))])
         harmonics = torch.ones_like(directions[:, :1])  # the colour is what the network says
     else:
-        raw, harmonics = field(samples.point), basis(directions, field.degree)
+        raw, harmonics = field(point), basis(directions, field.degree)
     return raw, dispatch.composite(raw, samples.length, samples.first, harmonics, behind, field.activation)
 
 

@@ -33,6 +33,10 @@ class TrainSettings:
         "efficient: valid, then pivotal samples; valid: valid, then by importance; hierarchical: NeRF's, all, then by importance; uniform: evenly, once",
         choices=("efficient", "valid", "hierarchical", "uniform"),
     )
+    discretise: int = _setting(
+        0, "voxels along the longest side of the box whose centres stand for all points in them, so that baking with bake.lookup=nearest loses nothing; 0: off",
+        minimum=0, maximum=4096,
+    )  # fmt: skip
     degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
     levels: int = _setting(12, "hash: levels", minimum=1, maximum=24)
     log2_table: int = _setting(17, "hash: entries of a level's table, as a power of two", minimum=8, maximum=24)

@@ -303,7 +303,7 @@ def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
     else:
         cell, point = refresh_cells(m.voxels, int(m.settings.refresh_share * m.voxels.side**3), generator)
     for part in range(0, len(cell), 2**17):
-        remember(m, point[part : part + 2**17], m.coarse.density(point[part : part + 2**17]), cell[part : part + 2**17])
+        remember(m, point[part : part + 2**17], m.coarse.density(m.asked(point[part : part + 2**17])), cell[part : part + 2**17])
 
 
 def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None) -> None:

@@ -32,7 +32,14 @@ FORWARD_ROOM = 4 / 3
 class BakeSettings:
     """How finely the field is baked."""
 
-    resolution: int = setting(0, "voxels along the longest side of the box; 0 chooses from what a pixel covers, up to max_resolution", minimum=0, maximum=4096)
+    resolution: int = setting(
+        0, "voxels along the longest side of the box; 0: train.discretise, or else chosen from what a pixel covers, up to max_resolution",
+        minimum=0, maximum=4096,
+    )  # fmt: skip
+    lookup: str = setting(
+        "trilinear", "what a point gets; trilinear: interpolated from the voxels around it; nearest: what its own voxel holds, drawn on CPUs, more slowly",
+        choices=("trilinear", "nearest"),
+    )  # fmt: skip
     max_resolution: int = setting(384, "the most voxels along the longest side that are chosen by themselves", minimum=8, maximum=4096)
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
     pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
@@ -44,7 +51,7 @@ class BakeSettings:
         choices=("compact", "small", "sparse"),
     )
     dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
-    points: int = setting(8, "jittered points averaged in a voxel", minimum=1, maximum=256)
+    points: int = setting(8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256)
     seed: int = setting(0, "seed of the jitter, and of the pixels of the optimisation", minimum=0)
     optimise: int = setting(160, "steps in which the baked values are fitted to the training images; 0: they stay as the network says", minimum=0)
     optimise_rays: int = setting(32768, "training pixels of a step of the optimisation", minimum=1, maximum=1 << 22)
@@ -72,7 +79,9 @@ def run(job: Job) -> None:
 
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
-    resolution = settings.resolution or chosen_resolution(s, settings.max_resolution)
+    resolution = settings.resolution or m.settings.discretise or chosen_resolution(s, settings.max_resolution)
+    if settings.lookup == "nearest" and m.settings.discretise not in (0, resolution):
+        job.warn(f"bake.resolution={resolution}, but the field was trained on train.discretise={m.settings.discretise}: on other voxels than are baked")
     bounds = m.space.bounds
     shape, voxel = baking.grid_of(bounds, resolution, settings.brick)
     low = np.asarray(bounds[0], np.float64)
@@ -85,9 +94,13 @@ def run(job: Job) -> None:
 
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
-    density, sh = _values(job, m, indices, voxel, low)
+    points = 0 if m.settings.discretise == resolution else settings.points
+    density, sh = _values(job, m, indices, voxel, low, points)
     facts = metadata_of(s, settings, m)
-    tree = tree_from_voxels(shape, voxel, low, indices, density, sh, brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc)
+    tree = tree_from_voxels(
+        shape, voxel, low, indices, density, sh,
+        brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc, lookup=settings.lookup,
+    )  # fmt: skip
     plain = behind_of(s)
     if plain is None:
         targets = Targets(pixels, None, seen.chosen, seen.before, seen.behind)
@@ -215,16 +228,16 @@ def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], degree: int) -> 
     return indices
 
 
-def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
     """Baked values of all voxels; blocks of an earlier attempt are taken as they are."""
     from efficientnerf.nerftree import baking
 
     settings: BakeSettings = job.settings
-    blocks = baking.blocks_of(len(indices), settings.points)
+    blocks = baking.blocks_of(len(indices), points)
     parts: list[np.ndarray] = []
     while len(parts) < blocks and (part := _read_npy(job.work / f"block_{len(parts):06d}.npy")) is not None:
         parts.append(part)
-    for density, sh in baking.voxel_values(m, indices, voxel, low, settings.points, settings.seed, first=len(parts)):
+    for density, sh in baking.voxel_values(m, indices, voxel, low, points, settings.seed, first=len(parts)):
         part = np.concatenate([density[:, None], sh.reshape(len(density), -1)], axis=1)
         _write_npy(part, job.work / f"block_{len(parts):06d}.npy")
         parts.append(part)

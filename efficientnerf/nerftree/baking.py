@@ -131,19 +131,20 @@ def voxel_values(
     """Density (n,) and harmonics (n, K, 3) of the voxels, block by block from the `first`-th block on.
 
     points  jittered points to a voxel: one in each of so many slices along a diagonal permutation, averaged; densities as they are,
-            harmonics weighted by density
+            harmonics weighted by density; 0: the centre of the voxel alone, for fields that were trained on these (`train.discretise`)
 
     Where the density voxels or the coarse field say that space is empty the density is zero: the fine field is hardly asked there and may say anything.
     """
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
-    per_block = max(1, POINTS_PER_BLOCK // points)
+    jittered, points = points > 0, max(1, points)
+    per_block = POINTS_PER_BLOCK // points or 1
     for number in range(first, math.ceil(len(indices) / per_block)):
         block = torch.from_numpy(indices[number * per_block : (number + 1) * per_block])
         rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 1, number]))
-        jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32))
+        jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32)) if jittered else torch.full((len(block), 1, 3), 0.5)
         world = (block[:, None] + jitter) * voxel + low
         point = m.space.grid(world.reshape(-1, 3)).to(m.device)
-        raw = m.fine(point).cpu()
+        raw = m.fine(m.asked(point)).cpu()
         valid = (m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold).cpu()
         density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
         density = density * _looked_into(m, (block + 0.5) * voxel + low)[:, None]
@@ -160,13 +161,13 @@ def _looked_into(m: Model, world: torch.Tensor) -> torch.Tensor:
     """
     if m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
         return torch.ones(len(world), dtype=torch.bool)
-    raw = m.coarse(m.space.grid(world.float()).to(m.device))[:, 0].cpu()
+    raw = m.coarse(m.asked(m.space.grid(world.float()).to(m.device)))[:, 0].cpu()
     return activate(raw, m.coarse.activation) > m.voxels.threshold
 
 
 def blocks_of(count: int, points: int) -> int:
     """How many blocks `voxel_values` yields for so many voxels."""
-    return math.ceil(count / max(1, POINTS_PER_BLOCK // points))
+    return math.ceil(count / max(1, POINTS_PER_BLOCK // max(1, points)))
 
 
 def voxel_coordinates(tree: NerfTree) -> np.ndarray:

@@ -9,10 +9,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from efficientnerf.compositing import activate
 from efficientnerf.grid import Space
-from efficientnerf.model import Model
+from efficientnerf.model import Model, look
 from efficientnerf.nerftree import baking
 from efficientnerf.nerftree.baking import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
+from efficientnerf.nerftree.tree import tree_from_voxels
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
 
@@ -204,3 +206,35 @@ def test_nothing_is_baked_where_the_voxels_are_empty() -> None:
     assert (before > 0).all()
     assert (after[empty] == 0).all()
     np.testing.assert_array_equal(after[~empty], before[~empty])
+
+
+@pytest.mark.parametrize("field", ["hash", "mlp"])
+def test_what_was_trained_on_voxel_centres_is_baked_as_it_is(field: str) -> None:
+    """The nearest voxel's density is what the network said of the sample, whichever of the voxel's points that was."""
+    side = 24
+    m = untrained(field=field, discretise=side, voxel_rule="momentum", pivotal_weight=0.0)
+    for parameter in m.fine.parameters():  # so that it differs from place to place
+        torch.nn.init.normal_(parameter, std=0.5, generator=torch.Generator().manual_seed(1))
+    bundle = pixels(2, 24).bundle(np.arange(2 * 24 * 24))
+    origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)) for a in bundle[:4])
+    with torch.no_grad():
+        seen = look(m, origins, directions, near, far, torch.full_like(near, 0.3), m.behind(directions))
+    said = activate(seen.fine_raw[:, 0], m.fine.activation).numpy()
+    shape, voxel = grid_of(BOUNDS, side, 4)
+    indices = np.argwhere(np.ones([n * 4 for n in shape], bool)).astype(np.int32)
+    density, sh = (np.concatenate(part) for part in zip(*voxel_values(m, indices, voxel, BOUNDS[0], 0, 0), strict=True))
+    tree = tree_from_voxels(shape, voxel, BOUNDS[0], indices, density, sh, lookup="nearest")
+    at = m.space.world(seen.fine.point).numpy().astype(np.float64)
+    local = (at - BOUNDS[0]) / voxel
+    sure = (np.abs(local - np.round(local)) > 1e-4).all(axis=1)  # at a face rounding decides
+    assert sure.sum() > 1000
+    assert sure.mean() > 0.99
+    assert said.std() > 0.1 * said.mean() > 0
+    np.testing.assert_allclose(tree.density(at[sure]), said[sure], rtol=1e-4, atol=1e-6)
+    # Several points of a voxel would say nothing else.
+    (few, _), *_ = voxel_values(m, indices[:300], voxel, BOUNDS[0], 5, 0)
+    np.testing.assert_allclose(few, density[:300], rtol=1e-4, atol=1e-6)
+    # The network that is asked for the samples themselves would.
+    with torch.no_grad():
+        free = activate(m.fine(seen.fine.point)[:, 0], m.fine.activation).numpy()
+    assert np.abs(free - said)[sure].max() > 0.1 * said.mean()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.grid import Space, contract, uncontract
+from efficientnerf.grid import Space, contract, uncontract, voxel_centres
 from tests import reference
 
 BOUNDS = np.array([[-1.0, -0.4, 0.2], [0.5, 0.9, 0.8]])
@@ -55,3 +55,24 @@ def test_world_is_the_inverse_of_grid(points: torch.Tensor, contracted: bool) ->
 def test_the_box_lies_where_it_should(contracted: bool, low: float, high: float) -> None:
     corners = Space(BOUNDS, contracted).grid(torch.from_numpy(BOUNDS))
     torch.testing.assert_close(corners, torch.tensor([[low] * 3, [high] * 3], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_voxel_centres_are_those_of_a_baked_grid(contracted: bool) -> None:
+    from efficientnerf.nerftree.baking import grid_of
+
+    space = Space(BOUNDS, contracted)
+    shape, side = grid_of(BOUNDS, 10, 1)
+    at = np.random.default_rng(0).uniform(BOUNDS[0] - 0.3, BOUNDS[1] + 0.3, (2000, 3))
+    inside = ((at > BOUNDS[0]) & (at < BOUNDS[1])).all(axis=1)
+    found = space.world(voxel_centres(space, space.grid(torch.from_numpy(at)), 10)).numpy()
+    index = np.floor((at[inside] - BOUNDS[0]) / side)
+    assert (index < shape).all()
+    np.testing.assert_allclose(found[inside], BOUNDS[0] + (index + 0.5) * side, atol=1e-9)
+    np.testing.assert_allclose(found[~inside], at[~inside], atol=1e-9)  # nothing is baked there
+    # A centre is where it is taken to, to the last bit, and the box's corners have voxels.
+    centres = voxel_centres(space, space.grid(torch.from_numpy(at[inside]).float()), 10)
+    within = (space.unit(space.world(centres)).abs() <= 1).all(dim=1)  # the last voxels may reach beyond the box
+    assert torch.equal(voxel_centres(space, centres, 10)[within], centres[within])
+    corners = space.world(voxel_centres(space, space.grid(torch.from_numpy(BOUNDS)), 10)).numpy()
+    np.testing.assert_allclose(corners, BOUNDS[0] + (np.array([[0, 0, 0], np.array(shape) - 1]) + 0.5) * side, atol=1e-9)

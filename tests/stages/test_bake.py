@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from efficientnerf.compositing import activate
 from efficientnerf.nerftree import baking, format
 from efficientnerf.nerftree.tree import NerfTree
 from pipeline.errors import Interrupted, StageFailed
@@ -168,3 +170,43 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
         assert format.describe(made.out / ASSET)["layout"] == layout
     assert sizes[1] <= 2**20
     assert sizes[64] > sizes[1] > 2**16
+
+
+def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: Path, inputs: dict[str, Path]) -> None:
+    scene = inputs["poses"]
+    train.run(job(tmp_path / "train", settings(iterations=30, samples=4096, warm_up=10, discretise=20), poses=scene))
+    given = {"poses": scene, "train": tmp_path / "train" / "out"}
+    near = dataclasses.replace(QUICK, resolution=0, lookup="nearest", layout="sparse", optimise=0)
+    made = job(tmp_path / "raw", near, **given)
+    run(made)
+    tree = NerfTree.load(made.out / ASSET)
+    assert tree.lookup == "nearest"
+    assert tree.resolution == (20, 20, 20)  # train.discretise
+    m = load_renderer(given["train"]).model
+    centre = tree.bounds_min + (baking.voxel_coordinates(tree) + 0.5) * tree.voxel
+    with torch.no_grad():
+        raw = m.fine(m.space.grid(torch.from_numpy(centre).float()))[:, 0]
+    said = activate(raw, m.fine.activation).numpy()
+    lit = tree.density_values > 0
+    assert lit.any()
+    np.testing.assert_allclose(tree.density_values[lit], np.minimum(said[lit], 65000), rtol=2e-3)
+    fitted = job(tmp_path / "fitted", dataclasses.replace(near, optimise=12), **given)
+    run(fitted)
+    assert NerfTree.load(fitted.out / ASSET).lookup == "nearest"
+    facts = json.loads((fitted.out / "report.json").read_text())["optimisation"]
+    assert facts["psnr_after"] > facts["psnr_before"] > 10
+
+
+def test_other_voxels_than_those_of_the_training_are_told_of(tmp_path: Path, inputs: dict[str, Path]) -> None:
+    m = load_renderer(inputs["train"])
+    m = dataclasses.replace(m, model=dataclasses.replace(m.model, settings=dataclasses.replace(m.model.settings, discretise=16)))
+    (tmp_path / "train").mkdir()
+    save_model(m.model, m.near, m.far, tmp_path / "train" / FILE)
+    given = {"poses": inputs["poses"], "train": tmp_path / "train"}
+    events: list[dict[str, Any]] = []
+    made = job(tmp_path / "bake", dataclasses.replace(QUICK, resolution=20, lookup="nearest", optimise=0), events=events, **given)
+    run(made)
+    told = [event["text"] for event in events if event["event"] == "warning"]
+    assert len(told) == 1
+    assert "train.discretise=16" in told[0]
+    assert NerfTree.load(made.out / ASSET).resolution == (20, 20, 20)
