@@ -25,7 +25,7 @@ SIGHTS_PER_BAND = 2**22  # directions of cameras with distortion that are kept f
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _corner(i, j, k, brick, brick_index, voxel_index):  # type: ignore[no-untyped-def]
+def stored_voxel(i, j, k, brick, brick_index, voxel_index):  # type: ignore[no-untyped-def]
     """Index of the stored voxel (i, j, k), or -1."""
     if i < 0 or j < 0 or k < 0:
         return -1
@@ -60,7 +60,7 @@ def _corners(u, v, w, brick, brick_index, voxel_index, index, weight):  # type: 
         return
     for n in range(8):
         dx, dy, dz = n >> 2, (n >> 1) & 1, n & 1
-        index[n] = _corner(i + dx, j + dy, k + dz, brick, brick_index, voxel_index)
+        index[n] = stored_voxel(i + dx, j + dy, k + dz, brick, brick_index, voxel_index)
         weight[n] = (fx if dx else one - fx) * (fy if dy else one - fy) * (fz if dz else one - fz)
 
 

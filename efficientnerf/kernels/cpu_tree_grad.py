@@ -16,24 +16,11 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-STEP = 0.5  # of a voxel
-STOP = 1e-3  # transmittance at which a ray ends
+from efficientnerf.kernels.cpu_march import STEP, STOP
+from efficientnerf.kernels.cpu_tree import stored_voxel
+
 BLOCK = 128  # rays per task
 LEAST, GREATEST = 1e-7, 150.0  # optical thickness of a voxel: nothing that shows, and beyond opaque
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _voxel(i, j, k, brick, brick_index, voxel_index):  # type: ignore[no-untyped-def]
-    """Index of the stored voxel (i, j, k), or -1."""
-    if i < 0 or j < 0 or k < 0:
-        return -1
-    a, b, c = i // brick, j // brick, k // brick
-    if a >= brick_index.shape[0] or b >= brick_index.shape[1] or c >= brick_index.shape[2]:
-        return -1
-    owner = brick_index[a, b, c]
-    if owner < 0:
-        return -1
-    return voxel_index[owner, ((i - a * brick) * brick + (j - b * brick)) * brick + (k - c * brick)]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -47,7 +34,7 @@ def _corners(i, j, k, brick, brick_index, voxel_index, index):  # type: ignore[n
             index[n] = voxel_index[owner, first + ((n >> 2) * brick + ((n >> 1) & 1)) * brick + (n & 1)] if owner >= 0 else -1
         return
     for n in range(8):
-        index[n] = _voxel(i + (n >> 2), j + ((n >> 1) & 1), k + (n & 1), brick, brick_index, voxel_index)
+        index[n] = stored_voxel(i + (n >> 2), j + ((n >> 1) & 1), k + (n & 1), brick, brick_index, voxel_index)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -104,7 +91,7 @@ def _march(origin, direction, brick, brick_index, voxel_index, density, leap, le
         if nearest:
             fx = fy = fz = 0.0
             row[:] = -1
-            row[0] = _voxel(int(u), int(v), int(w), brick, brick_index, voxel_index)
+            row[0] = stored_voxel(int(u), int(v), int(w), brick, brick_index, voxel_index)
         else:
             _corners(int(x), int(y), int(z), brick, brick_index, voxel_index, row)
         sigma = 0.0

@@ -8,6 +8,7 @@ N voxels, M points.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -49,7 +50,7 @@ def _parts(points: Tensor, side: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
         yield part, torch.where(inside[:, None], points[part], torch.zeros_like(points[part])).long(), inside
 
 
-class _Structure:
+class _Structure(ABC):
     """side voxels along each side; `tensors` are what it consists of."""
 
     side: int
@@ -62,8 +63,9 @@ class _Structure:
             words[part] = torch.where(inside, self._at(voxel), 0)
         return words, words != 0
 
+    @abstractmethod
     def _at(self, voxel: Tensor) -> Tensor:
-        raise NotImplementedError
+        """Words at voxels (m, 3) int64 of the grid, 0 where there is none."""
 
 
 @dataclass(frozen=True, eq=False)
