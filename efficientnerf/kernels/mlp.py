@@ -19,6 +19,9 @@ import torch
 from torch import Tensor
 
 ROWS = 4096  # in a chunk: 2 MiB of bfloat16 activations a layer of 256
+ROW_STEP = 256  # on the CPU, to a multiple of which the last chunk is filled with zeros: oneDNN prepares code for each new shape, which costs more than the
+# product itself, and each step of pruned sampling has another number of samples
+COLUMN_STEP = 8  # to a multiple of which widths are filled, so that rows of bfloat16 begin at whole 16 bytes: the paper's 63 inputs and 49 outputs do not
 
 
 @cache
@@ -92,22 +95,26 @@ def outer(grad: Tensor, x: Tensor) -> Tensor:
 class _Chain(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, skip: int | None, relu_last: bool, precision: torch.dtype, layers: int, *parameters: Tensor) -> Tensor:
-        weights = [w.detach().to(precision) for w in parameters[:layers]]
-        biases = [b.detach().to(precision) for b in parameters[layers:]]
-        out = torch.empty(len(x), len(weights[-1]), device=x.device)
+        inputs, outputs = x.shape[1], parameters[layers - 1].shape[0]
+        split = [None if layer != skip else len(parameters[layer - 1]) for layer in range(layers)]
+        weights = [_filled_weight(w.detach(), at, precision) for w, at in zip(parameters[:layers], split, strict=True)]
+        biases = [_filled(b.detach()[None], 1, _up(len(b), COLUMN_STEP), precision)[0] for b in parameters[layers:]]
+        out = torch.empty(len(x), outputs, device=x.device)
         keep = any(ctx.needs_input_grad)
         kept: list[list[Tensor]] = []
         for begin in range(0, len(x), ROWS):
-            first = x[begin : begin + ROWS].to(precision)
-            inputs, y = [], first
+            part = x[begin : begin + ROWS]
+            first = _filled(part, _rows(part), _up(inputs, COLUMN_STEP), precision)
+            given, y = [], first
             for layer in range(layers):
                 y = torch.cat([y, first], dim=1) if layer == skip else y
-                inputs.append(y)
+                given.append(y)
                 y = product(y, weights[layer], biases[layer], relu_last or layer < layers - 1)
-            out[begin : begin + ROWS] = y
+            out[begin : begin + ROWS] = y[: len(part), :outputs]
             if keep:
-                kept.append([*inputs, y] if relu_last else inputs)
-        ctx.kept, ctx.weights, ctx.relu_last = kept, weights, relu_last
+                kept.append([*given, y] if relu_last else given)
+        ctx.kept, ctx.weights, ctx.relu_last, ctx.split = kept, weights, relu_last, split
+        ctx.shapes = [p.shape for p in parameters]
         return out
 
     @staticmethod
@@ -117,21 +124,62 @@ class _Chain(torch.autograd.Function):
         transposed = [w.t().contiguous() for w in weights]
         weight_grads = [torch.zeros(w.shape, device=grad.device) for w in weights]
         bias_grads = [torch.zeros(len(w), device=grad.device) for w in weights]
-        x_grad = torch.empty(len(grad), weights[0].shape[1], device=grad.device) if ctx.needs_input_grad[0] else None
+        inputs = ctx.shapes[0][1]
+        x_grad = torch.empty(len(grad), inputs, device=grad.device) if ctx.needs_input_grad[0] else None
         for number, kept in enumerate(ctx.kept):
             begin = number * ROWS
-            g = grad[begin : begin + ROWS].to(weights[0].dtype)
+            part = grad[begin : begin + ROWS]
+            g = _filled(part, len(kept[0]), len(weights[-1]), weights[0].dtype)
             if ctx.relu_last:
-                g = torch.ops.aten.threshold_backward(g, kept[layers], 0)
+                g = _through_relu(g, kept[layers])
             for layer in reversed(range(layers)):
                 y = kept[layer]
                 weight_grads[layer] += outer(g, y)
                 bias_grads[layer] += g.sum(0)  # summed in float32, and rounded once
                 if layer:
                     hidden = len(weights[layer - 1])  # what x adds at the skip needs no gradient
-                    g = product(g, transposed[layer][:hidden], None, False)
-                    g = torch.ops.aten.threshold_backward(g, y[:, :hidden], 0)
+                    g = _through_relu(product(g, transposed[layer][:hidden], None, False), y[:, :hidden])
                 elif x_grad is not None:
-                    x_grad[begin : begin + ROWS] = product(g, transposed[0], None, False)
+                    x_grad[begin : begin + ROWS] = product(g, transposed[0], None, False)[: len(part), :inputs]
         ctx.kept = None
-        return (x_grad, None, None, None, None, *weight_grads, *bias_grads)
+        of_weights = [_emptied(g, shape, at) for g, shape, at in zip(weight_grads, ctx.shapes[:layers], ctx.split, strict=True)]
+        return (x_grad, None, None, None, None, *of_weights, *(g[: shape[0]] for g, shape in zip(bias_grads, ctx.shapes[layers:], strict=True)))
+
+
+def _up(count: int, step: int) -> int:
+    return -(-count // step) * step
+
+
+def _rows(part: Tensor) -> int:
+    return min(ROWS, _up(len(part), ROW_STEP)) if part.device.type == "cpu" else len(part)
+
+
+def _filled(x: Tensor, rows: int, columns: int, precision: torch.dtype) -> Tensor:
+    """x in the top left of a matrix of zeros."""
+    if x.shape == (rows, columns):
+        return x.to(precision)
+    out = torch.zeros(rows, columns, dtype=precision, device=x.device)
+    out[: x.shape[0], : x.shape[1]] = x
+    return out
+
+
+def _filled_weight(weight: Tensor, split: int | None, precision: torch.dtype) -> Tensor:
+    """A weight (O, I) for filled rows; at the skip, its columns from `split` on meet the input, which begins after the filled width before it."""
+    rows, step = _up(len(weight), COLUMN_STEP), COLUMN_STEP
+    if split is None:
+        return _filled(weight, rows, _up(weight.shape[1], step), precision)
+    before, after = weight[:, :split], weight[:, split:]
+    return torch.cat([_filled(part, rows, _up(part.shape[1], step), precision) for part in (before, after)], dim=1)
+
+
+def _emptied(grad: Tensor, shape: torch.Size, split: int | None) -> Tensor:
+    """The gradient of a filled weight as that of the weight."""
+    if split is None:
+        return grad[: shape[0], : shape[1]]
+    after = _up(split, COLUMN_STEP)
+    return torch.cat([grad[: shape[0], :split], grad[: shape[0], after : after + shape[1] - split]], dim=1)
+
+
+def _through_relu(grad: Tensor, out: Tensor) -> Tensor:
+    """The gradient before a ReLU that gave `out`."""
+    return torch.ops.aten.threshold_backward(grad, out, 0)
