@@ -37,12 +37,12 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
     behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
     if behind.shape != (3,):
         raise ValueError(f"background {background}: expected three numbers, red, green and blue")
-    if tree.ndc is not None or tree.lookup == "nearest":
-        return _render_by_rays(tree, camera, behind, supersample)
-    if tree.device != "cpu" and dispatch.triton_usable():
+    if tree.ndc is None and tree.device != "cpu" and dispatch.triton_usable():
         from efficientnerf.kernels.cuda_tree import draw
 
         return Rendering(*(part.cpu().numpy() for part in draw(tree.on_device, camera, background=background, supersample=supersample)))
+    if tree.ndc is not None or tree.lookup == "nearest":
+        return _render_by_rays(tree, camera, behind, supersample)
     return Rendering(*render_picture(tree, camera, supersample, behind, normals=True, rays_per_band=RAYS_PER_BAND))
 
 

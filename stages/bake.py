@@ -37,7 +37,7 @@ class BakeSettings:
         minimum=0, maximum=4096,
     )  # fmt: skip
     lookup: str = setting(
-        "trilinear", "what a point gets; trilinear: interpolated from the voxels around it; nearest: what its own voxel holds, drawn on CPUs, more slowly",
+        "trilinear", "what a point gets; trilinear: interpolated from the voxels around it; nearest: what its own voxel holds, drawn more slowly on CPUs",
         choices=("trilinear", "nearest"),
     )  # fmt: skip
     max_resolution: int = setting(384, "the most voxels along the longest side that are chosen by themselves", minimum=8, maximum=4096)

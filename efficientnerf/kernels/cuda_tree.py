@@ -21,7 +21,6 @@ from torch import Tensor
 from efficientnerf.cameras import Camera, rays
 from efficientnerf.kernels.cuda import INTERPRETED
 from efficientnerf.kernels.cuda_march import march
-from efficientnerf.nerftree.palettes import PaletteHarmonics
 
 if TYPE_CHECKING:
     from efficientnerf.nerftree.tree import NerfTree
@@ -42,6 +41,7 @@ class DeviceTree:
     index    (B, E^3) int32: which voxel's coefficients, -1 where nothing is stored
     sh       (N, row) float16: K coefficients for red, green and blue each, then zeros
     low      (3,) corner of the grid in the tree's frame; `voxel` its unit there
+    nearest  whether voxels are not interpolated
     """
 
     grid: Tensor
@@ -52,6 +52,7 @@ class DeviceTree:
     terms: int
     voxel: float
     low: np.ndarray
+    nearest: bool = False
 
     @property
     def bytes(self) -> int:
@@ -67,17 +68,11 @@ class Drawing(NamedTuple):
     normal: Tensor
 
 
-def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTree:
-    """Send a tree to the device; takes its bricks in blocks, so that little more than the result is needed.
-
-    ValueError where the tree is not interpolated, as the kernel does.
-    """
-    if tree.lookup != "trilinear":
-        raise ValueError(f"a tree of lookup {tree.lookup}: the kernel on CUDA interpolates; draw it on the CPU")
+def laid_out(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Tensor]:
+    """`grid` and `index` of a DeviceTree, on the device; bricks are taken in blocks, so that little more than the result is needed."""
     brick_index = torch.from_numpy(tree.brick_index).to(device)
     leap = torch.from_numpy(tree.leap.astype(np.int32)).to(device)
     voxel_index = torch.from_numpy(np.ascontiguousarray(tree.voxel_index, np.int32)).to(device)
-    values = torch.from_numpy(np.ascontiguousarray(tree.density_values, np.float32)).to(device)
     d, edge, bricks = tree.brick, tree.brick + 2, len(tree.voxel_index)
     reach = torch.arange(-1, d + 1, device=device)
     border = torch.stack(torch.meshgrid(reach, reach, reach, indexing="ij"), dim=-1).reshape(-1, 3)  # (E^3, 3)
@@ -85,7 +80,6 @@ def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTr
     cells = cells[torch.argsort(brick_index[tuple(cells.unbind(1))])]
     size = torch.tensor(tree.resolution, device=device)
     index = torch.empty(bricks, edge**3, dtype=torch.int32, device=device)
-    density = torch.empty(bricks, edge**3, dtype=torch.float16, device=device)
     for begin in range(0, bricks, BRICKS_AT_ONCE):
         at = cells[begin : begin + BRICKS_AT_ONCE, None] * d + border  # (b, E^3, 3)
         there = ((at >= 0) & (at < size)).all(dim=-1)
@@ -94,18 +88,25 @@ def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTr
         owner = brick_index[cell[..., 0], cell[..., 1], cell[..., 2]].long()
         local = at - cell * d
         slot = (local[..., 0] * d + local[..., 1]) * d + local[..., 2]
-        found = torch.where(there & (owner >= 0), voxel_index[owner.clamp(min=0), slot], -1)
-        index[begin : begin + BRICKS_AT_ONCE] = found
-        density[begin : begin + BRICKS_AT_ONCE] = torch.where(found >= 0, values[found.long().clamp(min=0)], 0).clamp(max=65504).half()
+        index[begin : begin + BRICKS_AT_ONCE] = torch.where(there & (owner >= 0), voxel_index[owner.clamp(min=0), slot], -1)
+    return torch.where(brick_index >= 0, brick_index, -leap).contiguous(), index
+
+
+def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTree:
+    """Send a tree to the device; in blocks, so that little more than the result is needed."""
+    grid, index = laid_out(tree, device)
+    values = torch.from_numpy(np.ascontiguousarray(tree.density_values, np.float32)).to(device)
+    density = torch.empty(index.shape, dtype=torch.float16, device=device)
+    for begin in range(0, len(index), BRICKS_AT_ONCE):
+        found = index[begin : begin + BRICKS_AT_ONCE].long()
+        density[begin : begin + BRICKS_AT_ONCE] = torch.where(found >= 0, values[found.clamp(min=0)], 0).clamp(max=65504).half()
     terms, row = tree.harmonics_count, triton.next_power_of_2(3 * tree.harmonics_count)
     sh = torch.zeros(len(values), row, dtype=torch.float16, device=device)
     step = 2**18
     for begin in range(0, len(values), step):
-        some = slice(begin, begin + step)
-        decoded = tree.harmonics.decoded(some) if isinstance(tree.harmonics, PaletteHarmonics) else tree.harmonics[some]
-        part = torch.from_numpy(np.ascontiguousarray(decoded)).to(device)
+        part = torch.from_numpy(np.ascontiguousarray(tree.coefficients(slice(begin, begin + step)))).to(device)
         sh[begin : begin + step, : 3 * terms] = part.transpose(1, 2).reshape(len(part), 3 * terms).clamp(-65504, 65504).half()
-    return DeviceTree(torch.where(brick_index >= 0, brick_index, -leap).contiguous(), density, index, sh, d, terms, tree.voxel, tree.bounds_min)
+    return DeviceTree(grid, density, index, sh, tree.brick, terms, tree.voxel, tree.bounds_min, tree.lookup == "nearest")
 
 
 def _launch(
@@ -123,7 +124,8 @@ def _launch(
     march[(programs,)](
         *(buffers or (out.colour, out.colour, out.colour)), t.grid, density, index, sh, *out,
         count, *size, *t.grid.shape, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
-        PINHOLE=buffers is None, OVER=background is not None, BRICK=t.brick, K=t.terms, ROW=t.sh.shape[1], WIDE=wide, HIGH=high, num_warps=WARPS[t.sh.shape[1]],
+        PINHOLE=buffers is None, OVER=background is not None, NEAREST=t.nearest, BRICK=t.brick, K=t.terms, ROW=t.sh.shape[1], WIDE=wide, HIGH=high,
+        num_warps=WARPS[t.sh.shape[1]],
     )  # fmt: skip
     return out
 

@@ -112,20 +112,17 @@ def pivotal_samples(
 
 
 def tree_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, looking: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-    """Colour, opacity, distance and normal of rays of a tree's frame, where the tree is to be drawn; see `efficientnerf.kernels.cpu_tree.render_rays`.
-
-    Trees that are not interpolated are drawn on the CPU whatever their device: the kernel on CUDA interpolates.
-    """
-    if tree.lookup == "nearest":
-        from efficientnerf.kernels import cpu_nearest
-
-        return cpu_nearest.render_rays(tree, origins, directions, looking)
+    """Colour, opacity, distance and normal of rays of a tree's frame, where the tree is to be drawn; see `efficientnerf.kernels.cpu_tree.render_rays`."""
     if tree.device != "cpu" and triton_usable():
         from efficientnerf.kernels import cuda_tree
 
         given = (origins, directions) if looking is None else (origins, directions, looking)
         there = [torch.from_numpy(np.ascontiguousarray(a, np.float64)).to(tree.device) for a in given]
         return tuple(part.cpu().numpy() for part in cuda_tree.draw_rays(tree.on_device, *there))
+    if tree.lookup == "nearest":
+        from efficientnerf.kernels import cpu_nearest
+
+        return cpu_nearest.render_rays(tree, origins, directions, looking)
     from efficientnerf.kernels.cpu_tree import render_rays
 
     return render_rays(tree, origins, directions, looking)

@@ -12,7 +12,6 @@ B bricks, N stored voxels, K harmonics, R rays.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -149,9 +148,7 @@ class NerfTree:
         return device_tree(self, self.device)
 
     def to(self, device: str) -> NerfTree:
-        """The same tree, drawn on "cpu" or "cuda", the latter where its kernels can be built and `lookup` is trilinear; points are answered on the CPU."""
-        if device != "cpu" and self.lookup != "trilinear":
-            warnings.warn(f"a tree of lookup {self.lookup} is drawn on the CPU: the kernel on {device} interpolates", RuntimeWarning, stacklevel=2)
+        """The same tree, drawn on "cpu" or "cuda", the latter where its kernels can be built; points are answered on the CPU."""
         return replace(self, device=device)
 
     @staticmethod

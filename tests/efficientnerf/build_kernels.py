@@ -96,6 +96,7 @@ def pictures() -> None:
         tree = cuda_tree.device_tree(random_tree(0, degree=degree, brick=4), "cpu")
         cuda_tree.draw(tree, camera, background=(1.0, 1.0, 1.0))
         if degree == 2:
+            cuda_tree.draw(cuda_tree.device_tree(random_tree(0, degree=degree, brick=4, lookup="nearest"), "cpu"), camera)
             cuda_tree.draw_rays(tree, torch.zeros(8, 3), torch.ones(8, 3))
 
 

@@ -76,6 +76,24 @@ def test_cameras_see_what_the_cpu_shows(model: str, params: tuple[float, ...]) -
         assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
 
 
+@pytest.mark.parametrize(("brick", "degree"), [(1, 0), (3, 1), (4, 2)])
+def test_rays_through_voxels_that_are_not_interpolated(brick: int, degree: int) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, lookup="nearest")
+    origins, directions = rays_at(tree, 240)
+    seen = drawn_rays(tree, origins, directions)
+    assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
+    agree(seen, tree.render_rays(origins, directions), faces=0.02)  # samples at faces of voxels: float32 may see the one on the other side
+    other = tree.render_rays(*rays_at(replace(tree, lookup="trilinear"), 240))
+    assert np.abs(other.colour - drawn_rays(replace(tree, lookup="trilinear"), origins, directions).colour).max() > 0.05
+
+
+def test_pictures_of_voxels_that_are_not_interpolated() -> None:
+    tree = random_tree(0, share=0.7, degree=2, lookup="nearest")
+    camera = looking(tree)
+    for supersample in (1, 2):
+        agree(drawn(tree, camera, supersample=supersample), tree.render(camera, supersample=supersample), faces=0.03)
+
+
 def test_supersampling() -> None:
     supersample = 2
     tree = random_tree(4, share=0.7, sigma=20.0)
