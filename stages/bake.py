@@ -51,6 +51,11 @@ class BakeSettings:
         choices=("compact", "small", "sparse"),
     )
     dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
+    min_component: float = setting(
+        0.02, "where surroundings are learned: pieces apart with less than this share of the largest one's voxels are left out if the box cuts them off,"
+        " and anywhere with less than a hundredth of it",
+        minimum=0.0, maximum=1.0,
+    )  # fmt: skip
     points: int = setting(8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256)
     seed: int = setting(0, "seed of the jitter, and of the pixels of the optimisation", minimum=0)
     optimise: int = setting(160, "steps in which the baked values are fitted to the training images; 0: they stay as the network says", minimum=0)

@@ -75,7 +75,7 @@ def _fit(job: Job, o: Optimiser, targets: Targets, until: int, pruned: bool) -> 
 
 
 def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Optimiser:
-    """Only the voxels that contribute more than bake.weight to a pixel, and of these at most `most`, those that contribute most."""
+    """Only the voxels that contribute more than bake.weight to a pixel, and of these at most `most`, those that contribute most; no scraps of surroundings."""
     from efficientnerf.nerftree import baking, optimising
 
     settings = job.settings
@@ -95,6 +95,10 @@ def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Opti
         job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out, to keep the asset within {settings.max_mib} MiB (bake.max_mib)")
     if not keep.any():
         return o
+    if tree.background is None:
+        from efficientnerf.nerftree.pieces import scraps
+
+        keep &= ~scraps(tree, keep, settings.min_component)
     return optimising.kept(o, keep, baking.with_voxels(tree, keep))
 
 
