@@ -58,7 +58,9 @@ class TrainSettings:
         0.0, "where rays end (the paper: 6); N_c intervals lie between near and far then, and those outside of the box are never valid", minimum=0.0
     )
     pivotal_weight: float = _setting(1e-4, "epsilon: weight above which a coarse sample is pivotal", minimum=0.0, maximum=1.0)
-    max_pivots: int = _setting(8, "pivotal samples on a ray at most; the lightest are dropped", minimum=1, maximum=4096)
+    max_pivots: int = _setting(
+        8, "pivotal samples on a ray at most; the lightest are dropped, which while all is fog are those behind (the paper drops none)", minimum=1, maximum=4096
+    )
     explored: float = _setting(0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0)
     distortion: float = _setting(0.01, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog", minimum=0.0)
     anchors: float = _setting(0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0)

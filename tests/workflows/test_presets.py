@@ -35,6 +35,7 @@ def test_the_papers_presets_are_the_papers() -> None:
         assert (train.field, train.degree, train.hidden, train.layers, train.coarse_hidden, train.coarse_layers) == ("mlp", 3, 256, 8, 128, 4)
         assert (train.voxels, train.voxel_initial, train.voxel_beta, train.voxel_rule) == (384, 10.0, 0.1, "momentum")
         assert (train.pivotal_weight, train.sampling, train.near, train.far) == (1e-4, "efficient", 2.0, 6.0)
+        assert train.max_pivots >= train.coarse_samples  # the paper drops none
         assert (train.rays, train.samples, train.iterations, train.learning_rate) == (1024, 0, 1_000_000, 5e-4)
         assert (train.final_rate, train.rate_steps) == (0.1, 500_000)
         assert (bake.resolution // bake.brick, bake.brick) == (384, 4)
