@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.cameras import Camera, rays
-from efficientnerf.compositing import ray_of_sample
+from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.harmonics import basis
 from efficientnerf.kernels import dispatch
 from efficientnerf.model import Look, Model, look
@@ -76,7 +76,7 @@ def _render_by_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, supersam
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """Samples of some rays; intervals: rays x N_c, between near and far (in contracted space, those that a ray passes)."""
+    """Samples of some rays; intervals: rays x N_c, between near and far (in contracted space, those that a ray passes); valid: see `valid_count`."""
 
     rays: int = 0
     intervals: float = 0.0
@@ -120,6 +120,17 @@ class FieldRendering:
     counts: SampleCounts = SampleCounts()
 
 
+def valid_count(m: Model, seen: Look) -> int:
+    """How many coarse samples were valid: those that the density voxels left, or, where nothing is pruned, those whose density the voxels would call
+    valid. That is how section 3.3 of EfficientNeRF counts on a trained NeRF (equation 5)."""
+    if m.prunes:
+        return len(seen.coarse.start)
+    density = seen.coarse_raw[:, 0]
+    if m.voxels.rule == "maximum":
+        density = activate(density, m.coarse.activation)
+    return int((density > m.voxels.threshold).sum())
+
+
 @dataclass(frozen=True)
 class FieldRenderer:
     """Draws a trained model; near and far along the view axis, world units."""
@@ -144,7 +155,7 @@ class FieldRenderer:
             beyond = m.behind(directions)
             seen = look(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), beyond)
             intervals = seen.coarse.tried if m.space.contracted else len(index) * (self.far - self.near) / m.step
-            counts += SampleCounts(len(index), intervals, len(seen.coarse.start), int(seen.pivotal.sum()), len(seen.fine.start))
+            counts += SampleCounts(len(index), intervals, valid_count(m, seen), int(seen.pivotal.sum()), len(seen.fine.start))
             parts.append([part.cpu().numpy() for part in split_by_box(m, origins, directions, slant, seen, beyond)])
             if progress is not None:
                 progress(begin + len(index), count)

@@ -115,7 +115,7 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
     out["bake"]["resolution"] = max(96, 8 * round(out["bake"]["resolution"] * scale**0.3 / 8))
     out["bake"]["points"] = max(4, round(out["bake"]["points"] * fifth))
     out["bake"]["pixels"] = max(50_000, round(1e6 * fifth))
-    out["evaluate"] |= {"views": 4 if scale < 0.1 else 0, "scale": 1.0}
+    out["evaluate"] |= {"views": 10 if scale < 0.1 else 0, "scale": 1.0}
     return out
 
 

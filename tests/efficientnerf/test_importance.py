@@ -12,6 +12,7 @@ from efficientnerf import sampling
 from efficientnerf.compositing import composite
 from efficientnerf.grid import Space
 from efficientnerf.model import look
+from efficientnerf.render import valid_count
 from efficientnerf.sampling import IMPORTANCE_FLOOR, Samples, importance_samples, stratified_samples, united, valid_samples
 from tests.efficientnerf.balls import pixels, untrained
 
@@ -194,3 +195,16 @@ def test_some_rays_are_looked_at_whole_in_training_only() -> None:
     assert (per_ray[:10] > 0).all()
     assert (per_ray[10:] == 0).all()
     assert len(look(m, *bundle, offset, behind).coarse.start) == 0
+
+
+@pytest.mark.parametrize("rule", ["momentum", "maximum"])
+def test_valid_samples_of_what_is_not_pruned_are_those_that_the_voxels_would_keep(rule: str) -> None:
+    """Equation 5 on a trained NeRF: density above zero, read as the voxels read it."""
+    m = untrained(field="mlp", sampling="hierarchical", voxel_rule=rule, importance_samples=6, coarse_samples=10)
+    bundle = [torch.from_numpy(a) for a in pixels().bundle(np.arange(100, 140))[:4]]
+    seen = look(m, *bundle, torch.full((40,), 0.5), torch.ones(40, 3))
+    raw = seen.coarse_raw[:, 0].detach()
+    expected = int((raw > 0).sum()) if rule == "momentum" else int((torch.nn.functional.softplus(raw) > m.voxels.threshold).sum())
+    assert valid_count(m, seen) == expected > 0
+    assert valid_count(m, seen._replace(coarse_raw=seen.coarse_raw * 0 - 50)) == 0
+    assert valid_count(untrained(), seen) == len(seen.coarse.start)
