@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.sampling import Samples
+from efficientnerf.transfer import fetched
 
 LAG = 8  # steps; the device is hardly ever further behind
 SETTLED = 64  # steps at the beginning of a run that are counted exactly, at the price of waiting
@@ -59,13 +60,7 @@ class Late:
         tried = torch.as_tensor(coarse.tried, device=loss.device)
         real = torch.arange(len(pivotal), device=loss.device) < coarse.first[-1]  # padding may have been chosen by chance
         numbers = torch.stack([x.detach().double() for x in (loss, tried, coarse.first[-1], (pivotal & real).sum(), fine.first[-1])])
-        arrived = None
-        if numbers.is_cuda:
-            host = torch.empty(len(numbers), dtype=torch.float64, pin_memory=True)
-            host.copy_(numbers, non_blocking=True)
-            arrived = torch.cuda.Event()
-            arrived.record()
-            numbers = host
+        numbers, arrived = fetched(numbers)
         self.pending.append((numbers, rays, arrived))
         self.steps += 1
         while len(self.pending) > (0 if self.steps < SETTLED else LAG):

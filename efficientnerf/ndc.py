@@ -160,9 +160,9 @@ def _like(constant: np.ndarray, value: Any) -> Any:
     """The constant in the kind, type and device of `value`."""
     if _is_numpy(value):
         return np.asarray(constant, value.dtype)
-    import torch
+    from efficientnerf import transfer
 
-    return torch.as_tensor(constant, dtype=value.dtype, device=value.device)
+    return transfer.constant(constant, value)
 
 
 def _one(value: Any) -> Any:

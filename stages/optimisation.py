@@ -34,6 +34,7 @@ def optimised(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[Ne
     settings = job.settings
     facts: dict[str, Any] = {"steps": settings.optimise, "psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(SAMPLE, 4 * len(targets.pixels))
+    targets = targets.to(job.device)
     before = optimising.error(tree, targets, sample, settings.seed)
     o, pruned = _restored(job, tree) or (optimising.optimiser(tree, optimising.OPAQUE if settings.optimise else math.inf), False)
     half = settings.optimise // 2
@@ -81,11 +82,12 @@ def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Opti
     settings = job.settings
     tree = o.result()
     count = min(max(settings.pixels, WEIGHED * len(o.density)), 4 * len(targets.pixels))
-    greatest = np.zeros(len(o.density), np.float32)
-    for done, weights in optimising.greatest_weights(tree, targets, count, settings.seed):
-        greatest = weights
-        job.progress(done, count, "dropping what does not show")
+
+    def looked(done: int, total: int) -> None:
+        job.progress(done, total, "dropping what does not show")
         job.safe_point()
+
+    greatest = optimising.greatest_weights(tree, targets, count, settings.seed, looked)
     keep = greatest > settings.weight
     if keep.sum() > most:
         order = np.argsort(-greatest, kind="stable")
@@ -108,6 +110,7 @@ def _checkpoint(job: Job, o: Optimiser, pruned: bool) -> None:
 
     from efficientnerf.nerftree import baking, optimising
 
+    o.fetch()
     tensors = {name: np.ascontiguousarray(getattr(o, name)) for name in optimising.STATE}
     tensors["coordinates"] = baking.voxel_coordinates(o.tree)
     tensors["progress"] = np.array([o.step, pruned], np.int64)

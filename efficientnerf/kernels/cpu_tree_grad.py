@@ -11,7 +11,7 @@ R rays, N voxels, K harmonics, M records.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -142,12 +142,14 @@ class Seen(NamedTuple):
     gain     (R,)   light that reaches the box
     opacity  (R,)   of the photograph
     matte    weight of the opacity's error
+
+    Arrays, or tensors of a device (`efficientnerf.kernels.cuda_tree_grad`).
     """
 
-    colour: np.ndarray
-    behind: np.ndarray
-    gain: np.ndarray
-    opacity: np.ndarray
+    colour: Any
+    behind: Any
+    gain: Any
+    opacity: Any
     matte: float
 
 

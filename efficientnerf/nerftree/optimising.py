@@ -5,7 +5,8 @@ nobody needs fades away) and its harmonics. The loss of a ray is that of `cpu_tr
 before and behind the box; objects that were cut out are compared over every background at once.
 
 Every random choice of step n is drawn from a generator seeded by (seed, n), as in training; the kernels sum in a fixed order. So the same
-steps give the same bytes, on any number of threads and whether or not they were interrupted.
+steps give the same bytes, on any number of threads and whether or not they were interrupted. On CUDA (`efficientnerf.nerftree.optimising_device`, for
+targets that were sent there) pixels and rules are the same, sums do not depend on their order, and values differ by rounding.
 
 PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2022) optimise trees and grids this way. N voxels, K harmonics,
 R rays, P pixels.
@@ -13,8 +14,9 @@ R rays, P pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,10 +26,15 @@ from efficientnerf.kernels.cpu_tree_grad import Grid, Records, Seen
 from efficientnerf.nerftree.tree import NerfTree
 from efficientnerf.pixels import Pixels
 
+if TYPE_CHECKING:
+    from efficientnerf.device_pixels import DevicePixels
+
 DECAY, EPSILON = 0.99, 1e-10
 OPAQUE = 2.0  # optical thickness of a voxel to begin with at most: networks say hundreds, behind which nothing would have a gradient
 GREY, MATTE = 0.5, 0.25  # mean of a channel of a background of any colour, and three times the variance: see `Targets`
 WEIGHED_RAYS = 2**16  # in a bundle
+
+Bundle = tuple[Any, Any, Seen]  # see `Targets.draw`
 
 
 @dataclass(frozen=True)
@@ -46,19 +53,34 @@ class Targets:
     the channels' summed variance, 3 / 12, times the squared error of the opacity: taken as it is, without the noise of drawing colours.
     """
 
-    pixels: Pixels
+    pixels: Pixels | DevicePixels
     background: tuple[float, float, float] | None
     chosen: np.ndarray | None = None
-    before: np.ndarray | None = None
-    behind: np.ndarray | None = None
+    before: Any = None
+    behind: Any = None
     infinite: bool = False
 
     def __post_init__(self) -> None:
         if self.background is None and (self.chosen is None or self.before is None or self.behind is None):
             raise ValueError("photographs with surroundings: the targets need to know what lies before and behind the box")
 
-    def draw(self, count: int, rng: np.random.Generator, *, declared: bool = False) -> tuple[np.ndarray, np.ndarray, Seen]:
-        """Origins (R, 3) and unit directions (R, 3) of `count` random pixels, world frame, and what they should show.
+    @property
+    def on_device(self) -> bool:
+        """Whether they were sent to a device, where trees are fitted to them then."""
+        return not isinstance(self.pixels, Pixels)
+
+    def to(self, device: str) -> Targets:
+        """These targets on "cpu" or "cuda", the latter where its kernels can be built."""
+        from efficientnerf.kernels import dispatch
+
+        if device == "cpu" or not dispatch.triton_usable():
+            return self
+        from efficientnerf.nerftree.optimising_device import sent_targets
+
+        return sent_targets(self, device)
+
+    def draw(self, count: int, rng: np.random.Generator, *, declared: bool = False) -> tuple[Any, Any, Seen]:
+        """Origins (R, 3) and unit directions (R, 3) of `count` random pixels, world frame, and what they should show; arrays, or tensors of the device.
 
         declared  objects are seen on the background of the scene alone
         """
@@ -67,24 +89,33 @@ class Targets:
         at = rng.integers(len(self.chosen), size=count)
         return self.of(self.chosen[at], at, declared=declared)
 
-    def of(self, index: np.ndarray, at: np.ndarray | None, *, declared: bool = False) -> tuple[np.ndarray, np.ndarray, Seen]:
+    def of(self, index: np.ndarray, at: np.ndarray | None, *, declared: bool = False) -> tuple[Any, Any, Seen]:
         """`draw` for pixels `index`; `at` are their places in `chosen`."""
-        origins, directions, _, _, colour = self.pixels.bundle(index)
-        rays = len(index)
-        gain, opacity = np.ones(rays, np.float32), np.ones(rays, np.float32)
+        bundle: tuple[Any, ...] = self.pixels.bundle(index)
+        origins, directions, _, _, colour = bundle
+        ones = colour[:, 0] * 0 + 1
         truth = colour[:, :3]
         if self.background is None:
-            assert self.before is not None and self.behind is not None and at is not None  # noqa: PT018
-            before, behind = self.before[at].astype(np.float32), self.behind[at].astype(np.float32)
-            return origins, directions, Seen(truth - before[:, :3], behind, 1 - before[:, 3], opacity, 0.0)
+            assert at is not None
+            before, behind = self._rows(self.before, at), self._rows(self.behind, at)
+            return origins, directions, Seen(truth - before[:, :3], behind, 1 - before[:, 3], ones, 0.0)
         matted = colour.shape[1] == 4
         anything = (matted or self.infinite) and not declared
+        behind = colour[:, :3] * 0
         ground = (GREY,) * 3 if anything else self.background
-        behind = np.broadcast_to(np.asarray(ground, np.float32), (rays, 3)).copy()
+        for channel, value in enumerate(ground):
+            behind[:, channel] += value
+        opacity = ones
         if matted:
-            opacity = np.ascontiguousarray(colour[:, 3])
+            opacity = colour[:, 3] * 1
             truth = truth * opacity[:, None] + behind * (1 - opacity[:, None])
-        return origins, directions, Seen(np.ascontiguousarray(truth), behind, gain, opacity, MATTE if anything else 0.0)
+        return origins, directions, Seen(truth * 1, behind, ones, opacity, MATTE if anything else 0.0)
+
+    def _rows(self, part: Any, at: np.ndarray) -> Any:
+        """Rows `at` of an array, or of a tensor on the pixels' device, in float32."""
+        if isinstance(self.pixels, Pixels):
+            return part[at].astype(np.float32)
+        return part[self.pixels.sent(at)].float()
 
 
 @dataclass
@@ -94,6 +125,7 @@ class Optimiser:
     density, sh          (N,), (N, 3 K) float32, the tree's own to begin with
     square_*             (N,) running means of the squared gradients by the logarithm of a voxel's optical thickness, and by its harmonics
     visits               (N,) in how many steps a voxel was seen
+    away                 the state on a device that steps are being taken on; `fetch` brings the arrays up to date
     """
 
     tree: NerfTree
@@ -103,9 +135,17 @@ class Optimiser:
     square_sh: np.ndarray
     visits: np.ndarray
     step: int = 0
+    away: Any = None  # a DeviceFit
+
+    def fetch(self) -> None:
+        """Have the arrays as they are after the last step."""
+        if self.away is not None:
+            for name, values in self.away.fetched().items():
+                setattr(self, name, values)
 
     def result(self) -> NerfTree:
         """The tree as it is now."""
+        self.fetch()
         return replace(self.tree, density_values=self.density.copy(), harmonics=self.sh.reshape(len(self.sh), -1, 3).copy())
 
 
@@ -122,6 +162,7 @@ def optimiser(tree: NerfTree, thickest: float = np.inf) -> Optimiser:
 
 def kept(o: Optimiser, keep: np.ndarray, tree: NerfTree) -> Optimiser:
     """The optimiser of a tree of some of the voxels, (N,) bool, in their order."""
+    o.fetch()
     return Optimiser(tree, step=o.step, **{name: getattr(o, name)[keep] for name in STATE})
 
 
@@ -140,21 +181,27 @@ def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tu
 def optimise(
     o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int
 ) -> Iterator[float]:
-    """Go on to step `until`, yielding the mean squared error of a channel after each step.
+    """Go on to step `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.
 
     steps         in all; the rates fall exponentially, to `final` of themselves at the last of them
     rays          in a step
     density_rate  for the logarithm of the optical thickness
     colour_rate   for the harmonics
     """
+    if targets.on_device:
+        from efficientnerf.nerftree import optimising_device
+
+        yield from optimising_device.optimise(
+            o, targets, until=until, steps=steps, rays=rays, density_rate=density_rate, colour_rate=colour_rate, final=final, seed=seed
+        )
+        return
     grid, records = grid_of(o.tree), Records()
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
     stamp = np.zeros(len(o.density), np.int32)
     rates = np.full(o.sh.shape[1], colour_rate, np.float32)
     while o.step < until:
         number = o.step + 1
-        rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 2, number]))
-        origins, directions, seen = targets.draw(rays, rng)
+        origins, directions, seen = targets.draw(rays, randomness(seed, number))
         start, along, bases = in_voxels(o.tree, origins, directions)
         loss, counts = kernels.look(grid, start, along, bases, o.density, o.sh, seen, records)
         fall = final ** (number / steps)
@@ -166,25 +213,50 @@ def optimise(
         yield float(loss.mean()) / 3
 
 
+def randomness(seed: int, step: int) -> np.random.Generator:
+    """What a step's pixels are chosen by."""
+    return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 2, step]))
+
+
 def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
     """Mean squared error of a channel over a sample of the training pixels that depends on `count` and `seed` alone, objects on their declared background."""
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
+    bundles = (targets.draw(min(WEIGHED_RAYS, count - begin), rng, declared=True) for begin in range(0, count, WEIGHED_RAYS))
+    if targets.on_device:
+        from efficientnerf.nerftree import optimising_device
+
+        return optimising_device.total_loss(tree, targets, bundles) / (3 * count)
     o, total = optimiser(tree), 0.0
-    for begin in range(0, count, WEIGHED_RAYS):
-        origins, directions, seen = targets.draw(min(WEIGHED_RAYS, count - begin), rng, declared=True)
+    for origins, directions, seen in bundles:
         loss, _ = kernels.look(grid_of(tree), *in_voxels(tree, origins, directions), o.density, o.sh, seen, Records())
         total += float(loss.sum())
     return total / (3 * count)
 
 
-def greatest_weights(tree: NerfTree, targets: Targets, count: int, seed: int) -> Iterator[tuple[int, np.ndarray]]:
-    """How much each voxel contributes at most to one of `count` random training pixels, through what interpolation leaves it: yields
-    the pixels looked at so far and the weights (N,) so far."""
+def greatest_weights(tree: NerfTree, targets: Targets, count: int, seed: int, looked: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """(N,) how much each voxel contributes at most to one of `count` random training pixels, through what interpolation leaves it.
+
+    looked  called with pixels looked at and their number
+    """
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 4, 0]))
+    bundles = reported((targets.draw(min(WEIGHED_RAYS, count - begin), rng) for begin in range(0, count, WEIGHED_RAYS)), count, looked)
+    if targets.on_device:
+        from efficientnerf.nerftree import optimising_device
+
+        return optimising_device.greatest_weights(tree, targets, bundles)
     o, records, grid = optimiser(tree), Records(), grid_of(tree)
     greatest = np.zeros_like(o.density)
-    for begin in range(0, count, WEIGHED_RAYS):
-        origins, directions, seen = targets.draw(min(WEIGHED_RAYS, count - begin), rng)
+    for origins, directions, seen in bundles:
         _, counts = kernels.look(grid, *in_voxels(tree, origins, directions), o.density, o.sh, seen, records, weighing=True)
         kernels.greatest(records, counts, seen.gain, greatest)
-        yield begin + len(origins), greatest
+    return greatest
+
+
+def reported(bundles: Iterator[Bundle], count: int, looked: Callable[[int, int], None] | None) -> Iterator[Bundle]:
+    """The bundles; after each `looked` is told how many rays there have been, of `count`."""
+    done = 0
+    for bundle in bundles:
+        yield bundle
+        done += len(bundle[0])
+        if looked is not None:
+            looked(done, count)

@@ -100,7 +100,26 @@ def pictures() -> None:
             cuda_tree.draw_rays(tree, torch.zeros(8, 3), torch.ones(8, 3))
 
 
+def fit() -> None:
+    from efficientnerf.kernels import cuda_tree_grad
+    from tests.efficientnerf.trees import random_tree
+
+    rays = cuda_tree_grad.Rays(torch.zeros(8, 3), torch.ones(8, 3), torch.ones(8, 3))
+    for degree, lookup in [*((degree, "trilinear") for degree in range(5)), (2, "nearest")]:
+        tree = random_tree(0, degree=degree, brick=4, lookup=lookup)
+        g, count, width = cuda_tree_grad.device_grid(tree, "cpu"), len(tree.density_values), 3 * tree.harmonics_count
+        values, squares = (torch.zeros(count), torch.zeros(count, width)), (torch.zeros(count), torch.zeros(count))
+        sums = torch.zeros(count, dtype=torch.int64), torch.zeros(count, width, dtype=torch.int64)
+        visits, stamp = torch.zeros(count, dtype=torch.int32), torch.zeros(count, dtype=torch.int32)
+        seen_as = cuda_tree_grad.look(g, rays, *values)
+        cuda_tree_grad.pull(g, rays, *values, seen_as, (seen_as[0], seen_as[1]), sums, stamp, 7)
+        cuda_tree_grad.weigh(g, rays, values[0], seen_as[1], squares[0])
+        told = {"number": 7, "rays": 8, "density_rate": 0.1, "colour_rate": 0.1, "decay": 0.9, "epsilon": 1e-10}
+        cuda_tree_grad.descend(g, values, sums, squares, visits, stamp, **told)
+
+
 if __name__ == "__main__":
     JITFunction.run = build
+    fit()
     training_step()
     pictures()

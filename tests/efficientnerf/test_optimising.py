@@ -221,8 +221,9 @@ def test_weights_are_what_voxels_contribute() -> None:
     """One voxel before another: the greatest weight of each, through what interpolation leaves it, against sums by hand."""
     tree = uniform_tree((2, 2, 2), brick=4, voxel=0.25, sigma=4.0)
     tree = replace(tree, bounds_min=BOUNDS[0], background=(1.0, 1.0, 1.0))
-    *_, (looked, weights) = greatest_weights(tree, Targets(pixels(8, 24), (1.0, 1.0, 1.0)), 4000, 0)
-    assert looked == 4000
+    looked: list[tuple[int, int]] = []
+    weights = greatest_weights(tree, Targets(pixels(8, 24), (1.0, 1.0, 1.0)), 4000, 0, lambda *done: looked.append(done))
+    assert looked == [(4000, 4000)]
     at = voxel_coordinates(tree)
     skin = ((at == 0) | (at == 7)).any(axis=1)
     assert weights.min() > 0

@@ -1,0 +1,226 @@
+"""The fit of baked values by the CUDA kernels against torch's autograd and the CPU kernel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.cameras import Camera
+from efficientnerf.device_pixels import DevicePixels
+from efficientnerf.kernels.cpu_tree_grad import Seen
+from efficientnerf.nerftree import optimising
+from efficientnerf.nerftree.optimising import Targets, error, greatest_weights, optimise, optimiser
+from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.pixels import Pixels
+from efficientnerf.render import render_tree_reference
+from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
+from tests.efficientnerf.device import DEVICE
+from tests.efficientnerf.test_ndc_tree import camera_at, wall
+from tests.efficientnerf.test_optimising import ball_tree, loss_by_torch, seen_at_random
+from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+
+kernels = pytest.importorskip("efficientnerf.kernels.cuda_tree_grad")
+device = pytest.importorskip("efficientnerf.nerftree.optimising_device")
+
+
+def there(seen: Seen) -> Seen:
+    return Seen(*(torch.from_numpy(np.asarray(part, np.float32)).to(DEVICE) for part in seen[:4]), seen.matte)
+
+
+def gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: Seen) -> tuple[np.ndarray, ...]:
+    """Loss of each ray, and the gradients of their sum by density and harmonics."""
+    rays = device.rays_in_voxels(tree, *(torch.from_numpy(a).to(DEVICE) for a in (origins, directions)))
+    grid, density, sh = device.values_of(tree, torch.device(DEVICE))
+    seen_as = kernels.look(grid, rays, density, sh)
+    loss, *by = kernels.loss_of(*seen_as, there(seen))
+    sums = torch.zeros(density.shape, dtype=torch.int64, device=DEVICE), torch.zeros(sh.shape, dtype=torch.int64, device=DEVICE)
+    stamp = torch.zeros(len(density), dtype=torch.int32, device=DEVICE)
+    kernels.pull(grid, rays, density, sh, seen_as, tuple(by), sums, stamp, 3)
+    by_thickness, by_sh = (part.cpu().double().numpy() / kernels.resolution(len(origins)) for part in sums)
+    assert set(stamp.tolist()) <= {0, 3}
+    assert np.array_equal(by_sh.any(axis=1) & (stamp.cpu().numpy() != 3), np.zeros(len(by_sh), bool))
+    return loss.cpu().numpy(), by_thickness * tree.voxel, by_sh.reshape(tree.sh.shape)
+
+
+@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
+@pytest.mark.parametrize(("brick", "degree", "matte"), [(1, 0, 0.7), (3, 1, 0.0), (4, 2, 0.25), (2, 3, 0.25)])
+def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, matte: float, lookup: str) -> None:
+    # Rays that stop early or graze a voxel's face part from the exact sums: thin matter, and rays at no angle of the grid.
+    tree = random_tree(brick, brick=brick, degree=degree, sigma=4.0, lookup=lookup)
+    origins, directions = (a[np.arange(160) % 4 != 2] for a in rays_at(tree, 160))
+    seen = seen_at_random(len(origins), matte)
+    loss, by_density, by_sh = gradients(tree, origins, directions, seen)
+    density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
+    wanted = loss_by_torch(*render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
+    wanted.sum().backward()
+    assert density.grad is not None
+    assert sh.grad is not None
+    np.testing.assert_allclose(loss, wanted.detach(), atol=2e-5 if lookup == "trilinear" else 1e-2)
+    for ours, theirs in ((by_density, density.grad.numpy()), (by_sh, sh.grad.numpy())):
+        scale = np.abs(theirs).max()
+        off = np.abs(ours - theirs)
+        if lookup == "trilinear":
+            assert off.max() < 2e-4 * scale
+        assert (off > 1e-4 * scale).mean() < 0.02  # in float32 a sample may lie in the voxel on the other side of a face
+    assert (by_density != 0).mean() > 0.15
+
+
+def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
+    tree = random_tree(4, brick=4, degree=1, share=0.6)
+    origins, directions = rays_at(tree, 120)
+    seen = seen_at_random(120, 0.3, np.float32)
+    _, by_density, by_sh = gradients(tree, origins, directions, seen)
+    order = np.random.default_rng(0).permutation(120)
+    again = gradients(tree, origins[order], directions[order], Seen(*(part[order] for part in seen[:4]), seen.matte))
+    assert np.array_equal(by_density, again[1])
+    assert np.array_equal(by_sh, again[2])
+
+
+def test_sums_of_the_most_rays_cannot_overflow() -> None:
+    """The greatest gradients there are: full light through thin matter onto a pixel that is off by 2, all on one voxel."""
+    for rays in (1, 32768, 2**22):
+        assert 25.0 * 7 * rays * kernels.resolution(rays) < 2**62.5
+        assert kernels.resolution(rays) >= 2**32
+    tree = uniform_tree((1, 1, 1), brick=1, sigma=1e-3, logit=0.0)
+    count = 500
+    middle = (tree.bounds_min + tree.bounds_max) / 2
+    origins = np.tile(middle - [0, 0, 2.0], (count, 1))
+    directions = np.tile([0.0, 0, 1], (count, 1))
+    seen = Seen(np.full((count, 3), -1.0), np.ones((count, 3)), np.ones(count), np.ones(count), 0.25)
+    _, by_density, _ = gradients(tree, origins, directions, seen)
+    per_ray = by_density[0] / tree.voxel / count
+    assert -25 < per_ray < -4
+
+
+def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
+    tree = random_tree(1, brick=2)
+    origins, directions = rays_at(tree, 40)
+    away = origins + 100.0
+    loss, by_density, by_sh = gradients(tree, away, directions, seen_at_random(40, 0.0))
+    assert not by_density.any()
+    assert not by_sh.any()
+    assert (loss > 0).any()
+    empty = optimising.kept(optimiser(tree), np.zeros(len(tree.density_values), bool), tree)
+    bare = replace(tree, brick_index=np.full_like(tree.brick_index, -1), voxel_index=tree.voxel_index[:0], density_values=empty.density, harmonics=tree.sh[:0])
+    assert (gradients(bare, origins, directions, seen_at_random(40, 0.0))[0] > 0).any()
+
+
+def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 6) -> tuple[optimising.Optimiser, list[float]]:
+    """Steps in one go, or in several with the state fetched in between, as a checkpoint does."""
+    o = optimiser(tree)
+    errors: list[float] = []
+    for end in until:
+        errors += optimise(o, targets, until=end, steps=steps, rays=rays, density_rate=0.3, colour_rate=0.05, final=0.1, seed=1)
+        o.fetch()
+    return o, errors
+
+
+def test_steps_are_those_of_the_cpu() -> None:
+    """From colours that are no pixel's: where an error is next to nothing its rounding would show, for steps are of one length."""
+    tree = ball_tree(8)
+    tree = replace(tree, harmonics=np.random.default_rng(0).normal(size=tree.sh.shape).astype(np.float32))
+    on_host = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
+    on_device = device.sent_targets(on_host, DEVICE)
+    assert on_device.on_device
+    ours, errors = fitted(on_device, tree, [4], steps=4)
+    theirs, wanted = fitted(on_host, tree, [4], steps=4)
+    assert (ours.visits == theirs.visits).mean() > 0.99
+    assert len(np.unique(theirs.visits)) > 2
+    for name in ("density", "sh", "square_density", "square_sh"):
+        a, b = getattr(ours, name), getattr(theirs, name)
+        assert (np.abs(a - b) > 1e-3 * np.abs(b) + 1e-3 * np.abs(b).max()).mean() < 0.02, name
+    assert errors[0] == pytest.approx(wanted[0], rel=1e-5)
+    assert errors == [errors[0]] * 4  # nothing later has arrived
+    assert error(ours.result(), on_device, 500, 0) == pytest.approx(error(theirs.result(), on_host, 500, 0), rel=1e-2)
+
+
+def test_interrupted_or_not_the_bytes_are_the_same() -> None:
+    targets = device.sent_targets(Targets(pixels(6, 16), (1.0, 1.0, 1.0)), DEVICE)
+    whole, apart = (fitted(targets, ball_tree(8), until)[0] for until in ([6], [2, 5, 6]))
+    for name in optimising.STATE:
+        assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
+
+
+def test_weights_are_those_of_the_cpu() -> None:
+    tree = replace(random_tree(4, shape=(5, 5, 5), brick=4, degree=1, share=0.5, sigma=20.0), voxel=2 / 20, bounds_min=BOUNDS[0])
+    targets = Targets(pixels(4, 12), (1.0, 1.0, 1.0))
+    wanted = greatest_weights(tree, targets, 700, 0)
+    told: list[int] = []
+    found = greatest_weights(tree, device.sent_targets(targets, DEVICE), 700, 0, lambda done, _: told.append(done))
+    assert told == [700]
+    assert (wanted > 0.01).mean() > 0.2
+    assert (np.abs(found - wanted) > 2e-3).mean() < 0.01
+
+
+@pytest.mark.parametrize("kind", ["matted", "infinite", "photographs", "declared"])
+def test_targets_on_the_device_say_the_same(kind: str) -> None:
+    some = pixels(5, 12)
+    if kind == "photographs":
+        made = cameras(5, 12)
+        some = Pixels(made, [photograph(c) for c in made], [None] * 5, np.full(5, 1.0), np.full(5, 5.0))
+        rng = np.random.default_rng(0)
+        chosen = np.sort(rng.choice(len(some), 300, replace=False))
+        targets = Targets(some, None, chosen, rng.random((300, 4)).astype(np.float16), rng.random((300, 3)).astype(np.float16))
+    else:
+        if kind == "infinite":
+            some.images = np.ascontiguousarray(some.images[:, :3])
+        targets = Targets(some, (0.2, 0.5, 0.7), infinite=kind == "infinite")
+    same = [each.draw(100, np.random.default_rng(1), declared=kind == "declared") for each in (targets, device.sent_targets(targets, DEVICE))]
+    for ours, theirs in zip((*same[1][:2], *same[1][2][:4]), (*same[0][:2], *same[0][2][:4]), strict=True):
+        np.testing.assert_allclose(ours.cpu().numpy(), theirs, atol=2e-6)
+        assert theirs.dtype == np.float32
+    assert same[0][2].matte == same[1][2].matte
+
+
+@pytest.mark.parametrize("stride", [1, 8])
+def test_rays_of_pixels_are_those_of_the_host(stride: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    from efficientnerf import pixels as module
+
+    monkeypatch.setattr(module, "EXACT", 2**23 if stride == 1 else 0)
+    lens = ("OPENCV", (30.0, 33.0, 9.0, 12.0, 0.05, -0.02, 0.003, 0.002))
+    poses = [c.world_from_camera for c in cameras(2)]
+    views = [Camera("a", 21, 23, *lens, poses[0]), Camera("b", 18, 12, "SIMPLE_PINHOLE", (20.0, 9.0, 6.0), poses[1])]
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (c.height, c.width, 3), np.uint8) for c in views]
+    host = Pixels(views, images, [None, np.ones((12, 18), bool)], np.array([1.0, 2.0]), np.array([4.0, 5.0]))
+    assert host.stride == stride
+    index = host.choose(400, np.random.default_rng(3))
+    there = DevicePixels(host, DEVICE)
+    assert np.array_equal(there.choose(400, np.random.default_rng(3)), index)
+    for ours, theirs in zip(there.bundle(index), host.bundle(index), strict=True):
+        np.testing.assert_allclose(ours.cpu().numpy(), theirs, rtol=1e-5, atol=1e-6)
+    there.images = None  # as where they are too many for the device
+    np.testing.assert_allclose(there.bundle(index)[4].cpu().numpy(), host.bundle(index)[4], atol=1e-7)
+
+
+def test_in_normalised_device_coordinates_too() -> None:
+    tree: Any = wall()
+    camera = camera_at(0, 0, 0)
+    image = np.full((camera.height, camera.width, 3), 128, np.uint8)
+    targets = Targets(Pixels([camera], [image], [None], np.ones(1), np.full(1, 5.0)), (0.5, 0.5, 0.5), infinite=True)
+    count = min(300, len(targets.pixels))
+    wanted, found = error(tree, targets, count, 0), error(tree, device.sent_targets(targets, DEVICE), count, 0)
+    assert wanted > 1e-3
+    assert found == pytest.approx(wanted, rel=1e-3)
+
+
+def test_targets_stay_on_the_host_where_kernels_cannot_be_built() -> None:
+    targets = Targets(pixels(2, 8), (1.0, 1.0, 1.0))
+    assert targets.to("cpu") is targets
+    assert targets.to("cuda").on_device == torch.cuda.is_available()
+
+
+@pytest.mark.gpu
+def test_the_fit_on_a_device_ends_as_on_the_cpu() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    on_host = Targets(pixels(10, 48), (1.0, 1.0, 1.0))
+    on_device = on_host.to("cuda")
+    ends = [error(fitted(t, ball_tree(40), [80], rays=2048, steps=80)[0].result(), on_host, 5000, 0) for t in (on_host, on_device)]
+    assert ends[1] == pytest.approx(ends[0], rel=0.05)
+    again = [fitted(on_device, ball_tree(40), [80], rays=2048, steps=80)[0].density for _ in range(2)]
+    assert np.array_equal(*again)
