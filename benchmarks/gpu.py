@@ -1,14 +1,18 @@
-"""A CUDA device at work: kernels, pictures, training steps and the whole pipeline, written to benchmarks/results/gpu.json after each part.
+"""A CUDA device at work: tests, kernels, pictures, training steps, a bake and the whole pipeline, written to benchmarks/results/gpu.json after each part.
 
-    python benchmarks/gpu.py [SOURCE] [--parts kernels,pictures,training,pipeline] [--seconds 560] [--preset standard] [--asset FILE] [--json FILE]
+    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,pictures,training,asset,pipeline] [--seconds 570] [--preset standard] [--asset FILE] [--json FILE]
 
-Says so and does nothing where torch has no CUDA device. What has not ended after --seconds is stopped and noted as such.
+Says so and does nothing where torch has no CUDA device. Each part runs in a process of its own, for what goes wrong on a device may take all that comes
+after with it; what has not ended after its share of --seconds is stopped and noted as such. All but the pipeline need torch, triton, numba, scipy and
+safetensors alone (the tests pytest, too): no pycolmap, and nothing of this project need be installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -19,20 +23,28 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-PARTS = ("kernels", "pictures", "training", "pipeline")
+ROOT = HERE.parent
+# Seconds at most. Most of the tests' time goes into building kernels.
+PARTS = {"tests": 200.0, "kernels": 60.0, "pictures": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0}
 TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
+TESTS = ["tests/efficientnerf", "--ignore=tests/efficientnerf/test_cuda_builds.py", "-k", "cuda or late or device or gpu"]
+PIPELINE = ["msgspec", "click", "rich", "filelock", "safetensors", "PIL", "cv2", "scipy", "skimage", "matplotlib", "OpenEXR", "av", "trimesh", "fast_simplification"]
 
 
 def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[str, Any]:
     """The summary of `enerf run`, and what it said last of its training."""
+    needed = PIPELINE if list(source.glob("transforms*.json")) else [*PIPELINE, "pycolmap"]
+    missing = [name for name in needed if importlib.util.find_spec(name) is None]
+    if missing:
+        return {"left_out": f"not installed here: {', '.join(missing)}"}
     command = [sys.executable, "-m", "workflows.cli", "run", str(source), "--out", str(folder), "--device", "cuda", "--json", *options]
     try:
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=max(1.0, seconds), check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=max(1.0, seconds), check=False)
     except subprocess.TimeoutExpired as late:
         return {"stopped_after_seconds": round(late.timeout)}
-    events = [json.loads(line) for line in done.stdout.splitlines()]
+    events = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     if done.returncode != 0:
-        return {"exit_code": done.returncode, "error": events[-1].get("error") if events else "it said nothing"}
+        return {"exit_code": done.returncode, "error": (events[-1].get("error") if events else None) or done.stderr[-2000:]}
     training = [event for event in events if event["event"] == "progress" and event["stage"] == "train"]
     summary = events[-1]
     took = summary["seconds"]
@@ -46,9 +58,35 @@ def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[
     }
 
 
+def tests(seconds: float) -> dict[str, Any]:
+    """How the tests of the kernels went on the device, and what pytest said last."""
+    if importlib.util.find_spec("pytest") is None:
+        return {"left_out": "not installed here: pytest"}
+    # Other versions of the libraries than those of this project may warn of things to come.
+    command = [sys.executable, "-m", "pytest", "-q", "-W", "default", "-p", "no:cacheprovider", "--continue-on-collection-errors", *TESTS]
+    if importlib.util.find_spec("xdist") is not None:
+        command += ["-n", str(min(8, os.cpu_count() or 1))]
+    with tempfile.TemporaryFile("w+") as said:
+        try:
+            code: int | None = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, cwd=ROOT, timeout=seconds, check=False).returncode
+        except subprocess.TimeoutExpired:
+            code = None
+        said.seek(0)
+        lines = said.read().splitlines()
+    failed = [line for line in lines if line.startswith(("FAILED", "ERROR", "E   "))]
+    return {"exit_code": code, **({} if code == 0 else {"failed": failed[:80]}), "last": lines[-1] if lines else ""}
+
+
 def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, Any]:
     """The figures of one part."""
-    sys.path.insert(0, str(HERE))
+    sys.path[:0] = [str(ROOT), str(HERE)]
+    if part == "tests":
+        return tests(seconds)
+    if part == "pipeline":
+        options = ["--preset", given.preset, *(word for text in given.sets for word in ("--set", text))]
+        with tempfile.TemporaryDirectory(prefix="gpu-") as folder:
+            return run(given.source, Path(folder) / "run", options, seconds)
+    import gpu_asset
     import gpu_kernels
 
     if part == "kernels":
@@ -58,27 +96,48 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
 
         tree = NerfTree.load(given.asset) if given.asset else gpu_kernels.shell(384)
         return gpu_kernels.frame_rates("cuda", tree, 800, 10, TILES)
-    if part == "training":
-        return gpu_kernels.training_rates("cuda", 1500, 400, 40, samples=2**18, rays=2**16, levels=16, log2_table=19, finest=2048)
-    options = ["--preset", given.preset, *(word for text in given.sets for word in ("--set", text))]
+    if part == "asset":
+        return gpu_asset.asset_rates("cuda", steps=2000, side=400, views=60, resolution=256, pixels=1_000_000, fit_steps=160, rays=32768, samples=2**18)
+    return gpu_kernels.training_rates("cuda", 1500, 400, 40, samples=2**18, rays=2**16, levels=16, log2_table=19, finest=2048)
+
+
+def apart(part: str, seconds: float) -> dict[str, Any]:
+    """The figures of one part from a process of its own, which is given the same words."""
     with tempfile.TemporaryDirectory(prefix="gpu-") as folder:
-        return run(given.source, Path(folder) / "run", options, seconds)
+        figures = Path(folder) / "figures.json"
+        command = [sys.executable, __file__, *sys.argv[1:], "--only", part, "--seconds", str(max(1.0, seconds - 10)), "--json", str(figures)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
+        begun = time.monotonic()
+        with tempfile.TemporaryFile("w+") as said:
+            try:
+                code = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, env=environment, timeout=seconds, check=False).returncode
+            except subprocess.TimeoutExpired:
+                return {"stopped_after_seconds": round(seconds)}
+            said.seek(0)
+            words = said.read()
+        if code != 0 or not figures.exists():
+            return {"error": words[-3000:] or f"exit code {code}"}
+        return {**json.loads(figures.read_text(encoding="utf-8")), "seconds_in_all": round(time.monotonic() - begun, 1)}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", nargs="?", type=Path, default=HERE.parent / "examples" / "still_life")
+    parser.add_argument("source", nargs="?", type=Path, default=ROOT / "examples" / "still_life")
     parser.add_argument("--parts", default=",".join(PARTS))
-    parser.add_argument("--seconds", type=float, default=560.0)
+    parser.add_argument("--seconds", type=float, default=570.0)
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="STAGE.NAME=VALUE")
     parser.add_argument("--asset", type=Path, help="draw this tree instead of a made-up one")
     parser.add_argument("--json", type=Path, default=HERE / "results" / "gpu.json")
+    parser.add_argument("--only", help=argparse.SUPPRESS)
     given = parser.parse_args()
     wanted = given.parts.split(",")
     for part in wanted:
         if part not in PARTS:
             parser.error(f"--parts: found {part!r}, expected some of {', '.join(PARTS)}")
+    if given.only:
+        given.json.write_text(json.dumps(measured(given.only, given, given.seconds)), encoding="utf-8")
+        return 0
 
     import torch
 
@@ -93,12 +152,9 @@ def main() -> int:
     result: dict[str, Any] = {"device": torch.cuda.get_device_name(), "torch": torch.__version__, "efficientnerf": ours, "platform": platform.platform()}
     failed = False
     for part in wanted:
-        left = given.seconds - (time.monotonic() - started)
-        try:
-            result[part] = measured(part, given, left) if left > 0 else {"left_out": f"{given.seconds:g} s were over"}
-        except Exception as error:  # the other parts are worth their figures all the same
-            result[part] = {"error": f"{type(error).__name__}: {error}"}
-            failed = True
+        left = min(PARTS[part], given.seconds - (time.monotonic() - started))
+        result[part] = apart(part, left) if left > 15 else {"left_out": f"{given.seconds:g} s were over"}
+        failed |= "error" in result[part] or result[part].get("exit_code", 0) != 0
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
         print(json.dumps({part: result[part]}, indent=1), flush=True)

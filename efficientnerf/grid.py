@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.ndc import Ndc, warped_distance, world_distance
+from efficientnerf.transfer import constant
 
 
 class FrameRays(NamedTuple):
@@ -90,9 +91,7 @@ class Space:
 
     def unit(self, points: Tensor) -> Tensor:
         """Points (..., 3) of the space's frame to unit coordinates."""
-        centre = torch.as_tensor(self.centre, dtype=points.dtype, device=points.device)
-        half = torch.as_tensor(self.half, dtype=points.dtype, device=points.device)
-        return (points - centre) / half
+        return (points - constant(self.centre, points)) / constant(self.half, points)
 
     def grid(self, points: Tensor) -> Tensor:
         """Points (..., 3) of the space's frame to grid coordinates, in [0, 1] wherever the space reaches."""
@@ -106,8 +105,7 @@ class Space:
         c = grid * (2 * self.reach) - self.reach
         if self.contracted:
             c = uncontract(c)
-        half = torch.as_tensor(self.half, dtype=grid.dtype, device=grid.device)
-        return c * half + torch.as_tensor(self.centre, dtype=grid.dtype, device=grid.device)
+        return c * constant(self.half, grid) + constant(self.centre, grid)
 
 
 def voxel_centres(space: Space, points: Tensor, resolution: int) -> Tensor:
@@ -121,8 +119,7 @@ def voxel_centres(space: Space, points: Tensor, resolution: int) -> Tensor:
     """
     extent = 2 * space.half
     side = float(extent.max()) / resolution
-    low = torch.as_tensor(np.asarray(space.bounds[0], np.float64), dtype=points.dtype, device=points.device)
-    last = torch.as_tensor(np.ceil(np.round(extent / side, 6)) - 1, dtype=points.dtype, device=points.device)
+    low, last = constant(space.bounds[0], points), constant(np.ceil(np.round(extent / side, 6)) - 1, points)
     voxel = torch.floor((space.world(points) - low) / side)
     centre = space.grid((torch.minimum(voxel.clamp(min=0), last) + 0.5) * side + low)
     inside = (space.unit(space.world(points)).abs() <= 1 + 1e-5).all(dim=-1, keepdim=True)

@@ -21,6 +21,7 @@ from efficientnerf.kernels import dispatch
 from efficientnerf.late import Room
 from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples, united
 from efficientnerf.settings import TrainSettings
+from efficientnerf.transfer import sent
 
 SKY_DEGREE = 2
 COARSEST = 16
@@ -257,14 +258,14 @@ def _even_samples(
         near, far = clip_to_space(m.space, origins, directions, near, far)
     jitter = offset[:, None].expand(-1, count)
     if rng is not None:
-        jitter = torch.from_numpy(rng.random((len(origins), count), np.float32)).to(offset.device)
+        jitter = sent(torch.from_numpy(rng.random((len(origins), count), np.float32)), offset.device)
     return stratified_samples(m.space, origins, directions, near, far, jitter, outside=m.settings.field != "hash")
 
 
 def _strata(rays: int, count: int, rng: np.random.Generator | None, device: torch.device) -> Tensor:
     """(rays, count) quantiles, one in each of `count` equal parts of [0, 1]: random in training, the middles in rendering."""
     within = torch.full((rays, count), 0.5) if rng is None else torch.from_numpy(rng.random((rays, count), np.float32))
-    return ((torch.arange(count) + within) / count).to(device)
+    return sent((torch.arange(count) + within) / count, device)
 
 
 def state_of(m: Model) -> dict[str, Tensor]:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.grid import Space
+from efficientnerf.transfer import constant
 
 FARTHEST = 1.0 / 64  # 1 / |u|_inf at which a ray in contracted space ends
 
@@ -43,7 +44,7 @@ def clip_to_space(space: Space, origins: Tensor, directions: Tensor, near: Tenso
     """Distances (R,) at which rays enter and leave the space, within near and far; leave <= enter where they miss it."""
     if space.contracted:
         return near, far
-    u, du = space.unit(origins), directions / torch.as_tensor(space.half, dtype=directions.dtype, device=directions.device)
+    u, du = space.unit(origins), directions / constant(space.half, directions)
     du = torch.where(du.abs() < 1e-12, torch.full_like(du, 1e-12), du)
     one, other = (-1 - u) / du, (1 - u) / du
     return torch.maximum(torch.minimum(one, other).amax(dim=-1), near), torch.minimum(torch.maximum(one, other).amin(dim=-1), far)

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from efficientnerf.compositing import activate, ray_of_sample
 from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
+from efficientnerf.device_pixels import DevicePixels
 from efficientnerf.exposure import exposed, exposure_loss
 from efficientnerf.kernels import dispatch
 from efficientnerf.late import Counted, Late, mean_over, whole_rays
@@ -182,6 +183,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
     transparent = pixels.images.shape[1] == 4
     # On CUDA nothing waits for the device; see `efficientnerf.late`.
     late = Late() if dispatch.on_device(m.voxels.values) and m.settings.sampling == "efficient" and m.settings.refresh_rays == 0 else None
+    there = DevicePixels(pixels, device) if device.type == "cuda" else pixels
     while t.step < m.settings.iterations:
         number, settings = t.step + 1, m.settings
         rng = np.random.Generator(np.random.Philox(key=settings.seed, counter=[0, 0, 0, number]))
@@ -189,7 +191,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         # A bundle of rays of about as many samples as the settings ask for.
         count = int(min(settings.rays, max(FEWEST_RAYS, settings.samples / t.samples_per_ray))) if settings.samples else settings.rays
         chosen = pixels.choose(count, rng, middle=number <= settings.crop_steps)
-        origins, directions, near, far, colour = (sent(torch.from_numpy(a), device) for a in pixels.bundle(chosen))
+        origins, directions, near, far, colour = (torch.as_tensor(a, device=device) for a in there.bundle(chosen))
         offset = sent(torch.from_numpy(rng.random(count, np.float32)), device)
         behind = m.behind(directions)
         if m.space.ndc is not None and m.background is None:

@@ -21,6 +21,7 @@ from torch import Tensor
 from efficientnerf.cameras import Camera, rays
 from efficientnerf.kernels.cuda import INTERPRETED
 from efficientnerf.kernels.cuda_march import march
+from efficientnerf.transfer import constant, sent
 
 if TYPE_CHECKING:
     from efficientnerf.nerftree.tree import NerfTree
@@ -135,8 +136,7 @@ def draw_rays(t: DeviceTree, origins: Tensor, directions: Tensor, looking: Tenso
 
     Depth is the distance along the ray, normals are of the frame; nothing waits for the device.
     """
-    low = torch.as_tensor(t.low, device=origins.device, dtype=torch.float64)
-    start = ((origins.double() - low) / t.voxel).float().contiguous()
+    start = ((origins.double() - constant(t.low, origins.double())) / t.voxel).float().contiguous()
     along = directions.float().contiguous()
     seen_from = along if looking is None else looking.float().contiguous()
     return _launch(t, len(start), (start, along, seen_from), (0.0,) * 16, (0, 0), None)
@@ -167,7 +167,7 @@ def draw(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float
         flat = _launch(t, height * width, None, tuple(float(x) for x in (*place, *lens)), (width, height), over)
     else:
         local = _lens(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
-        rotation = torch.as_tensor(camera.world_from_camera[:3, :3].T.copy(), dtype=torch.float32).to(local.device, non_blocking=True)
+        rotation = sent(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), local.device)
         place = tuple(float(x) for x in (camera.centre - t.low) / t.voxel)
         start = torch.stack([torch.full_like(local[:, 0], x) for x in place], dim=1)
         along = local @ rotation

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 ROWS = 4096  # in a chunk: 2 MiB of bfloat16 activations a layer of 256
+DEVICE_ROWS = 2**18  # on CUDA, whose caches are small and whose launches cost more than small products: nearly always all
 ROW_STEP = 256  # on the CPU, to a multiple of which the last chunk is filled with zeros: oneDNN prepares code for each new shape, which costs more than the
 # product itself, and each step of pruned sampling has another number of samples
 COLUMN_STEP = 8  # to a multiple of which widths are filled, so that rows of bfloat16 begin at whole 16 bytes: the paper's 63 inputs and 49 outputs do not
@@ -102,18 +103,19 @@ class _Chain(torch.autograd.Function):
         out = torch.empty(len(x), outputs, device=x.device)
         keep = any(ctx.needs_input_grad)
         kept: list[list[Tensor]] = []
-        for begin in range(0, len(x), ROWS):
-            part = x[begin : begin + ROWS]
+        rows = ROWS if x.device.type == "cpu" else DEVICE_ROWS
+        for begin in range(0, len(x), rows):
+            part = x[begin : begin + rows]
             first = _filled(part, _rows(part), _up(inputs, COLUMN_STEP), precision)
             given, y = [], first
             for layer in range(layers):
                 y = torch.cat([y, first], dim=1) if layer == skip else y
                 given.append(y)
                 y = product(y, weights[layer], biases[layer], relu_last or layer < layers - 1)
-            out[begin : begin + ROWS] = y[: len(part), :outputs]
+            out[begin : begin + rows] = y[: len(part), :outputs]
             if keep:
                 kept.append([*given, y] if relu_last else given)
-        ctx.kept, ctx.weights, ctx.relu_last, ctx.split = kept, weights, relu_last, split
+        ctx.kept, ctx.weights, ctx.relu_last, ctx.split, ctx.rows = kept, weights, relu_last, split, rows
         ctx.shapes = [p.shape for p in parameters]
         return out
 
@@ -127,8 +129,8 @@ class _Chain(torch.autograd.Function):
         inputs = ctx.shapes[0][1]
         x_grad = torch.empty(len(grad), inputs, device=grad.device) if ctx.needs_input_grad[0] else None
         for number, kept in enumerate(ctx.kept):
-            begin = number * ROWS
-            part = grad[begin : begin + ROWS]
+            begin = number * ctx.rows
+            part = grad[begin : begin + ctx.rows]
             g = _filled(part, len(kept[0]), len(weights[-1]), weights[0].dtype)
             if ctx.relu_last:
                 g = _through_relu(g, kept[layers])
@@ -140,7 +142,7 @@ class _Chain(torch.autograd.Function):
                     hidden = len(weights[layer - 1])  # what x adds at the skip needs no gradient
                     g = _through_relu(product(g, transposed[layer][:hidden], None, False), y[:, :hidden])
                 elif x_grad is not None:
-                    x_grad[begin : begin + ROWS] = product(g, transposed[0], None, False)[: len(part), :inputs]
+                    x_grad[begin : begin + ctx.rows] = product(g, transposed[0], None, False)[: len(part), :inputs]
         ctx.kept = None
         of_weights = [_emptied(g, shape, at) for g, shape, at in zip(weight_grads, ctx.shapes[:layers], ctx.split, strict=True)]
         return (x_grad, None, None, None, None, *of_weights, *(g[: shape[0]] for g, shape in zip(bias_grads, ctx.shapes[layers:], strict=True)))

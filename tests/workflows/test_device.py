@@ -29,6 +29,14 @@ def test_cuda_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch, devi
         device.resolve_device("cuda")
 
 
+def test_torch_has_the_last_word_where_cuda_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "cuda_device_count", lambda: 0)
+    monkeypatch.setattr(device, "torch_has_cuda", lambda: True)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    assert device.resolve_device("cuda") == "cuda"
+    assert device.resolve_device("auto") == "cpu"
+
+
 @pytest.mark.parametrize("hidden", ["", "-1"])
 def test_hidden_devices_do_not_count(monkeypatch: pytest.MonkeyPatch, hidden: str) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", hidden)

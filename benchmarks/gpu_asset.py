@@ -1,0 +1,118 @@
+"""What benchmarks/gpu.py measures of a whole asset on a made-up scene: training, baking, fitting, pictures; the method alone, without files.
+
+Sizes are arguments, so that the code can be tried without a device.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gpu_kernels import BOUNDS, ball, orbit
+
+from efficientnerf.cameras import Camera
+from efficientnerf.grid import Space
+from efficientnerf.model import Model, model
+from efficientnerf.nerftree import baking, optimising
+from efficientnerf.nerftree.optimising import Targets
+from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.pixels import Pixels
+from efficientnerf.render import FieldRenderer
+from efficientnerf.settings import TrainSettings
+from efficientnerf.training import train, trainer
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+class Clock:
+    """Seconds of one thing after the other, what the device still has to do included."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self.seconds: dict[str, float] = {}
+        self.last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        if self.device == "cuda":
+            torch.cuda.synchronize()
+        now = time.perf_counter()
+        self.seconds[name], self.last = round(now - self.last, 3), now
+
+
+def asset_rates(device: str, *, steps: int, side: int, views: int, resolution: int, pixels: int, fit_steps: int, rays: int, **settings: Any) -> dict[str, Any]:
+    """Seconds of each part, the fit's steps a second and the lines in which it waited for the device, and decibels on a view that was not trained on."""
+    cameras = orbit(side, views + 1)
+    held, scene = cameras.pop(views // 2), ball(cameras)
+    clock = Clock(device)
+    m = model(Space(BOUNDS, False), TrainSettings(iterations=steps, **settings), WHITE, device)
+    for _ in train(trainer(m), scene):
+        pass
+    clock.lap("train")
+    tree = baked(m, scene, resolution, pixels)
+    clock.lap("bake")
+    targets = Targets(scene, WHITE).to(device)
+    o = optimising.optimiser(tree, optimising.OPAQUE)
+    told: dict[str, Any] = {"steps": fit_steps, "rays": rays, "density_rate": 0.3, "colour_rate": 0.03, "final": 0.3, "seed": 0}
+    for _ in optimising.optimise(o, targets, until=fit_steps // 4, **told):
+        pass
+    clock.lap("fit_begins")
+    for _ in optimising.optimise(o, targets, until=fit_steps, **told):
+        pass
+    clock.lap("fit")
+    pace = (fit_steps - fit_steps // 4) / clock.seconds["fit"]
+    waits = waits_of(o, targets, device, {**told, "steps": fit_steps + 32, "until": fit_steps + 32})
+    clock.lap("waits")
+    weights = optimising.greatest_weights(o.result(), targets, pixels, 0)
+    clock.lap("weights")
+    errors = [optimising.error(each, targets, 2**16, 0) for each in (tree, o.result())]
+    clock.lap("errors")
+    return {
+        "seconds": clock.seconds, "voxels": len(tree.density_values), "voxels_that_show": int((weights > 1e-3).sum()),
+        "fit_steps_per_second": round(pace, 1), "fit_waits_in_32_steps": waits, "fit_on": "device" if targets.on_device else "host",
+        "training_psnr": {"baked": decibels(errors[0]), "fitted": decibels(errors[1])},
+        "held_back_psnr": held_back(m, [tree, o.result()], held, device),
+    }  # fmt: skip
+
+
+def baked(m: Model, scene: Pixels, resolution: int, pixels: int) -> NerfTree:
+    """The network's values in all voxels that it shows."""
+    shape, voxel = baking.grid_of(BOUNDS, resolution, 4)
+    seen = baking.visible_voxels(m, scene, shape, voxel, BOUNDS[0], 4, pixels, lambda done, total: None)
+    indices = baking.chosen_voxels(seen, shape, 4, 1e-3, 1)
+    parts = list(baking.voxel_values(m, indices, voxel, BOUNDS[0], 4, 0))
+    density, sh = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return tree_from_voxels(shape, voxel, BOUNDS[0], indices, density, sh, background=WHITE)
+
+
+def waits_of(o: optimising.Optimiser, targets: Targets, device: str, told: dict[str, Any]) -> dict[str, int]:
+    """Lines that waited for the device in more steps, the first left out, which waits by design."""
+    running = optimising.optimise(o, targets, **told)
+    next(running)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("warn")
+        for _ in running:
+            pass
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("default")
+    return dict(Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)))
+
+
+def held_back(m: Model, trees: list[NerfTree], camera: Camera, device: str) -> dict[str, float]:
+    rgba = ball([camera]).images.reshape(camera.height, camera.width, 4) / 255
+    truth = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
+    pictures = {"network": FieldRenderer(m, 1.5, 4.5).render(camera).colour}
+    for name, tree in zip(("baked", "fitted"), trees, strict=True):
+        pictures[name] = tree.to(device).render(camera, background=WHITE).colour
+    return {name: decibels(float(((colour - truth) ** 2).mean())) for name, colour in pictures.items()}
+
+
+def decibels(error: float) -> float:
+    return round(-10 * math.log10(max(error, 1e-10)), 2)

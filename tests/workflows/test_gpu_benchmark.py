@@ -1,0 +1,58 @@
+"""benchmarks/gpu.py as far as it goes without a device: its parts at small sizes on the CPU, and that a part that fails takes no other with it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+SMALL = {
+    "levels": 4, "log2_table": 11, "finest": 64, "hidden": 16, "layers": 1, "coarse_hidden": 16, "coarse_layers": 1, "degree": 1, "voxels": 24,
+    "coarse_samples": 16, "fine_samples": 2, "samples": 6144, "warm_up": 20, "refresh_every": 4, "learning_rate": 3e-2,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def benchmarks_on_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+def test_an_asset_is_made_without_files() -> None:
+    import gpu_asset
+
+    found = gpu_asset.asset_rates("cpu", steps=60, side=32, views=8, resolution=24, pixels=4000, fit_steps=12, rays=512, **SMALL)
+    assert found["fit_on"] == "host"
+    assert found["fit_waits_in_32_steps"] == {}
+    assert 0 < found["voxels_that_show"] < found["voxels"]
+    assert found["training_psnr"]["fitted"] > found["training_psnr"]["baked"] > 8
+    assert found["held_back_psnr"]["fitted"] > found["held_back_psnr"]["network"]
+
+
+def test_a_part_that_fails_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is a CUDA device, on which nothing fails")
+    import gpu
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "none")
+    out = tmp_path / "out.json"
+    monkeypatch.setattr(sys, "argv", ["gpu.py", "--parts", "kernels,pipeline", "--json", str(out), str(tmp_path)])
+    assert gpu.main() == 1
+    written = json.loads(out.read_text())
+    assert "CUDA" in written["kernels"]["error"]
+    assert "exit_code" in written["pipeline"] or "left_out" in written["pipeline"]
+
+
+def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import gpu
+
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in ("pycolmap", "msgspec", "pytest") else object())
+    assert gpu.run(tmp_path, tmp_path / "run", [], 5.0) == {"left_out": "not installed here: msgspec, pycolmap"}
+    (tmp_path / "transforms_train.json").touch()
+    assert gpu.run(tmp_path, tmp_path / "run", [], 5.0) == {"left_out": "not installed here: msgspec"}
+    assert gpu.measured("tests", argparse.Namespace(), 5.0) == {"left_out": "not installed here: pytest"}
