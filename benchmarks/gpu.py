@@ -28,7 +28,9 @@ ROOT = HERE.parent
 PARTS = {"tests": 200.0, "kernels": 60.0, "pictures": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0}
 TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
 TESTS = ["tests/efficientnerf", "--ignore=tests/efficientnerf/test_cuda_builds.py", "-k", "cuda or late or device or gpu"]
-PIPELINE = ["msgspec", "click", "rich", "filelock", "safetensors", "PIL", "cv2", "scipy", "skimage", "matplotlib", "OpenEXR", "av", "trimesh", "fast_simplification"]
+PIPELINE = [
+    "msgspec", "click", "rich", "filelock", "safetensors", "PIL", "cv2", "scipy", "skimage", "matplotlib", "OpenEXR", "av", "trimesh", "fast_simplification",
+]  # fmt: skip
 
 
 def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[str, Any]:
