@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from efficientnerf.compositing import sample_weights
 from efficientnerf.transfer import sent
 
 
@@ -79,6 +80,21 @@ def update(voxels: DensityVoxels, cell: Tensor, density: Tensor) -> None:
     seen, index, counts = torch.unique(cell, return_inverse=True, return_counts=True)
     mean = torch.zeros(len(seen), dtype=flat.dtype, device=flat.device).index_add_(0, index, density) / counts
     flat[seen] = (1 - voxels.beta) * flat[seen] + voxels.beta * mean
+
+
+DEEPEST = 1.0  # optical depth of an interval at most, where voxels alone say what hides what
+
+
+def voxel_weights(voxels: DensityVoxels, point: Tensor, length: Tensor, first: Tensor) -> Tensor:
+    """(N,) weights of coarse samples by the density that the voxels remember, in place of a coarse field's.
+
+    A voxel remembers the largest density anywhere in it: one that a surface grazes would hide what is behind. So no interval's optical depth counts as
+    more than `DEEPEST`, and a surface is followed through a few intervals.
+
+    point (N, 3) grid coordinates, length (N,) of the intervals, first (R + 1,) offsets of the rays
+    """
+    density = voxels.values.view(-1)[cell_of(point, voxels.side)].clamp(min=0)
+    return sample_weights((density * length).clamp(max=DEEPEST), first)
 
 
 def fade(voxels: DensityVoxels) -> None:

@@ -16,8 +16,9 @@ class TrainSettings:
 
     iterations: int = _setting(3000, "optimisation steps", minimum=1)
     budget: float = _setting(
-        0.0, "seconds to train for, in place of a number of steps: the first are timed, the number that fits is fixed and reported; 0: iterations", minimum=0.0
-    )
+        0.0, "seconds to train for, in place of a number of steps: steps are timed, the number that fits is settled on the way and reported; 0: iterations",
+        minimum=0.0,
+    )  # fmt: skip
     samples: int = _setting(65536, "network evaluations aimed at in a step; the number of rays follows from it; 0: always `rays`", minimum=0)
     rays: int = _setting(8192, "rays in a step at most", minimum=1)
     seed: int = _setting(0, "seed of every random choice", minimum=0)
@@ -61,6 +62,10 @@ class TrainSettings:
     max_pivots: int = _setting(
         8, "pivotal samples on a ray at most; the lightest are dropped, which while all is fog are those behind (the paper drops none)", minimum=1, maximum=4096
     )
+    coarse: str = _setting(
+        "field", "hash: what pivots are chosen by; field: a lighter field that gives densities alone; voxels: the density voxels, and no coarse field",
+        choices=("field", "voxels"),
+    )  # fmt: skip
     explored: float = _setting(0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0)
     distortion: float = _setting(0.01, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog", minimum=0.0)
     anchors: float = _setting(0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0)
@@ -88,6 +93,9 @@ class TrainSettings:
     final_rate: float = _setting(0.05, "what is left of the rate after rate_steps; it falls exponentially", minimum=0.0, maximum=1.0)
     rate_steps: int = _setting(0, "steps in which the rate falls to final_rate of itself (the paper: 0.1 every 500,000); 0: all of them", minimum=0)
     rate_hold: int = _setting(0, "first steps in which the rate does not fall; 0: none, or with a budget those that are timed", minimum=0)
+    rate_aims: tuple[int, ...] = _setting(
+        (), "pairs n, s: up to step s the schedule was one of n steps; a budget writes them, so that its steps can be repeated", minimum=1
+    )
     adam_beta2: float = _setting(0.99, "Adam's second decay (0.999 by default elsewhere, so for the paper)", minimum=0.0, maximum=0.99999)
     adam_epsilon: float = _setting(1e-15, "Adam's epsilon: this small because a table entry's gradient can be (1e-8 by default elsewhere)", minimum=0.0)
     crop_steps: int = _setting(

@@ -161,18 +161,25 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     t.step, t.samples_per_ray = int(state["progress"][0]), float(state["progress"][1])
 
 
-def share_of_fall(step: int, iterations: int, hold: int = 0) -> float:
-    """How much of the way from the end of the hold to the last step is gone: 0 to 1."""
-    return max(0, step - hold) / max(1, iterations - hold)
+def share_of_fall(step: int, iterations: int, hold: int = 0, aims: tuple[int, ...] = ()) -> float:
+    """How much of the way from the end of the hold to the last step is gone: 0 to 1.
+
+    aims  pairs (n, s) where the number of steps was not always known: up to step s the way was one to step n
+    """
+    share, begin = 0.0, hold
+    for aim, until in [*zip(aims[::2], aims[1::2], strict=True), (iterations, iterations)]:
+        share += (1 - share) * min(1.0, max(0, min(step, until) - begin) / max(1, aim - begin))
+        begin = max(begin, until)
+    return share
 
 
-def learning_rate(step: int, settings_rate: float, final: float, iterations: int, fall: int = 0, hold: int = 0) -> float:
+def learning_rate(step: int, settings_rate: float, final: float, iterations: int, fall: int = 0, hold: int = 0, aims: tuple[int, ...] = ()) -> float:
     """Rises over the first steps, is held up to step `hold`, then falls exponentially, to `final` of itself in every `fall` steps (0: by the last).
 
-    With a hold, the rate up to its end does not depend on the number of iterations.
+    With a hold, the rate up to its end does not depend on the number of iterations. aims: see `share_of_fall`.
     """
     rise = max(1, min(RATE_WARM_UP, hold or iterations // 10))
-    share = max(0, step - hold) / fall if fall else share_of_fall(step, iterations, hold)
+    share = max(0, step - hold) / fall if fall else share_of_fall(step, iterations, hold, aims)
     return settings_rate * min(1.0, step / rise) * final**share
 
 
@@ -181,11 +188,13 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
     m = t.model
     device = m.device
     transparent = pixels.images.shape[1] == 4
-    # On CUDA nothing waits for the device; see `efficientnerf.late`.
-    late = Late() if dispatch.on_device(m.voxels.values) and m.settings.sampling == "efficient" and m.settings.refresh_rays == 0 else None
+    # On CUDA nothing waits for the device where numbers of samples can be told ahead; see `efficientnerf.late`.
+    known_ahead = m.coarse is not None and m.settings.sampling == "efficient" and m.settings.refresh_rays == 0
+    late = Late() if dispatch.on_device(m.voxels.values) and known_ahead else None
     there = DevicePixels(pixels, device) if device.type == "cuda" else pixels
     while t.step < m.settings.iterations:
         number, settings = t.step + 1, m.settings
+        way = share_of_fall(number, settings.iterations, settings.rate_hold, settings.rate_aims)
         rng = np.random.Generator(np.random.Philox(key=settings.seed, counter=[0, 0, 0, number]))
 
         # A bundle of rays of about as many samples as the settings ask for.
@@ -218,21 +227,23 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             loss = loss + exposure_loss(t.exposure)
         if m.space.contracted or m.space.ndc is not None:
             # In normalised device coordinates it grows from nothing: at first it would gather all matter on the near plane, where cameras overlap least.
-            share = 1.0 if m.space.contracted else share_of_fall(number, settings.iterations, settings.rate_hold)
+            share = 1.0 if m.space.contracted else way
             loss = loss + share * settings.distortion * seen.distortion.mean()
             if m.space.contracted:  # in normalised device coordinates rays do not crowd together before the cameras
                 _quieten_near_cameras(m, origins, seen)
-            strength = settings.anchors * max(0.0, 1 - 2 * share_of_fall(number, settings.iterations, settings.rate_hold))
+            strength = settings.anchors * max(0.0, 1 - 2 * way)
             if anchors is not None and strength > 0:
                 loss = loss + strength * anchor_loss(m, anchors, max(1, count // ANCHOR_SHARE), rng, late, prune=number > settings.warm_up)
         loss.backward()
-        rate = learning_rate(number, settings.learning_rate, settings.final_rate, settings.iterations, settings.rate_steps, settings.rate_hold)
+        ends = (settings.iterations, settings.rate_steps, settings.rate_hold, settings.rate_aims)
+        rate = learning_rate(number, settings.learning_rate, settings.final_rate, *ends)
         t.adam.step(number, rate)
 
         # The voxels remember what the coarse field said on the rays, and are refreshed at random.
         with torch.no_grad():
             if m.prunes:
-                remember(m, seen.coarse.point, seen.coarse_raw[:, 0].detach())
+                told, raw = (seen.fine, seen.fine_raw) if m.coarse is None else (seen.coarse, seen.coarse_raw)
+                remember(m, told.point, raw[:, 0].detach())
             if m.prunes and number % settings.refresh_every == 0:
                 refresh(m, number, rng)
             # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
@@ -247,7 +258,8 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             t.samples_per_ray = max(late.valid_per_ray + late.fine_per_ray, 1.0)
         else:
             counted = Counted(float(fine_loss.detach()), seen.coarse.tried, len(seen.coarse.start), int(seen.pivotal.sum()), len(seen.fine.start))
-            t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max((counted.fine + counted.valid) / count, 1.0)
+            asked = counted.fine if m.coarse is None else counted.fine + counted.valid  # of a network
+            t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max(asked / count, 1.0)
         yield Progress(number, counted.loss, count, counted.tried, counted.valid, counted.pivotal, counted.fine)
 
 
@@ -305,10 +317,10 @@ def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
     else:
         cell, point = refresh_cells(m.voxels, int(m.settings.refresh_share * m.voxels.side**3), generator)
     for part in range(0, len(cell), 2**17):
-        remember(m, point[part : part + 2**17], m.coarse.density(m.asked(point[part : part + 2**17])), cell[part : part + 2**17])
+        remember(m, point[part : part + 2**17], m.scout.density(m.asked(point[part : part + 2**17])), cell[part : part + 2**17])
 
 
 def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None) -> None:
     """Update the density voxels with what the coarse field said, before its activation, at points in grid coordinates."""
     cell = cell_of(point, m.voxels.side) if cell is None else cell
-    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.coarse.activation))
+    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.scout.activation))

@@ -71,7 +71,13 @@ def space_of(s: Scene) -> Space:
     return Space(s.bounds, s.contracted) if s.forward is None else Space(s.forward.bounds, False, s.forward.ndc)
 
 
-def save_model(m: Model, near: float, far: float, path: Path) -> None:
+GAINS = "exposure.gains"
+
+
+def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, np.ndarray] | None = None) -> None:
+    """gains: of each training view by the name of its image, (3,) the factors from the scene's colours to the photograph's, where they were learned."""
+    import torch
+
     from efficientnerf.model import state_of
 
     about = {
@@ -83,7 +89,24 @@ def save_model(m: Model, near: float, far: float, path: Path) -> None:
         "near": near,
         "far": far,
     }
-    write_tensors(state_of(m), about, path)
+    tensors = state_of(m)
+    if gains:
+        tensors[GAINS] = torch.from_numpy(np.stack([gains[name] for name in sorted(gains)]).astype(np.float32))  # (C, 3)
+        about["exposed"] = sorted(gains)
+    write_tensors(tensors, about, path)
+
+
+def load_gains(folder: Path) -> dict[str, np.ndarray]:
+    """What `save_model` was given: the factors (3,) of each training view; none where exposure was not learned."""
+    path = folder / FILE
+    tensors, about = read_tensors(path)
+    names = about.get("exposed", [])
+    if not names and GAINS not in tensors:
+        return {}
+    if GAINS not in tensors or tuple(tensors[GAINS].shape) != (len(names), 3):
+        found = tuple(tensors[GAINS].shape) if GAINS in tensors else None
+        raise CorruptArtifact(f"{path}: '{GAINS}' is {found}; expected {(len(names), 3)}. Train again.")
+    return dict(zip(names, tensors[GAINS].numpy(), strict=True))
 
 
 def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:

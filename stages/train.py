@@ -1,6 +1,6 @@
 """The train stage: a scene in, a trained field out.
 
-    field.safetensors  both fields, the density voxels, what they mean
+    field.safetensors  both fields, the density voxels, what they mean; each photograph's exposure where it was learned
     report.json        steps and seconds, and the settings that give the same field again
     log.jsonl          a line every few steps
     curve.png          PSNR over steps
@@ -44,6 +44,7 @@ def run(job: Job) -> None:
     from stages import field, scene
 
     settings: TrainSettings = job.settings
+    _check(settings)
     use_all_cores()
     folder = job.inputs["poses"]
     s = scene.load(folder)
@@ -70,8 +71,8 @@ def run(job: Job) -> None:
     for done in training.train(t, pixels, anchors_of(folder, s)):
         working += clock() - resumed
         loss = done.loss if done.step == first + 1 else 0.95 * loss + 0.05 * done.loss
-        if budget is not None and m.settings.iterations == MOST:
-            _fix_steps(job, m, budget, done.step)
+        if budget is not None:
+            _settle_steps(job, m, budget, done.step)
         last = done.step == m.settings.iterations
         drawn = _preview(renderer, watched, folder, job, done.step, settings)
         held_back = drawn or held_back
@@ -96,16 +97,36 @@ def run(job: Job) -> None:
             raise
         resumed = clock()
     _append(log, lines)
-    field.save_model(m, near, far, job.out / field.FILE)
+    field.save_model(m, near, far, job.out / field.FILE, gains_of(t, views))
     _report(job, t, spent + clock() - started, held_back)
     _publish_log(log, job)
 
 
-def _fix_steps(job: Job, m: Model, budget: Budget, step: int) -> None:
-    """Once enough steps have been timed, settle how many there will be."""
-    if (fixed := budget.after(step)) is not None:
-        m.settings = fixed
-        job.say(f"{fixed.iterations} steps fit into the budget of {job.settings.budget:g} s")
+def _check(settings: TrainSettings) -> None:
+    """UsageError where settings contradict each other."""
+    from pipeline.errors import UsageError
+
+    if len(settings.rate_aims) % 2:
+        raise UsageError(f"train.rate_aims={list(settings.rate_aims)}: expected pairs, a number of steps and the step up to which it was aimed at.")
+    if settings.coarse == "voxels" and (settings.field, settings.sampling, settings.voxel_rule) != ("hash", "efficient", "maximum"):
+        raise UsageError("train.coarse=voxels needs train.field=hash, train.sampling=efficient and train.voxel_rule=maximum.")
+
+
+def gains_of(t: Trainer, views: tuple[View, ...]) -> dict[str, np.ndarray] | None:
+    """The factors (3,) that were learned for each training view, by the name of its image; None where none were."""
+    if t.exposure is None:
+        return None
+    from efficientnerf.exposure import log_gains
+
+    return dict(zip((view.image for view in views), np.exp(log_gains(t.exposure.detach()).cpu().numpy()), strict=True))
+
+
+def _settle_steps(job: Job, m: Model, budget: Budget, step: int) -> None:
+    """Once enough steps have been timed, settle how many there will be, and again on the way."""
+    known = m.settings.iterations
+    if (settled := budget.after(step)) is not None:
+        m.settings = settled
+        job.say(f"{settled.iterations} steps fit into the budget of {job.settings.budget:g} s" + ("" if known == MOST else f" (so far: {known})"))
 
 
 def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> None:
@@ -114,13 +135,20 @@ def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> No
     report = {
         "iterations": reached.iterations,
         "rate_hold": reached.rate_hold,
+        "rate_aims": reached.rate_aims,
         "budget": job.settings.budget,
         "seconds": round(seconds, 1),
         "held_back_psnr": held_back,
         "occupied": t.model.voxels.occupied,
-        "again": f"--set train.budget=0 --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}",
+        "again": _again(reached),
     }
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _again(reached: TrainSettings) -> str:
+    """Options that give the same field again."""
+    aims = f" --set train.rate_aims={json.dumps(reached.rate_aims, separators=(',', ':'))}" if reached.rate_aims else ""
+    return f"--set train.budget=0 --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}{aims}"
 
 
 def _range(s: Scene, pixels: Pixels, settings: TrainSettings) -> tuple[float, float]:

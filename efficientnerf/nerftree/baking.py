@@ -159,7 +159,7 @@ def _looked_into(m: Model, world: torch.Tensor) -> torch.Tensor:
     Where it says less a pivot is among the lightest of its ray and dropped before the subject, but not before the sky: the network hides what
     the fine field has there just where it would be seen, and nothing in the asset could.
     """
-    if m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
+    if m.coarse is None or m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
         return torch.ones(len(world), dtype=torch.bool)
     raw = m.coarse(m.asked(m.space.grid(world.float()).to(m.device)))[:, 0].cpu()
     return activate(raw, m.coarse.activation) > m.voxels.threshold

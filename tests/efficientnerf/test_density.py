@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.density import cell_of, density_voxels, fade, refresh_cells, sweep_cells, update
+from efficientnerf.density import DEEPEST, cell_of, density_voxels, fade, refresh_cells, sweep_cells, update, voxel_weights
 from tests import reference
 
 SIDE = 3
@@ -105,3 +107,19 @@ def test_refreshing_lets_pruned_space_return(rule: str, empty: float, full: floa
         shares.append(voxels.occupied)
     assert shares[0] == 0.0
     assert shares[1] > 0.9
+
+
+def test_weights_by_voxels_are_those_of_their_densities_up_to_a_depth() -> None:
+    voxels = density_voxels(4, "maximum", threshold=0.1)
+    voxels.values.copy_(torch.rand(4, 4, 4, generator=torch.Generator().manual_seed(0)))
+    voxels.values[0] = 1e6
+    point = torch.rand(30, 3, generator=torch.Generator().manual_seed(1))
+    length, first = torch.full((30,), 0.2), torch.tensor([0, 10, 10, 30])
+    depth = [min(float(voxels.values[tuple((p * 4).long())]) * 0.2, DEEPEST) for p in point]
+    expected = []
+    for begin, end in ((0, 10), (10, 30)):
+        light = 1.0
+        for d in depth[begin:end]:
+            expected.append(light * (1 - math.exp(-d)))
+            light *= math.exp(-d)
+    torch.testing.assert_close(voxel_weights(voxels, point, length, first), torch.tensor(expected), atol=1e-6, rtol=1e-5)

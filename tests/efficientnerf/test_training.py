@@ -205,3 +205,29 @@ def test_other_samplings_learn_too_and_only_those_that_prune_touch_the_voxels(fi
 def test_the_rate_can_fall_by_a_tenth_in_so_many_steps() -> None:
     assert learning_rate(500_000, 5e-4, 0.1, 1_000_000, 500_000) == pytest.approx(5e-5)
     assert learning_rate(1_000_000, 5e-4, 0.1, 1_000_000, 500_000) == pytest.approx(5e-6)
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_voxels_alone_can_choose_the_pivots(contracted: bool) -> None:
+    m = untrained(contracted=contracted, coarse="voxels", iterations=120)
+    made = cameras()
+    photographs = Pixels(made, [photograph(camera) for camera in made], [None] * len(made), np.full(len(made), 1.0), np.full(len(made), 50.0))
+    steps = run(m, photographs if contracted else None)
+    assert not any(name.startswith("coarse") for name, _ in m.parameters())
+    assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 2
+    for step in steps[: m.settings.warm_up]:
+        assert step.tried == step.valid == step.pivotal == step.fine  # everything, once
+    for step in steps[m.settings.warm_up :]:
+        assert step.fine == m.settings.fine_samples * step.pivotal
+    assert all(step.valid < step.tried for step in steps[-10:])  # what is empty is found
+
+
+def test_a_schedule_that_was_settled_anew_goes_on_from_where_it_stood() -> None:
+    aims = (1000, 400, 3000, 700)
+    shares = [training.share_of_fall(step, 2000, 100, aims) for step in range(2001)]
+    assert all(a <= b for a, b in itertools.pairwise(shares))
+    assert max(b - a for a, b in itertools.pairwise(shares)) < 2 / 900  # no leap
+    assert shares[:401] == [training.share_of_fall(step, 1000, 100) for step in range(401)]
+    assert shares[:701] == [training.share_of_fall(step, 3000, 100, aims[:2]) for step in range(701)]
+    assert shares[2000] == pytest.approx(1)
+    assert learning_rate(2000, 1e-2, 0.05, 2000, 0, 100, aims) == pytest.approx(5e-4)

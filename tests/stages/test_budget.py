@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from efficientnerf import training
+from efficientnerf.settings import TrainSettings
 from efficientnerf.training import Progress, Trainer
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
@@ -54,19 +55,27 @@ def report(made: Job) -> dict[str, Any]:
     return found
 
 
+def repeated(said: dict[str, Any]) -> TrainSettings:
+    """The settings of a plain run, as the report names them."""
+    return replace(settings(**QUICK), budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"], rate_aims=tuple(said["rate_aims"]))
+
+
 def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     budgeted = job(tmp_path / "a", settings(**QUICK), poses=scene)
     first = digest(budgeted)
     said = report(budgeted)
     assert said["iterations"] > QUICK["warm_up"] + TIMED  # it was long enough to be planned
     assert 0.95 * QUICK["budget"] <= said["seconds"] <= QUICK["budget"]
-    assert said["again"] == f"--set train.budget=0 --set train.iterations={said['iterations']} --set train.rate_hold={said['rate_hold']}"
-    plain = replace(settings(**QUICK), budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"])
+    assert len(said["rate_aims"]) >= 2  # settled anew on the way
+    aims = json.dumps(said["rate_aims"], separators=(",", ":"))
+    steps = f"--set train.iterations={said['iterations']} --set train.rate_hold={said['rate_hold']}"
+    assert said["again"] == f"--set train.budget=0 {steps} --set train.rate_aims={aims}"
+    plain = repeated(said)
     assert digest(job(tmp_path / "b", plain, poses=scene)) == first
     assert load_renderer(budgeted.out).model.settings == plain
 
 
-@pytest.mark.parametrize("at", [6, 60])
+@pytest.mark.parametrize("at", [6, 51, 60])
 def test_an_interrupted_run_keeps_to_its_plan(scene: Path, tmp_path: Path, at: int) -> None:
     """Stopped before and after the number of steps is fixed."""
     stop = StopAt(at)
@@ -74,13 +83,11 @@ def test_an_interrupted_run_keeps_to_its_plan(scene: Path, tmp_path: Path, at: i
         train.run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop))
     plan = tmp_path / "work" / "plan.json"
     assert plan.exists() == (at > QUICK["warm_up"] + TIMED)
-    known = json.loads(plan.read_text())["iterations"] if plan.exists() else None
     again = job(tmp_path, settings(**QUICK), poses=scene, stop=stop)
     first = digest(again)
     said = report(again)
-    assert known in (None, said["iterations"])
     assert 0.95 * QUICK["budget"] <= said["seconds"] <= QUICK["budget"]  # what was spent before counts
-    plain = replace(settings(**QUICK), budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"])
+    plain = repeated(said)
     assert digest(job(tmp_path / "plain", plain, poses=scene)) == first
 
 
@@ -103,7 +110,43 @@ def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
             break
     assert step == 10 + TIMED
     assert fixed is not None
-    assert fixed.iterations == step + int((97 - 54) / 0.5)
+    assert fixed.iterations == step + int((99 - 54) / 0.5)
     assert Budget(settings(warm_up=10, budget=100.0), tmp_path, 54.0, lambda: 0.0).planned() == fixed
     (tmp_path / "plan.json").write_text("{")
     assert Budget(settings(warm_up=10, budget=100.0), tmp_path, 54.0, lambda: 0.0).planned().iterations == MOST
+
+
+PACES: dict[str, Callable[[int], float]] = {
+    "dearer": lambda step: 0.2 + step / 2000,
+    "cheaper": lambda step: 0.5 - step / 2000,
+    "sudden": lambda step: 0.3 if step < 200 else 0.2,
+}
+
+
+@pytest.mark.parametrize("pace", PACES.values(), ids=PACES)
+@pytest.mark.parametrize("stops", [(), (40, 90, 300), (61, 62, 63)])
+def test_steps_that_change_their_pace_end_on_time(tmp_path: Path, pace: Callable[[int], float], stops: tuple[int, ...]) -> None:
+    """Also where attempts are interrupted and go on from a checkpoint ten steps before."""
+    times, step, spent, began = [0.0], 0, 0.0, 0.0
+    given = settings(warm_up=10, budget=120.0)
+    budget = Budget(given, tmp_path, 0.0, lambda: times[-1])
+    planned = budget.planned()
+    lost: dict[int, TrainSettings] = {}  # what the steps after the checkpoint were taken with
+    while step < planned.iterations:
+        if step in stops and step not in lost:
+            lost[step] = planned
+            step -= 10
+            spent, began = spent + times[-1] - began, times[-1]
+            budget = Budget(given, tmp_path, spent, lambda: times[-1])
+            planned = budget.planned()
+        before = rate(step + 1, planned)
+        times.append(times[-1] + pace(step))
+        step += 1
+        planned = budget.after(step) or planned
+        assert rate(step, planned) == pytest.approx(before, abs=1e-6)  # what is settled later changes nothing that has been done
+    assert 0.97 * 120 < spent + times[-1] - began <= 120 * 1.005
+    assert rate(step, planned) == pytest.approx(1.0)
+
+
+def rate(step: int, s: TrainSettings) -> float:
+    return training.share_of_fall(step, s.iterations, s.rate_hold, s.rate_aims)

@@ -11,7 +11,7 @@ import torch
 from efficientnerf.cameras import Camera
 from efficientnerf.model import state_of
 from pipeline.errors import CorruptArtifact
-from stages.field import FILE, load_renderer, read_tensors, save_model, write_tensors
+from stages.field import FILE, GAINS, load_gains, load_renderer, read_tensors, save_model, write_tensors
 from tests.efficientnerf.balls import pose, untrained
 
 CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3))
@@ -83,3 +83,20 @@ def test_tensors_that_do_not_fit_are_named(tmp_path: Path) -> None:
     write_tensors(tensors, {**about, "settings": {"iterations": "many"}}, path)
     with pytest.raises(CorruptArtifact, match="iterations"):
         load_renderer(tmp_path)
+
+
+def test_exposures_lie_beside_the_field(tmp_path: Path) -> None:
+    m = untrained(contracted=True)
+    given = {"images/b.png": np.array([1.1, 1.0, 0.9]), "images/a.png": np.array([0.9, 1.0, 1.1])}
+    save_model(m, 0.5, 20.0, tmp_path / FILE, given)
+    found = load_gains(tmp_path)
+    assert found.keys() == given.keys()
+    for name, gain in given.items():
+        np.testing.assert_allclose(found[name], gain, rtol=1e-6)
+    assert load_renderer(tmp_path).model.background is None
+    tensors, about = read_tensors(tmp_path / FILE)
+    write_tensors({name: t for name, t in tensors.items() if name != GAINS}, about, tmp_path / FILE)
+    with pytest.raises(CorruptArtifact, match=r"exposure\.gains' is None; expected \(2, 3\)"):
+        load_gains(tmp_path)
+    save_model(m, 0.5, 20.0, tmp_path / FILE)
+    assert load_gains(tmp_path) == {}

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import Interrupted
+from pipeline.errors import Interrupted, UsageError
 from pipeline.stage import Job
 from stages import scene as scenes
 from stages import train
 from stages.capture import SparsePoints
-from stages.field import FILE, load_renderer
+from stages.field import FILE, load_gains, load_renderer
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -178,3 +178,26 @@ def test_points_in_a_camera_or_behind_it_are_no_anchors(tmp_path: Path) -> None:
     assert rays(points)[0] == sorted(before)
     only = SparsePoints(np.repeat(cameras[0].centre[None], 1, axis=0), points.rgb[:1], points.error[:1], ((0, 0, 0),))
     assert rays(only) == ([], None)
+
+
+def test_exposures_are_saved(tmp_path: Path) -> None:
+    scene = poses(tmp_path / "poses", photographs=True)
+    made = job(tmp_path / "a", settings(exposure="gain", iterations=6, preview_every=0), poses=scene)
+    train.run(made)
+    gains = load_gains(made.out)
+    assert len(gains) == 7  # of the training views alone
+    assert all((scene / name).exists() for name in gains)
+    assert np.log(np.stack(list(gains.values()))).mean(axis=0) == pytest.approx(0, abs=1e-6)
+    assert any(np.abs(gain - 1).max() > 1e-6 for gain in gains.values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"rate_aims": (30,)}, r"train\.rate_aims=\[30\]: expected pairs"),
+        ({"coarse": "voxels", "field": "mlp"}, r"train\.coarse=voxels needs train\.field=hash"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_told(scene: Path, tmp_path: Path, changes: dict[str, object], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        train.run(job(tmp_path, settings(**changes), poses=scene))
