@@ -127,7 +127,7 @@ def valid_count(m: Model, seen: Look) -> int:
         return len(seen.coarse.start)
     density = seen.coarse_raw[:, 0]
     if m.voxels.rule == "maximum":
-        density = activate(density, m.coarse.activation)
+        density = activate(density, m.scout.activation)
     return int((density > m.voxels.threshold).sum())
 
 
