@@ -98,8 +98,8 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
 
     work = np.concatenate([picture_work(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
     cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
-    # A cell is 4 bytes; a tested sample reads one density, an interpolated one seven more; a colour reads eight neighbours, indices and harmonics.
-    asked = 4 * cells + 4 * tested + 28 * mixed + 8 * (8 + tree.packed.colour_bytes) * colours
+    # A cell is 4 bytes; a tested sample reads one density; an interpolated one the four numbers of eight voxels, colours among them.
+    asked = 4 * cells + 4 * tested + 8 * 16 * mixed
     return {
         "cells_per_ray": round(cells, 3),
         "samples_per_ray": round(tested, 3),
@@ -108,6 +108,19 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
         "bytes_per_ray": round(asked, 1),
         "rays_that_hit": round(float((work[:, 3] > 0).mean()), 4),
     }
+
+
+def memory(tree: Any, view: Any) -> dict[str, float]:
+    """Bytes of all that lies in memory while a picture is drawn: the tree, what is packed of it, the threads' blocks, and the picture."""
+    from efficientnerf.kernels.cpu_tree import pool_bytes
+
+    values = vars(tree) | vars(tree.harmonics) if hasattr(tree.harmonics, "__dict__") else vars(tree)
+    own = sum(part.nbytes for part in values.values() if hasattr(part, "nbytes") and not isinstance(part, tuple))
+    picture = tree.render(view)
+    drawn = sum(part.nbytes for part in vars(picture).values())
+    total = own + tree.packed.nbytes + pool_bytes(tree) + drawn
+    each = round(total / max(1, len(tree.density_values)), 1)
+    return {"tree": own, "packed": tree.packed.nbytes, "blocks": pool_bytes(tree), "picture": drawn, "total": total, "bytes_per_voxel": each}
 
 
 def main() -> int:
@@ -148,7 +161,7 @@ def main() -> int:
         "picture": {"width": given.width, "height": given.height, "supersample": given.supersample, "frames": given.frames},
         "speed": measure(tree, views, given.supersample),
         "work": counts(tree, views),
-        "packed_bytes": tree.packed.nbytes,
+        "memory": memory(tree, views[0]),
         "machine": {
             "processor": processor(),
             "cores": os.cpu_count(),

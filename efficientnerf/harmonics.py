@@ -101,3 +101,8 @@ def basis_numpy(directions: np.ndarray, degree: int) -> np.ndarray:
     """`basis` for arrays: (R, 3) to (R, K), same dtype."""
     harmonics_count(degree)
     return np.stack(_terms(directions[..., 0], directions[..., 1], directions[..., 2], degree), axis=-1)
+
+
+def squared_slopes(degree: int) -> np.ndarray:
+    """(K,) mean over the sphere of the square of what Y_k changes per radian that a direction moves, for moves to any side: l (l + 1) / (8 pi)."""
+    return np.array([band * (band + 1) / (8 * np.pi) for band in range(degree + 1) for _ in range(2 * band + 1)])

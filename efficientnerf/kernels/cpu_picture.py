@@ -6,16 +6,20 @@ first might meet something, and a tile that meets nothing is finished. That skip
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
+from efficientnerf.kernels.cpu_blocks import Pool, grid_of
 from efficientnerf.kernels.cpu_march import STEP, march, normal_into
+from efficientnerf.kernels.lanes import pointer
 
 TILE = 8  # rays along each side of a tile
+RUNS = 8  # of neighbouring tiles that a thread takes
 LEAST_ADVANCE = 0.5  # voxels: a cone that advances by less has arrived
 MOST_ADVANCES = 64
+PINHOLE, SIGHTS, FREE = 0, 1, 2
 
 
 class Shot(NamedTuple):
@@ -41,6 +45,40 @@ class Shot(NamedTuple):
     starts: np.ndarray
     alongs: np.ndarray
     looking: np.ndarray
+
+
+class Rays(NamedTuple):
+    """A Shot whose arrays are pointers; `kind` is PINHOLE, SIGHTS or FREE, `looks` whether `looking` is there."""
+
+    kind: int
+    width: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    pitch: float
+    first: int
+    turn: Any
+    x: float
+    y: float
+    z: float
+    sights: Any
+    starts: Any
+    alongs: Any
+    looks: bool
+    looking: Any
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def rays_of(shot):  # type: ignore[no-untyped-def]
+    """The arrays of a Shot as pointers."""
+    kind = FREE if len(shot.starts) > 0 else SIGHTS if len(shot.sights) > 0 else PINHOLE
+    width = shot.starts.shape[1] if kind == FREE else shot.sights.shape[1]
+    lens, centre = shot.lens, shot.centre
+    return Rays(
+        kind, width, lens[0], lens[1], lens[2], lens[3], shot.pitch, shot.first, pointer(shot.turn), centre[0], centre[1], centre[2],
+        pointer(shot.sights), pointer(shot.starts), pointer(shot.alongs), len(shot.looking) > 0, pointer(shot.looking),
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -69,14 +107,15 @@ def _entry(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _free(x, y, z, brick, cell):  # type: ignore[no-untyped-def]
+def _free(x, y, z, grid):  # type: ignore[no-untyped-def]
     """Radius of a ball round a point, voxel coordinates, that touches no occupied cell."""
-    nx, ny, nz = cell.shape[0] * brick, cell.shape[1] * brick, cell.shape[2] * brick
+    brick = grid.brick
+    nx, ny, nz = grid.nx * brick, grid.ny * brick, grid.nz * brick
     # What lies in the box is no nearer to the point than to the point's nearest in the box.
     qx, qy, qz = min(max(x, 0.0), nx), min(max(y, 0.0), ny), min(max(z, 0.0), nz)
     away = (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2
-    a, e, c = min(int(qx) // brick, cell.shape[0] - 1), min(int(qy) // brick, cell.shape[1] - 1), min(int(qz) // brick, cell.shape[2] - 1)
-    leap = -1 - cell[a, e, c]
+    a, e, c = min(int(qx) // brick, grid.nx - 1), min(int(qy) // brick, grid.ny - 1), min(int(qz) // brick, grid.nz - 1)
+    leap = -1 - grid.cell[(a * grid.ny + e) * grid.nz + c]
     inner = 0.0
     if leap > 0:
         ux, uy, uz = qx - a * brick, qy - e * brick, qz - c * brick
@@ -85,19 +124,19 @@ def _free(x, y, z, brick, cell):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _clear_until(ox, oy, oz, dx, dy, dz, spread, widening, brick, cell):  # type: ignore[no-untyped-def]
+def _clear_until(ox, oy, oz, dx, dy, dz, spread, widening, grid):  # type: ignore[no-untyped-def]
     """The parameter up to which rays see nothing; infinity where they never do.
 
     o, d      a ray, voxel coordinates
     spread    how far the other rays' origins lie from o at most
     widening  how far their directions lie from d at most
     """
-    nx, ny, nz = cell.shape[0] * brick / 2, cell.shape[1] * brick / 2, cell.shape[2] * brick / 2
+    nx, ny, nz = grid.nx * grid.brick / 2, grid.ny * grid.brick / 2, grid.nz * grid.brick / 2
     beyond = np.sqrt((ox - nx) ** 2 + (oy - ny) ** 2 + (oz - nz) ** 2) + np.sqrt(nx * nx + ny * ny + nz * nz) + 2 * spread
     t = 0.0
     for _ in range(MOST_ADVANCES):
         # At t + a a ray is no farther than spread + (t + a) * widening + a from the point here.
-        advance = (_free(ox + t * dx, oy + t * dy, oz + t * dz, brick, cell) - spread - t * widening) / (1 + widening)
+        advance = (_free(ox + t * dx, oy + t * dy, oz + t * dz, grid) - spread - t * widening) / (1 + widening)
         if not advance > LEAST_ADVANCE:
             return t
         t += advance
@@ -108,140 +147,164 @@ def _clear_until(ox, oy, oz, dx, dy, dz, spread, widening, brick, cell):  # type
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _turned(turn, x, y, z):  # type: ignore[no-untyped-def]
-    return (
-        turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
-        turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,
-        turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z,
-    )
+    return turn[0] * x + turn[1] * y + turn[2] * z, turn[3] * x + turn[4] * y + turn[5] * z, turn[6] * x + turn[7] * y + turn[8] * z
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _sight(x, y, lens, turn):  # type: ignore[no-untyped-def]
+def _sight(x, y, rays):  # type: ignore[no-untyped-def]
     """Unit direction that the position (x, y) in the picture sees, and its part along the view axis."""
-    u, v = (x - lens[2]) / lens[0], (y - lens[3]) / lens[1]
+    u, v = (x - rays.cx) / rays.fx, (y - rays.cy) / rays.fy
     slant = 1 / np.sqrt(u * u + v * v + 1)
-    dx, dy, dz = _turned(turn, u * slant, v * slant, slant)
+    dx, dy, dz = _turned(rays.turn, u * slant, v * slant, slant)
     return dx, dy, dz, slant
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile_of_pinhole(top, low, left, right, pitch, lens, turn, centre, brick, cell):  # type: ignore[no-untyped-def]
+def _tile_of_pinhole(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
     """`_clear_until` of the rays of some rows and columns: those in the corners lie farthest from the middle."""
-    ax, ay, az, _ = _sight((left + right) / 2 * pitch, (top + low) / 2 * pitch, lens, turn)
+    ax, ay, az, _ = _sight((left + right) / 2 * rays.pitch, (top + low) / 2 * rays.pitch, rays)
     most = 0.0
     for n in range(4):
         row, column = top if n & 1 else low, left if n & 2 else right
-        dx, dy, dz, _ = _sight(column * pitch, row * pitch, lens, turn)
+        dx, dy, dz, _ = _sight(column * rays.pitch, row * rays.pitch, rays)
         most = max(most, (dx - ax) ** 2 + (dy - ay) ** 2 + (dz - az) ** 2)
-    return _clear_until(centre[0], centre[1], centre[2], ax, ay, az, 0.0, np.sqrt(most), brick, cell)
+    return _clear_until(rays.x, rays.y, rays.z, ax, ay, az, 0.0, np.sqrt(most), grid)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile_of_sights(top, low, left, right, sights, turn, centre, brick, cell):  # type: ignore[no-untyped-def]
+def _tile_of_sights(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
     """The same of directions in the camera's frame."""
-    m = sights[(top + low) // 2, (left + right) // 2]
+    sights = rays.sights
+    m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
     most = 0.0
     for row in range(top, low):
         for column in range(left, right):
-            s = sights[row, column]
-            most = max(most, (s[0] - m[0]) ** 2 + (s[1] - m[1]) ** 2 + (s[2] - m[2]) ** 2)
-    ax, ay, az = _turned(turn, m[0], m[1], m[2])
-    return _clear_until(centre[0], centre[1], centre[2], ax, ay, az, 0.0, np.sqrt(most), brick, cell)
+            s = 3 * (row * rays.width + column)
+            most = max(most, (sights[s] - sights[m]) ** 2 + (sights[s + 1] - sights[m + 1]) ** 2 + (sights[s + 2] - sights[m + 2]) ** 2)
+    ax, ay, az = _turned(rays.turn, sights[m], sights[m + 1], sights[m + 2])
+    return _clear_until(rays.x, rays.y, rays.z, ax, ay, az, 0.0, np.sqrt(most), grid)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile_of_rays(top, low, left, right, starts, alongs, brick, cell):  # type: ignore[no-untyped-def]
+def _tile_of_rays(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
     """The same of rays as they come."""
-    o, d = starts[(top + low) // 2, (left + right) // 2], alongs[(top + low) // 2, (left + right) // 2]
+    o, d = rays.starts, rays.alongs
+    m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
     spread = widening = 0.0
     for row in range(top, low):
         for column in range(left, right):
-            s, a = starts[row, column], alongs[row, column]
-            spread = max(spread, (s[0] - o[0]) ** 2 + (s[1] - o[1]) ** 2 + (s[2] - o[2]) ** 2)
-            widening = max(widening, (a[0] - d[0]) ** 2 + (a[1] - d[1]) ** 2 + (a[2] - d[2]) ** 2)
-    return _clear_until(o[0], o[1], o[2], d[0], d[1], d[2], np.sqrt(spread), np.sqrt(widening), brick, cell)
+            s = 3 * (row * rays.width + column)
+            spread = max(spread, (o[s] - o[m]) ** 2 + (o[s + 1] - o[m + 1]) ** 2 + (o[s + 2] - o[m + 2]) ** 2)
+            widening = max(widening, (d[s] - d[m]) ** 2 + (d[s + 1] - d[m + 1]) ** 2 + (d[s + 2] - d[m + 2]) ** 2)
+    return _clear_until(o[m], o[m + 1], o[m + 2], d[m], d[m + 1], d[m + 2], np.sqrt(spread), np.sqrt(widening), grid)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile(top, low, left, right, shot, brick, cell):  # type: ignore[no-untyped-def]
+def _tile(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
     """The parameter up to which the rays of some rows and columns see nothing."""
-    if len(shot.starts) > 0:
-        return _tile_of_rays(top, low, left, right, shot.starts, shot.alongs, brick, cell)
-    if len(shot.sights) > 0:
-        return _tile_of_sights(top, low, left, right, shot.sights, shot.turn, shot.centre, brick, cell)
-    rows, columns = (shot.first + top + 0.5, shot.first + low - 0.5), (left + 0.5, right - 0.5)
-    return _tile_of_pinhole(rows[0], rows[1], columns[0], columns[1], shot.pitch, shot.lens, shot.turn, shot.centre, brick, cell)
+    if rays.kind == FREE:
+        return _tile_of_rays(top, low, left, right, rays, grid)
+    if rays.kind == SIGHTS:
+        return _tile_of_sights(top, low, left, right, rays, grid)
+    return _tile_of_pinhole(rays.first + top + 0.5, rays.first + low - 0.5, left + 0.5, right - 0.5, rays, grid)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _ray(row, column, shot):  # type: ignore[no-untyped-def]
+def _ray(row, column, rays):  # type: ignore[no-untyped-def]
     """Origin, direction, and how far along the view axis a step along the ray leads."""
-    if len(shot.starts) > 0:
-        o, d = shot.starts[row, column], shot.alongs[row, column]
-        return o[0], o[1], o[2], d[0], d[1], d[2], 1.0
-    if len(shot.sights) > 0:
-        s = shot.sights[row, column]
-        dx, dy, dz = _turned(shot.turn, s[0], s[1], s[2])
-        return shot.centre[0], shot.centre[1], shot.centre[2], dx, dy, dz, np.float64(s[2])
-    dx, dy, dz, slant = _sight((column + 0.5) * shot.pitch, (shot.first + row + 0.5) * shot.pitch, shot.lens, shot.turn)
-    return shot.centre[0], shot.centre[1], shot.centre[2], dx, dy, dz, slant
+    p = 3 * (row * rays.width + column)
+    if rays.kind == FREE:
+        o, d = rays.starts, rays.alongs
+        return o[p], o[p + 1], o[p + 2], d[p], d[p + 1], d[p + 2], 1.0
+    if rays.kind == SIGHTS:
+        dx, dy, dz = _turned(rays.turn, rays.sights[p], rays.sights[p + 1], rays.sights[p + 2])
+        return rays.x, rays.y, rays.z, dx, dy, dz, np.float64(rays.sights[p + 2])
+    dx, dy, dz, slant = _sight((column + 0.5) * rays.pitch, (rays.first + row + 0.5) * rays.pitch, rays)
+    return rays.x, rays.y, rays.z, dx, dy, dz, slant
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _seen(row, column, clear, shot, grid, view, pool, basis, seen, normal):  # type: ignore[no-untyped-def]
+    """What one ray sees, which meets nothing until `clear`, into seen (9,), see `march`, but the depth is from the origin; and its normal into (3,)."""
+    ox, oy, oz, dx, dy, dz, slant = _ray(row, column, shot)
+    lx, ly, lz = np.float32(dx), np.float32(dy), np.float32(dz)
+    if shot.looks:
+        p = 3 * (row * shot.width + column)
+        lx, ly, lz = shot.looking[p], shot.looking[p + 1], shot.looking[p + 2]
+    t0, t1 = _entry(ox, oy, oz, dx, dy, dz, grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick)
+    last = int(np.ceil((t1 - t0) / STEP - 0.5)) if t1 > t0 else 0
+    begin = int(min(max((clear - t0) / STEP - 0.5, 0.0), last))
+    ex, ey, ez = np.float32(ox + t0 * dx), np.float32(oy + t0 * dy), np.float32(oz + t0 * dz)
+    ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
+    march(ex, ey, ez, ax, ay, az, begin, last, grid, view, lx, ly, lz, basis, pool, seen)
+    hit = seen[4]
+    seen[4] = (t0 + hit) * slant
+    if hit < np.inf:
+        normal_into(ex + hit * ax, ey + hit * ay, ez + hit * az, grid, view, pool, normal)
+    else:
+        normal[0] = normal[1] = normal[2] = np.float32(0)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def trace(shot, behind, brick, grid, degree, units, tile, threads, colour, opacity, depth, normal, work):  # type: ignore[no-untyped-def]
-    """What rays in rows and columns see, into colour (H, W, 3), opacity (H, W), depth (H, W), normal (H, W, 3) or (0, 0, 3) where none is wanted.
+def trace(shot, behind, packed, brick, view, units, tile, threads, capacity, colour, opacity, depth, normal, work):  # type: ignore[no-untyped-def]
+    """What rays in rows and columns see.
 
-    behind  (3,) float32 colour to composite over
-    units   world units per voxel
-    tile    (rows, columns) of a tile
-    work    (H, W, 4) int32, or (0, 0, 4) where it is of no interest: cells looked at, samples tested, samples interpolated, colours looked up
-
-    Depth is along the view axis for a camera and along the ray for rays as they come, world units.
+    behind    (3,) float32 colour to composite over
+    packed    see `packed_tree`
+    view      see `cpu_blocks`
+    units     world units per voxel
+    tile      (rows, columns) of a tile
+    capacity  blocks in a thread's pool
+    colour    (H, W, 3) float32
+    opacity   (H, W) float32
+    depth     (H, W) float32, world units: along the view axis for a camera and along the ray for rays as they come
+    normal    (H, W, 3) float32, or (0, 0, 3) where none is wanted
+    work      (H, W, 4) int32, or (0, 0, 4) where it is of no interest: cells looked at, samples tested, samples interpolated, colours looked up
     """
-    nx, ny, nz = grid.cell.shape[0] * brick, grid.cell.shape[1] * brick, grid.cell.shape[2] * brick
+    # What is written to an array taken out of a tuple numba would think of no use, and leave out.
     height, width = opacity.shape
-    strips = (height + tile[0] - 1) // tile[0]
-    share = (strips + threads - 1) // threads
-    for part in numba.prange(share * threads):
-        # A thread gets a run of parts: every so many-th strip of the picture, for strips of the sky cost next to nothing.
-        top = (part % share * threads + part // share) * tile[0]
-        low = min(top + tile[0], height)
-        basis = np.zeros((3, grid.sh.shape[1]), np.float32)
-        look, out = np.empty(3, np.float32), np.empty(9, np.float32)
-        for left in range(0, width if top < height else 0, tile[1]):
-            right = min(left + tile[1], width)
-            clear = _tile(top, low, left, right, shot, brick, grid.cell)
+    across = (width + tile[1] - 1) // tile[1]
+    tiles = (height + tile[0] - 1) // tile[0] * across
+    # Each thread takes runs of tiles from all over the picture, for tiles of the sky cost next to nothing; neighbours meet the same bricks.
+    run = max(1, tiles // (threads * RUNS))
+    bricks, size = len(packed.place), 4 * (brick + 2) ** 3
+    blocks = max(1, min(bricks, capacity))
+    slot, owner = np.full((threads, bricks), -1, np.int32), np.full((threads, blocks), -1, np.int32)
+    kind, following = np.zeros((threads, blocks), np.uint8), np.zeros((threads, 1), np.int64)
+    values, room = np.empty((threads, blocks * size), np.float32), np.zeros((threads, 128), np.float32)
+    words = values.view(np.int32)
+    for worker in numba.prange(threads):
+        pool = Pool(
+            size, blocks, pointer(slot[worker]), pointer(owner[worker]), pointer(kind[worker]), pointer(following[worker]), pointer(values[worker]),
+            pointer(words[worker]), pointer(room[worker, :32]),
+        )
+        grid, rays = grid_of(packed, brick), rays_of(shot)
+        basis, seen, face = pointer(room[worker, 32:64]), pointer(room[worker, 64:96]), pointer(room[worker, 96:])
+        for n in range((tiles + threads - 1) // threads + run):
+            number = (n // run * threads + worker) * run + n % run
+            if number >= tiles:
+                continue
+            top, left = number // across * tile[0], number % across * tile[1]
+            low, right = min(top + tile[0], height), min(left + tile[1], width)
+            clear = _tile(top, low, left, right, rays, grid)
             for row in range(top, low):
                 for column in range(left, right):
                     if clear == np.inf:
-                        colour[row, column, 0], colour[row, column, 1], colour[row, column, 2] = behind[0], behind[1], behind[2]
-                        opacity[row, column], depth[row, column] = np.float32(0), np.float32(np.inf)
-                        if len(normal) > 0:
-                            normal[row, column, 0] = normal[row, column, 1] = normal[row, column, 2] = np.float32(0)
-                        continue
-                    ox, oy, oz, dx, dy, dz, slant = _ray(row, column, shot)
-                    look[0], look[1], look[2] = dx, dy, dz
-                    if len(shot.looking) > 0:
-                        look[0], look[1], look[2] = shot.looking[row, column, 0], shot.looking[row, column, 1], shot.looking[row, column, 2]
-                    t0, t1 = _entry(ox, oy, oz, dx, dy, dz, nx, ny, nz)
-                    last = int(np.ceil((t1 - t0) / STEP - 0.5)) if t1 > t0 else 0
-                    begin = int(min(max((clear - t0) / STEP - 0.5, 0.0), last))
-                    ex, ey, ez = np.float32(ox + t0 * dx), np.float32(oy + t0 * dy), np.float32(oz + t0 * dz)
-                    ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
-                    march(ex, ey, ez, ax, ay, az, begin, last, np.float32(STEP * units), brick, grid, look, degree, basis, out)
-                    through = np.float32(1) - out[3]
+                        for m in range(9):
+                            seen[m] = np.float32(0)
+                        seen[4] = np.float32(np.inf)
+                        face[0] = face[1] = face[2] = np.float32(0)
+                    else:
+                        _seen(row, column, clear, rays, grid, view, pool, basis, seen, face)
+                    through = np.float32(1) - seen[3]
                     for c in range(3):
-                        colour[row, column, c] = out[c] + through * behind[c]
-                    opacity[row, column] = out[3]
-                    depth[row, column] = (t0 + out[4]) * slant * units
+                        colour[row, column, c] = seen[c] + through * behind[c]
+                        if len(normal) > 0:
+                            normal[row, column, c] = face[c]
+                    opacity[row, column], depth[row, column] = seen[3], seen[4] * units
                     if len(work) > 0:
-                        for n in range(4):
-                            work[row, column, n] = out[5 + n]
-                    if len(normal) > 0:
-                        if out[4] < np.inf:
-                            normal_into(ex + out[4] * ax, ey + out[4] * ay, ez + out[4] * az, brick, grid.cell, grid.density, normal[row, column])
-                        else:
-                            normal[row, column, 0] = normal[row, column, 1] = normal[row, column, 2] = np.float32(0)
+                        for m in range(4):
+                            work[row, column, m] = seen[5 + m]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

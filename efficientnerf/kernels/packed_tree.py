@@ -1,14 +1,9 @@
-"""A tree laid out for the marching kernel, made once from whatever the tree keeps in memory.
+"""What the marching kernel reads of a tree, beside the arrays of the tree itself: made once, a few bytes a voxel.
 
-Marching reads densities far more often than anything else, at points whose eight voxels lie in up to eight bricks. So every brick gets a block
-of its own densities and of the one layer around them, (b + 2)^3 values side by side: no lookup leaves the block. Where all eight voxels of
-an interpolation are zero the density at its low corner is -0.0, which adds up as zero does and says that the other seven need not be read.
+A brick near which nothing absorbs light is empty to the kernel, as a coarse cell without one is. Blocks of the others, in which a march finds all that
+it interpolates side by side, are laid out while a picture is drawn, where its rays come by: see `efficientnerf.kernels.cpu_blocks`.
 
-A second block says where the harmonics of the same voxels lie. Floats become 16-bit whole numbers with a scale to each
-voxel, one cache line to a voxel at degree 2. So do codes into palettes in a tree of moderate size; in a large one they are read as the tree keeps
-them, which takes about twice as long and a fifth of the memory: a table says which bricks lie around a brick, and there is no second block.
-
-B bricks, N stored voxels, K harmonics, G groups of a palette; b = brick.
+B bricks, N stored voxels, K harmonics, P entries of a palette; b = brick.
 """
 
 from __future__ import annotations
@@ -21,128 +16,97 @@ import numpy as np
 if TYPE_CHECKING:
     from efficientnerf.nerftree.tree import NerfTree
 
-LANES = 16  # coefficients are padded to multiples of it: what the widest vectors hold
-LEVELS = 32767
-DECODED = 2**18  # voxels whose harmonics are floats at a time
-ROWS_LIMIT = 128 * 2**20  # bytes: palettes are decoded into rows, which are read faster, where those take no more
+SOME = 2**16  # voxels that stand for all
 
 
 class Packed(NamedTuple):
-    """See the module. The harmonics are either in `sh` and `scale` or in the four arrays after them; the others are empty.
+    """See the module. The harmonics are either in `sh` or in the four arrays after it; the others are empty.
 
-    cell     (X, Y, Z) int32: the brick of a coarse cell, or -1 - leap where it is empty
-    density  (B, (b + 2)^3) float32, per world unit; local voxel (i, j, k) is voxel (i - 1, j - 1, k - 1) of the brick
-    around   (B, 27) int32: the bricks at (-1, -1, -1), (-1, -1, 0), ... (1, 1, 1) of a brick, -1 where the cell there is empty
-    voxel    (B, (b + 2)^3) int32: which row of sh, N where nothing is stored; with codes the tree's own `voxel_index`
-    sh       (N + 1, P) int16: coefficient k of channel c at 3 k + c, padded with zeros; the last row is zeros
-    scale    (N + 1,) float32: coefficient = sh * scale
-    base, base_table, codes, palette  as in PaletteHarmonics: the tree's own
-    column   (K - 1,) int64: which of a voxel's codes each harmonic above the base goes by
+    cell      (X, Y, Z) int32: the brick of a coarse cell, or -1 - leap where there is none, or nothing that absorbs light
+    place     (B, 3) int32: the coarse cell of a brick
+    brick_index, voxel_index, density  the tree's own
+    sh        (N, K, 3) float32: the tree's own
+    base, base_table, codes  as in PaletteHarmonics: the tree's own
+    palette   (K - 1, P, 4) float32: the tree's, with a zero before red
+    column    (K - 1,) int64: which of a voxel's codes each harmonic above the base goes by
+    slope     how much colours turn: mean over voxels of what their harmonics' sums change, at most of the three channels, per radian that a direction
+              moves, root mean square over all directions
     """
 
     cell: np.ndarray
+    place: np.ndarray
+    brick_index: np.ndarray
+    voxel_index: np.ndarray
     density: np.ndarray
-    around: np.ndarray
-    voxel: np.ndarray
     sh: np.ndarray
-    scale: np.ndarray
     base: np.ndarray
     base_table: np.ndarray
     codes: np.ndarray
     palette: np.ndarray
     column: np.ndarray
+    slope: float
 
     @property
     def nbytes(self) -> int:
         """Of the arrays that are not the tree's own."""
-        own = (self.cell, self.density, self.around, self.sh, self.scale)
-        return sum(part.nbytes for part in own) + (0 if len(self.codes) else self.voxel.nbytes)
-
-    @property
-    def colour_bytes(self) -> int:
-        """What a voxel's harmonics take."""
-        return 3 + self.codes.shape[1] * self.codes.itemsize if len(self.codes) else self.sh.shape[1] * self.sh.itemsize + self.scale.itemsize
-
-
-def padded_coefficients(degree: int) -> int:
-    """P of a degree: coefficients of a voxel, padded."""
-    return -(-3 * (degree + 1) ** 2 // LANES) * LANES
+        return self.cell.nbytes + self.place.nbytes + self.palette.nbytes
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _fill(cells, brick, brick_index, voxel_index, values, density, around, voxel):  # type: ignore[no-untyped-def]
-    """Blocks and neighbours of the bricks; cells (B, 3) says where each brick lies; voxel may be empty."""
-    side = brick + 2
-    for owner in numba.prange(len(cells)):
+def _absorbing(place, brick, brick_index, voxel_index, values, out):  # type: ignore[no-untyped-def]
+    """Whether a brick's voxels, or those in the one layer around them, absorb any light, into `out`."""
+    for owner in numba.prange(len(place)):
+        found = False
         for n in range(27):
-            a, e, c = cells[owner, 0] + n // 9 - 1, cells[owner, 1] + n // 3 % 3 - 1, cells[owner, 2] + n % 3 - 1
-            inside = 0 <= a < brick_index.shape[0] and 0 <= e < brick_index.shape[1] and 0 <= c < brick_index.shape[2]
-            around[owner, n] = brick_index[a, e, c] if inside else -1
-        for i in range(side):
-            for j in range(side):
-                for k in range(side):
-                    # The neighbour and the voxel of it: 0, 1 or 2 along each axis.
-                    p, q, r = (i + brick - 1) // brick, (j + brick - 1) // brick, (k + brick - 1) // brick
-                    there = around[owner, (p * 3 + q) * 3 + r]
-                    value, index = np.float32(0), np.int32(-1)
-                    if there >= 0:
-                        x, y, z = i - 1 - (p - 1) * brick, j - 1 - (q - 1) * brick, k - 1 - (r - 1) * brick
-                        index = voxel_index[there, (x * brick + y) * brick + z]
-                        value = values[index] if index >= 0 else value
-                    density[owner, (i * side + j) * side + k] = value
-                    if len(voxel) > 0:
-                        voxel[owner, (i * side + j) * side + k] = index if index >= 0 else len(values)
-        for i in range(side - 1):
-            for j in range(side - 1):
-                for k in range(side - 1):
-                    at = (i * side + j) * side + k
-                    idle = True
-                    for n in range(8):
-                        if density[owner, at + (n >> 2) * side * side + ((n >> 1) & 1) * side + (n & 1)] > 0:
-                            idle = False
-                    if idle:
-                        density[owner, at] = np.float32(-0.0)
+            p, q, r = n // 9, n // 3 % 3, n % 3
+            a, e, c = place[owner, 0] + p - 1, place[owner, 1] + q - 1, place[owner, 2] + r - 1
+            if found or not (0 <= a < brick_index.shape[0] and 0 <= e < brick_index.shape[1] and 0 <= c < brick_index.shape[2]):
+                continue
+            there = brick_index[a, e, c]
+            if there < 0:
+                continue
+            # Of a neighbour only the layer that faces the brick.
+            for x in range(brick - 1 if p == 0 else 0, 1 if p == 2 else brick):
+                for y in range(brick - 1 if q == 0 else 0, 1 if q == 2 else brick):
+                    for z in range(brick - 1 if r == 0 else 0, 1 if r == 2 else brick):
+                        voxel = voxel_index[there, (x * brick + y) * brick + z]
+                        found = found or (voxel >= 0 and values[voxel] > 0)
+        out[owner] = found
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def _quantise(values, sh, scale):  # type: ignore[no-untyped-def]
-    """Rows of (n, K, 3) float32 to whole numbers and their scales."""
-    for n in numba.prange(len(values)):
-        most = np.float32(0)
-        for k in range(values.shape[1]):
-            for c in range(3):
-                most = max(most, abs(values[n, k, c]))
-        scale[n] = most / np.float32(LEVELS)
-        if most > 0:
-            for k in range(values.shape[1]):
-                for c in range(3):
-                    sh[n, 3 * k + c] = np.int16(np.rint(values[n, k, c] / most * np.float32(LEVELS)))
+def _slope(tree: NerfTree) -> float:
+    """`Packed.slope`, of voxels from all over the tree."""
+    from efficientnerf.harmonics import squared_slopes
+
+    count = len(tree.density_values)
+    if count == 0 or tree.degree == 0:
+        return 0.0
+    some = tree.coefficients(np.arange(0, count, -(-count // SOME)))
+    return float(np.sqrt(np.einsum("nkc,nkc,k->nc", some, some, squared_slopes(tree.degree))).max(axis=1).mean())
 
 
 def pack(tree: NerfTree) -> Packed:
     """The packed form of a tree; see the module. ValueError where the tree is not interpolated, as the kernel that reads it does."""
     from efficientnerf.nerftree.palettes import PaletteHarmonics
+    from efficientnerf.nerftree.tree import leaps
 
     if tree.lookup != "trilinear":
         raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; draw it by `efficientnerf.kernels.cpu_nearest`")
 
-    brick = tree.brick
     cells = np.argwhere(tree.brick_index >= 0)
-    place = np.empty_like(cells)
+    place = np.empty(cells.shape, np.int32)
     place[tree.brick_index[tree.brick_index >= 0]] = cells
-    cell = np.where(tree.brick_index >= 0, tree.brick_index, -1 - tree.leap.astype(np.int32)).astype(np.int32)
-    width, harmonics, count = padded_coefficients(tree.degree), tree.harmonics, len(tree.density_values)
-    blocks = (len(cells), (brick + 2) ** 3)
-    density, around = np.empty(blocks, np.float32), np.empty((len(cells), 27), np.int32)
-    if isinstance(harmonics, PaletteHarmonics) and count * (2 * width + 4) > ROWS_LIMIT:
-        _fill(place, brick, tree.brick_index, tree.voxel_index, tree.density_values, density, around, np.empty((0, 0), np.int32))
-        coded = harmonics.base, harmonics.base_table, harmonics.codes, harmonics.palette, harmonics.group_of
-        return Packed(cell, density, around, tree.voxel_index, np.empty((0, width), np.int16), np.empty(0, np.float32), *coded)
-    voxel = np.empty(blocks, np.int32)
-    _fill(place, brick, tree.brick_index, tree.voxel_index, tree.density_values, density, around, voxel)
-    sh, scale = np.zeros((count + 1, width), np.int16), np.zeros(count + 1, np.float32)
-    for begin in range(0, count, DECODED):  # floats of all voxels at once may be more than all the rest
-        block = slice(begin, min(count, begin + DECODED))
-        _quantise(np.ascontiguousarray(tree.coefficients(block), np.float32), sh[block], scale[block])
-    none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 3), np.float32), np.empty(0, np.int64)
-    return Packed(cell, density, around, voxel, sh, scale, *none)
+    absorbing = np.zeros(len(place), bool)
+    _absorbing(place, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, absorbing)
+    full = tree.brick_index >= 0
+    full[full] = absorbing[tree.brick_index[full]]
+    cell = np.where(full, tree.brick_index, -1 - leaps(full).astype(np.int32))
+    harmonics = tree.harmonics
+    if isinstance(harmonics, PaletteHarmonics):
+        palette = np.zeros((harmonics.palette.shape[1], harmonics.palette.shape[0], 4), np.float32)
+        palette[..., 1:] = harmonics.palette.swapaxes(0, 1)
+        coded = np.empty((0, harmonics.count, 3), np.float32), harmonics.base, harmonics.base_table, harmonics.codes, palette, harmonics.group_of
+    else:
+        none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
+        coded = np.ascontiguousarray(harmonics, np.float32), *none
+    return Packed(cell, place, tree.brick_index, tree.voxel_index, tree.density_values, *coded, _slope(tree))

@@ -126,12 +126,7 @@ class NerfTree:
 
         The chessboard distance to the nearest occupied cell: a cube of that radius minus one around the cell is empty.
         """
-        from scipy.ndimage import distance_transform_cdt
-
-        empty = self.brick_index < 0
-        if empty.all():
-            return np.full(self.shape, 255, np.uint8)
-        return np.ascontiguousarray(np.minimum(distance_transform_cdt(empty, metric="chessboard"), 255).astype(np.uint8))
+        return leaps(self.brick_index >= 0)
 
     @cached_property
     def packed(self) -> Packed:
@@ -264,6 +259,15 @@ class NerfTree:
 
     def with_metadata(self, **entries: Any) -> NerfTree:
         return replace(self, metadata={**self.metadata, **entries})
+
+
+def leaps(occupied: np.ndarray) -> np.ndarray:
+    """`NerfTree.leap` of coarse cells (X, Y, Z) bool."""
+    from scipy.ndimage import distance_transform_cdt
+
+    if not occupied.any():
+        return np.full(occupied.shape, 255, np.uint8)
+    return np.ascontiguousarray(np.minimum(distance_transform_cdt(~occupied, metric="chessboard"), 255).astype(np.uint8))
 
 
 def tree_from_voxels(

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 import torch
 
 from efficientnerf.cameras import Camera, rays, resized
-from efficientnerf.harmonics import basis_numpy, harmonics_count
-from efficientnerf.kernels import cpu_march
+from efficientnerf.harmonics import basis_numpy
+from efficientnerf.kernels import cpu_blocks, cpu_march
+from efficientnerf.kernels.cpu_blocks import Pool, View, colour, fill, grid_of
+from efficientnerf.kernels.lanes import pointer
 from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
 from efficientnerf.render import render_tree_reference
 from tests.efficientnerf.balls import pose
@@ -39,58 +42,109 @@ def test_the_kernels_harmonics_are_those_of_the_project(degree: int) -> None:
     directions = np.random.default_rng(0).normal(size=(50, 3))
     directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
     expected = basis_numpy(directions.astype(np.float64), degree)
-    width = 3 * harmonics_count(degree) + 5
     for d, row in zip(directions, expected, strict=True):
-        out = np.zeros((3, width), np.float32)
-        cpu_march._harmonics(*d, degree, out)
-        for c in range(3):
-            wanted = np.zeros(width)
-            wanted[c : 3 * len(row) : 3] = row
-            np.testing.assert_allclose(out[c], wanted, atol=2e-6)
+        out = np.zeros(len(row), np.float32)
+        cpu_blocks.basis_into(*d, degree, out)
+        np.testing.assert_allclose(out, row, atol=2e-6)
 
 
 def test_the_kernels_exponential_and_logistic() -> None:
     x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 400), [0.0, np.inf]]).astype(np.float32)
-    np.testing.assert_allclose([cpu_march._exp_minus(v) for v in x], np.exp(-x.astype(np.float64)), atol=2e-7)
-    assert cpu_march._exp_minus(np.float32(0)) == 1
+    np.testing.assert_allclose([cpu_march._exp2_minus(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
+    assert cpu_march._exp2_minus(np.float32(0)) == 1
     y = np.concatenate([-x, x[:-1], np.linspace(-20, 20, 2000).astype(np.float32)])
     with np.errstate(over="ignore"):
         np.testing.assert_allclose([cpu_march._logistic(v) for v in y], 1 / (1 + np.exp(-y.astype(np.float64))), atol=4e-6)
 
 
+@numba.njit
+def laid_out(packed, brick, view, owners, painted, kind, values):  # type: ignore[no-untyped-def]
+    """Blocks of some bricks, one after the other, as a thread lays them out: what they hold, and their kinds."""
+    blocks, size = values.shape
+    slot, owner, after = np.full(len(packed.place), -1, np.int32), np.full(blocks, -1, np.int32), np.zeros(1, np.int64)
+    words, basis = values.view(np.int32), np.zeros(32, np.float32)
+    pool = Pool(size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(basis))
+    grid = grid_of(packed, brick)
+    for brick_number in owners:
+        at = fill(brick_number, grid, view.scale, pool)
+        if painted:
+            colour(at, grid, view, pool)
+    # They must outlive the pointers to them.
+    return slot[0] + owner[0] + after[0] + words[0, 0] + basis[0]
+
+
+def blocks_of(tree: NerfTree, painted: bool, centre: np.ndarray, nearest: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """(B, side, side, side, 4) and kinds (B,) of the blocks of all bricks, densities times 2."""
+    side, owners = tree.brick + 2, np.random.default_rng(0).permutation(len(tree.voxel_index))
+    values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
+    laid_out(tree.packed, tree.brick, View(*(float(x) for x in centre), nearest, np.float32(2), tree.degree), owners, painted, kind, values)
+    back = np.argsort(owners)
+    return values[back].reshape(-1, side, side, side, 4), kind[back]
+
+
 @pytest.mark.parametrize("brick", [1, 2, 3, 4, 5])
-def test_blocks_of_the_packed_tree_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
+def test_blocks_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
     tree = random_tree(brick, brick=brick, degree=2)
-    packed, side = tree.packed, brick + 2
-    whole = tree.density_block((-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
-    for x, y, z in np.argwhere(tree.brick_index >= 0):
-        block = packed.density[packed.cell[x, y, z]].reshape(side, side, side)
-        low = np.array([x, y, z]) * brick
-        expected = whole[tuple(slice(a, a + side) for a in low)]
-        assert np.array_equal(block, expected)
-        stored = packed.voxel[packed.cell[x, y, z]].reshape(side, side, side)
-        known = stored < len(tree.density_values)
-        assert np.array_equal(tree.density_values[stored[known]], expected[known])
-        assert not expected[~known].any()
-        inner = stored[1:-1, 1:-1, 1:-1].reshape(-1)
-        assert np.array_equal(np.where(inner < len(tree.density_values), inner, -1), tree.voxel_index[tree.brick_index[x, y, z]])
+    side = brick + 2
+    whole = 2 * tree.density_block((-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
+    values, kind = blocks_of(tree, False, np.zeros(3))
+    assert (kind == cpu_blocks.VOXELS).all()
+    for block, place in zip(values, tree.packed.place, strict=True):
+        assert tree.brick_index[tuple(place)] >= 0
+        expected = whole[tuple(slice(a, a + side) for a in place * brick)]
+        density, stored = block[..., 0], block[..., 1].copy().view(np.int32)
+        assert np.array_equal(density, expected)
+        assert np.array_equal(2 * tree.density_values[stored[stored >= 0]], expected[stored >= 0])
+        assert not expected[stored < 0].any()
+        assert np.array_equal(stored[1:-1, 1:-1, 1:-1].reshape(-1), tree.voxel_index[tree.brick_index[tuple(place)]])
         eight = np.stack([expected[i : i + side - 1, j : j + side - 1, k : k + side - 1] for i, j, k in np.ndindex(2, 2, 2)])
-        assert np.array_equal(np.signbit(block[:-1, :-1, :-1]), (eight == 0).all(axis=0))
-    assert np.array_equal(-1 - packed.cell[tree.brick_index < 0], tree.leap[tree.brick_index < 0])
+        assert np.array_equal(np.signbit(density[:-1, :-1, :-1]), (eight == 0).all(axis=0))
 
 
-def test_harmonics_of_the_packed_tree_are_the_trees_to_a_part_in_65534_of_the_largest_of_a_voxel() -> None:
-    tree = random_tree(0, degree=3, share=0.8)
-    sh = tree.sh.copy()
-    sh[::5] *= 1000
-    sh[3] = 0
-    packed = replace(tree, harmonics=sh).packed
-    count = 3 * sh.shape[1]
-    close = packed.sh[:-1, :count].astype(np.float64) * packed.scale[:-1, None]
-    assert (np.abs(close - sh.reshape(len(sh), -1)) <= np.abs(sh).max(axis=(1, 2))[:, None] * (0.505 / 32767)).all()
-    assert not packed.sh[:, count:].any()
-    assert not packed.sh[-1].any()
-    assert packed.nbytes > packed.sh.nbytes + packed.density.nbytes
+@pytest.mark.parametrize("brick", [1, 2, 4])
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("layout", ["floats", "codes"])
+def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_sees_them(brick: int, degree: int, layout: str) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, share=0.5)
+    if layout == "codes":
+        tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
+    centre = np.array([-31.0, 12.5, 57.0])
+    values, kind = blocks_of(tree, True, centre)
+    assert (kind == cpu_blocks.COLOURS).all()
+    voxels, _ = blocks_of(tree, False, centre)
+    side = brick + 2
+    for block, before, place in zip(values, voxels, tree.packed.place, strict=True):
+        stored = before[..., 1].copy().view(np.int32)
+        assert np.array_equal(block[..., 0], before[..., 0])
+        assert np.isnan(block[stored < 0][:, 1:]).all()
+        away = place * brick - 0.5 + np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1)[stored >= 0] - centre
+        basis = basis_numpy(away / np.linalg.norm(away, axis=1, keepdims=True), degree)
+        np.testing.assert_allclose(block[stored >= 0][:, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[stored[stored >= 0]]), atol=1e-4)
+
+
+def test_blocks_near_the_camera_keep_their_voxels() -> None:
+    tree = random_tree(3, shape=(12, 12, 12), brick=4, degree=2, share=0.3)
+    centre = np.array([-20.0, 24.0, 24.0])
+    values, kind = blocks_of(tree, True, centre, nearest=40.0)
+    away = np.linalg.norm((tree.packed.place + 0.5) * 4 - centre, axis=1)
+    assert np.array_equal(kind == cpu_blocks.COLOURS, away >= 52)
+    assert 0.1 < (kind == cpu_blocks.COLOURS).mean() < 0.9
+    voxels, _ = blocks_of(tree, False, centre)
+    assert np.array_equal(values[kind == cpu_blocks.EXACT].view(np.int32), voxels[kind == cpu_blocks.EXACT].view(np.int32))
+
+
+def test_bricks_near_which_nothing_absorbs_light_are_empty_to_the_kernel() -> None:
+    tree = random_tree(7, shape=(8, 7, 6), brick=2, share=0.2)
+    dark = tree.density_values * (np.random.default_rng(1).random(len(tree.density_values)) < 0.1)
+    tree = replace(tree, density_values=dark.astype(np.float32))
+    absorbs = np.zeros(tree.shape, bool)
+    for cell in np.argwhere(tree.brick_index >= 0):
+        absorbs[tuple(cell)] = tree.density_block(tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
+    assert 0 < absorbs.sum() < (tree.brick_index >= 0).sum()
+    cell = tree.packed.cell
+    assert np.array_equal(cell[absorbs], tree.brick_index[absorbs])
+    for at in np.argwhere(~absorbs):
+        assert -1 - cell[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()
 
 
 def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTree:
@@ -105,34 +159,63 @@ def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTr
 
 
 @pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((8,), 1000), ((3, 5), 17), ((), 1)])
-def test_codes_into_palettes_are_drawn_as_what_they_decode_to(groups: tuple[int, ...], entries: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.kernels import packed_tree
-
+def test_codes_into_palettes_are_drawn_as_what_they_decode_to(groups: tuple[int, ...], entries: int) -> None:
     tree = in_palettes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
     origins, directions = rays_at(tree, 300)
     colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    rows = tree.render_rays(origins, directions)
-    assert not len(tree.packed.codes)
-    monkeypatch.setattr(packed_tree, "ROWS_LIMIT", 0)
-    large = replace(tree)
-    coded = large.render_rays(origins, directions)
-    assert large.packed.codes is tree.harmonics.codes  # type: ignore[union-attr]
-    assert large.packed.nbytes < tree.packed.nbytes
-    for seen in (rows, coded):
-        np.testing.assert_allclose(seen.opacity, opacity, atol=1.01e-3)
-        np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
-    assert coded.opacity.max() > 0.5
+    seen = tree.render_rays(origins, directions)
+    assert tree.packed.codes is tree.harmonics.codes  # type: ignore[union-attr]
+    np.testing.assert_allclose(seen.opacity, opacity, atol=1.01e-3)
+    np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
+    assert seen.opacity.max() > 0.5
 
 
 @pytest.mark.parametrize("brick", [1, 2, 4, 5])
-def test_codes_are_found_across_bricks_of_any_size(brick: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.kernels import packed_tree
-
-    monkeypatch.setattr(packed_tree, "ROWS_LIMIT", 0)
+def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
     tree = in_palettes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
     origins, directions = rays_at(tree, 300)
     colour, _ = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
     np.testing.assert_allclose(tree.render_rays(origins, directions).colour, colour, atol=1e-3)
+
+
+def far_camera(tree: NerfTree, voxels: float) -> Camera:
+    """Sees the tree from that many voxels away, large in the picture."""
+    at = pose(0.7, 0.4, voxels * tree.voxel)
+    at[:3, 3] += (tree.bounds_min + tree.bounds_max) / 2
+    return Camera("far", 40, 36, "SIMPLE_PINHOLE", (30 * voxels / max(tree.resolution), 20.0, 18.0), at)
+
+
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("distance", [0.0, 30.0, 300.0, 1000.0, 3000.0])
+@pytest.mark.parametrize("layout", ["floats", "codes"])
+def test_pictures_are_the_torch_functions_from_near_and_far(degree: int, distance: float, layout: str) -> None:
+    """Whether colours are summed once for a voxel or at each sample: the harmonics of neighbours have nothing in common here, surfaces are opaque."""
+    tree = random_tree(degree, shape=(6, 5, 7), brick=4, degree=degree, share=0.6, sigma=300.0)
+    if layout == "codes":
+        tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 256)
+    camera = far_camera(tree, distance) if distance else replace(camera_of(tree, distance=0.02), params=(8.0, 8.0, 13.0, 11.0))
+    origins, directions = rays(camera)
+    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    seen = tree.render(camera)
+    np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour, atol=1e-3)
+    np.testing.assert_allclose(seen.opacity.reshape(-1), opacity, atol=1.01e-3)
+    assert (seen.opacity > 0.9).mean() > 0.1
+
+
+def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    from efficientnerf.kernels import cpu_tree
+
+    tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=0.6, sigma=100.0)
+    tree.packed  # noqa: B018  # made once, for both
+    for distance in (40.0, 2000.0):
+        camera = far_camera(tree, distance)
+        usual = tree.render(camera, supersample=2)
+        with monkeypatch.context() as patch:
+            patch.setattr(cpu_tree, "POOL_BYTES", 1)
+            patch.setattr("numba.get_num_threads", lambda: 3)
+            other = tree.render(camera, supersample=2)
+        for name in FIELDS:
+            assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
 def test_the_work_of_a_picture_is_counted() -> None:
@@ -203,7 +286,7 @@ def test_pictures_of_every_camera_model_are_their_rays(model: str, supersample: 
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=share)
     timid = replace(tree)
-    timid.__dict__["leap"] = np.zeros_like(tree.leap)
+    timid.__dict__["packed"] = tree.packed._replace(cell=np.maximum(tree.packed.cell, -1))
     camera = camera_of(tree, model, distance)
     usual, other = tree.render(camera), timid.render(camera)
     for name in FIELDS:
