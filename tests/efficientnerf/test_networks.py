@@ -24,6 +24,7 @@ CASES = {
     "no skip": ([(7, 16), (16, 3)], None, False),
     "relu last": ([(7, 16), (23, 16)], 1, True),
     "one layer": ([(7, 4)], None, False),
+    "odd widths": ([(7, 13), (13, 11), (18, 9), (9, 5)], 2, False),
 }
 
 
