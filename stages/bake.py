@@ -73,6 +73,7 @@ def run(job: Job) -> None:
     from stages import scene
     from stages.evaluate import behind_of
     from stages.field import load_renderer
+    from stages.memory import refuse_more_than_fits
     from stages.optimisation import optimised
     from stages.train import pixels_of, use_all_cores
 
@@ -99,6 +100,7 @@ def run(job: Job) -> None:
 
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
+    refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, resolution, settings.max_mib)
     points = 0 if m.settings.discretise == resolution else settings.points
     density, sh = _values(job, m, indices, voxel, low, points)
     facts = metadata_of(s, settings, m)

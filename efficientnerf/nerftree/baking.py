@@ -11,6 +11,7 @@ B coarse cells, P pixels, N voxels.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from efficientnerf.render import split_by_box
 
 RAYS_PER_BLOCK = 8192
 POINTS_PER_BLOCK = 2**17
+SLAB = 2**27  # voxels of the grid that are marked at once: a byte each
 
 
 def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int, int, int], float]:
@@ -107,21 +109,34 @@ def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
 
 
 def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
-    """Coordinates (N, 3) of the voxels whose greatest weight exceeds `threshold`, and of those around them, in the order of the grid."""
+    """Coordinates (N, 3) int32 of the voxels whose greatest weight exceeds `threshold`, and of those around them, in the order of the grid.
+
+    They are marked in one slab of the grid after the other, so that memory grows with what is found and not with the neighbours that are looked at, of
+    which there are 27 to a voxel and most the same.
+    """
     row, local = np.nonzero(seen.greatest > threshold)
-    cell = np.stack(np.unravel_index(seen.cells[row], shape), axis=-1)
-    index = cell * brick + np.stack(np.unravel_index(local, (brick,) * 3), axis=-1)
+    x, y, z = ((c * brick + o).astype(np.int32) for c, o in zip(np.unravel_index(seen.cells[row], shape), np.unravel_index(local, (brick,) * 3), strict=True))
+    order = np.argsort(x, kind="stable")
+    x, y, z = x[order], y[order], z[order]
     size = [n * brick for n in shape]
-    # One axis after the other: a cube round each voxel at the cost of three segments.
-    for axis in range(3):
-        parts = []
-        for shift in range(-dilate, dilate + 1):
-            moved = index.copy()
-            moved[:, axis] += shift
-            parts.append(moved[(moved[:, axis] >= 0) & (moved[:, axis] < size[axis])])
-        flat = np.unique(np.ravel_multi_index(tuple(np.concatenate(parts).T), size))
-        index = np.stack(np.unravel_index(flat, size), axis=-1)
-    return index.astype(np.int32)
+    wide = [n + 2 * dilate for n in size]  # with a margin, so that no neighbour has to be tested
+    planes = max(1, SLAB // (wide[1] * wide[2]))
+    shifts = range(-dilate, dilate + 1)
+    found = []
+    for begin in range(0, size[0], planes):
+        end = min(size[0], begin + planes)
+        near = slice(*np.searchsorted(x, (begin - dilate, end + dilate)))
+        if near.start == near.stop:
+            continue
+        marks = np.zeros((end - begin + 4 * dilate, wide[1], wide[2]), bool)
+        at = ((x[near] - begin + 2 * dilate).astype(np.int64) * wide[1] + y[near] + dilate) * wide[2] + z[near] + dilate
+        for dx, dy, dz in itertools.product(shifts, repeat=3):
+            marks.reshape(-1)[at + ((dx * wide[1] + dy) * wide[2] + dz)] = True
+        inside = marks[2 * dilate : 2 * dilate + end - begin, dilate : dilate + size[1], dilate : dilate + size[2]]
+        part = np.argwhere(inside).astype(np.int32)
+        part[:, 0] += begin
+        found.append(part)
+    return np.concatenate(found) if found else np.empty((0, 3), np.int32)
 
 
 @torch.no_grad()

@@ -15,9 +15,9 @@ import torch
 from efficientnerf.compositing import activate
 from efficientnerf.nerftree import baking, format
 from efficientnerf.nerftree.tree import NerfTree
-from pipeline.errors import Interrupted, StageFailed
+from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
-from stages import bake, train
+from stages import bake, memory, train
 from stages.bake import ASSET, BakeSettings, chosen_resolution
 from stages.evaluate import truth_of
 from stages.field import FILE, load_renderer, save_model
@@ -56,6 +56,18 @@ def undisturbed(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactor
         never = StopAt()
         made = job(tmp_path_factory.mktemp("undisturbed"), QUICK, stop=never, **inputs)
         return run(made), made, never.count
+
+
+def test_more_voxels_than_fit_into_memory_are_refused_before_they_are_baked(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert memory.needed(1_000_000, 16) == 3 * 4 * 49 * 1_000_000
+    assert (memory.installed() or 2**40) > 2**28
+    monkeypatch.setattr(memory, "installed", lambda: 2**16)
+    made = job(tmp_path, QUICK, **inputs)
+    with pytest.raises(UsageError, match=r"voxels with \d+ harmonics need about .* GiB of memory.*bake\.max_mib \(\d+\) or bake\.resolution \(24\)"):
+        bake.run(made)
+    assert not list(made.work.glob("block_*.npy"))
+    monkeypatch.setattr(memory, "installed", lambda: None)
+    bake.run(made)
 
 
 def test_the_same_twice(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int]) -> None:
