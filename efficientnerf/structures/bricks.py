@@ -94,6 +94,31 @@ def _store(coordinates, words, side, blocks, cells, values):  # type: ignore[no-
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
+def _store_apart(coordinates, words, side, blocks, cells, values):  # type: ignore[no-untyped-def]
+    """`_store` step by step for a chunk of voxels, for lists whose neighbours seldom share a cell: nothing is guessed, and accesses to memory overlap."""
+    n = len(coordinates)
+    for task in numba.prange((n + TASK - 1) // TASK):
+        record, local = np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64)
+        for begin in range(task * TASK, min(n, (task + 1) * TASK), CHUNK):
+            end = min(begin + CHUNK, n)
+            voxel, word, many = coordinates[begin:end], words[begin:end], np.uint64(end - begin)
+            for i in range(many):
+                x, y, z = whole(voxel[i, 0]), whole(voxel[i, 1]), whole(voxel[i, 2])
+                record[i], local[i] = _cell(x, y, z, side), _lowest_of(x, y, z)
+            for i in range(many):
+                block = (record[i] >> SIX) << ONE
+                record[i] = (blocks[block | ONE] + bits_below(blocks[block], record[i] & np.uint64(63))) << ONE
+            for i in range(many):
+                values[cells[record[i] | ONE] + bits_below(cells[record[i]], local[i])] = word[i]
+
+
+def _lie_apart(coordinates: np.ndarray) -> bool:
+    """Whether most neighbours in the list lie in different cells, by a sample of it."""
+    at = np.linspace(0, max(len(coordinates) - 2, 0), 1024).astype(np.int64)
+    return len(coordinates) > 1 and bool(((coordinates[at] >> 2) != (coordinates[at + 1] >> 2)).any(axis=1).mean() > 0.5)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def _look_up(points, extent, side, blocks, cells, values, words, found):  # type: ignore[no-untyped-def]
     """Step by step for a chunk of points: what ends early is left out of the steps after, without a branch to be guessed wrong."""
     n, top = len(points), np.float32(extent)
@@ -158,7 +183,8 @@ class BrickTree:
         cells = np.empty(2 * int(number_bits(blocks, ZERO)), np.uint64)
         _pack_masks(masks, blocks, cells)
         values = np.empty(int(number_bits(cells, ZERO)), np.uint64)
-        _store(voxels.coordinates, voxels.words, side, blocks, cells, values)
+        store = _store_apart if _lie_apart(voxels.coordinates) else _store
+        store(voxels.coordinates, voxels.words, side, blocks, cells, values)
         return BrickTree(voxels.side, blocks, cells, values)
 
     @property

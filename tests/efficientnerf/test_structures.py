@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from efficientnerf.structures import on_device
+from efficientnerf.structures import bricks, on_device
 from efficientnerf.structures.bricks import BrickTree, FullBricks
 from efficientnerf.structures.dense import DenseVoxels
 from efficientnerf.structures.hashing import HashMap
@@ -163,3 +163,14 @@ def test_words_carry_the_values() -> None:
 def test_lists_that_no_grid_has_are_refused(coordinates: list[list[int]], values: list[list[float]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         voxels_from_values(4, np.array(coordinates), np.array(values, np.float16))
+
+
+def test_bricks_are_the_same_whichever_way_they_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    for voxels, apart in ((scattered(40, 0.2, 1), True), (clustered(40, 0.2, 1), False), (shuffled(clustered(40, 0.2, 1), 2), True)):
+        assert bricks._lie_apart(voxels.coordinates) == apart
+        made = []
+        for way in (True, False):
+            monkeypatch.setattr(bricks, "_lie_apart", lambda coordinates, way=way: way)
+            made.append(bricks.BrickTree.cache(voxels).arrays)
+        monkeypatch.undo()
+        assert all(np.array_equal(made[0][name], made[1][name]) for name in made[0])
