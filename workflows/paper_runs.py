@@ -81,12 +81,13 @@ def scenes(data: Path) -> list[Path]:
 
 
 def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
-    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, voxels 0.25, batch 0.2, widths 0.15, depths 0.05.
+    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, voxels 0.225, batch 0.2, widths 0.15, depths 0.05.
 
     Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
     and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
     matter is, and more rays are looked at whole, to bring back what was pruned by mistake. As in the paper, voxels learn from rays alone: asking about
-    them densely besides prunes them sooner, which cost 0.7 dB on chair at a scale of 0.001, and saved nothing.
+    them densely besides pruned them sooner, and chair was no better for it. How often rays meet a voxel depends on the exponent of the voxels: at a
+    scale of 0.001 chair ended with 6.0 % of its samples valid with 0.25, 12.2 % with 0.2, at the same PSNR (the paper: 9.6 %).
     """
     if scale == 1:
         return stages
@@ -102,7 +103,7 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
         train[name] = width(train[name])
     for name in ("layers", "coarse_layers"):
         train[name] = max(2, round(train[name] * scale**0.05))
-    train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.25 / 8))
+    train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.225 / 8))
     train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
     train["rate_steps"] = max(1, round(train["rate_steps"] * scale**0.9))
     train["warm_up"] = round(train["iterations"] * min(0.35, train["warm_up"] / 1e6 * scale**-0.6))
