@@ -22,6 +22,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from machine import processor
+
 RAYS, PER_RAY = 8192, 4  # coarse samples; fine ones are about as many
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -207,17 +209,10 @@ def main() -> None:
     if arguments.json:
         report = {
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-            "processor": _processor(), "cores": len(os.sched_getaffinity(0)), "load_before": load, "load_after": os.getloadavg(),
+            "processor": processor(), "cores": len(os.sched_getaffinity(0)), "load_before": load, "load_after": os.getloadavg(),
             "python": platform.python_version(), "versions": {name: version(name) for name in ("torch", "numba", "numpy")}, "threads": found,
         }  # fmt: skip
         arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-
-
-def _processor() -> str:
-    try:
-        return next(line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or "unknown"
 
 
 if __name__ == "__main__":

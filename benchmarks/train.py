@@ -25,6 +25,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from machine import processor
+
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple")
 
 
@@ -171,7 +173,7 @@ def main() -> None:
                 print(f"{each.name:12} {each.wall:7.1f} s  {each.processor:7.1f} s cpu  step {each.trainer.step:6}  {found:6.2f} dB", flush=True)
     report = {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "source": arguments.source.name, "processor": _processor(), "threads": int(os.environ.get("OMP_NUM_THREADS", 0)) or len(os.sched_getaffinity(0)),
+        "source": arguments.source.name, "processor": processor(), "threads": int(os.environ.get("OMP_NUM_THREADS", 0)) or len(os.sched_getaffinity(0)),
         "load_before": load, "load_after": os.getloadavg(), "views": len(views), "strides": sorted({stride for *_, stride in views}),
         "whole_schedule": arguments.whole, "python": platform.python_version(), "versions": {name: version(name) for name in ("torch", "numba", "numpy")},
         "points_are": ["wall seconds", "processor seconds", "steps", "PSNR"],
@@ -181,13 +183,6 @@ def main() -> None:
         arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     if arguments.plot:
         plot(report, arguments.plot)
-
-
-def _processor() -> str:
-    try:
-        return next(line.split(":", 1)[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or "unknown"
 
 
 if __name__ == "__main__":

@@ -101,6 +101,11 @@ class Job:
         self._last_progress, self._last_text = now, text
         self._emit("progress", done=done, total=total, text=text, **facts)
 
+    def reached(self, done: float, total: float, text: str = "") -> None:
+        """`progress` at a safe point."""
+        self.progress(done, total, text)
+        self.safe_point()
+
     def say(self, text: str, **facts: Any) -> None:
         """A sentence for the user."""
         self._emit("message", text=text, **facts)

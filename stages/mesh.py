@@ -96,13 +96,9 @@ def run(job: Job) -> None:
     from stages.exporters.writing import source_frame
     from stages.shading import IN_FRONT, draw_sides
 
-    def progress(done: int, total: int, text: str) -> None:
-        job.safe_point()
-        job.progress(done, total, text)
-
     tree = load(job.inputs["bake"] / "asset.nerftree")
     frame = source_frame(tree.metadata)
-    found = mesh_of(tree, job.settings, progress)
+    found = mesh_of(tree, job.settings, job.reached)
     job.safe_point()
     orbit = tree.metadata.get("orbit", {})
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))

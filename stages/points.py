@@ -52,13 +52,9 @@ def run(job: Job) -> None:
     from stages.exporters import POINT_EXPORTERS
     from stages.exporters.writing import source_frame
 
-    def progress(done: int, total: int, text: str) -> None:
-        job.safe_point()
-        job.progress(done, total, text)
-
     tree = load(job.inputs["bake"] / "asset.nerftree")
     frame = source_frame(tree.metadata)
-    cloud = points_of(tree, job.settings, frame, progress)
+    cloud = points_of(tree, job.settings, frame, job.reached)
     job.safe_point()
     POINT_EXPORTERS[".ply"](cloud, job.out / "points.ply", frame)
     job.say(f"{len(cloud.positions)} points", points=len(cloud.positions))

@@ -15,6 +15,7 @@ import triton.language as tl
 from torch import Tensor
 
 from efficientnerf.compositing import LARGEST_LOGIT, Composite
+from efficientnerf.kernels.cuda_walk import sigmoid
 
 CHUNK = 32
 # Optical depth beyond which a sample is as good as opaque (e^-25 = 1e-11). Capped so that a sum over the chunk minus a sample's own part still holds
@@ -35,12 +36,6 @@ def _activate(x, EXPONENTIAL: tl.constexpr):  # type: ignore[no-untyped-def]
         density = tl.maximum(z, 0.0) + tl.log(1 + e)
         slope = tl.where(z >= 0, 1.0, e) / (1 + e)
     return density, slope
-
-
-@triton.jit
-def _sigmoid(x):  # type: ignore[no-untyped-def]
-    e = tl.exp(-tl.abs(x))
-    return tl.where(x >= 0, 1.0, e) / (1 + e)
 
 
 @triton.jit
@@ -71,9 +66,9 @@ def _forward(  # type: ignore[no-untyped-def]
         w = tl.exp(-(passed + tl.cumsum(depth, 0) - depth)) * (1 - tl.exp(-depth))
         tile = raw + n[:, None] * WIDTH + 1 + k[None, :]
         seen = live[:, None] & (k < K)[None, :]
-        cr = _sigmoid(tl.sum(tl.load(tile, seen, other=0.0) * basis[None, :], 1))
-        cg = _sigmoid(tl.sum(tl.load(tile + K, seen, other=0.0) * basis[None, :], 1))
-        cb = _sigmoid(tl.sum(tl.load(tile + 2 * K, seen, other=0.0) * basis[None, :], 1))
+        cr = sigmoid(tl.sum(tl.load(tile, seen, other=0.0) * basis[None, :], 1))
+        cg = sigmoid(tl.sum(tl.load(tile + K, seen, other=0.0) * basis[None, :], 1))
+        cb = sigmoid(tl.sum(tl.load(tile + 2 * K, seen, other=0.0) * basis[None, :], 1))
         tl.store(weight + n, w, live)
         tl.store(rgb + n * 3, cr, live)
         tl.store(rgb + n * 3 + 1, cg, live)

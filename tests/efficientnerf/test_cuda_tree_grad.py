@@ -16,11 +16,10 @@ from efficientnerf.nerftree import optimising
 from efficientnerf.nerftree.optimising import Targets, error, greatest_weights, optimise, optimiser
 from efficientnerf.nerftree.tree import NerfTree
 from efficientnerf.pixels import Pixels
-from efficientnerf.render import render_tree_reference
 from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.test_ndc_tree import camera_at, wall
-from tests.efficientnerf.test_optimising import ball_tree, loss_by_torch, seen_at_random
+from tests.efficientnerf.test_optimising import ball_tree, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
 kernels = pytest.importorskip("efficientnerf.kernels.cuda_tree_grad")
@@ -54,13 +53,9 @@ def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, mat
     origins, directions = (a[np.arange(160) % 4 != 2] for a in rays_at(tree, 160))
     seen = seen_at_random(len(origins), matte)
     loss, by_density, by_sh = gradients(tree, origins, directions, seen)
-    density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
-    wanted = loss_by_torch(*render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
-    wanted.sum().backward()
-    assert density.grad is not None
-    assert sh.grad is not None
-    np.testing.assert_allclose(loss, wanted.detach(), atol=2e-5 if lookup == "trilinear" else 1e-2)
-    for ours, theirs in ((by_density, density.grad.numpy()), (by_sh, sh.grad.numpy())):
+    wanted, wanted_by_density, wanted_by_sh = gradients_by_autograd(tree, origins, directions, seen)
+    np.testing.assert_allclose(loss, wanted, atol=2e-5 if lookup == "trilinear" else 1e-2)
+    for ours, theirs in ((by_density, wanted_by_density), (by_sh, wanted_by_sh)):
         scale = np.abs(theirs).max()
         off = np.abs(ours - theirs)
         if lookup == "trilinear":

@@ -106,3 +106,11 @@ def test_a_safe_point_raises_once_a_signal_has_arrived(tmp_path: Path) -> None:
     with pytest.raises(Interrupted) as caught:
         job.safe_point()
     assert caught.value.exit_code == 143
+
+
+def test_what_is_reached_is_said_before_a_stop(tmp_path: Path) -> None:
+    events = Events()
+    job = Job(settings=None, out=tmp_path / "o", work=tmp_path / "w", report=events, stop=lambda: 2)
+    with pytest.raises(Interrupted):
+        job.reached(3, 4, "walking")
+    assert [(event["done"], event["text"]) for event in events] == [(3, "walking")]
