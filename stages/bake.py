@@ -1,7 +1,7 @@
 """The bake stage: a trained field in, the asset out.
 
     asset.nerftree  see efficientnerf/nerftree/FORMAT.md
-    report.json     resolution, voxels, bytes; PSNR of a sample of the training pixels before and after the optimisation
+    report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the optimisation
 
 What takes long is kept in the scratch folder: what the network shows of the voxels, each block of baked values, and the state of the optimisation.
 """
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from efficientnerf.nerftree.baking import Visible
     from efficientnerf.pixels import Pixels
     from stages.forward import Forward
+    from stages.resolution import Choice
     from stages.scene import Scene
 
 ASSET = "asset.nerftree"
-FORWARD_ROOM = 4 / 3
 
 
 @dataclass(frozen=True)
@@ -33,18 +33,21 @@ class BakeSettings:
     """How finely the field is baked."""
 
     resolution: int = setting(
-        0, "voxels along the longest side of the box; 0: train.discretise, or else chosen from what a pixel covers, up to max_resolution",
+        0, "voxels along the longest side of the box; 0: train.discretise, or else chosen: what max_mib has room for, but none smaller than pixels show",
         minimum=0, maximum=4096,
     )  # fmt: skip
     lookup: str = setting(
         "trilinear", "what a point gets; trilinear: interpolated from the voxels around it; nearest: what its own voxel holds, drawn more slowly on CPUs",
         choices=("trilinear", "nearest"),
     )  # fmt: skip
-    max_resolution: int = setting(384, "the most voxels along the longest side that are chosen by themselves", minimum=8, maximum=4096)
+    max_resolution: int = setting(1024, "the most voxels along the longest side that are chosen by themselves", minimum=32, maximum=4096)
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
     pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
-    max_mib: int = setting(64, "how large the asset may get; a larger one keeps only voxels of greater weight", minimum=1, unit="MiB")
+    max_mib: int = setting(
+        32, "how large the asset may get; its resolution follows, and the time about in proportion; where that is set, the lightest voxels are left out",
+        minimum=1, unit="MiB",
+    )  # fmt: skip
     layout: str = setting(
         "compact",
         "how the voxels lie in the asset: compact (codes of 8 bits), small (a coarser palette, half the bytes) or sparse (16-bit floats)",
@@ -85,60 +88,44 @@ def run(job: Job) -> None:
 
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
-    resolution = settings.resolution or m.settings.discretise or chosen_resolution(s, settings.max_resolution)
+    bounds = m.space.bounds
+    low = np.asarray(bounds[0], np.float64)
+    pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
+    choice, seen, indices = _chosen(job, m, s, pixels)
+    resolution = choice.resolution
     if settings.lookup == "nearest" and m.settings.discretise not in (0, resolution):
         job.warn(f"bake.resolution={resolution}, but the field was trained on train.discretise={m.settings.discretise}: on other voxels than are baked")
-    bounds = m.space.bounds
-    shape, voxel = baking.grid_of(bounds, resolution, settings.brick)
-    low = np.asarray(bounds[0], np.float64)
-
-    pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
-    seen = _seen(job, m, pixels, shape, voxel, low)
-    indices = _kept(job, seen, shape, m.fine.degree)
     if not len(indices):
         from pipeline.errors import StageFailed
 
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
     refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, resolution, settings.max_mib)
+    shape, voxel = baking.grid_of(bounds, resolution, settings.brick)
+    job.say(f"{resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
     points = 0 if m.settings.discretise == resolution else settings.points
-    density, sh = _values(job, m, indices, voxel, low, points)
     facts = metadata_of(s, settings, m)
-    tree = tree_from_voxels(
-        shape, voxel, low, indices, density, sh,
-        brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc, lookup=settings.lookup,
-    )  # fmt: skip
     plain = behind_of(s)
     if plain is None:
         targets = Targets(pixels, None, seen.chosen, seen.before, seen.behind)
     else:
         targets = Targets(pixels, plain, infinite=s.background is None)
-    tree, fitted = optimised(job, tree, targets, writing.most_voxels(settings.max_mib * 2**20, settings.layout, tree.degree, shape, settings.brick))
+    most = writing.most_voxels(settings.max_mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
+    # The raw values go in without a name here: they are large, and not needed once the fitting has its own.
+    tree, fitted = optimised(
+        job,
+        tree_from_voxels(
+            shape, voxel, low, indices, *_values(job, m, indices, voxel, low, points),
+            brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc, lookup=settings.lookup,
+        ),
+        targets, most,
+    )  # fmt: skip
     provenance = {**facts["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": fitted["psnr_after"]}}
     format.save(tree.with_metadata(provenance=provenance), job.out / ASSET, settings.layout)
     size = (job.out / ASSET).stat().st_size
     report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size, "optimisation": fitted}
+    report |= {"chosen": {"resolution": resolution, "why": choice.why}}
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-
-
-def chosen_resolution(s: Scene, most: int) -> int:
-    """Voxels along the longest side of the box, so that a voxel covers about three quarters of a pixel at the box's centre, for the median camera.
-
-    In normalised device coordinates a voxel is as wide as a pixel, and FORWARD_ROOM times as many voxels are let be: their box is as wide as
-    the surroundings, and nearly empty.
-    """
-    if s.forward is not None:
-        # In normalised device coordinates a pixel is as wide at any depth.
-        wide = s.forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
-        side = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
-        return int(np.clip(round(side / wide), 32, round(FORWARD_ROOM * most)))
-    centre = np.asarray(s.bounds, np.float64).mean(axis=0)
-    footprints = []
-    for view in s.views:
-        focal = view.camera.intrinsics["fx"]
-        footprints.append(np.linalg.norm(view.camera.centre - centre) / focal)
-    side = float((s.bounds[1] - s.bounds[0]).max())
-    return int(np.clip(round(side / (0.75 * float(np.median(footprints)))), 32, most))
 
 
 def sources_of(job: Job) -> dict[str, str]:
@@ -193,7 +180,47 @@ def spiral_of(forward: Forward) -> dict[str, Any]:
     }
 
 
-SPARE = 2  # so many times the voxels that there is room for are baked: the tree itself then shows which of them matter
+SPARE = 2  # so many times the voxels that there is room for are baked at most: the tree itself then shows which of them matter
+DENSE = 1.75  # and so many at a resolution that is chosen: about as many as are kept, and some more, for the lightest matter less than detail
+
+
+def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels) -> tuple[Choice, Visible, np.ndarray]:
+    """The resolution, what the network shows, and the coordinates of the voxels to bake."""
+    from efficientnerf.nerftree import baking, writing
+    from stages.resolution import Choice, affordable_resolution, finest_resolution
+
+    settings: BakeSettings = job.settings
+    bounds, brick = m.space.bounds, settings.brick
+
+    def room(resolution: int) -> int:
+        shape, _ = baking.grid_of(bounds, resolution, brick)
+        return writing.most_voxels(settings.max_mib * 2**20, settings.layout, m.fine.degree, shape, brick)
+
+    if settings.resolution or m.settings.discretise:
+        choice = Choice(settings.resolution, "bake.resolution") if settings.resolution else Choice(m.settings.discretise, "train.discretise")
+        shape, voxel = baking.grid_of(bounds, choice.resolution, brick)
+        seen = _seen(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64))
+        return choice, seen, _kept(job, seen, shape, SPARE * room(choice.resolution))
+
+    finest = finest_resolution(s, settings.max_resolution)
+    top_shape, top_voxel = baking.grid_of(bounds, finest.resolution, brick)
+    seen = _seen(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64))
+    last: tuple[int, Visible, np.ndarray] | None = None
+
+    def look(resolution: int) -> tuple[int, Visible, np.ndarray]:
+        nonlocal last
+        if last is None or last[0] != resolution:
+            last = None
+            job.safe_point()
+            shape, voxel = baking.grid_of(bounds, resolution, brick)
+            coarse = seen if resolution == finest.resolution else baking.coarsened(seen, top_shape, top_voxel, shape, voxel, brick, settings.weight)
+            last = resolution, coarse, baking.chosen_voxels(coarse, shape, brick, settings.weight, settings.dilate)
+        return last
+
+    choice = affordable_resolution(finest, lambda at: len(look(at)[2]), lambda at: int(DENSE * room(at)))
+    _, coarse, indices = look(choice.resolution)
+    most = SPARE * room(choice.resolution)
+    return choice, coarse, indices if len(indices) <= most else _kept(job, coarse, baking.grid_of(bounds, choice.resolution, brick)[0], most)
 
 
 def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray) -> Visible:
@@ -218,14 +245,13 @@ def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: 
     return seen
 
 
-def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], degree: int) -> np.ndarray:
-    """Coordinates of the voxels to bake."""
-    from efficientnerf.nerftree import baking, writing
+def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], most: int) -> np.ndarray:
+    """Coordinates of the voxels to bake: not many more than `most`, and then those of greatest weight."""
+    from efficientnerf.nerftree import baking
 
     settings: BakeSettings = job.settings
     threshold = settings.weight
     indices = baking.chosen_voxels(seen, shape, settings.brick, threshold, settings.dilate)
-    most = SPARE * writing.most_voxels(settings.max_mib * 2**20, settings.layout, degree, shape, settings.brick)
     weights = np.sort(seen.greatest[seen.greatest > threshold])
     while len(indices) > most and len(weights) > 1:
         job.safe_point()
@@ -240,18 +266,25 @@ def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray
     from efficientnerf.nerftree import baking
 
     settings: BakeSettings = job.settings
-    blocks = baking.blocks_of(len(indices), points)
-    parts: list[np.ndarray] = []
-    while len(parts) < blocks and (part := _read_npy(job.work / f"block_{len(parts):06d}.npy")) is not None:
-        parts.append(part)
-    for density, sh in baking.voxel_values(m, indices, voxel, low, points, settings.seed, first=len(parts)):
-        part = np.concatenate([density[:, None], sh.reshape(len(density), -1)], axis=1)
-        _write_npy(part, job.work / f"block_{len(parts):06d}.npy")
-        parts.append(part)
-        job.progress(len(parts), blocks, "baking voxels")
+    blocks, harmonics = baking.blocks_of(len(indices), points), (m.fine.degree + 1) ** 2
+    density, sh = np.empty(len(indices), np.float32), np.empty((len(indices), harmonics, 3), np.float32)
+    done = rows = 0
+
+    def take(part: np.ndarray) -> None:
+        nonlocal done, rows
+        density[rows : rows + len(part)] = part[:, 0]
+        sh[rows : rows + len(part)] = part[:, 1:].reshape(len(part), harmonics, 3)
+        done, rows = done + 1, rows + len(part)
+
+    while done < blocks and (stored := _read_npy(job.work / f"block_{done:06d}.npy")) is not None:
+        take(stored)
+    for some, colours in baking.voxel_values(m, indices, voxel, low, points, settings.seed, first=done):
+        part = np.concatenate([some[:, None], colours.reshape(len(some), -1)], axis=1)
+        _write_npy(part, job.work / f"block_{done:06d}.npy")
+        take(part)
+        job.progress(done, blocks, "baking voxels")
         job.safe_point()
-    values = np.concatenate(parts)
-    return values[:, 0], values[:, 1:].reshape(len(values), -1, 3)
+    return density, sh
 
 
 def _write_npy(values: np.ndarray, path: Path) -> None:
@@ -271,4 +304,4 @@ def _read_npy(path: Path) -> np.ndarray | None:
         return None
 
 
-STAGE = Stage(name="bake", version=2, settings=BakeSettings, needs=("poses", "train"), run=run)
+STAGE = Stage(name="bake", version=3, settings=BakeSettings, needs=("poses", "train"), run=run)

@@ -156,12 +156,9 @@ class Seen(NamedTuple):
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _look(  # type: ignore[no-untyped-def]
     origins, directions, bases, brick, brick_index, voxel_index, density, sh, leap, length, nearest, stop, most,
-    seen_colour, seen_behind, seen_gain, seen_opacity, matte, weighing, room, index, frac, gradient, ray_of, counts, loss,
+    seen_colour, seen_behind, seen_gain, seen_opacity, matte, room, index, frac, gradient, ray_of, counts, loss,
 ):  # fmt: skip
-    """Forward and backward. Block b writes its records from b * room on, and to counts[b] how many there are (more than `room`: they did not fit).
-
-    weighing  the records hold the sample's weight in place of gradients, and colours are not looked at
-    """
+    """Forward and backward. Block b writes its records from b * room on, and to counts[b] how many there are (more than `room`: they did not fit)."""
     rays, terms = len(origins), sh.shape[1]
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         b_index, b_frac = np.empty((most, 8), np.int32), np.empty((most, 3), density.dtype)
@@ -175,12 +172,6 @@ def _look(  # type: ignore[no-untyped-def]
             fits = written + count <= room
             at = block * room + written
             written += count
-            if weighing:
-                if fits:
-                    for n in range(count):
-                        index[at + n], frac[at + n] = b_index[n], b_frac[n]
-                        gradient[at + n, 0], ray_of[at + n] = b_light[n] * b_alpha[n], ray
-                continue
             behind_it[:] = 0
             for n in range(count):
                 _shade(b_index[n], b_frac[n], sh, bases[ray], mixed, b_rgb[n])
@@ -256,18 +247,22 @@ def _sum(slabs, room, index, frac, gradient, ray_of, counts, bases, by_density, 
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _greatest(slabs, room, index, frac, gradient, ray_of, counts, gain, greatest):  # type: ignore[no-untyped-def]
-    voxels = len(greatest)
-    for slab in numba.prange(slabs):
-        low, high = voxels * slab // slabs, voxels * (slab + 1) // slabs
-        for block in range(len(counts)):
-            for at in range(block * room, block * room + counts[block]):
+def _greatest(origins, directions, brick, brick_index, voxel_index, density, leap, length, nearest, stop, most, gain, greatest):  # type: ignore[no-untyped-def]
+    """Raise greatest[p] to what the rays of part p show of each voxel: nothing is shared, and a maximum doesn't ask in which order it was taken."""
+    parts, rays = len(greatest), len(origins)
+    for part in numba.prange(parts):
+        index, frac, alpha, light = np.empty((most, 8), np.int32), np.empty((most, 3), density.dtype), np.empty(most), np.empty(most)
+        into = greatest[part]
+        for ray in range(rays * part // parts, rays * (part + 1) // parts):
+            count, _ = _march(
+                origins[ray], directions[ray], brick, brick_index, voxel_index, density, leap, length, nearest, stop, index, frac, alpha, light,
+            )  # fmt: skip
+            for m in range(count):
+                arrives = gain[ray] * light[m] * alpha[m]
                 for n in range(8):
-                    v = index[at, n]
-                    if low <= v < high:
-                        weight = gain[ray_of[at]] * gradient[at, 0] * _share(n, frac[at, 0], frac[at, 1], frac[at, 2])
-                        if weight > greatest[v]:
-                            greatest[v] = weight
+                    v = index[m, n]
+                    if v >= 0:
+                        into[v] = max(into[v], into.dtype.type(arrives * _share(n, frac[m, 0], frac[m, 1], frac[m, 2])))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -349,9 +344,14 @@ def slabs() -> int:
     return 2 * numba.get_num_threads()
 
 
+def parts() -> int:
+    """Into how many shares the rays of `greatest` are dealt; each has a copy of what is found."""
+    return min(16, numba.get_num_threads())
+
+
 def look(
     grid: Grid, origins: np.ndarray, directions: np.ndarray, bases: np.ndarray, density: np.ndarray, sh: np.ndarray, seen: Seen, records: Records, *,
-    weighing: bool = False, stop: float = STOP,
+    stop: float = STOP,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Loss (R,) of rays in voxel coordinates; `records` then holds their samples, and the returned counts how many there are in each block.
 
@@ -365,7 +365,7 @@ def look(
     while True:
         _look(
             origins, directions, bases, grid.brick, grid.brick_index, grid.voxel_index, density, sh, grid.leap, grid.length, grid.nearest, stop, grid.most,
-            seen.colour, seen.behind, seen.gain, seen.opacity, seen.matte, weighing, records.room, *records.arrays, counts, loss,
+            seen.colour, seen.behind, seen.gain, seen.opacity, seen.matte, records.room, *records.arrays, counts, loss,
         )  # fmt: skip
         if not len(counts) or counts.max() <= records.room:
             return loss, counts
@@ -377,9 +377,17 @@ def gradients(records: Records, counts: np.ndarray, bases: np.ndarray, by_densit
     _sum(slabs(), records.room, *records.arrays, counts, bases, by_density, by_sh)
 
 
-def greatest(records: Records, counts: np.ndarray, gain: np.ndarray, into: np.ndarray) -> None:
-    """Raise `into` (N,) to the greatest contributions of voxels to the pixels of a `look` that was weighing."""
-    _greatest(slabs(), records.room, records.index, records.frac, records.gradient, records.ray_of, counts, gain, into)
+def greatest(grid: Grid, origins: np.ndarray, directions: np.ndarray, density: np.ndarray, gain: np.ndarray, into: np.ndarray, *, stop: float = STOP) -> None:
+    """Raise `into` to the greatest contributions of voxels to the pixels of rays in voxel coordinates, through what interpolation leaves of them.
+
+    origins, directions  (R, 3) float64
+    density              (N,)
+    gain                 (R,) light that reaches the box
+    into                 (P, N) float32: of each share of the rays; P at least one, and more than threads are of no use
+    """
+    _greatest(
+        origins, directions, grid.brick, grid.brick_index, grid.voxel_index, density, grid.leap, grid.length, grid.nearest, stop, grid.most, gain, into,
+    )  # fmt: skip
 
 
 def descend(

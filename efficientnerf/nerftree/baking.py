@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -106,6 +106,24 @@ def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
     stretches = np.arange(0, total, stride)
     chosen = np.minimum(stretches + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(stretches)), total - 1)
     return chosen[pixels.usable_at(chosen)]
+
+
+def coarsened(
+    seen: Visible, shape: tuple[int, int, int], voxel: float, to_shape: tuple[int, int, int], to_voxel: float, brick: int, threshold: float
+) -> Visible:
+    """What was seen of a grid, for one of larger voxels of the same corner: each of these has the greatest weight of the voxels whose centres lie in it.
+    Weights that don't exceed `threshold` are left out."""
+    row, local = np.nonzero(seen.greatest > threshold)
+    cell = np.stack(np.unravel_index(seen.cells[row], shape), axis=-1)
+    index = cell * brick + np.stack(np.unravel_index(local, (brick,) * 3), axis=-1)
+    index = ((index + 0.5) * (voxel / to_voxel)).astype(np.int64)
+    cell = np.minimum(index // brick, np.asarray(to_shape) - 1)
+    inside = index - cell * brick
+    cells, row_of = np.unique(np.ravel_multi_index(tuple(cell.T), to_shape), return_inverse=True)
+    greatest = np.zeros((len(cells), brick**3), np.float32)
+    slot = row_of * brick**3 + (inside[:, 0] * brick + inside[:, 1]) * brick + inside[:, 2]
+    np.maximum.at(greatest.reshape(-1), slot, seen.greatest[row, local])
+    return replace(seen, cells=cells, greatest=greatest)
 
 
 def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:

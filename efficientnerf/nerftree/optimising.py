@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 DECAY, EPSILON = 0.99, 1e-10
 OPAQUE = 2.0  # optical thickness of a voxel to begin with at most: networks say hundreds, behind which nothing would have a gradient
 GREY, MATTE = 0.5, 0.25  # mean of a channel of a background of any colour, and three times the variance: see `Targets`
-WEIGHED_RAYS = 2**16  # in a bundle
+WEIGHED_RAYS, MEASURED_RAYS = 2**16, 2**14  # in a bundle; those that are measured leave records
 
 Bundle = tuple[Any, Any, Seen]  # see `Targets.draw`
 
@@ -120,17 +120,14 @@ class Targets:
 
 @dataclass
 class Optimiser:
-    """A tree whose values are being fitted.
+    """A tree whose values are being fitted, in place: harmonics are most of the memory, and are there once.
 
-    density, sh          (N,), (N, 3 K) float32, the tree's own to begin with
-    square_*             (N,) running means of the squared gradients by the logarithm of a voxel's optical thickness, and by its harmonics
-    visits               (N,) in how many steps a voxel was seen
-    away                 the state on a device that steps are being taken on; `fetch` brings the arrays up to date
+    square_*  (N,) running means of the squared gradients by the logarithm of a voxel's optical thickness, and by its harmonics
+    visits    (N,) in how many steps a voxel was seen
+    away      the state on a device that steps are being taken on; `fetch` brings the arrays up to date
     """
 
     tree: NerfTree
-    density: np.ndarray
-    sh: np.ndarray
     square_density: np.ndarray
     square_sh: np.ndarray
     visits: np.ndarray
@@ -140,30 +137,42 @@ class Optimiser:
     def fetch(self) -> None:
         """Have the arrays as they are after the last step."""
         if self.away is not None:
-            for name, values in self.away.fetched().items():
-                setattr(self, name, values)
+            found = self.away.fetched()
+            self.tree = replace(self.tree, density_values=found["density"], harmonics=found["sh"].reshape(self.tree.sh.shape))
+            for name in SQUARES:
+                setattr(self, name, found[name])
+
+    @property
+    def density(self) -> np.ndarray:
+        """(N,) float32, the tree's own."""
+        return self.tree.density_values
+
+    @property
+    def sh(self) -> np.ndarray:
+        """(N, 3 K) float32, the tree's own."""
+        return self.tree.sh.reshape(len(self.tree.sh), self.tree.harmonics_count * 3)
 
     def result(self) -> NerfTree:
         """The tree as it is now."""
         self.fetch()
-        return replace(self.tree, density_values=self.density.copy(), harmonics=self.sh.reshape(len(self.sh), -1, 3).copy())
+        return replace(self.tree, density_values=self.density.copy(), harmonics=self.tree.sh.copy())
 
 
-STATE = ("density", "sh", "square_density", "square_sh", "visits")
+SQUARES = ("square_density", "square_sh", "visits")
+STATE = ("density", "sh", *SQUARES)
 
 
 def optimiser(tree: NerfTree, thickest: float = np.inf) -> Optimiser:
-    """At the beginning; no voxel of more optical thickness than `thickest`, so that what lies behind a floater pulls at it from the first step on."""
-    count = len(tree.density_values)
-    sh = np.array(tree.sh, np.float32).reshape(count, tree.harmonics_count * 3)
+    """At the beginning, of a copy; no voxel of more optical thickness than `thickest`, so that what lies behind a floater pulls at it from the first
+    step on."""
     density = np.minimum(tree.density_values, np.float32(thickest / tree.voxel))
-    return Optimiser(tree, density, sh, np.zeros_like(density), np.zeros_like(density), np.zeros(count, np.int32))
+    tree = replace(tree, density_values=density, harmonics=np.array(tree.sh, np.float32))
+    return Optimiser(tree, np.zeros_like(density), np.zeros_like(density), np.zeros(len(density), np.int32))
 
 
 def kept(o: Optimiser, keep: np.ndarray, tree: NerfTree) -> Optimiser:
-    """The optimiser of a tree of some of the voxels, (N,) bool, in their order."""
-    o.fetch()
-    return Optimiser(tree, step=o.step, **{name: getattr(o, name)[keep] for name in STATE})
+    """The optimiser that goes on with `tree`, which is `o.tree` after `fetch` with some of its voxels alone, (N,) bool, in their order."""
+    return Optimiser(tree, **{name: getattr(o, name)[keep] for name in SQUARES}, step=o.step)
 
 
 def grid_of(tree: NerfTree) -> Grid:
@@ -221,14 +230,15 @@ def randomness(seed: int, step: int) -> np.random.Generator:
 def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
     """Mean squared error of a channel over a sample of the training pixels that depends on `count` and `seed` alone, objects on their declared background."""
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
-    bundles = (targets.draw(min(WEIGHED_RAYS, count - begin), rng, declared=True) for begin in range(0, count, WEIGHED_RAYS))
+    bundles = (targets.draw(min(MEASURED_RAYS, count - begin), rng, declared=True) for begin in range(0, count, MEASURED_RAYS))
     if targets.on_device:
         from efficientnerf.nerftree import optimising_device
 
         return optimising_device.total_loss(tree, targets, bundles) / (3 * count)
-    o, total = optimiser(tree), 0.0
+    grid, records, sh = grid_of(tree), Records(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
+    total = 0.0
     for origins, directions, seen in bundles:
-        loss, _ = kernels.look(grid_of(tree), *in_voxels(tree, origins, directions), o.density, o.sh, seen, Records())
+        loss, _ = kernels.look(grid, *in_voxels(tree, origins, directions), tree.density_values, sh, seen, records)
         total += float(loss.sum())
     return total / (3 * count)
 
@@ -244,12 +254,11 @@ def greatest_weights(tree: NerfTree, targets: Targets, count: int, seed: int, lo
         from efficientnerf.nerftree import optimising_device
 
         return optimising_device.greatest_weights(tree, targets, bundles)
-    o, records, grid = optimiser(tree), Records(), grid_of(tree)
-    greatest = np.zeros_like(o.density)
+    grid, greatest = grid_of(tree), np.zeros((kernels.parts(), len(tree.density_values)), np.float32)
     for origins, directions, seen in bundles:
-        _, counts = kernels.look(grid, *in_voxels(tree, origins, directions), o.density, o.sh, seen, records, weighing=True)
-        kernels.greatest(records, counts, seen.gain, greatest)
-    return greatest
+        start, along, _ = in_voxels(tree, origins, directions)
+        kernels.greatest(grid, start, along, tree.density_values, seen.gain, greatest)
+    return greatest.max(axis=0)
 
 
 def reported(bundles: Iterator[Bundle], count: int, looked: Callable[[int, int], None] | None) -> Iterator[Bundle]:

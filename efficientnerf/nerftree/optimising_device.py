@@ -18,7 +18,7 @@ from efficientnerf.device_pixels import DevicePixels
 from efficientnerf.kernels import cuda_tree_grad as kernels
 from efficientnerf.kernels.cuda_tree_grad import DeviceGrid, Rays, device_grid
 from efficientnerf.late import LAG
-from efficientnerf.nerftree.optimising import DECAY, EPSILON, STATE, Bundle, Optimiser, Targets, optimiser, randomness
+from efficientnerf.nerftree.optimising import DECAY, EPSILON, STATE, Bundle, Optimiser, Targets, randomness
 from efficientnerf.nerftree.tree import NerfTree
 from efficientnerf.pixels import Pixels
 from efficientnerf.transfer import constant, fetched
@@ -92,8 +92,8 @@ def optimise(
 
 def values_of(tree: NerfTree, device: torch.device) -> tuple[DeviceGrid, Tensor, Tensor]:
     """Where a tree's voxels lie, their density (N,) and harmonics (N, 3 K)."""
-    o = optimiser(tree)
-    return device_grid(tree, device), torch.from_numpy(o.density).to(device), torch.from_numpy(o.sh).to(device)
+    density, sh = (np.array(values, np.float32) for values in (tree.density_values, tree.sh.reshape(len(tree.sh), -1)))
+    return device_grid(tree, device), torch.from_numpy(density).to(device), torch.from_numpy(sh).to(device)
 
 
 def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> float:

@@ -83,6 +83,20 @@ def test_more_pixels_never_make_a_voxel_less_visible() -> None:
     assert (few > 0).sum() < (many > 0).sum()
 
 
+@pytest.mark.parametrize("resolution", [16, 15, 9, 4])
+def test_of_a_coarser_grid_what_was_seen_of_a_finer_one(resolution: int) -> None:
+    """Each coarse voxel has the greatest of the fine ones whose centres it holds, and about what it would have shown itself."""
+    bounds = np.array([[0.0, 0.0, 0.0], [2.0, 1.5, 1.0]])
+    (shape, voxel), (coarse_shape, coarse_voxel) = grid_of(bounds, 16, 4), grid_of(bounds, resolution, 4)
+    fine = np.random.default_rng(3).random([4 * n for n in shape]).astype(np.float32) ** 8
+    made = dense(baking.coarsened(sparse(fine, 4), shape, voxel, coarse_shape, coarse_voxel, 4, 0.01), coarse_shape, 4)
+    expected = np.zeros_like(made)
+    for at in np.argwhere(fine > 0.01):
+        to = tuple(np.floor((at + 0.5) * voxel / coarse_voxel).astype(int))
+        expected[to] = max(expected[to], fine[tuple(at)])
+    np.testing.assert_array_equal(made, expected)
+
+
 def test_masked_pixels_are_not_looked_at_and_progress_ends_at_its_total() -> None:
     some = pixels(8, 24)
     some.usable = np.packbits(np.arange(len(some)) < 7)

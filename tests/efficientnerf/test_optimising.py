@@ -240,6 +240,44 @@ def test_weights_are_what_voxels_contribute() -> None:
     np.testing.assert_array_equal(voxel_coordinates(without), at[weights > np.median(weights)])
 
 
+def weights_by_hand(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """Samples of FORMAT.md, section 6, one after the other."""
+    out, number = np.zeros(len(tree.density_values)), {tuple(at): n for n, at in enumerate(voxel_coordinates(tree).tolist())}
+    size = np.array(tree.resolution)
+    for ray, (origin, along) in enumerate(zip((origins - tree.bounds_min) / tree.voxel, directions, strict=True)):
+        with np.errstate(divide="ignore"):
+            faces = np.stack([-origin / along, (size - origin) / along])
+        begin, end, light = max(faces.min(axis=0).max(), 0.0), faces.max(axis=0).min(), 1.0
+        for t in np.arange(begin + 0.25, end, 0.5):
+            point = origin + t * along
+            sigma = float(tree.density((tree.bounds_min + point * tree.voxel)[None])[0])
+            alpha = 1 - np.exp(-sigma * 0.5 * tree.voxel)
+            low = np.floor(point - 0.5).astype(int)
+            for corner in np.ndindex(2, 2, 2):
+                v = number.get(tuple((low + corner).tolist()), -1)
+                share = np.prod(np.where(corner, point - 0.5 - low, 1.5 - point + low))
+                if v >= 0:
+                    out[v] = max(out[v], gain[ray] * light * alpha * share)
+            light *= 1 - alpha
+    return out
+
+
+def test_greatest_weights_are_those_of_a_march_by_hand_in_any_number_of_parts() -> None:
+    tree = random_tree(3, shape=(2, 3, 2), brick=3, sigma=6.0)
+    origins, directions = rays_at(tree, 40)
+    gain = np.random.default_rng(0).random(40).astype(np.float32)
+    start, along, _ = in_voxels(tree, origins, directions)
+    found = []
+    for parts in (1, 3):
+        into = np.zeros((parts, len(tree.density_values)), np.float32)
+        for half in (slice(0, 25), slice(25, 40)):  # what is known is raised
+            kernels.greatest(grid_of(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
+        found.append(into.max(axis=0))
+    np.testing.assert_array_equal(*found)
+    np.testing.assert_allclose(found[0], weights_by_hand(tree, origins, directions, gain), atol=1e-5)
+    assert (found[0] > 0).mean() > 0.3
+
+
 def test_steps_are_those_of_the_formula() -> None:
     tree = random_tree(4, brick=2, degree=1)
     o, records = optimiser(tree), Records()
@@ -288,4 +326,5 @@ def test_what_hides_behind_an_opaque_wall_is_reached() -> None:
 
 def test_state_names_every_array_of_an_optimiser() -> None:
     o = optimiser(random_tree(2))
-    assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(optimising.STATE)
+    assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(optimising.SQUARES)
+    assert all(isinstance(getattr(o, name), np.ndarray) for name in optimising.STATE)

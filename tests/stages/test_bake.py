@@ -13,12 +13,17 @@ import pytest
 import torch
 
 from efficientnerf.compositing import activate
-from efficientnerf.nerftree import baking, format
+from efficientnerf.nerftree import baking, format, writing
 from efficientnerf.nerftree.tree import NerfTree
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
+<<<<<<< HEAD
 from stages import bake, memory, train
 from stages.bake import ASSET, BakeSettings, chosen_resolution
+=======
+from stages import bake, resolution, train
+from stages.bake import ASSET, BakeSettings
+>>>>>>> 6c25860 (Choose an asset's resolution from its budget: what was left over of 64 MiB bought nothing, and small budgets made holes where a coarser grid has none; find the voxels that show without keeping every sample, on a quarter of the rays)
 from stages.evaluate import truth_of
 from stages.field import FILE, load_renderer, save_model
 from stages.scene import load
@@ -128,6 +133,7 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
     assert fitted["voxels_baked"] >= len(tree.density_values)
     assert report == {
         "resolution": [24, 24, 24],
+        "chosen": {"resolution": 24, "why": "bake.resolution"},
         "voxels": len(tree.density_values),
         "bricks": len(tree.voxel_index),
         "bytes": (made.out / ASSET).stat().st_size,
@@ -158,14 +164,25 @@ def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None
         run(job(tmp_path, QUICK, poses=inputs["poses"], train=tmp_path / "train"))
 
 
-def test_the_resolution_follows_the_pixels(inputs: dict[str, Path]) -> None:
-    s = load(inputs["poses"])
-    # A pixel covers 3 / (1.3 * 16) at the centre, a voxel three quarters of that; the box is 2 wide; 32 at least.
-    assert chosen_resolution(s, 384) == 32
-    focal = 100.0
-    sharper = tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, params=(focal, 8.0, 8.0))) for v in s.views)
-    assert chosen_resolution(dataclasses.replace(s, views=sharper), 384) == round(2 / (0.75 * 3 / focal))
-    assert chosen_resolution(dataclasses.replace(s, views=sharper), 64) == 64
+def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is room the pixels decide, else the room, and the coarser asset is as if that resolution had been asked for."""
+    fitted = dataclasses.replace(QUICK, resolution=0, points=1, optimise=2, weight=0.0)
+    monkeypatch.setattr(resolution, "PIXELS", 0.2)
+    sizes = {}
+    for room in (10**7, 20_000):
+        monkeypatch.setattr(writing, "most_voxels", lambda *asked, room=room: room)
+        told: list[dict[str, Any]] = []
+        made = job(tmp_path / str(room), fitted, **inputs)
+        made._report = told.append
+        digest = run(made)
+        assert run(job(tmp_path / f"{room} again", fitted, **inputs)) == digest
+        report = json.loads((made.out / "report.json").read_text())
+        sizes[room] = report["chosen"]["resolution"], report["optimisation"]["voxels_baked"], report["voxels"]
+        assert max(report["resolution"]) >= report["chosen"]["resolution"] > max(report["resolution"]) - 4
+        assert any(report["chosen"]["why"] in event.get("text", "") for event in told)
+    assert sizes[10**7][0] == resolution.finest_resolution(load(inputs["poses"]), 1024).resolution > sizes[20_000][0] >= 32
+    assert 10_000 < sizes[20_000][1] <= 2 * 20_000
+    assert sizes[20_000][2] <= 20_000 < sizes[10**7][2]
 
 
 @pytest.mark.parametrize("layout", ["compact", "sparse"])

@@ -1,0 +1,80 @@
+"""The resolution of an asset: as fine as its budget has room for, and no finer than the photographs tell apart.
+
+How many voxels a surface or a fog takes at some resolution can't be told from the box. So the network is looked at once, on the finest grid
+that comes into question; on coarser grids the same voxels are counted: first on two that are cheap, whose exponent says how the number grows (2
+for surfaces, 3 for what fills space), then on the one that this promises. Nothing depends on the clock or on the memory that happens to be free.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from stages.scene import Scene
+
+LEAST = 32  # voxels along the longest side
+PIXELS = 0.75  # of a pixel's width that a voxel is at least wide
+CLOSE = 0.93  # of the room that is used, at least
+TRIES = 4
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A resolution, and one sentence on what decided it."""
+
+    resolution: int
+    why: str
+
+
+def finest_resolution(s: Scene, most: int) -> Choice:
+    """Voxels along the longest side of the box, so that a voxel covers about three quarters of a pixel at the box's centre, for the median camera;
+    at most `most` of them.
+
+    In normalised device coordinates, where a pixel is as wide at any depth, a voxel is as wide as a pixel.
+    """
+    if s.forward is not None:
+        wide, share = s.forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views])), 1.0
+        side = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
+    else:
+        centre = np.asarray(s.bounds, np.float64).mean(axis=0)
+        wide, share = float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views])), PIXELS
+        side = float((s.bounds[1] - s.bounds[0]).max())
+    told = max(LEAST, round(side / (share * wide)))
+    if told > most:
+        return Choice(most, f"bake.max_resolution; pixels would tell {told} apart")
+    return Choice(told, f"a voxel covers {share:g} of a pixel")
+
+
+def affordable_resolution(finest: Choice, count: Callable[[int], int], room: Callable[[int], int]) -> Choice:
+    """The greatest resolution up to the finest at which no more voxels are baked than there is room for, about.
+
+    count  voxels that would be baked at a resolution
+    room   voxels that may be
+    """
+    top = finest.resolution
+    low, high = (max(LEAST, top // n) for n in (4, 2))
+    few, more = count(low), count(high)
+    power = float(np.clip(math.log(max(more, 1) / max(few, 1)) / math.log(high / low), 1.5, 3)) if high > low else 2.0
+
+    def scaled(at: int, voxels: int) -> int:
+        return int(np.clip(int(at * (0.5 * (1 + CLOSE) * room(at) / max(voxels, 1)) ** (1 / power)), LEAST, top))
+
+    at = top if more * (top / high) ** power <= 1.2 * room(top) else scaled(high, more)
+    best = 0
+    for _ in range(TRIES):
+        voxels = count(at)
+        if voxels <= room(at):
+            best = max(best, at)
+            if at == top or voxels >= CLOSE * room(at):
+                break
+        following = scaled(at, voxels)
+        if following in (at, best):
+            break
+        at = following
+    best = best or at
+    return finest if best == top else Choice(best, f"as fine as bake.max_mib has room for, where voxels grow with the resolution to the power {power:.1f}")
