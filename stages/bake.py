@@ -181,7 +181,6 @@ def spiral_of(forward: Forward) -> dict[str, Any]:
 
 
 SPARE = 2  # so many times the voxels that there is room for are baked at most: the tree itself then shows which of them matter
-DENSE = 1.75  # and so many at a resolution that is chosen: about as many as are kept, and some more, for the lightest matter less than detail
 
 
 def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels) -> tuple[Choice, Visible, np.ndarray]:
@@ -217,10 +216,12 @@ def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels) -> tuple[Choice, Visible
             last = resolution, coarse, baking.chosen_voxels(coarse, shape, brick, settings.weight, settings.dilate)
         return last
 
-    choice = affordable_resolution(finest, lambda at: len(look(at)[2]), lambda at: int(DENSE * room(at)))
+    choice = affordable_resolution(finest, lambda at: len(look(at)[2]), lambda at: SPARE * room(at))
     _, coarse, indices = look(choice.resolution)
     most = SPARE * room(choice.resolution)
-    return choice, coarse, indices if len(indices) <= most else _kept(job, coarse, baking.grid_of(bounds, choice.resolution, brick)[0], most)
+    if len(indices) > most:  # on the coarsest grid, too
+        indices = _kept(job, coarse, baking.grid_of(bounds, choice.resolution, brick)[0], most)
+    return choice, coarse, indices
 
 
 def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray) -> Visible:

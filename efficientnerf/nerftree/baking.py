@@ -11,7 +11,6 @@ B coarse cells, P pixels, N voxels.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -28,7 +27,6 @@ from efficientnerf.render import split_by_box
 
 RAYS_PER_BLOCK = 8192
 POINTS_PER_BLOCK = 2**17
-SLAB = 2**27  # voxels of the grid that are marked at once: a byte each
 
 
 def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int, int, int], float]:
@@ -113,48 +111,44 @@ def coarsened(
 ) -> Visible:
     """What was seen of a grid, for one of larger voxels of the same corner: each of these has the greatest weight of the voxels whose centres lie in it.
     Weights that don't exceed `threshold` are left out."""
-    row, local = np.nonzero(seen.greatest > threshold)
-    cell = np.stack(np.unravel_index(seen.cells[row], shape), axis=-1)
-    index = cell * brick + np.stack(np.unravel_index(local, (brick,) * 3), axis=-1)
-    index = ((index + 0.5) * (voxel / to_voxel)).astype(np.int64)
-    cell = np.minimum(index // brick, np.asarray(to_shape) - 1)
-    inside = index - cell * brick
-    cells, row_of = np.unique(np.ravel_multi_index(tuple(cell.T), to_shape), return_inverse=True)
-    greatest = np.zeros((len(cells), brick**3), np.float32)
-    slot = row_of * brick**3 + (inside[:, 0] * brick + inside[:, 1]) * brick + inside[:, 2]
-    np.maximum.at(greatest.reshape(-1), slot, seen.greatest[row, local])
-    return replace(seen, cells=cells, greatest=greatest)
+    from efficientnerf.kernels.cpu_voxels import carry
+
+    row_of = np.full(math.prod(to_shape), -1, np.int32)
+    given = seen.cells, seen.greatest, float(np.float32(threshold)), shape, to_shape, voxel / to_voxel, brick, row_of
+    rows = carry(*given, np.zeros((0, brick**3), np.float32), 0)
+    greatest = np.zeros((rows, brick**3), np.float32)
+    carry(*given, greatest, rows)
+    cells = np.flatnonzero(row_of >= 0)
+    return replace(seen, cells=cells, greatest=greatest[row_of[cells]])
 
 
 def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
     """Coordinates (N, 3) int32 of the voxels whose greatest weight exceeds `threshold`, and of those around them, in the order of the grid.
 
-    They are marked in one slab of the grid after the other, so that memory grows with what is found and not with the neighbours that are looked at, of
-    which there are 27 to a voxel and most the same.
+    They are marked in the cells that they reach, so that memory grows with what is found, and neither with the grid nor with the neighbours looked at.
     """
-    row, local = np.nonzero(seen.greatest > threshold)
-    x, y, z = ((c * brick + o).astype(np.int32) for c, o in zip(np.unravel_index(seen.cells[row], shape), np.unravel_index(local, (brick,) * 3), strict=True))
-    order = np.argsort(x, kind="stable")
-    x, y, z = x[order], y[order], z[order]
-    size = [n * brick for n in shape]
-    wide = [n + 2 * dilate for n in size]  # with a margin, so that no neighbour has to be tested
-    planes = max(1, SLAB // (wide[1] * wide[2]))
-    shifts = range(-dilate, dilate + 1)
-    found = []
-    for begin in range(0, size[0], planes):
-        end = min(size[0], begin + planes)
-        near = slice(*np.searchsorted(x, (begin - dilate, end + dilate)))
-        if near.start == near.stop:
-            continue
-        marks = np.zeros((end - begin + 4 * dilate, wide[1], wide[2]), bool)
-        at = ((x[near] - begin + 2 * dilate).astype(np.int64) * wide[1] + y[near] + dilate) * wide[2] + z[near] + dilate
-        for dx, dy, dz in itertools.product(shifts, repeat=3):
-            marks.reshape(-1)[at + ((dx * wide[1] + dy) * wide[2] + dz)] = True
-        inside = marks[2 * dilate : 2 * dilate + end - begin, dilate : dilate + size[1], dilate : dilate + size[2]]
-        part = np.argwhere(inside).astype(np.int32)
-        part[:, 0] += begin
-        found.append(part)
-    return np.concatenate(found) if found else np.empty((0, 3), np.int32)
+    from efficientnerf.kernels.cpu_voxels import listed, mark
+
+    threshold = float(np.float32(threshold))
+    reached = np.zeros(shape, bool)
+    reached.reshape(-1)[seen.cells[(seen.greatest > threshold).any(axis=1)]] = True
+    for axis in range(3):
+        for _ in range(math.ceil(dilate / brick)):
+            low, high = reached.copy().swapaxes(0, axis), reached.swapaxes(0, axis)
+            high[1:] |= low[:-1]
+            high[:-1] |= low[1:]
+    cells = np.flatnonzero(reached)
+    row_of = np.full(reached.size, -1, np.int32)
+    row_of[cells] = np.arange(len(cells))
+    into = np.zeros((len(cells), brick**3), bool)
+    mark(seen.cells, seen.greatest, threshold, shape, brick, dilate, row_of, into)
+    flat = np.empty(np.count_nonzero(into), np.int64)
+    listed(into, cells, shape, brick, flat)
+    flat.sort()
+    index = np.empty((len(flat), 3), np.int32)
+    for axis in (2, 1, 0):
+        flat, index[:, axis] = np.divmod(flat, shape[axis] * brick)
+    return index
 
 
 @torch.no_grad()

@@ -92,7 +92,7 @@ def optimise(
 
 def values_of(tree: NerfTree, device: torch.device) -> tuple[DeviceGrid, Tensor, Tensor]:
     """Where a tree's voxels lie, their density (N,) and harmonics (N, 3 K)."""
-    density, sh = (np.array(values, np.float32) for values in (tree.density_values, tree.sh.reshape(len(tree.sh), -1)))
+    density, sh = (np.array(values, np.float32) for values in (tree.density_values, tree.sh.reshape(len(tree.sh), 3 * tree.harmonics_count)))
     return device_grid(tree, device), torch.from_numpy(density).to(device), torch.from_numpy(sh).to(device)
 
 

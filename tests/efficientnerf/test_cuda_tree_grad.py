@@ -99,8 +99,9 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
     assert not by_density.any()
     assert not by_sh.any()
     assert (loss > 0).any()
-    empty = optimising.kept(optimiser(tree), np.zeros(len(tree.density_values), bool), tree)
-    bare = replace(tree, brick_index=np.full_like(tree.brick_index, -1), voxel_index=tree.voxel_index[:0], density_values=empty.density, harmonics=tree.sh[:0])
+    bare = replace(
+        tree, brick_index=np.full_like(tree.brick_index, -1), voxel_index=tree.voxel_index[:0], density_values=tree.density_values[:0], harmonics=tree.sh[:0]
+    )
     assert (gradients(bare, origins, directions, seen_at_random(40, 0.0))[0] > 0).any()
 
 

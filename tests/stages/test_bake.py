@@ -17,13 +17,8 @@ from efficientnerf.nerftree import baking, format, writing
 from efficientnerf.nerftree.tree import NerfTree
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
-<<<<<<< HEAD
-from stages import bake, memory, train
-from stages.bake import ASSET, BakeSettings, chosen_resolution
-=======
-from stages import bake, resolution, train
+from stages import bake, memory, resolution, train
 from stages.bake import ASSET, BakeSettings
->>>>>>> 6c25860 (Choose an asset's resolution from its budget: what was left over of 64 MiB bought nothing, and small budgets made holes where a coarser grid has none; find the voxels that show without keeping every sample, on a quarter of the rays)
 from stages.evaluate import truth_of
 from stages.field import FILE, load_renderer, save_model
 from stages.scene import load
