@@ -45,7 +45,7 @@ class BakeSettings:
     pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
     max_mib: int = setting(
-        32, "how large the asset may get; its resolution follows, and the time about in proportion; where that is set, the lightest voxels are left out",
+        24, "how large the asset may get; its resolution follows, and the time about in proportion; where that is set, the lightest voxels are left out",
         minimum=1, unit="MiB",
     )  # fmt: skip
     layout: str = setting(
