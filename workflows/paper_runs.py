@@ -81,7 +81,7 @@ def scenes(data: Path) -> list[Path]:
 
 
 def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
-    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, voxels 0.225, batch 0.2, widths 0.15, depths 0.05.
+    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, voxels 0.225, batches 0.2, widths 0.15, depths 0.05.
 
     Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
     and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
@@ -115,6 +115,7 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
     out["bake"]["resolution"] = max(96, 8 * round(out["bake"]["resolution"] * scale**0.3 / 8))
     out["bake"]["points"] = max(4, round(out["bake"]["points"] * fifth))
     out["bake"]["pixels"] = max(50_000, round(1e6 * fifth))
+    out["bake"]["optimise_rays"] = max(4096, 1024 * round(out["bake"]["optimise_rays"] * fifth / 1024))
     out["evaluate"] |= {"views": 10 if scale < 0.1 else 0, "scale": 1.0}
     return out
 
