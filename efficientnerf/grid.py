@@ -116,6 +116,10 @@ def voxel_centres(space: Space, points: Tensor, resolution: int) -> Tensor:
 
     The paper's alternative to linear interpolation (EfficientNeRF, section 4.1): a field that only ever is asked for discrete coordinates loses
     nothing when its values there are all that is kept.
+
+    What it costs, and brings, was measured once: Realistic Synthetic *chair* at 200x200, 700 steps of the preset `preview`, 160 voxels, 80 steps of the fit
+    of baked values, one seed. Test views of the asset: 33.5 dB interpolated; 31.6 dB trained on centres and not interpolated; 31.4 dB trained as
+    usual and not interpolated.
     """
     extent = 2 * space.half
     side = float(extent.max()) / resolution

@@ -35,7 +35,9 @@ class TrainSettings:
         choices=("efficient", "valid", "hierarchical", "uniform"),
     )
     discretise: int = _setting(
-        0, "voxels along the longest side of the box whose centres stand for all points in them, so that baking with bake.lookup=nearest loses nothing; 0: off",
+        0,
+        "voxels along the longest side of the box whose centres stand for all points in them, so that baking with bake.lookup=nearest loses nothing; "
+        "looks up a single voxel a sample, but at 160 voxels a short run on chair came out 1.9 dB below interpolation; 0: off",
         minimum=0, maximum=4096,
     )  # fmt: skip
     degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
