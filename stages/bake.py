@@ -124,7 +124,7 @@ def run(job: Job) -> None:
     format.save(tree.with_metadata(provenance=provenance), job.out / ASSET, settings.layout)
     size = (job.out / ASSET).stat().st_size
     report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size, "optimisation": fitted}
-    report |= {"chosen": {"resolution": resolution, "why": choice.why}}
+    report |= {"voxels_along_longest_side": resolution, "resolution_decided_by": choice.why}
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 

@@ -66,6 +66,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         _looks(folder),
         _files(folder),
         _section("Held-back views", _picture(folder, "evaluate/contact_sheet.png", "Truth, render and error") + _views(found)),
+        _section("Asset", _facts(folder, "bake/report.json")),
         _section("Mesh", _picture(folder, "mesh/preview.png", "The mesh, coloured and plain") + _facts(folder, "mesh/report.json")),
         _section("Training", _picture(folder, "train/curve.png", "PSNR over steps") + _row(folder, "train/previews", "Held-back view, truth left")),
         _section("Cameras", _cameras(folder) + _picture(folder, "poses/contact_sheet.png", "The photographs and what became of them")),

@@ -128,7 +128,8 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
     assert fitted["voxels_baked"] >= len(tree.density_values)
     assert report == {
         "resolution": [24, 24, 24],
-        "chosen": {"resolution": 24, "why": "bake.resolution"},
+        "voxels_along_longest_side": 24,
+        "resolution_decided_by": "bake.resolution",
         "voxels": len(tree.density_values),
         "bricks": len(tree.voxel_index),
         "bytes": (made.out / ASSET).stat().st_size,
@@ -172,9 +173,9 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
         digest = run(made)
         assert run(job(tmp_path / f"{room} again", fitted, **inputs)) == digest
         report = json.loads((made.out / "report.json").read_text())
-        sizes[room] = report["chosen"]["resolution"], report["optimisation"]["voxels_baked"], report["voxels"]
-        assert max(report["resolution"]) >= report["chosen"]["resolution"] > max(report["resolution"]) - 4
-        assert any(report["chosen"]["why"] in event.get("text", "") for event in told)
+        sizes[room] = report["voxels_along_longest_side"], report["optimisation"]["voxels_baked"], report["voxels"]
+        assert max(report["resolution"]) >= report["voxels_along_longest_side"] > max(report["resolution"]) - 4
+        assert any(report["resolution_decided_by"] in event.get("text", "") for event in told)
     assert sizes[10**7][0] == resolution.finest_resolution(load(inputs["poses"]), 1024).resolution > sizes[20_000][0] >= 32
     assert 10_000 < sizes[20_000][1] <= 2 * 20_000
     assert sizes[20_000][2] <= 20_000 < sizes[10**7][2]

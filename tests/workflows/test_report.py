@@ -85,8 +85,11 @@ def test_names_and_reasons_are_text_not_markup(tmp_path: Path) -> None:
     run = a_run(tmp_path / "a run & more", {"network": {"psnr": 20.0, "ssim": 0.5}, "views": [view]})
     (run.path / "poses").mkdir()
     (run.path / "poses/report.json").write_text(json.dumps({"registered": [1], "rejected": [{"name": "<i>", "reason": "blur & fog"}]}), encoding="utf-8")
+    (run.path / "bake").mkdir(exist_ok=True)
+    (run.path / "bake/report.json").write_text(json.dumps({"voxels": 5, "resolution_decided_by": "pixels & room"}), encoding="utf-8")
     text = page(run, [])
     links(text)
+    assert "pixels &amp; room" in text
     assert "<script" not in text
     assert "<b>chairs" not in text
     assert "blur &amp; fog" in text
@@ -96,7 +99,7 @@ def test_names_and_reasons_are_text_not_markup(tmp_path: Path) -> None:
 
 def test_a_damaged_run_gets_a_page_too(tmp_path: Path) -> None:
     run = a_run(tmp_path / "run")
-    for name in ("evaluate/metrics.json", "poses/report.json", "mesh/report.json"):
+    for name in ("evaluate/metrics.json", "poses/report.json", "bake/report.json", "mesh/report.json"):
         (run.path / name).parent.mkdir(exist_ok=True)
         (run.path / name).write_text("{", encoding="utf-8")
     assert "not evaluated yet" in page(run, [])
