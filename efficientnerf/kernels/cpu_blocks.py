@@ -21,7 +21,7 @@ import numpy as np
 from efficientnerf import harmonics
 from efficientnerf.kernels.lanes import apart, four_at, plus_scaled, pointer, scaled
 
-POOL_BYTES = 8 * 2**20  # of a thread's blocks
+POOL_BYTES = 4 * 2**20  # of a thread's blocks
 
 # Sums may be taken in any order and products fused; infinities and no-numbers keep their meaning.
 LOOSE = {"contract", "reassoc", "arcp", "nsz"}
@@ -62,7 +62,7 @@ class Grid(NamedTuple):
     nx: int
     ny: int
     nz: int
-    cell: Any
+    leap: Any
     place: Any
     brick_index: Any
     voxel_index: Any
@@ -110,7 +110,7 @@ class Pool(NamedTuple):
 def grid_of(packed, brick):  # type: ignore[no-untyped-def]
     """The arrays of a Packed as pointers."""
     return Grid(
-        brick, packed.cell.shape[0], packed.cell.shape[1], packed.cell.shape[2], pointer(packed.cell), pointer(packed.place),
+        brick, packed.leap.shape[0], packed.leap.shape[1], packed.leap.shape[2], pointer(packed.leap), pointer(packed.place),
         pointer(packed.brick_index), pointer(packed.voxel_index), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0,
         pointer(packed.sh), pointer(packed.base), pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1],
         pointer(packed.palette), packed.palette.shape[1], pointer(packed.column),
@@ -156,20 +156,15 @@ def _voxels_into(owner, grid, scale, values, words, begin):  # type: ignore[no-u
         k0, k1 = (0, 1) if r == 0 else (1, side - 1) if r == 1 else (side - 1, side)
         for i in range(i0, i1):
             for j in range(j0, j1):
-                at = begin + 4 * ((i * side + j) * side + k0)
-                if there < 0:
-                    for _ in range(k0, k1):
-                        values[at], words[at + 1] = np.float32(0), np.int32(-1)
-                        at += 4
-                else:
-                    x, y, z = i - 1 - (p - 1) * brick, j - 1 - (q - 1) * brick, k0 - 1 - (r - 1) * brick
-                    local = ((there * brick + x) * brick + y) * brick + z
-                    for _ in range(k0, k1):
-                        index = grid.voxel_index[local]
-                        values[at] = grid.density[index] * scale if index >= 0 else np.float32(0)
-                        words[at + 1] = index
-                        at += 4
-                        local += 1
+                at = begin + 4 * ((i * side + j) * side + k0) + 1
+                x, y, z = i - 1 - (p - 1) * brick, j - 1 - (q - 1) * brick, k0 - 1 - (r - 1) * brick
+                local = ((there * brick + x) * brick + y) * brick + z
+                for k in range(k1 - k0):
+                    words[at + 4 * k] = grid.voxel_index[local + k] if there >= 0 else np.int32(-1)
+    # In a loop of its own and without branches: what is looked up lies far away, and waiting for one should not keep from asking for the next.
+    for n in range(side * side * side):
+        index = words[begin + 4 * n + 1]
+        values[begin + 4 * n] = grid.density[max(index, np.int32(0))] * (scale if index >= 0 else np.float32(0))
     _mark_idle(values, begin, side)
 
 

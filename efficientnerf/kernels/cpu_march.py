@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from efficientnerf.kernels.cpu_blocks import COLOURS, EXACT, LOOSE, VOXELS, basis_into, colour, fill, sum_of_harmonics
-from efficientnerf.kernels.lanes import apart, four_at, plus_scaled, scaled
+from efficientnerf.kernels.lanes import EXP2, apart, four_at, logistic, plus_scaled, scaled, together
 
 STEP = 0.5  # of a voxel
 STOP = 1e-3  # transmittance at which a ray may end
@@ -23,11 +23,8 @@ FAINT = 1e-4  # weight under which a sample's colour is not looked up; the next 
 ROUNDING = 1e-3  # of a step: a skip that is computed in float32 ends so much early, for it must never end late
 
 _HALF, _ONE = np.float32(0.5), np.float32(1)
-_LOGISTIC_REACH, _LOGISTIC_PER_UNIT = 16, 64
-_LOGISTIC = (1 / (1 + np.exp(-np.linspace(-_LOGISTIC_REACH, _LOGISTIC_REACH, 2 * _LOGISTIC_REACH * _LOGISTIC_PER_UNIT + 1)))).astype(np.float32)
 LOG2E = math.log2(math.e)
-# 2^-f = 1 + f (c_0 + f (c_1 + ...)) for f from 0 to 1, to 6e-8: least largest error among those that are 1 at 0.
-_EXP2 = tuple(np.float32(c) for c in (-0.69314442, 0.24018671, -0.05531669, 0.00922838, -0.00095403))
+_EXP2 = tuple(np.float32(c) for c in EXP2)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
@@ -62,26 +59,18 @@ def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
 def _mixed(block, at, j, i, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Interpolates the four numbers of eight voxels; no-numbers where one is not stored."""
+    """Interpolates the four numbers of eight voxels: density and colours before the sigmoid; these are no-numbers where a voxel is not stored."""
     w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
     one = plus_scaled(scaled(w0, four_at(block, at)), w1, four_at(block, at + 4))
     one = plus_scaled(plus_scaled(one, w2, four_at(block, at + j)), w3, four_at(block, at + j + 4))
     other = plus_scaled(scaled(w4, four_at(block, at + i)), w5, four_at(block, at + i + 4))
     other = plus_scaled(plus_scaled(other, w6, four_at(block, at + i + j)), w7, four_at(block, at + i + j + 4))
-    return apart(plus_scaled(one, _ONE, other))
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
-def _logistic(x):  # type: ignore[no-untyped-def]
-    """1 / (1 + exp(-x)) to 3e-6."""
-    at = min(max((x + np.float32(_LOGISTIC_REACH)) * np.float32(_LOGISTIC_PER_UNIT), np.float32(0)), np.float32(len(_LOGISTIC) - 1.001))
-    i = int(at)
-    return _LOGISTIC[i] + (at - np.float32(i)) * (_LOGISTIC[i + 1] - _LOGISTIC[i])
+    return plus_scaled(one, _ONE, other)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
 def _partial(block, at, j, i, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Colours before the sigmoid interpolated over those of the eight voxels that are stored."""
+    """Zero, and colours before the sigmoid interpolated over those of the eight voxels that are stored."""
     w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
     weight = (w0, w1, w2, w3, w4, w5, w6, w7)
     total = r = g = b = np.float32(0)
@@ -94,7 +83,7 @@ def _partial(block, at, j, i, fx, fy, fz):  # type: ignore[no-untyped-def]
             g += weight[n] * block[one + 2]
             b += weight[n] * block[one + 3]
     share = _ONE / total if total > 0 else np.float32(0)
-    return r * share, g * share, b * share
+    return together(np.float32(0), r * share, g * share, b * share)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
@@ -112,7 +101,7 @@ def _exact(words, at, j, i, fx, fy, fz, grid, basis):  # type: ignore[no-untyped
             green += weight[n] * g
             blue += weight[n] * b
     share = _ONE / total if total > 0 else np.float32(0)
-    return red * share, green * share, blue * share
+    return together(np.float32(0), red * share, green * share, blue * share)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -121,10 +110,12 @@ def _density(u, v, w, grid, view, pool):  # type: ignore[no-untyped-def]
     brick = grid.brick
     if not (0 <= u < grid.nx * brick and 0 <= v < grid.ny * brick and 0 <= w < grid.nz * brick):
         return np.float32(0)
-    a, e, c = int(u) // brick, int(v) // brick, int(w) // brick
-    owner = np.int64(grid.cell[(a * grid.ny + e) * grid.nz + c])
-    if owner < 0:
+    part = np.float32(1 / brick)
+    a, e, c = min(int(u * part), grid.nx - 1), min(int(v * part), grid.ny - 1), min(int(w * part), grid.nz - 1)
+    there = (a * grid.ny + e) * grid.nz + c
+    if grid.leap[there] > 0:
         return np.float32(0)
+    owner = np.int64(grid.brick_index[there])
     slot = pool.slot[owner]
     if slot < 0:
         slot = fill(owner, grid, view.scale, pool)
@@ -168,7 +159,7 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, b
     # The parameter at which a face at x is crossed: x * slope + shift; never, along an axis that the ray does not move on.
     slope_x, slope_y, slope_z = (_ONE / dx if dx != 0 else none), (_ONE / dy if dy != 0 else none), (_ONE / dz if dz != 0 else none)
     light, owed = _ONE, np.float32(0)
-    red = green = blue = np.float32(0)
+    total = together(np.float32(0), np.float32(0), np.float32(0), np.float32(0))
     hit = np.float32(np.inf)
     looked = False
     cells = tested = mixed = colours = 0
@@ -178,9 +169,10 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, b
         a = min(max(int(u * per_brick), 0), grid.nx - 1)
         e = min(max(int(v * per_brick), 0), grid.ny - 1)
         c = min(max(int(w * per_brick), 0), grid.nz - 1)
-        owner = np.int64(grid.cell[(a * grid.ny + e) * grid.nz + c])
+        there = (a * grid.ny + e) * grid.nz + c
+        leap = np.int64(grid.leap[there])
         cells += 1
-        far = 1 if owner >= 0 else -1 - owner
+        far = max(leap, 1)
         # To the end of the cell, or of the empty cube round it: the nearest of its three far faces.
         x = np.float32(a + far if dx > 0 else a - far + 1) * width
         y = np.float32(e + far if dy > 0 else e - far + 1) * width
@@ -190,9 +182,10 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, b
         tz = (z - ez) * slope_z if dz != 0 else big
         end = min(min(tx, ty, tz) * np.float32(1 / STEP) - np.float32(0.5 + ROUNDING), np.float32(last))
         until = min(max(int(np.ceil(end)), k + 1), last)
-        if owner < 0:
+        if leap > 0:
             k = until
             continue
+        owner = np.int64(grid.brick_index[there])
         slot = pool.slot[owner]
         if slot < 0:
             slot = fill(owner, grid, view.scale, pool)
@@ -211,9 +204,10 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, b
             if kind == VOXELS:
                 kind = colour(slot, grid, view, pool)
             fx, fy, fz = x - i, y - j, z - l
-            r = g = b = np.float32(0)
+            mix, red = total, _ONE
             if kind == COLOURS:
-                sigma, r, g, b = _mixed(values, at, 4 * side, 4 * plane, fx, fy, fz)
+                mix = _mixed(values, at, 4 * side, 4 * plane, fx, fy, fz)
+                sigma, red, _, _ = apart(mix)
             else:
                 sigma = _trilinear(values, at, 4 * side, 4 * plane, fx, fy, fz)
             if sigma <= 0:
@@ -226,12 +220,10 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, b
                     if not looked:
                         basis_into(look_x, look_y, look_z, view.degree, basis)
                         looked = True
-                    r, g, b = _exact(words, at, 4 * side, 4 * plane, fx, fy, fz, grid, basis)
-                elif r != r:
-                    r, g, b = _partial(values, at, 4 * side, 4 * plane, fx, fy, fz)
-                red += owed * _logistic(r)
-                green += owed * _logistic(g)
-                blue += owed * _logistic(b)
+                    mix = _exact(words, at, 4 * side, 4 * plane, fx, fy, fz, grid, basis)
+                elif red != red:
+                    mix = _partial(values, at, 4 * side, 4 * plane, fx, fy, fz)
+                total = plus_scaled(total, owed, logistic(mix))
                 owed = np.float32(0)
             if left <= _HALF and light > _HALF:
                 hit = s - _HALF * step + np.log2(2 * light) / sigma * step
@@ -240,5 +232,6 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, b
                 last = k
                 break
         tested += k
-    out[0], out[1], out[2], out[3], out[4] = red, green, blue, _ONE - light, hit
+    _, out[0], out[1], out[2] = apart(total)
+    out[3], out[4] = _ONE - light, hit
     out[5], out[6], out[7], out[8] = cells, tested, mixed, colours

@@ -114,8 +114,9 @@ def _free(x, y, z, grid):  # type: ignore[no-untyped-def]
     # What lies in the box is no nearer to the point than to the point's nearest in the box.
     qx, qy, qz = min(max(x, 0.0), nx), min(max(y, 0.0), ny), min(max(z, 0.0), nz)
     away = (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2
-    a, e, c = min(int(qx) // brick, grid.nx - 1), min(int(qy) // brick, grid.ny - 1), min(int(qz) // brick, grid.nz - 1)
-    leap = -1 - grid.cell[(a * grid.ny + e) * grid.nz + c]
+    part = 1 / brick
+    a, e, c = min(int(qx * part), grid.nx - 1), min(int(qy * part), grid.ny - 1), min(int(qz * part), grid.nz - 1)
+    leap = np.int64(grid.leap[(a * grid.ny + e) * grid.nz + c])
     inner = 0.0
     if leap > 0:
         ux, uy, uz = qx - a * brick, qy - e * brick, qz - c * brick

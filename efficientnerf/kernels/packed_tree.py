@@ -22,7 +22,7 @@ SOME = 2**16  # voxels that stand for all
 class Packed(NamedTuple):
     """See the module. The harmonics are either in `sh` or in the four arrays after it; the others are empty.
 
-    cell      (X, Y, Z) int32: the brick of a coarse cell, or -1 - leap where there is none, or nothing that absorbs light
+    leap      (X, Y, Z) uint8: as `NerfTree.leap`, but a brick near which nothing absorbs light is none
     place     (B, 3) int32: the coarse cell of a brick
     brick_index, voxel_index, density  the tree's own
     sh        (N, K, 3) float32: the tree's own
@@ -33,7 +33,7 @@ class Packed(NamedTuple):
               moves, root mean square over all directions
     """
 
-    cell: np.ndarray
+    leap: np.ndarray
     place: np.ndarray
     brick_index: np.ndarray
     voxel_index: np.ndarray
@@ -49,7 +49,7 @@ class Packed(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Of the arrays that are not the tree's own."""
-        return self.cell.nbytes + self.place.nbytes + self.palette.nbytes
+        return self.leap.nbytes + self.place.nbytes + self.palette.nbytes
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -100,7 +100,6 @@ def pack(tree: NerfTree) -> Packed:
     _absorbing(place, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, absorbing)
     full = tree.brick_index >= 0
     full[full] = absorbing[tree.brick_index[full]]
-    cell = np.where(full, tree.brick_index, -1 - leaps(full).astype(np.int32))
     harmonics = tree.harmonics
     if isinstance(harmonics, PaletteHarmonics):
         palette = np.zeros((harmonics.palette.shape[1], harmonics.palette.shape[0], 4), np.float32)
@@ -109,4 +108,4 @@ def pack(tree: NerfTree) -> Packed:
     else:
         none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
         coded = np.ascontiguousarray(harmonics, np.float32), *none
-    return Packed(cell, place, tree.brick_index, tree.voxel_index, tree.density_values, *coded, _slope(tree))
+    return Packed(leaps(full), place, tree.brick_index, tree.voxel_index, tree.density_values, *coded, _slope(tree))

@@ -13,7 +13,7 @@ from efficientnerf.cameras import Camera, rays, resized
 from efficientnerf.harmonics import basis_numpy
 from efficientnerf.kernels import cpu_blocks, cpu_march
 from efficientnerf.kernels.cpu_blocks import Pool, View, colour, fill, grid_of
-from efficientnerf.kernels.lanes import pointer
+from efficientnerf.kernels.lanes import apart, logistic, pointer, together
 from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
 from efficientnerf.render import render_tree_reference
 from tests.efficientnerf.balls import pose
@@ -48,13 +48,18 @@ def test_the_kernels_harmonics_are_those_of_the_project(degree: int) -> None:
         np.testing.assert_allclose(out, row, atol=2e-6)
 
 
+@numba.njit
+def logistics(a, b, c, d):  # type: ignore[no-untyped-def]
+    return apart(logistic(together(a, b, c, d)))
+
+
 def test_the_kernels_exponential_and_logistic() -> None:
     x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 400), [0.0, np.inf]]).astype(np.float32)
     np.testing.assert_allclose([cpu_march._exp2_minus(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
     assert cpu_march._exp2_minus(np.float32(0)) == 1
-    y = np.concatenate([-x, x[:-1], np.linspace(-20, 20, 2000).astype(np.float32)])
+    y = np.concatenate([-x, x, np.linspace(-20, 20, 2000).astype(np.float32)])
     with np.errstate(over="ignore"):
-        np.testing.assert_allclose([cpu_march._logistic(v) for v in y], 1 / (1 + np.exp(-y.astype(np.float64))), atol=4e-6)
+        np.testing.assert_allclose([logistics(*v) for v in y.reshape(-1, 4)], 1 / (1 + np.exp(-y.astype(np.float64).reshape(-1, 4))), atol=4e-6)
 
 
 @numba.njit
@@ -141,10 +146,10 @@ def test_bricks_near_which_nothing_absorbs_light_are_empty_to_the_kernel() -> No
     for cell in np.argwhere(tree.brick_index >= 0):
         absorbs[tuple(cell)] = tree.density_block(tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
     assert 0 < absorbs.sum() < (tree.brick_index >= 0).sum()
-    cell = tree.packed.cell
-    assert np.array_equal(cell[absorbs], tree.brick_index[absorbs])
+    leap = tree.packed.leap
+    assert not leap[absorbs].any()
     for at in np.argwhere(~absorbs):
-        assert -1 - cell[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()
+        assert leap[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()
 
 
 def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTree:
@@ -286,7 +291,7 @@ def test_pictures_of_every_camera_model_are_their_rays(model: str, supersample: 
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=share)
     timid = replace(tree)
-    timid.__dict__["packed"] = tree.packed._replace(cell=np.maximum(tree.packed.cell, -1))
+    timid.__dict__["packed"] = tree.packed._replace(leap=np.minimum(tree.packed.leap, 1))
     camera = camera_of(tree, model, distance)
     usual, other = tree.render(camera), timid.render(camera)
     for name in FIELDS:
