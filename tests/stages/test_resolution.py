@@ -14,12 +14,12 @@ from tests.stages.balls import poses
 
 def test_the_finest_follows_the_pixels(tmp_path: Path) -> None:
     s = load(poses(tmp_path))
-    # A pixel covers 3 / (1.3 * 16) at the centre, a voxel three quarters of that; the box is 2 wide; 32 at least.
+    # A pixel covers 3 / (1.3 * 16) at the centre, a voxel half of that; the box is 2 wide; 32 at least.
     assert finest_resolution(s, 384).resolution == LEAST
     focal = 100.0
     sharper = dataclasses.replace(s, views=tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, params=(focal, 8.0, 8.0))) for v in s.views))
-    told = round(2 / (0.75 * 3 / focal))
-    assert finest_resolution(sharper, 384) == Choice(told, "a voxel covers 0.75 of a pixel")
+    told = round(2 / (0.5 * 3 / focal))
+    assert finest_resolution(sharper, 384) == Choice(told, "a voxel covers 0.5 of a pixel")
     held = finest_resolution(sharper, 64)
     assert held.resolution == 64
     assert "bake.max_resolution" in held.why
@@ -29,7 +29,7 @@ def test_the_finest_follows_the_pixels(tmp_path: Path) -> None:
 @pytest.mark.parametrize("power", [1.6, 2.0, 2.4, 3.0])
 @pytest.mark.parametrize("room", [3_000, 50_000, 800_000, 10_000_000])
 def test_the_room_is_used_where_voxels_grow_by_a_power(power: float, room: int) -> None:
-    finest = Choice(800, "a voxel covers 0.75 of a pixel")
+    finest = Choice(800, "pixels")
     asked = []
 
     def count(resolution: int) -> int:
