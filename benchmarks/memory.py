@@ -1,0 +1,118 @@
+"""Peak memory and time of each stage for many large photographs: 100 of 12 megapixels unless told otherwise, drawn here, with known cameras.
+
+    python benchmarks/memory.py [--count 100] [--width 4000] [--set train.iterations=300] [--json FILE] [--keep FOLDER]
+
+The scene is a patterned ball over a patterned floor under a plain sky, written as JPEGs and a transforms.json. It is trained at full size
+(`poses.max_side` is the width), for a few hundred steps, and baked with a few steps of fitting: quality is not the matter here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+DRAWN = 4  # pixels a side of a photograph for each that is computed; noise fills in between
+
+
+def pose(angle: float, height: float) -> np.ndarray:
+    """Camera to world, (4, 4), x right, y up, looking along -z from a circle of radius 4 at the ball's foot."""
+    centre = np.array([4 * np.cos(angle), 4 * np.sin(angle), height])
+    back = centre / np.linalg.norm(centre)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    out = np.eye(4)
+    out[:3, 0], out[:3, 1], out[:3, 2], out[:3, 3] = right, np.cross(back, right), back, centre
+    return out
+
+
+def drawing(world_from_camera: np.ndarray, width: int, height: int, focal: float) -> np.ndarray:
+    """(H, W, 3) uint8: what a pinhole camera sees of a ball of radius 1 that stands on a floor."""
+    y, x = np.mgrid[0:height, 0:width]
+    local = np.stack([(x + 0.5 - width / 2) / focal, -(y + 0.5 - height / 2) / focal, -np.ones(x.shape)], axis=-1)
+    d = local @ world_from_camera[:3, :3].T
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    o = world_from_camera[:3, 3] - np.array([0.0, 0.0, 0.3])  # of the ball's centre
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = d @ o
+        ball = -along - np.sqrt(along**2 - (o @ o - 1))
+        floor = np.where(d[..., 2] < 0, -(o[2] + 1) / d[..., 2], np.nan)
+    ball, floor = (np.nan_to_num(t, nan=np.inf)[..., None] for t in (ball, floor))
+    nearest = np.minimum(ball, floor)
+    at = np.where(np.isfinite(nearest), o + np.where(np.isfinite(nearest), nearest, 0) * d, 0)
+    spots = 0.5 + 0.5 * np.sin(9 * at) * np.sin(7 * at[..., [1, 2, 0]])
+    tiles = 0.35 + 0.3 * ((np.floor(2 * at[..., :1]) + np.floor(2 * at[..., 1:2])) % 2) * np.array([1.0, 0.9, 0.7])
+    colour = np.where(ball < floor, 0.2 + 0.7 * spots, np.where(floor < 25, tiles, np.array([0.7, 0.8, 0.95])))
+    return (255 * np.clip(colour, 0, 1)).astype(np.uint8)
+
+
+def draw(folder: Path, count: int, width: int) -> None:
+    """The photographs and their transforms.json."""
+    from PIL import Image
+
+    height, rng = 3 * width // 4, np.random.default_rng(0)
+    frames = []
+    for n in range(count):
+        camera = pose(2.399963 * n, 0.6 + 2.4 * n / count)  # turned by the golden angle
+        small = drawing(camera, width // DRAWN, height // DRAWN, 0.9 * width / DRAWN)
+        image = np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC), np.int16)
+        noisy = np.clip(image + rng.integers(-6, 7, image.shape, np.int16), 0, 255).astype(np.uint8)
+        Image.fromarray(noisy).save(folder / f"{n:04d}.jpg", quality=92)
+        frames.append({"file_path": f"{n:04d}.jpg", "transform_matrix": camera.tolist()})
+    lens = {"camera_model": "PINHOLE", "w": width, "h": height, "fl_x": 0.9 * width, "fl_y": 0.9 * width, "cx": width / 2, "cy": height / 2}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}), encoding="utf-8")
+
+
+def measured(photographs: Path, run: Path, sets: list[str]) -> dict[str, dict[str, float]]:
+    """Seconds and peak of resident memory of each stage, made by a process of its own."""
+    rows = {}
+    for stage in ("poses", "train", "bake"):
+        source = [str(photographs)] if stage == "poses" else []
+        command = [sys.executable, "-m", "workflows.cli", "run", *source, "--out", str(run), "--until", stage, "--quiet"]
+        for text in sets if stage == "poses" else []:
+            command += ["--set", text]
+        began = time.perf_counter()
+        child = subprocess.Popen(command)
+        _, status, used = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        if child.returncode != 0:
+            raise SystemExit(f"{' '.join(command)}: exit code {child.returncode}")
+        rows[stage] = {"seconds": time.perf_counter() - began, "cpu_seconds": used.ru_utime + used.ru_stime, "peak_mib": used.ru_maxrss / 1024}
+        print(f"{stage:8}{rows[stage]['seconds']:8.0f} s{rows[stage]['cpu_seconds']:8.0f} s of the processor{rows[stage]['peak_mib']:8.0f} MiB", flush=True)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=100, help="photographs")
+    parser.add_argument("--width", type=int, default=4000, help="of each, pixels; three quarters as high")
+    parser.add_argument("--set", dest="sets", action="append", default=[], help="a setting of the run, as for enerf; may be given again")
+    parser.add_argument("--json", type=Path, help="where to write the figures")
+    parser.add_argument("--keep", type=Path, help="folder that is kept, with the photographs and the run; else one that is removed")
+    arguments = parser.parse_args()
+    sets = [f"poses.max_side={arguments.width}", "train.iterations=300", "train.preview_every=0", "bake.optimise=8", *arguments.sets]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = arguments.keep or Path(temporary)
+        (folder / "photographs").mkdir(parents=True, exist_ok=True)
+        load = os.getloadavg()
+        draw(folder / "photographs", arguments.count, arguments.width)
+        rows = measured(folder / "photographs", folder / "run", sets)
+    if arguments.json is not None:
+        report: dict[str, Any] = {
+            "photographs": arguments.count, "width": arguments.width, "height": 3 * arguments.width // 4, "settings": sets, "stages": rows,
+            "cores": len(os.sched_getaffinity(0)), "processor": platform.machine(), "load_before": load, "load_after": os.getloadavg(),
+        }  # fmt: skip
+        arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
