@@ -140,27 +140,39 @@ def basis_into(x, y, z, degree, out):  # type: ignore[no-untyped-def]
         out[23], out[24] = _C4[7] * x * z * (xx - three * yy), _C4[8] * (xx * (xx - three * yy) - yy * (three * xx - yy))
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _beside(owner, a, e, c, grid):  # type: ignore[no-untyped-def]
+    """The brick (a, e, c) cells away from one, or -1."""
+    x, y, z = grid.place[3 * owner] + a, grid.place[3 * owner + 1] + e, grid.place[3 * owner + 2] + c
+    other = np.int64(-1)
+    if 0 <= x < grid.nx and 0 <= y < grid.ny and 0 <= z < grid.nz:
+        other = np.int64(grid.brick_index[(x * grid.ny + y) * grid.nz + z])
+    return other
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _voxels_into(owner, grid, scale, values, words, begin):  # type: ignore[no-untyped-def]
     """Densities and which voxels they are of into the block that begins there."""
-    brick, side = grid.brick, grid.brick + 2
-    for n in range(27):
-        p, q, r = n // 9, n // 3 % 3, n % 3
-        a, e, c = grid.place[3 * owner] + p - 1, grid.place[3 * owner + 1] + q - 1, grid.place[3 * owner + 2] + r - 1
-        there = np.int64(-1)
-        if 0 <= a < grid.nx and 0 <= e < grid.ny and 0 <= c < grid.nz:
-            there = np.int64(grid.brick_index[(a * grid.ny + e) * grid.nz + c])
-        # Voxels of the block that are the neighbour's: one layer where it is beside the brick.
+    brick, side, index, none = grid.brick, grid.brick + 2, grid.voxel_index, np.int32(-1)
+    cube = brick * brick * brick
+    for n in range(9):
+        p, q = n // 3, n % 3
+        before, here, after = _beside(owner, p - 1, q - 1, -1, grid), _beside(owner, p - 1, q - 1, 0, grid), _beside(owner, p - 1, q - 1, 1, grid)
+        # Rows of the block that are those neighbours': one layer where they are beside the brick.
         i0, i1 = (0, 1) if p == 0 else (1, side - 1) if p == 1 else (side - 1, side)
         j0, j1 = (0, 1) if q == 0 else (1, side - 1) if q == 1 else (side - 1, side)
-        k0, k1 = (0, 1) if r == 0 else (1, side - 1) if r == 1 else (side - 1, side)
         for i in range(i0, i1):
             for j in range(j0, j1):
-                at = begin + 4 * ((i * side + j) * side + k0) + 1
-                x, y, z = i - 1 - (p - 1) * brick, j - 1 - (q - 1) * brick, k0 - 1 - (r - 1) * brick
-                local = ((there * brick + x) * brick + y) * brick + z
-                for k in range(k1 - k0):
-                    words[at + 4 * k] = grid.voxel_index[local + k] if there >= 0 else np.int32(-1)
+                at = begin + 4 * (i * side + j) * side + 1
+                row = ((i - 1 - (p - 1) * brick) * brick + j - 1 - (q - 1) * brick) * brick
+                words[at] = index[before * cube + row + brick - 1] if before >= 0 else none
+                words[at + 4 * (side - 1)] = index[after * cube + row] if after >= 0 else none
+                if here >= 0:
+                    for k in range(brick):
+                        words[at + 4 * k + 4] = index[here * cube + row + k]
+                else:
+                    for k in range(brick):
+                        words[at + 4 * k + 4] = none
     # In a loop of its own and without branches: what is looked up lies far away, and waiting for one should not keep from asking for the next.
     for n in range(side * side * side):
         index = words[begin + 4 * n + 1]
@@ -212,14 +224,11 @@ def sum_of_harmonics(n, grid, basis):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _painted(owner, a, e, c, grid, pool):  # type: ignore[no-untyped-def]
     """Where the block of the brick beside one begins, (a, e, c) cells away, if it has colours; else -1."""
-    x, y, z = grid.place[3 * owner] + a, grid.place[3 * owner + 1] + e, grid.place[3 * owner + 2] + c
-    begin = np.int64(-1)
-    if 0 <= x < grid.nx and 0 <= y < grid.ny and 0 <= z < grid.nz:
-        other = np.int64(grid.brick_index[(x * grid.ny + y) * grid.nz + z])
-        if other >= 0:
-            slot = np.int64(pool.slot[other])
-            if slot >= 0 and pool.kind[slot] == COLOURS:
-                begin = slot * pool.size
+    other, begin = _beside(owner, a, e, c, grid), np.int64(-1)
+    if other >= 0:
+        slot = np.int64(pool.slot[other])
+        if slot >= 0 and pool.kind[slot] == COLOURS:
+            begin = slot * pool.size
     return begin
 
 
