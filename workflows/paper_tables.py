@@ -61,7 +61,10 @@ def quality(request: Request) -> Result:
         ["EfficientNeRF, NerfTree", _mean(t["psnr"] for t in tree), 31.68, _mean(t["ssim"] for t in tree), 0.954, None, None,
          _mean(t["fps"] for t in tree), 238.46, tree[0]["frame"]],
     ]  # fmt: skip
-    notes = ["The paper's figures are means of the eight synthetic scenes at 800x800; LPIPS stands in metrics.json of `enerf run` where its weights are given.", FIT]
+    notes = [
+        "The paper's figures are means of the eight synthetic scenes at 800x800; LPIPS stands in metrics.json of `enerf run` where its weights are given.",
+        FIT,
+    ]
     return Result(columns, [dict(zip(columns, row, strict=True)) for row in table], [*notes, *_notes(request, rows)], curves)
 
 
