@@ -65,6 +65,11 @@ class BakeSettings:
     optimise_rays: int = setting(32768, "training pixels of a step of the optimisation", minimum=1, maximum=1 << 22)
     density_rate: float = setting(0.3, "optimisation: rate of RMSprop for the logarithm of a voxel's optical thickness", minimum=0.0)
     colour_rate: float = setting(0.03, "optimisation: rate of RMSprop for the harmonics", minimum=0.0)
+    view_share: float | None = setting(
+        None, "optimisation: share of colour_rate for what depends on the direction; none: 1 for cut-out objects, and 0.2 where surroundings are learned,"
+        " for noise of photographs and small errors of their cameras would go there",
+        minimum=0.0, maximum=1.0,
+    )  # fmt: skip
     final_rate: float = setting(0.3, "optimisation: what is left of the rates at the last step; they fall exponentially", minimum=0.0, maximum=1.0)
     licence: str = setting("", "licence text to write into the asset")
 

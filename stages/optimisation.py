@@ -26,6 +26,8 @@ CHECKPOINT_SECONDS = 30.0
 SAMPLE = 2**16  # training pixels that the report's figures are taken from
 WEIGHED = 1  # training pixels per voxel that are looked at to see which voxels show; not fewer than bake.pixels. Four kept a tenth more that no picture missed
 
+PHOTOGRAPHS = 0.2  # view_share where surroundings are learned. Held-back views of still_life, 384 voxels a side: at 1, 28.57 dB; 0.2: 28.65; 0.05: 28.59
+
 
 def optimised(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[NerfTree, dict[str, Any]]:
     """The fitted tree with at most `most` voxels, and figures for the report."""
@@ -63,6 +65,7 @@ def _fit(job: Job, o: Optimiser, targets: Targets, until: int, pruned: bool) -> 
     run = optimising.optimise(
         o, targets, until=until, steps=settings.optimise, rays=settings.optimise_rays, density_rate=settings.density_rate,
         colour_rate=settings.colour_rate, final=settings.final_rate, seed=settings.seed,
+        view_share=settings.view_share if settings.view_share is not None else 1.0 if o.tree.background is not None else PHOTOGRAPHS,
     )  # fmt: skip
     for error in run:
         smooth = error if not smooth else 0.9 * smooth + 0.1 * error

@@ -203,7 +203,7 @@ def _weigh(  # type: ignore[no-untyped-def]
 @triton.jit(do_not_specialize=["number"])
 def _descend(  # type: ignore[no-untyped-def]
     density, sh, by_thickness, by_sh, square_density, square_sh, visits, stamp,
-    voxels, number, a_one, voxel, density_rate, colour_rate, decay, log_decay, epsilon, least, greatest, most_visits,
+    voxels, number, a_one, voxel, density_rate, colour_rate, view_share, decay, log_decay, epsilon, least, greatest, most_visits,
     WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """`efficientnerf.kernels.cpu_tree_grad.descend` from gradients in whole numbers, `a_one` each."""
@@ -228,7 +228,8 @@ def _descend(  # type: ignore[no-untyped-def]
         square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(grown * grown, 1) / WIDTH
         tl.store(square_sh + v, square, met)
         scale = colour_rate / (tl.sqrt(square * right) + epsilon)
-        tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * grown, there)
+        of_column = tl.where(column < 3, 1.0, view_share)
+        tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * of_column[None, :] * grown, there)
         tl.store(by_sh + at, tl.zeros_like(at), there)
 
 
@@ -286,11 +287,12 @@ def weigh(g: DeviceGrid, rays: Rays, density: Tensor, gain: Tensor, greatest: Te
 
 def descend(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], squares: tuple[Tensor, Tensor], visits: Tensor, stamp: Tensor, *,
-    number: int, rays: int, density_rate: float, colour_rate: float, decay: float, epsilon: float,
+    number: int, rays: int, density_rate: float, colour_rate: float, view_share: float, decay: float, epsilon: float,
 ) -> None:  # fmt: skip
     """A step of RMSprop for the voxels that the last `pull`, of so many rays, met; see `efficientnerf.kernels.cpu_tree_grad.descend`."""
     voxels = len(visits)
     _descend[(max(1, triton.cdiv(voxels, VOXELS)),)](
-        *values, *sums, *squares, visits, stamp, voxels, number, 1 / resolution(rays), float(g.voxel), density_rate, colour_rate, decay, math.log(decay),
+        *values, *sums, *squares, visits, stamp, voxels, number, 1 / resolution(rays), float(g.voxel), density_rate, colour_rate, float(view_share),
+        decay, math.log(decay),
         epsilon, LEAST, GREATEST, MOST_VISITS, WIDTH=3 * g.terms, ROW=g.row, BLOCK=VOXELS, num_warps=4,
     )  # fmt: skip

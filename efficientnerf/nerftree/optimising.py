@@ -188,7 +188,8 @@ def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tu
 
 
 def optimise(
-    o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int
+    o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int,
+    view_share: float = 1.0,
 ) -> Iterator[float]:
     """Go on to step `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.
 
@@ -196,18 +197,21 @@ def optimise(
     rays          in a step
     density_rate  for the logarithm of the optical thickness
     colour_rate   for the harmonics
+    view_share    of that rate, for harmonics of degree 1 and above: what depends on the direction
     """
     if targets.on_device:
         from efficientnerf.nerftree import optimising_device
 
         yield from optimising_device.optimise(
-            o, targets, until=until, steps=steps, rays=rays, density_rate=density_rate, colour_rate=colour_rate, final=final, seed=seed
-        )
+            o, targets, until=until, steps=steps, rays=rays, density_rate=density_rate, colour_rate=colour_rate, final=final, seed=seed,
+            view_share=view_share,
+        )  # fmt: skip
         return
     grid, records = grid_of(o.tree), Records()
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
     stamp = np.zeros(len(o.density), np.int32)
     rates = np.full(o.sh.shape[1], colour_rate, np.float32)
+    rates[3:] *= view_share
     while o.step < until:
         number = o.step + 1
         origins, directions, seen = targets.draw(rays, randomness(seed, number))

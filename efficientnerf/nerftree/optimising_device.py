@@ -46,7 +46,7 @@ class DeviceFit:
         """The arrays on the host."""
         return {name: values.cpu().numpy() for name, values in self.values.items()}
 
-    def step(self, number: int, rays: Rays, seen: Any, density_rate: float, colour_rate: float) -> Tensor:
+    def step(self, number: int, rays: Rays, seen: Any, density_rate: float, colour_rate: float, view_share: float = 1.0) -> Tensor:
         """Losses (R,) of the rays before the step."""
         v, sums = self.values, (self.by_thickness, self.by_sh)
         seen_as = kernels.look(self.grid, rays, v["density"], v["sh"])
@@ -54,7 +54,7 @@ class DeviceFit:
         kernels.pull(self.grid, rays, v["density"], v["sh"], seen_as, (by[0], by[1]), sums, self.stamp, number)
         kernels.descend(
             self.grid, (v["density"], v["sh"]), sums, (v["square_density"], v["square_sh"]), v["visits"], self.stamp,
-            number=number, rays=len(loss), density_rate=density_rate, colour_rate=colour_rate, decay=DECAY, epsilon=EPSILON,
+            number=number, rays=len(loss), density_rate=density_rate, colour_rate=colour_rate, view_share=view_share, decay=DECAY, epsilon=EPSILON,
         )  # fmt: skip
         return loss
 
@@ -67,7 +67,8 @@ def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
 
 
 def optimise(
-    o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int
+    o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int,
+    view_share: float = 1.0,
 ) -> Iterator[float]:
     """See `efficientnerf.nerftree.optimising.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
     assert isinstance(targets.pixels, DevicePixels)
@@ -79,7 +80,7 @@ def optimise(
         number = o.step + 1
         origins, directions, seen = targets.draw(rays, randomness(seed, number))
         fall = final ** (number / steps)
-        loss = fit.step(number, rays_in_voxels(o.tree, origins, directions), seen, density_rate * fall, colour_rate * fall)
+        loss = fit.step(number, rays_in_voxels(o.tree, origins, directions), seen, density_rate * fall, colour_rate * fall, view_share)
         pending.append(fetched(loss.mean() / 3))
         o.step = number
         if error is None or len(pending) > LAG:

@@ -114,7 +114,7 @@ def fit() -> None:
         seen_as = cuda_tree_grad.look(g, rays, *values)
         cuda_tree_grad.pull(g, rays, *values, seen_as, (seen_as[0], seen_as[1]), sums, stamp, 7)
         cuda_tree_grad.weigh(g, rays, values[0], seen_as[1], squares[0])
-        told = {"number": 7, "rays": 8, "density_rate": 0.1, "colour_rate": 0.1, "decay": 0.9, "epsilon": 1e-10}
+        told = {"number": 7, "rays": 8, "density_rate": 0.1, "colour_rate": 0.1, "view_share": 0.5, "decay": 0.9, "epsilon": 1e-10}
         cuda_tree_grad.descend(g, values, sums, squares, visits, stamp, **told)
 
 

@@ -110,7 +110,7 @@ def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, s
     o = optimiser(tree)
     errors: list[float] = []
     for end in until:
-        errors += optimise(o, targets, until=end, steps=steps, rays=rays, density_rate=0.3, colour_rate=0.05, final=0.1, seed=1)
+        errors += optimise(o, targets, until=end, steps=steps, rays=rays, density_rate=0.3, colour_rate=0.05, final=0.1, seed=1, view_share=0.5)
         o.fetch()
     return o, errors
 

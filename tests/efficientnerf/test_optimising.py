@@ -151,6 +151,16 @@ def test_fog_becomes_the_ball_of_the_pictures() -> None:
     assert (tree.density_values >= 0).all()
 
 
+def test_no_share_for_what_depends_on_the_direction_leaves_it_alone() -> None:
+    targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
+    tree = ball_tree(12)
+    fixed, _ = fitted(tree, targets, 10, view_share=0.0)
+    free, _ = fitted(tree, targets, 10)
+    np.testing.assert_array_equal(fixed.sh[:, 1:], tree.sh[:, 1:])
+    assert (fixed.sh[:, 0] != tree.sh[:, 0]).any()
+    assert (free.sh[:, 1:] != tree.sh[:, 1:]).any()
+
+
 def test_photographs_are_compared_through_what_lies_before_and_behind() -> None:
     """A pixel that the network's foreground hides pulls at nothing; elsewhere the right background leaves nothing for the tree to do."""
     some = pixels(4, 12)
