@@ -40,7 +40,11 @@ class BakeSettings:
         "trilinear", "what a point gets; trilinear: interpolated from the voxels around it; nearest: what its own voxel holds, drawn more slowly on CPUs",
         choices=("trilinear", "nearest"),
     )  # fmt: skip
-    max_resolution: int = setting(1024, "the most voxels along the longest side that are chosen by themselves", minimum=32, maximum=4096)
+    max_resolution: int | None = setting(
+        None, "the most voxels along the longest side that are chosen by themselves; none: 1024 for cut-out objects, 384 where surroundings are learned"
+        " (512 in normalised device coordinates)",
+        minimum=32, maximum=4096,
+    )  # fmt: skip
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
     pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)

@@ -21,6 +21,7 @@ LEAST = 32  # voxels along the longest side
 PIXELS = 0.5  # of a pixel's width that a voxel is at least wide. Held-back views of chair_200 at 1: 36.5 dB; 0.75: 37.4; 0.5: 37.6, at three times the bytes
 SURROUNDED = 4 / 3  # likewise where surroundings are learned: photographs hold noise, and finer voxels learn it. Held-back views of still_life at
 # 1.31 pixels (384 voxels a side): 28.57 dB; 0.98 (512): 28.44, and 28.36 after twice the steps
+MOST = {"cut out": 1024, "surrounded": 384, "ndc": 512}  # finer voxels took photographs longer than they were seen to gain
 CLOSE = 0.93  # of the room that is used, at least
 TRIES = 4
 
@@ -33,9 +34,9 @@ class Choice:
     why: str
 
 
-def finest_resolution(s: Scene, most: int) -> Choice:
+def finest_resolution(s: Scene, most: int | None) -> Choice:
     """Voxels along the longest side of the box, so that a voxel covers half a pixel at the box's centre, for the median camera, and 4/3 of it
-    where surroundings are learned; at most `most` of them.
+    where surroundings are learned; at most `most` of them, or MOST where it is None.
 
     In normalised device coordinates, where a pixel is as wide at any depth, a voxel is as wide as 4/3 of a pixel.
     """
@@ -47,6 +48,8 @@ def finest_resolution(s: Scene, most: int) -> Choice:
         wide = float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
         share = PIXELS if s.background is not None else SURROUNDED
         side = float((s.bounds[1] - s.bounds[0]).max())
+    if most is None:
+        most = MOST["ndc" if s.forward is not None else "cut out" if s.background is not None else "surrounded"]
     told = max(LEAST, round(side / (share * wide)))
     if told > most:
         return Choice(most, f"bake.max_resolution; pixels would tell {told} apart")
