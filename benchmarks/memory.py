@@ -12,14 +12,13 @@ import argparse
 import json
 import os
 import platform
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stage_runs import cost_of
 
 DRAWN = 4  # pixels a side of a photograph for each that is computed; noise fills in between
 
@@ -80,13 +79,7 @@ def measured(photographs: Path, run: Path, sets: list[str]) -> dict[str, dict[st
         command = [sys.executable, "-m", "workflows.cli", "run", *source, "--out", str(run), "--until", stage, "--quiet"]
         for text in sets if stage == "poses" else []:
             command += ["--set", text]
-        began = time.perf_counter()
-        child = subprocess.Popen(command)
-        _, status, used = os.wait4(child.pid, 0)
-        child.returncode = os.waitstatus_to_exitcode(status)
-        if child.returncode != 0:
-            raise SystemExit(f"{' '.join(command)}: exit code {child.returncode}")
-        rows[stage] = {"seconds": time.perf_counter() - began, "cpu_seconds": used.ru_utime + used.ru_stime, "peak_mib": used.ru_maxrss / 1024}
+        rows[stage] = cost_of(command)
         print(f"{stage:8}{rows[stage]['seconds']:8.0f} s{rows[stage]['cpu_seconds']:8.0f} s of the processor{rows[stage]['peak_mib']:8.0f} MiB", flush=True)
     return rows
 

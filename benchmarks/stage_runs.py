@@ -40,6 +40,11 @@ def made(run: Path, stage: str, settings: dict[str, Any]) -> dict[str, float]:
     command = [sys.executable, "-m", "workflows.cli", "stage", stage, str(run), "--force", "--quiet"]
     for name, value in settings.items():
         command += ["--set", f"{name}={value}"]
+    return cost_of(command)
+
+
+def cost_of(command: list[str]) -> dict[str, float]:
+    """Run a command: `seconds` by the clock, `cpu_seconds` of all its threads and `peak_mib` of resident memory."""
     start = time.perf_counter()
     child = subprocess.Popen(command)
     _, status, used = os.wait4(child.pid, 0)
