@@ -3,18 +3,34 @@
 numba's cache looks at the file of the kernel that is called, not at those of the functions written into it: whoever changes this file or those that it
 imports deletes `__pycache__` beside it, or sees the old march.
 
+Samples whose eight voxels hold something are composited four at a time: that many fill the widest registers that processors have, and one branch
+decides for all of them.
+
 Every ray samples at t = t_enter + (k + 1/2) * step, step = half a voxel, whatever it skips, so that skipping empty space changes no value.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
-from efficientnerf.kernels.cpu_blocks import COLOURS, EXACT, LOOSE, VOXELS, basis_into, colour, fill, sum_of_harmonics
-from efficientnerf.kernels.lanes import EXP2, apart, four_at, logistic, plus_scaled, scaled, together
+from efficientnerf.kernels.cpu_blocks import COLOURS, EXACT, LOOSE, QUEUE, basis_into, fill, sum_of_harmonics
+from efficientnerf.kernels.lanes import (
+    EXP2,
+    apart,
+    exp2_minus,
+    firsts,
+    four_at,
+    interpolated,
+    logistic,
+    plus_scaled,
+    put_four,
+    quarters,
+    together,
+)  # fmt: skip
 
 STEP = 0.5  # of a voxel
 STOP = 1e-3  # transmittance at which a ray may end
@@ -37,6 +53,12 @@ def _exp2_minus(x):  # type: ignore[no-untyped-def]
     return p * np.int32((np.int32(127) - whole) << np.int32(23)).view(np.float32)
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _lives(owner, voxel, grid):  # type: ignore[no-untyped-def]
+    """Whether any of the eight voxels from one of a block on has density."""
+    return (grid.live[owner * grid.words + (voxel >> 6)] >> (voxel & 63)) & 1 != 0
+
+
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
 def _trilinear(block, at, j, i, fx, fy, fz):  # type: ignore[no-untyped-def]
     """Interpolates the first of the four numbers of eight voxels from `at`; j and i are the strides of y and x."""
@@ -57,45 +79,16 @@ def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
     return a * gz, a * fz, b * gz, b * fz, c * gz, c * fz, d * gz, d * fz
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
-def _mixed(block, at, j, i, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Interpolates the four numbers of eight voxels: density and colours before the sigmoid; these are no-numbers where a voxel is not stored."""
-    w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
-    one = plus_scaled(scaled(w0, four_at(block, at)), w1, four_at(block, at + 4))
-    one = plus_scaled(plus_scaled(one, w2, four_at(block, at + j)), w3, four_at(block, at + j + 4))
-    other = plus_scaled(scaled(w4, four_at(block, at + i)), w5, four_at(block, at + i + 4))
-    other = plus_scaled(plus_scaled(other, w6, four_at(block, at + i + j)), w7, four_at(block, at + i + j + 4))
-    return plus_scaled(one, _ONE, other)
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def _partial(block, at, j, i, fx, fy, fz):  # type: ignore[no-untyped-def]
-    """Zero, and colours before the sigmoid interpolated over those of the eight voxels that are stored."""
-    w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
-    weight = (w0, w1, w2, w3, w4, w5, w6, w7)
-    total = r = g = b = np.float32(0)
-    for n in range(8):
-        one = at + (i if n & 4 else 0) + (j if n & 2 else 0) + (4 if n & 1 else 0)
-        red = block[one + 1]
-        if red == red:
-            total += weight[n]
-            r += weight[n] * red
-            g += weight[n] * block[one + 2]
-            b += weight[n] * block[one + 3]
-    share = _ONE / total if total > 0 else np.float32(0)
-    return together(np.float32(0), r * share, g * share, b * share)
-
-
 @numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
 def _exact(words, at, j, i, fx, fy, fz, grid, basis):  # type: ignore[no-untyped-def]
-    """The same where a block says which voxels are stored: their harmonics along the direction that `basis` is of."""
+    """Zero, and colours before the sigmoid where a block says which voxels are stored: their harmonics along the direction that `basis` is of."""
     w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
     weight = w0, w1, w2, w3, w4, w5, w6, w7
     total = red = green = blue = np.float32(0)
     for n in range(8):
         voxel = words[at + (i if n & 4 else 0) + (j if n & 2 else 0) + (5 if n & 1 else 1)]
         if voxel >= 0:
-            r, g, b = sum_of_harmonics(np.int64(voxel), grid, basis)
+            r, g, b = sum_of_harmonics(np.int64(voxel), grid, basis, 0, 1)
             total += weight[n]
             red += weight[n] * r
             green += weight[n] * g
@@ -116,13 +109,16 @@ def _density(u, v, w, grid, view, pool):  # type: ignore[no-untyped-def]
     if grid.leap[there] > 0:
         return np.float32(0)
     owner = np.int64(grid.brick_index[there])
-    slot = pool.slot[owner]
-    if slot < 0:
-        slot = fill(owner, grid, view.scale, pool)
     x, y, z = u - np.float32(a * brick) + _HALF, v - np.float32(e * brick) + _HALF, w - np.float32(c * brick) + _HALF
     i, j, k = int(x), int(y), int(z)
     side = brick + 2
-    at = slot * pool.size + 4 * ((i * side + j) * side + k)
+    voxel = (i * side + j) * side + k
+    if not _lives(owner, voxel, grid):
+        return np.float32(0)
+    slot = np.int64(pool.slot[owner])
+    if slot < 0:
+        slot = fill(owner, grid, view, pool)
+    at = slot * pool.size + 4 * voxel
     return _trilinear(pool.values, at, 4 * side, 4 * side * side, x - np.float32(i), y - np.float32(j), z - np.float32(k))
 
 
@@ -139,30 +135,125 @@ def normal_into(u, v, w, grid, view, pool, out):  # type: ignore[no-untyped-def]
         out[0] = out[1] = out[2] = np.float32(0)
 
 
+class Bench(NamedTuple):
+    """Where a ray is worked on, arrays as pointers.
+
+    x, y, z  (QUEUE,) float32: where the samples that wait lie between voxels, 0 to 1; their voxels are in `Pool.waiting`
+    along    (QUEUE,) float32: how far along the ray, voxels
+    state    (10,) float32: see below
+    basis    (K,) float32: the ray's harmonics
+    """
+
+    x: Any
+    y: Any
+    z: Any
+    along: Any
+    state: Any
+    basis: Any
+
+
+# What is known of a ray: four numbers of which the last three are its colour; the light that is left; what samples absorbed that have no colour yet; where
+# half of the light was gone; whether its harmonics are known; and how many samples were interpolated, and colours looked up.
+TOTAL, LIGHT, OWED, HIT, LOOKED, MIXED, LOOKUPS = 0, 4, 5, 6, 7, 8, 9
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
+def _crossing(light, left, sigma, along):  # type: ignore[no-untyped-def]
+    """Where half of the light is gone, if that is within a sample; else infinity."""
+    if left <= _HALF and light > _HALF:
+        return along - _HALF * np.float32(STEP) + np.log2(2 * light) / sigma * np.float32(STEP)
+    return np.float32(np.inf)
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, basis, pool, out):  # type: ignore[no-untyped-def]
+def _composite(count, grid, pool, bench):  # type: ignore[no-untyped-def]
+    """Adds the samples that wait, the first `count` of them, to what is known of a ray; the light that is left. Their blocks hold colours."""
+    at, x, y, z, along, state = pool.waiting, bench.x, bench.y, bench.z, bench.along, bench.state
+    side, spent = grid.brick + 2, np.float32(SPENT)
+    for n in range(count, QUEUE):
+        at[n] = pool.blocks * pool.size
+    mix = interpolated(
+        pool.values, at[0], at[1], at[2], at[3], 4 * side, 4 * side * side, together(x[0], x[1], x[2], x[3]), together(y[0], y[1], y[2], y[3]),
+        together(z[0], z[1], z[2], z[3]),
+    )  # fmt: skip
+    sigma = firsts(mix)
+    e0, e1, e2, e3 = apart(exp2_minus(sigma))
+    c0, c1, c2, c3 = quarters(logistic(mix))
+    # A ray that is spent ends at once, wherever its samples are cut into groups.
+    l0 = state[LIGHT]
+    l1 = l0 * e0
+    l2 = l1 * e1 if l1 >= spent else l1
+    l3 = l2 * e2 if l2 >= spent else l2
+    l4 = l3 * e3 if l3 >= spent else l3
+    total = plus_scaled(plus_scaled(four_at(state, TOTAL), l0 - l1, c0), l1 - l2, c1)
+    put_four(state, TOTAL, plus_scaled(plus_scaled(total, l2 - l3, c2), l3 - l4, c3))
+    if l4 <= _HALF and l0 > _HALF:
+        s0, s1, s2, s3 = apart(sigma)
+        first = min(_crossing(l0, l1, s0, along[0]), _crossing(l1, l2, s1, along[1]))
+        state[HIT] = min(first, _crossing(l2, l3, s2, along[2]), _crossing(l3, l4, s3, along[3]))
+    used = np.float32(min(count, 1 + (l1 >= spent) + (l2 >= spent) + (l3 >= spent)))
+    state[LIGHT], state[MIXED], state[LOOKUPS] = l4, state[MIXED] + used, state[LOOKUPS] + used
+    return l4
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
+def _composite_exactly(count, grid, view, pool, bench, look_x, look_y, look_z):  # type: ignore[no-untyped-def]
+    """The same where blocks hold voxels."""
+    at, state, side, light = pool.waiting, bench.state, grid.brick + 2, bench.state[LIGHT]
+    j, i = 4 * side, 4 * side * side
+    for n in range(count):
+        if light < np.float32(SPENT):
+            break
+        state[MIXED] += _ONE
+        fx, fy, fz = bench.x[n], bench.y[n], bench.z[n]
+        sigma = _trilinear(pool.values, at[n], j, i, fx, fy, fz)
+        left = light * _exp2_minus(sigma)
+        owed = state[OWED] + light - left
+        if owed > np.float32(FAINT):
+            if state[LOOKED] == 0:
+                basis_into(look_x, look_y, look_z, view.degree, bench.basis)
+                state[LOOKED] = _ONE
+            state[LOOKUPS] += _ONE
+            colour = logistic(_exact(pool.words, at[n], j, i, fx, fy, fz, grid, bench.basis))
+            put_four(state, TOTAL, plus_scaled(four_at(state, TOTAL), owed, colour))
+            owed = np.float32(0)
+        state[OWED] = owed
+        state[HIT] = min(state[HIT], _crossing(light, left, sigma, bench.along[n]))
+        light = left
+    state[LIGHT] = light
+    return light
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _composited(kind, count, grid, view, pool, bench, look_x, look_y, look_z):  # type: ignore[no-untyped-def]
+    """Adds the samples that wait to what is known of a ray; the light that is left."""
+    if kind == EXACT:
+        return _composite_exactly(count, grid, view, pool, bench, look_x, look_y, look_z)
+    return _composite(count, grid, pool, bench)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
+def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, pool, bench, out):  # type: ignore[no-untyped-def]
     """What lies on a ray from its k-th to its last-th sample.
 
     ex, ey, ez, dx, dy, dz  float32: where it enters the box, voxel coordinates, and its unit direction
     view, pool              see `cpu_blocks`; the view's scale is the length of a step, units of the frame, times log2(e)
     look_x, look_y, look_z  float32: the direction that the harmonics are asked for
-    basis                   (K,) float32: room for its harmonics
     out                     (9,) float32: red, green, blue, opacity; where half of the light is gone, voxels from the entry, or infinity; and what it took:
                             cells looked at, samples tested, samples interpolated, colours looked up
     """
-    values, words, brick = pool.values, pool.words, grid.brick
+    brick, state = grid.brick, bench.state
     side = brick + 2
-    plane = side * side
     step, width, per_brick = np.float32(STEP), np.float32(brick), np.float32(1 / brick)
     big, none = np.float32(1e30), np.float32(0)
-    row, layer = np.float32(side), np.float32(plane)
+    row, layer = np.float32(side), np.float32(side * side)
     # The parameter at which a face at x is crossed: x * slope + shift; never, along an axis that the ray does not move on.
     slope_x, slope_y, slope_z = (_ONE / dx if dx != 0 else none), (_ONE / dy if dy != 0 else none), (_ONE / dz if dz != 0 else none)
-    light, owed = _ONE, np.float32(0)
-    total = together(np.float32(0), np.float32(0), np.float32(0), np.float32(0))
-    hit = np.float32(np.inf)
-    looked = False
-    cells = tested = mixed = colours = 0
+    for n in range(10):
+        state[n] = none
+    state[LIGHT], state[HIT] = _ONE, np.float32(np.inf)
+    waiting, kind = 0, np.int64(COLOURS)
+    cells = tested = 0
     while k < last:
         s = (np.float32(k) + _HALF) * step
         u, v, w = ex + s * dx, ey + s * dy, ez + s * dz
@@ -185,53 +276,38 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, b
         if leap > 0:
             k = until
             continue
-        owner = np.int64(grid.brick_index[there])
-        slot = pool.slot[owner]
-        if slot < 0:
-            slot = fill(owner, grid, view.scale, pool)
-        kind, begin = pool.kind[slot], slot * pool.size
+        owner, begin = np.int64(grid.brick_index[there]), np.int64(-1)
         tested -= k
         bx, by, bz = ex - np.float32(a) * width + _HALF, ey - np.float32(e) * width + _HALF, ez - np.float32(c) * width + _HALF
         while k < until:
             s = (np.float32(k) + _HALF) * step
             x, y, z = bx + s * dx, by + s * dy, bz + s * dz
             i, j, l = np.floor(x), np.floor(y), np.floor(z)
-            at = begin + 4 * np.int64(np.int32(i * layer + j * row + l))
+            voxel = np.int64(np.int32(i * layer + j * row + l))
             k += 1
-            if words[at] < 0:
+            if not _lives(owner, voxel, grid):
                 continue
-            mixed += 1
-            if kind == VOXELS:
-                kind = colour(slot, grid, view, pool)
-            fx, fy, fz = x - i, y - j, z - l
-            mix, red = total, _ONE
-            if kind == COLOURS:
-                mix = _mixed(values, at, 4 * side, 4 * plane, fx, fy, fz)
-                sigma, red, _, _ = apart(mix)
-            else:
-                sigma = _trilinear(values, at, 4 * side, 4 * plane, fx, fy, fz)
-            if sigma <= 0:
-                continue
-            left = light * _exp2_minus(sigma)
-            owed += light - left
-            if owed > np.float32(FAINT):
-                colours += 1
-                if kind == EXACT:
-                    if not looked:
-                        basis_into(look_x, look_y, look_z, view.degree, basis)
-                        looked = True
-                    mix = _exact(words, at, 4 * side, 4 * plane, fx, fy, fz, grid, basis)
-                elif red != red:
-                    mix = _partial(values, at, 4 * side, 4 * plane, fx, fy, fz)
-                total = plus_scaled(total, owed, logistic(mix))
-                owed = np.float32(0)
-            if left <= _HALF and light > _HALF:
-                hit = s - _HALF * step + np.log2(2 * light) / sigma * step
-            light = left
-            if light < np.float32(SPENT):
-                last = k
-                break
+            if begin < 0:
+                slot = np.int64(pool.slot[owner])
+                if slot < 0:
+                    slot = fill(owner, grid, view, pool)
+                begin = slot * pool.size
+                if pool.kind[slot] != kind:
+                    if waiting > 0 and _composited(kind, waiting, grid, view, pool, bench, look_x, look_y, look_z) < np.float32(SPENT):
+                        last, waiting = k, 0
+                        break
+                    waiting, kind = 0, np.int64(pool.kind[slot])
+            pool.waiting[waiting] = begin + 4 * voxel
+            bench.x[waiting], bench.y[waiting], bench.z[waiting], bench.along[waiting] = x - i, y - j, z - l, s
+            waiting += 1
+            if waiting == QUEUE:
+                waiting = 0
+                if _composited(kind, QUEUE, grid, view, pool, bench, look_x, look_y, look_z) < np.float32(SPENT):
+                    last = k
+                    break
         tested += k
-    _, out[0], out[1], out[2] = apart(total)
-    out[3], out[4] = _ONE - light, hit
-    out[5], out[6], out[7], out[8] = cells, tested, mixed, colours
+    if waiting > 0:
+        _composited(kind, waiting, grid, view, pool, bench, look_x, look_y, look_z)
+    out[0], out[1], out[2] = state[TOTAL + 1], state[TOTAL + 2], state[TOTAL + 3]
+    out[3], out[4] = _ONE - state[LIGHT], state[HIT]
+    out[5], out[6], out[7], out[8] = cells, tested, state[MIXED], state[LOOKUPS]

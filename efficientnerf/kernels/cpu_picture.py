@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from efficientnerf.kernels.cpu_blocks import Pool, grid_of
-from efficientnerf.kernels.cpu_march import STEP, march, normal_into
+from efficientnerf.kernels.cpu_blocks import QUEUE, Pool, View, grid_of
+from efficientnerf.kernels.cpu_march import STEP, Bench, march, normal_into
 from efficientnerf.kernels.lanes import pointer
 
 TILE = 8  # rays along each side of a tile
-RUNS = 8  # of neighbouring tiles that a thread takes
+RUNS = 32  # of neighbouring tiles that a thread takes
 LEAST_ADVANCE = 0.5  # voxels: a cone that advances by less has arrived
 MOST_ADVANCES = 64
 PINHOLE, SIGHTS, FREE = 0, 1, 2
@@ -30,6 +30,7 @@ class Shot(NamedTuple):
     first     row of the first ray
     turn      (3, 3) the camera's rotation, world from camera
     centre    (3,) where it stands, voxel coordinates
+    toward    (3, 4) along which direction points are seen, see `cpu_blocks.View`
     sights    (H, W, 3) float32 unit directions in the camera's frame, or (0, 0, 3)
     starts    (H, W, 3) origins, voxel coordinates, or (0, 0, 3)
     alongs    (H, W, 3) unit directions, with `starts`
@@ -41,6 +42,7 @@ class Shot(NamedTuple):
     first: int
     turn: np.ndarray
     centre: np.ndarray
+    toward: np.ndarray
     sights: np.ndarray
     starts: np.ndarray
     alongs: np.ndarray
@@ -225,7 +227,7 @@ def _ray(row, column, rays):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _seen(row, column, clear, shot, grid, view, pool, basis, seen, normal):  # type: ignore[no-untyped-def]
+def _seen(row, column, clear, shot, grid, view, pool, bench, seen, normal):  # type: ignore[no-untyped-def]
     """What one ray sees, which meets nothing until `clear`, into seen (9,), see `march`, but the depth is from the origin; and its normal into (3,)."""
     ox, oy, oz, dx, dy, dz, slant = _ray(row, column, shot)
     lx, ly, lz = np.float32(dx), np.float32(dy), np.float32(dz)
@@ -237,7 +239,7 @@ def _seen(row, column, clear, shot, grid, view, pool, basis, seen, normal):  # t
     begin = int(min(max((clear - t0) / STEP - 0.5, 0.0), last))
     ex, ey, ez = np.float32(ox + t0 * dx), np.float32(oy + t0 * dy), np.float32(oz + t0 * dz)
     ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
-    march(ex, ey, ez, ax, ay, az, begin, last, grid, view, lx, ly, lz, basis, pool, seen)
+    march(ex, ey, ez, ax, ay, az, begin, last, grid, view, lx, ly, lz, pool, bench, seen)
     hit = seen[4]
     seen[4] = (t0 + hit) * slant
     if hit < np.inf:
@@ -246,16 +248,49 @@ def _seen(row, column, clear, shot, grid, view, pool, basis, seen, normal):  # t
         normal[0] = normal[1] = normal[2] = np.float32(0)
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _side_of_runs(down, across, threads):  # type: ignore[no-untyped-def]
+    """Tiles along the sides of the rectangles of them that threads take."""
+    tiles = down * across // (threads * RUNS)
+    tall = min(down, max(1, int(np.sqrt(tiles))))
+    return tall, min(across, max(1, tiles // tall))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _draw_tile(top, low, left, right, rays, behind, grid, view, units, pool, bench, seen, face, colour, opacity, depth, normal, work):  # type: ignore[no-untyped-def]
+    """The pixels of some rows and columns into the pictures of `trace`."""
+    clear = _tile(top, low, left, right, rays, grid)
+    for row in range(top, low):
+        for column in range(left, right):
+            if clear == np.inf:
+                for m in range(9):
+                    seen[m] = np.float32(0)
+                seen[4] = np.float32(np.inf)
+                face[0] = face[1] = face[2] = np.float32(0)
+            else:
+                _seen(row, column, clear, rays, grid, view, pool, bench, seen, face)
+            through = np.float32(1) - seen[3]
+            for c in range(3):
+                colour[row, column, c] = seen[c] + through * behind[c]
+                if len(normal) > 0:
+                    normal[row, column, c] = face[c]
+            opacity[row, column], depth[row, column] = seen[3], seen[4] * units
+            if len(work) > 0:
+                for m in range(4):
+                    work[row, column, m] = seen[5 + m]
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def trace(shot, behind, packed, brick, view, units, tile, threads, capacity, colour, opacity, depth, normal, work):  # type: ignore[no-untyped-def]
+def trace(shot, behind, packed, painted, brick, nearest, stretch, scale, degree, units, tile, threads, blocks, colour, opacity, depth, normal, work):  # type: ignore[no-untyped-def]
     """What rays in rows and columns see.
 
     behind    (3,) float32 colour to composite over
     packed    see `packed_tree`
-    view      see `cpu_blocks`
+    painted   (N + 1, 4) float32: see `cpu_blocks.paint`; not read where `nearest` is infinity
+    nearest, stretch, scale, degree  see `cpu_blocks.View`
     units     world units per voxel
     tile      (rows, columns) of a tile
-    capacity  blocks in a thread's pool
+    blocks    in a thread's pool
     colour    (H, W, 3) float32
     opacity   (H, W) float32
     depth     (H, W) float32, world units: along the view axis for a camera and along the ray for rays as they come
@@ -264,48 +299,41 @@ def trace(shot, behind, packed, brick, view, units, tile, threads, capacity, col
     """
     # What is written to an array taken out of a tuple numba would think of no use, and leave out.
     height, width = opacity.shape
-    across = (width + tile[1] - 1) // tile[1]
-    tiles = (height + tile[0] - 1) // tile[0] * across
-    # Each thread takes runs of tiles from all over the picture, for tiles of the sky cost next to nothing; neighbours meet the same bricks.
-    run = max(1, tiles // (threads * RUNS))
+    down, across = (height + tile[0] - 1) // tile[0], (width + tile[1] - 1) // tile[1]
+    # Each thread takes rectangles of tiles from all over the picture, for tiles of the sky cost next to nothing; neighbours meet the same bricks.
+    tall, wide = _side_of_runs(down, across, threads)
+    columns = (across + wide - 1) // wide
+    runs = (down + tall - 1) // tall * columns
     bricks, size = len(packed.place), 4 * (brick + 2) ** 3
-    blocks = max(1, min(bricks, capacity))
     slot, owner = np.full((threads, bricks), -1, np.int32), np.full((threads, blocks), -1, np.int32)
-    kind, following = np.zeros((threads, blocks), np.uint8), np.zeros((threads, 1), np.int64)
-    values, room = np.empty((threads, blocks * size), np.float32), np.zeros((threads, 128), np.float32)
+    kind, whole = np.zeros((threads, blocks), np.uint8), np.zeros((threads, 16), np.int64)
+    values, voxels, room = np.empty((threads, (blocks + 1) * size), np.float32), np.empty((threads, size // 4), np.int32), np.zeros((threads, 256), np.float32)
     words = values.view(np.int32)
     for worker in numba.prange(threads):
+        values[worker, blocks * size :] = 0
+        whole[worker, 8 : 8 + QUEUE] = blocks * size
         pool = Pool(
-            size, blocks, pointer(slot[worker]), pointer(owner[worker]), pointer(kind[worker]), pointer(following[worker]), pointer(values[worker]),
-            pointer(words[worker]), pointer(room[worker, :32]),
+            size, blocks, pointer(slot[worker]), pointer(owner[worker]), pointer(kind[worker]), pointer(whole[worker, :8]), pointer(values[worker]),
+            pointer(words[worker]), pointer(painted), len(painted) - 1, pointer(voxels[worker]), pointer(whole[worker, 8:]),
         )
-        grid, rays = grid_of(packed, brick), rays_of(shot)
-        basis, seen, face = pointer(room[worker, 32:64]), pointer(room[worker, 64:96]), pointer(room[worker, 96:])
-        for n in range((tiles + threads - 1) // threads + run):
-            number = (n // run * threads + worker) * run + n % run
-            if number >= tiles:
+        bench = Bench(
+            pointer(room[worker, 32:48]), pointer(room[worker, 48:64]), pointer(room[worker, 64:80]), pointer(room[worker, 80:96]),
+            pointer(room[worker, 96:128]), pointer(room[worker, 128:160]),
+        )
+        grid, rays, view = grid_of(packed, brick), rays_of(shot), View(pointer(shot.toward), stretch, nearest, scale, degree)
+        seen, face = pointer(room[worker, 160:192]), pointer(room[worker, 192:])
+        for run in range(runs):
+            # Neighbouring runs, along rows and columns, go to different threads.
+            if (run // columns + run % columns) % threads != worker:
                 continue
-            top, left = number // across * tile[0], number % across * tile[1]
-            low, right = min(top + tile[0], height), min(left + tile[1], width)
-            clear = _tile(top, low, left, right, rays, grid)
-            for row in range(top, low):
-                for column in range(left, right):
-                    if clear == np.inf:
-                        for m in range(9):
-                            seen[m] = np.float32(0)
-                        seen[4] = np.float32(np.inf)
-                        face[0] = face[1] = face[2] = np.float32(0)
-                    else:
-                        _seen(row, column, clear, rays, grid, view, pool, basis, seen, face)
-                    through = np.float32(1) - seen[3]
-                    for c in range(3):
-                        colour[row, column, c] = seen[c] + through * behind[c]
-                        if len(normal) > 0:
-                            normal[row, column, c] = face[c]
-                    opacity[row, column], depth[row, column] = seen[3], seen[4] * units
-                    if len(work) > 0:
-                        for m in range(4):
-                            work[row, column, m] = seen[5 + m]
+            for n in range(tall * wide):
+                row, column = run // columns * tall + n // wide, run % columns * wide + n % wide
+                if row < down and column < across:
+                    top, left = row * tile[0], column * tile[1]
+                    _draw_tile(
+                        top, min(top + tile[0], height), left, min(left + tile[1], width), rays, behind, grid, view, units, pool, bench, seen, face,
+                        colour, opacity, depth, normal, work,
+                    )  # fmt: skip
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

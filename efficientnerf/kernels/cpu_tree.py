@@ -8,14 +8,14 @@ The torch reference is `efficientnerf.render.render_tree_reference`.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
 
 from efficientnerf.cameras import Camera, rays
 from efficientnerf.harmonics import basis_numpy
-from efficientnerf.kernels.cpu_blocks import POOL_BYTES, View
+from efficientnerf.kernels.cpu_blocks import LEAST_BLOCKS, POOL_BYTES, paint
 from efficientnerf.kernels.cpu_march import LOG2E, STEP
 from efficientnerf.kernels.cpu_picture import TILE, Shot, merge, trace
 
@@ -174,25 +174,45 @@ def _pixels(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np.n
     return np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32), normal
 
 
-def _trace(tree: NerfTree, shot: Shot, behind: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...], work: np.ndarray | None = None) -> None:
+class Paint(NamedTuple):
+    """How voxels are seen: `stretch` and `nearest` as in `cpu_blocks.View`, and `painted` as `cpu_picture.trace` takes it."""
+
+    stretch: float
+    nearest: float
+    painted: np.ndarray
+
+
+def _paint(tree: NerfTree, toward: np.ndarray) -> Paint:
+    """Colours of all voxels, each as it is seen along the direction that `toward` gives it."""
+    painted = np.empty((len(tree.density_values) + 1, 4), np.float32)
+    paint(tree.packed, tree.brick, toward, _scale(tree), tree.degree, painted)
+    return Paint(float(np.linalg.norm(toward[:, :3], 2)), VOXELS_PER_SLOPE * tree.packed.slope, painted)
+
+
+def _scale(tree: NerfTree) -> np.float32:
+    """What the kernels multiply densities with."""
+    return np.float32(STEP * tree.voxel * LOG2E)
+
+
+def _trace(
+    tree: NerfTree, shot: Shot, colours: Paint, behind: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...], work: np.ndarray | None = None
+) -> None:
     work = np.zeros((0, 0, 4), np.int32) if work is None else work
-    packed = tree.packed
-    # Voxels know their colours where rays pass a common point, far enough away; without harmonics above the base always.
-    nearest = VOXELS_PER_SLOPE * packed.slope if not len(shot.starts) or tree.degree == 0 else np.inf
-    view = View(float(shot.centre[0]), float(shot.centre[1]), float(shot.centre[2]), nearest, np.float32(STEP * tree.voxel * LOG2E), tree.degree)
-    trace(shot, behind, packed, tree.brick, view, float(tree.voxel), tile, numba.get_num_threads(), _capacity(tree.brick), *out, work)
+    trace(
+        shot, behind, tree.packed, colours.painted, tree.brick, colours.nearest, colours.stretch, _scale(tree), tree.degree, float(tree.voxel), tile,
+        numba.get_num_threads(), _capacity(tree), *out, work,
+    )  # fmt: skip
 
 
-def _capacity(brick: int) -> int:
+def _capacity(tree: NerfTree) -> int:
     """Blocks in a thread's pool."""
-    return max(1, POOL_BYTES // (16 * (brick + 2) ** 3))
+    return min(max(1, len(tree.voxel_index)), max(LEAST_BLOCKS, POOL_BYTES // (16 * (tree.brick + 2) ** 3)))
 
 
 def pool_bytes(tree: NerfTree) -> int:
-    """What the threads' pools take at most while a picture is drawn."""
-    bricks = len(tree.voxel_index)
-    blocks = min(bricks, _capacity(tree.brick))
-    return numba.get_num_threads() * (4 * bricks + blocks * (16 * (tree.brick + 2) ** 3 + 5))
+    """What painted voxels and the threads' pools take while a picture is drawn."""
+    each = 4 * len(tree.voxel_index) + (_capacity(tree) + 1) * (16 * (tree.brick + 2) ** 3 + 5)
+    return 16 * (len(tree.density_values) + 1) + numba.get_num_threads() * each
 
 
 def render_rays(
@@ -207,10 +227,11 @@ def render_rays(
     alongs = np.asarray(directions, np.float64)[None]
     looks = np.zeros((0, 0, 3), np.float32) if looking is None else np.ascontiguousarray(looking, np.float32)[None]
     nothing = np.zeros((0, 0, 3), np.float32)
-    shot = Shot(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), nothing, np.ascontiguousarray(starts), np.ascontiguousarray(alongs), looks)
+    unpainted = Paint(1.0, np.inf, np.zeros((1, 4), np.float32))
+    shot = Shot(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), np.eye(3, 4), nothing, np.ascontiguousarray(starts), np.ascontiguousarray(alongs), looks)
     out = _pixels(1, len(origins), normals=True)
     if len(origins):
-        _trace(tree, shot, np.zeros(3, np.float32), (1, TILE * TILE), out)
+        _trace(tree, shot, unpainted, np.zeros(3, np.float32), (1, TILE * TILE), out)
     colour, opacity, depth, normal = (part[0] for part in out)
     return colour, opacity, depth, normal
 
@@ -224,15 +245,27 @@ def _sights(model: str, params: tuple[float, ...], width: int, height: int, supe
     return rays(camera, pixels)[1].astype(np.float32).reshape(*x.shape, 3)
 
 
+def _place(tree: NerfTree, camera: Camera) -> np.ndarray:
+    """Where a camera stands, voxel coordinates."""
+    return (np.asarray(camera.centre, np.float64) - tree.bounds_min) / tree.voxel
+
+
+def _toward(centre: np.ndarray) -> np.ndarray:
+    """The directions to points from one (3,), all voxel coordinates, as `cpu_blocks.View` takes them."""
+    return np.concatenate([np.eye(3), -centre[:, None]], axis=1)
+
+
 def _shot(tree: NerfTree, camera: Camera, supersample: int, top: int, low: int) -> Shot:
     """The rays through rows top to low of a camera's picture."""
     k, none = camera.intrinsics, np.zeros((0, 0, 3), np.float32)
+    centre = _place(tree, camera)
     return Shot(
         lens=np.array([k["fx"], k["fy"], k["cx"], k["cy"]]),
         pitch=1 / supersample,
         first=top * supersample,
         turn=np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64),
-        centre=(np.asarray(camera.centre, np.float64) - tree.bounds_min) / tree.voxel,
+        centre=centre,
+        toward=_toward(centre),
         sights=none if camera.model in PINHOLES else _sights(camera.model, camera.params, camera.width, camera.height, supersample, top, low),
         starts=none.astype(np.float64),
         alongs=none.astype(np.float64),
@@ -255,15 +288,16 @@ def render_picture(
     if camera.model not in PINHOLES:
         most = min(most, SIGHTS_PER_BAND)
     step = max(1, most // max(1, width * supersample**2))
+    colours = _paint(tree, _toward(_place(tree, camera)))
     for top in range(0, height, step):
         low = min(top + step, height)
         part = tuple(whole[top:low] if len(whole) else whole for whole in picture)
         shot = _shot(tree, camera, supersample, top, low)
         if supersample == 1:
-            _trace(tree, shot, behind, (TILE, TILE), part)
+            _trace(tree, shot, colours, behind, (TILE, TILE), part)
         else:
             fine = _pixels((low - top) * supersample, width * supersample, normals=normals)
-            _trace(tree, shot, behind, (TILE, TILE), fine)
+            _trace(tree, shot, colours, behind, (TILE, TILE), fine)
             merge(supersample, *fine, *part)
     return picture
 
@@ -272,7 +306,8 @@ def picture_work(tree: NerfTree, camera: Camera) -> np.ndarray:
     """What each pixel's ray takes: cells looked at, samples tested, samples interpolated, colours looked up; (H, W, 4) int32."""
     work = np.zeros((camera.height, camera.width, 4), np.int32)
     out = _pixels(camera.height, camera.width, normals=False)
-    _trace(tree, _shot(tree, camera, 1, 0, camera.height), np.zeros(3, np.float32), (TILE, TILE), out, work)
+    shot = _shot(tree, camera, 1, 0, camera.height)
+    _trace(tree, shot, _paint(tree, shot.toward), np.zeros(3, np.float32), (TILE, TILE), out, work)
     return work
 
 

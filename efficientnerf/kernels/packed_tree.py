@@ -23,6 +23,8 @@ class Packed(NamedTuple):
     """See the module. The harmonics are either in `sh` or in the four arrays after it; the others are empty.
 
     leap      (X, Y, Z) uint8: as `NerfTree.leap`, but a brick near which nothing absorbs light is none
+    live      (B, W) int64: bit n % 64 of word n // 64 is set where any of eight voxels has density, of which the first is voxel (i - 1, j - 1, k - 1) of the
+              brick and n = (i (b + 2) + j) (b + 2) + k
     place     (B, 3) int32: the coarse cell of a brick
     brick_index, voxel_index, density  the tree's own
     sh        (N, K, 3) float32: the tree's own
@@ -34,6 +36,7 @@ class Packed(NamedTuple):
     """
 
     leap: np.ndarray
+    live: np.ndarray
     place: np.ndarray
     brick_index: np.ndarray
     voxel_index: np.ndarray
@@ -49,29 +52,52 @@ class Packed(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Of the arrays that are not the tree's own."""
-        return self.leap.nbytes + self.place.nbytes + self.palette.nbytes
+        return self.leap.nbytes + self.live.nbytes + self.place.nbytes + self.palette.nbytes
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _densities_around(owner, place, brick, brick_index, voxel_index, values, dense):  # type: ignore[no-untyped-def]
+    """Whether a brick's voxels, and those in the one layer around them, have density, into (b + 2, b + 2, b + 2) uint8."""
+    dense[:] = 0
+    for n in range(27):
+        p, q, r = n // 9, n // 3 % 3, n % 3
+        a, e, c = place[owner, 0] + p - 1, place[owner, 1] + q - 1, place[owner, 2] + r - 1
+        if not (0 <= a < brick_index.shape[0] and 0 <= e < brick_index.shape[1] and 0 <= c < brick_index.shape[2]):
+            continue
+        there = brick_index[a, e, c]
+        if there < 0:
+            continue
+        # Of a neighbour only the layer that faces the brick.
+        for x in range(brick - 1 if p == 0 else 0, 1 if p == 2 else brick):
+            for y in range(brick - 1 if q == 0 else 0, 1 if q == 2 else brick):
+                for z in range(brick - 1 if r == 0 else 0, 1 if r == 2 else brick):
+                    voxel = voxel_index[there, (x * brick + y) * brick + z]
+                    if voxel >= 0 and values[voxel] > 0:
+                        dense[x + 1 + (p - 1) * brick, y + 1 + (q - 1) * brick, z + 1 + (r - 1) * brick] = 1
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _absorbing(place, brick, brick_index, voxel_index, values, out):  # type: ignore[no-untyped-def]
-    """Whether a brick's voxels, or those in the one layer around them, absorb any light, into `out`."""
-    for owner in numba.prange(len(place)):
-        found = False
-        for n in range(27):
-            p, q, r = n // 9, n // 3 % 3, n % 3
-            a, e, c = place[owner, 0] + p - 1, place[owner, 1] + q - 1, place[owner, 2] + r - 1
-            if found or not (0 <= a < brick_index.shape[0] and 0 <= e < brick_index.shape[1] and 0 <= c < brick_index.shape[2]):
-                continue
-            there = brick_index[a, e, c]
-            if there < 0:
-                continue
-            # Of a neighbour only the layer that faces the brick.
-            for x in range(brick - 1 if p == 0 else 0, 1 if p == 2 else brick):
-                for y in range(brick - 1 if q == 0 else 0, 1 if q == 2 else brick):
-                    for z in range(brick - 1 if r == 0 else 0, 1 if r == 2 else brick):
-                        voxel = voxel_index[there, (x * brick + y) * brick + z]
-                        found = found or (voxel >= 0 and values[voxel] > 0)
-        out[owner] = found
+def _live(place, brick, brick_index, voxel_index, values, out):  # type: ignore[no-untyped-def]
+    """`Packed.live` into `out`, which is zero."""
+    side = brick + 2
+    for part in numba.prange((len(place) + 255) // 256):
+        dense = np.empty((side, side, side), np.uint8)
+        for owner in range(256 * part, min(len(place), 256 * part + 256)):
+            _densities_around(owner, place, brick, brick_index, voxel_index, values, dense)
+            # Of the voxel and the one after it, along one axis after the other.
+            for i in range(side):
+                for j in range(side):
+                    for k in range(side - 1):
+                        dense[i, j, k] |= dense[i, j, k + 1]
+            for i in range(side):
+                for j in range(side - 1):
+                    for k in range(side - 1):
+                        dense[i, j, k] |= dense[i, j + 1, k]
+            for i in range(side - 1):
+                for j in range(side - 1):
+                    for k in range(side - 1):
+                        n = (i * side + j) * side + k
+                        out[owner, n >> 6] |= np.int64(dense[i, j, k] | dense[i + 1, j, k]) << (n & 63)
 
 
 def _slope(tree: NerfTree) -> float:
@@ -96,10 +122,10 @@ def pack(tree: NerfTree) -> Packed:
     cells = np.argwhere(tree.brick_index >= 0)
     place = np.empty(cells.shape, np.int32)
     place[tree.brick_index[tree.brick_index >= 0]] = cells
-    absorbing = np.zeros(len(place), bool)
-    _absorbing(place, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, absorbing)
+    live = np.zeros((len(place), ((tree.brick + 2) ** 3 + 63) // 64), np.int64)
+    _live(place, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, live)
     full = tree.brick_index >= 0
-    full[full] = absorbing[tree.brick_index[full]]
+    full[full] = np.asarray(live.any(axis=1))[tree.brick_index[full]]
     harmonics = tree.harmonics
     if isinstance(harmonics, PaletteHarmonics):
         palette = np.zeros((harmonics.palette.shape[1], harmonics.palette.shape[0], 4), np.float32)
@@ -108,4 +134,4 @@ def pack(tree: NerfTree) -> Packed:
     else:
         none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
         coded = np.ascontiguousarray(harmonics, np.float32), *none
-    return Packed(leaps(full), place, tree.brick_index, tree.voxel_index, tree.density_values, *coded, _slope(tree))
+    return Packed(leaps(full), live, place, tree.brick_index, tree.voxel_index, tree.density_values, *coded, _slope(tree))

@@ -12,8 +12,8 @@ import torch
 from efficientnerf.cameras import Camera, rays, resized
 from efficientnerf.harmonics import basis_numpy
 from efficientnerf.kernels import cpu_blocks, cpu_march
-from efficientnerf.kernels.cpu_blocks import Pool, View, colour, fill, grid_of
-from efficientnerf.kernels.lanes import apart, logistic, pointer, together
+from efficientnerf.kernels.cpu_blocks import Pool, View, fill, grid_of, paint
+from efficientnerf.kernels.lanes import apart, exp2_minus, interpolated, logistic, pointer, quarters, together
 from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
 from efficientnerf.render import render_tree_reference
 from tests.efficientnerf.balls import pose
@@ -53,36 +53,72 @@ def logistics(a, b, c, d):  # type: ignore[no-untyped-def]
     return apart(logistic(together(a, b, c, d)))
 
 
+@numba.njit
+def powers(a, b, c, d):  # type: ignore[no-untyped-def]
+    return apart(exp2_minus(together(a, b, c, d)))
+
+
 def test_the_kernels_exponential_and_logistic() -> None:
-    x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 400), [0.0, np.inf]]).astype(np.float32)
+    x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 402), [0.0, np.inf]]).astype(np.float32)
     np.testing.assert_allclose([cpu_march._exp2_minus(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
     assert cpu_march._exp2_minus(np.float32(0)) == 1
+    np.testing.assert_allclose([powers(*v) for v in x.reshape(-1, 4)], np.exp2(-x.astype(np.float64)).reshape(-1, 4), atol=2e-7)
+    assert powers(*np.zeros(4, np.float32)) == (1, 1, 1, 1)
     y = np.concatenate([-x, x, np.linspace(-20, 20, 2000).astype(np.float32)])
     with np.errstate(over="ignore"):
         np.testing.assert_allclose([logistics(*v) for v in y.reshape(-1, 4)], 1 / (1 + np.exp(-y.astype(np.float64).reshape(-1, 4))), atol=4e-6)
 
 
 @numba.njit
-def laid_out(packed, brick, view, owners, painted, kind, values):  # type: ignore[no-untyped-def]
+def between(values, starts, x, y, z):  # type: ignore[no-untyped-def]
+    """Of a cube of three voxels a side with four numbers each."""
+    four = together(x[0], x[1], x[2], x[3]), together(y[0], y[1], y[2], y[3]), together(z[0], z[1], z[2], z[3])
+    a, b, c, d = quarters(interpolated(pointer(values), starts[0], starts[1], starts[2], starts[3], 12, 36, four[0], four[1], four[2]))
+    return apart(a), apart(b), apart(c), apart(d)
+
+
+def test_four_points_are_interpolated_at_once_over_what_is_there() -> None:
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(3, 3, 3, 4)).astype(np.float32)
+    values[..., 1:][rng.random((3, 3, 3)) < 0.4] = np.nan
+    values[:2, :2, :2, 1:] = np.nan
+    low = np.stack(np.meshgrid(*[range(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    for cells in low.reshape(2, 4, 3):
+        at = rng.random((4, 3)).astype(np.float32)
+        found = between(values, 4 * (cells @ [9, 3, 1]), *at.T.copy())
+        for (i, j, k), f, row in zip(cells, at, found, strict=True):
+            weight = np.einsum("i,j,k->ijk", *np.stack([1 - f, f], axis=1))
+            eight = values[i : i + 2, j : j + 2, k : k + 2]
+            share = weight[..., None] * ~np.isnan(eight)
+            expected = np.einsum("ijkc,ijkc->c", share, np.nan_to_num(eight)) / np.maximum(share.sum((0, 1, 2)), 1e-12)
+            np.testing.assert_allclose(row, expected, atol=2e-6)
+    assert not np.isnan(found).any()
+
+
+@numba.njit
+def laid_out(packed, painted, brick, toward, nearest, degree, owners, kind, values):  # type: ignore[no-untyped-def]
     """Blocks of some bricks, one after the other, as a thread lays them out: what they hold, and their kinds."""
     blocks, size = values.shape
     slot, owner, after = np.full(len(packed.place), -1, np.int32), np.full(blocks, -1, np.int32), np.zeros(1, np.int64)
-    words, basis = values.view(np.int32), np.zeros(32, np.float32)
-    pool = Pool(size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(basis))
-    grid = grid_of(packed, brick)
+    words, voxels, waiting = values.view(np.int32), np.zeros(size // 4, np.int32), np.full(4, blocks * size)
+    pool = Pool(
+        size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(painted), len(painted) - 1,
+        pointer(voxels), pointer(waiting),
+    )  # fmt: skip
+    grid, view = grid_of(packed, brick), View(pointer(toward), 1.0, nearest, np.float32(2), degree)
     for brick_number in owners:
-        at = fill(brick_number, grid, view.scale, pool)
-        if painted:
-            colour(at, grid, view, pool)
+        fill(brick_number, grid, view, pool)
     # They must outlive the pointers to them.
-    return slot[0] + owner[0] + after[0] + words[0, 0] + basis[0]
+    return slot[0] + owner[0] + after[0] + words[0, 0] + voxels[0] + waiting[0]
 
 
-def blocks_of(tree: NerfTree, painted: bool, centre: np.ndarray, nearest: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """(B, side, side, side, 4) and kinds (B,) of the blocks of all bricks, densities times 2."""
     side, owners = tree.brick + 2, np.random.default_rng(0).permutation(len(tree.voxel_index))
     values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
-    laid_out(tree.packed, tree.brick, View(*(float(x) for x in centre), nearest, np.float32(2), tree.degree), owners, painted, kind, values)
+    toward, painted = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
+    paint(tree.packed, tree.brick, toward, np.float32(2), tree.degree, painted)
+    laid_out(tree.packed, painted, tree.brick, toward, nearest, tree.degree, owners, kind, values)
     back = np.argsort(owners)
     return values[back].reshape(-1, side, side, side, 4), kind[back]
 
@@ -92,9 +128,9 @@ def test_blocks_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
     tree = random_tree(brick, brick=brick, degree=2)
     side = brick + 2
     whole = 2 * tree.density_block((-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
-    values, kind = blocks_of(tree, False, np.zeros(3))
-    assert (kind == cpu_blocks.VOXELS).all()
-    for block, place in zip(values, tree.packed.place, strict=True):
+    values, kind = blocks_of(tree, np.zeros(3), nearest=np.inf)
+    assert (kind == cpu_blocks.EXACT).all()
+    for block, place, live in zip(values, tree.packed.place, tree.packed.live, strict=True):
         assert tree.brick_index[tuple(place)] >= 0
         expected = whole[tuple(slice(a, a + side) for a in place * brick)]
         density, stored = block[..., 0], block[..., 1].copy().view(np.int32)
@@ -103,10 +139,12 @@ def test_blocks_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
         assert not expected[stored < 0].any()
         assert np.array_equal(stored[1:-1, 1:-1, 1:-1].reshape(-1), tree.voxel_index[tree.brick_index[tuple(place)]])
         eight = np.stack([expected[i : i + side - 1, j : j + side - 1, k : k + side - 1] for i, j, k in np.ndindex(2, 2, 2)])
-        assert np.array_equal(np.signbit(density[:-1, :-1, :-1]), (eight == 0).all(axis=0))
+        bits = np.unpackbits(live.view(np.uint8), bitorder="little").astype(bool)
+        assert np.array_equal(bits[: side**3].reshape(side, side, side)[:-1, :-1, :-1], (eight > 0).any(axis=0))
+        assert bits.sum() == (eight > 0).any(axis=0).sum()
 
 
-@pytest.mark.parametrize("brick", [1, 2, 4])
+@pytest.mark.parametrize("brick", [1, 2, 4, 5])
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("layout", ["floats", "codes"])
 def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_sees_them(brick: int, degree: int, layout: str) -> None:
@@ -114,15 +152,18 @@ def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_
     if layout == "codes":
         tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
     centre = np.array([-31.0, 12.5, 57.0])
-    values, kind = blocks_of(tree, True, centre)
+    values, kind = blocks_of(tree, centre)
     assert (kind == cpu_blocks.COLOURS).all()
-    voxels, _ = blocks_of(tree, False, centre)
     side = brick + 2
-    for block, before, place in zip(values, voxels, tree.packed.place, strict=True):
-        stored = before[..., 1].copy().view(np.int32)
-        assert np.array_equal(block[..., 0], before[..., 0])
+    cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
+    for block, place in zip(values, tree.packed.place, strict=True):
+        at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
+        local = (at - 1) % brick @ [brick**2, brick, 1]
+        owner = cells[tuple(at.reshape(-1, 3).T)].reshape(local.shape)
+        stored = np.where(owner >= 0, tree.voxel_index[owner, local], -1)
+        assert np.array_equal(block[..., 0], np.where(stored >= 0, 2 * tree.density_values[stored], 0))
         assert np.isnan(block[stored < 0][:, 1:]).all()
-        away = place * brick - 0.5 + np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1)[stored >= 0] - centre
+        away = at[stored >= 0] - 0.5 - centre
         basis = basis_numpy(away / np.linalg.norm(away, axis=1, keepdims=True), degree)
         np.testing.assert_allclose(block[stored >= 0][:, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[stored[stored >= 0]]), atol=1e-4)
 
@@ -130,11 +171,11 @@ def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_
 def test_blocks_near_the_camera_keep_their_voxels() -> None:
     tree = random_tree(3, shape=(12, 12, 12), brick=4, degree=2, share=0.3)
     centre = np.array([-20.0, 24.0, 24.0])
-    values, kind = blocks_of(tree, True, centre, nearest=40.0)
+    values, kind = blocks_of(tree, centre, nearest=40.0)
     away = np.linalg.norm((tree.packed.place + 0.5) * 4 - centre, axis=1)
     assert np.array_equal(kind == cpu_blocks.COLOURS, away >= 52)
     assert 0.1 < (kind == cpu_blocks.COLOURS).mean() < 0.9
-    voxels, _ = blocks_of(tree, False, centre)
+    voxels, _ = blocks_of(tree, centre, nearest=np.inf)
     assert np.array_equal(values[kind == cpu_blocks.EXACT].view(np.int32), voxels[kind == cpu_blocks.EXACT].view(np.int32))
 
 
