@@ -72,88 +72,124 @@ def machine(seconds: float) -> dict[str, float]:
     return out
 
 
+def row(samples: int, seconds: float, moved: float, operations: float = 0.0) -> dict[str, Any]:
+    """What one call comes to: samples, seconds, bytes that must be moved at least, multiplications and additions."""
+    return {"samples": samples, "seconds": seconds, "bytes": moved, "operations": operations}
+
+
 def kernels(seconds: float) -> dict[str, Any]:
-    """name -> samples, seconds, bytes that must be moved at least, multiplications and additions; of one call."""
-    import numpy as np
+    """name -> `row`."""
+    return {**field_kernels(seconds), **compositing_kernels(seconds), **march_kernel(seconds), **adam_kernel(seconds)}
+
+
+def default_field() -> Any:
+    """The fine field of the default preset, untrained."""
     import torch
 
-    from efficientnerf.fields.hash import FEATURES, HashField
-    from efficientnerf.harmonics import basis
-    from efficientnerf.kernels import cpu, cpu_hash, cpu_network, dispatch
-    from efficientnerf.kernels.mlp import has_bfloat16
+    from efficientnerf.fields.hash import HashField
     from efficientnerf.settings import TrainSettings
 
     s = TrainSettings()
-    rng = np.random.default_rng(0)
-    field = HashField(
+    return HashField(
         levels=s.levels, log2_table=s.log2_table, coarsest=16, finest=s.finest, hidden=s.hidden, layers=s.layers, degree=s.degree,
         initial_density=s.initial_density, generator=torch.Generator().manual_seed(0), precision=s.precision,
     )  # fmt: skip
+
+
+def field_kernels(seconds: float) -> dict[str, Any]:
+    """The encoding, and the field's passes as a whole; the network is what is left of these."""
+    import numpy as np
+    import torch
+
+    from efficientnerf.fields.hash import FEATURES
+    from efficientnerf.kernels import cpu_hash
+    from efficientnerf.kernels.mlp import has_bfloat16
+
+    field, rng = default_field(), np.random.default_rng(0)
     # Samples lie one behind the other on rays that end on a sphere, as those of a trained scene do.
     count = RAYS * PER_RAY
     surface = rng.normal(size=(RAYS, 1, 3))
     surface *= 0.3 / np.linalg.norm(surface, axis=2, keepdims=True)
     points = torch.from_numpy((0.5 + surface * (1 + 0.01 * np.arange(PER_RAY)[:, None])).reshape(-1, 3).astype(np.float32))
     across = points.t().contiguous().numpy()
-    features = np.empty((FEATURES * s.levels, count), np.float32)
+    features = np.empty((FEATURES * len(field.sides), count), np.float32)
     pull = rng.normal(size=features.shape).astype(np.float32)
-    table = field.table.detach().numpy()
-    table_grad = np.zeros_like(table)
+    table_grad = np.zeros_like(field.table.detach().numpy())
     levels = (field.sides, field.dense, field.starts, field.mask)
-    out: dict[str, Any] = {}
+    corners = count * len(field.sides) * 8
+    forth = best(lambda: cpu_hash.encode(across, field.table.detach().numpy(), *levels, features), seconds)
+    back = best(lambda: cpu_hash.encode_backward(across, pull, *levels, table_grad), seconds)
 
-    def add(name: str, samples: int, work: Callable[[], object], moved: float, operations: float = 0.0) -> None:
-        out[name] = {"samples": samples, "seconds": best(work, seconds), "bytes": moved, "operations": operations}
-
-    corners = count * s.levels * 8
-    add("encode", count, lambda: cpu_hash.encode(across, table, *levels, features), corners * 8 + features.nbytes, corners * 4)
-    add("encode backward", count, lambda: cpu_hash.encode_backward(across, pull, *levels, table_grad), corners * 16 + features.nbytes, corners * 4)
-
-    outputs = field.weights[-1].shape[0]
-    towards = torch.randn(count, outputs)
+    towards = torch.randn(count, field.weights[-1].shape[0])
     products = 2 * count * sum(w.numel() for w in field.weights)
-
-    def passes() -> None:
-        field(points).backward(towards)
-
-    wide = 2 if has_bfloat16("cpu") and s.precision != "float32" else 4
+    wide = 2 if has_bfloat16("cpu") and field.precision != "float32" else 4
     activations = wide * count * sum(w.shape[1] for w in field.weights)
-    both = best(passes, seconds)
-    forth = out["encode"]["seconds"] + out["encode backward"]["seconds"]
-    out["network, forward and backward"] = {"samples": count, "seconds": max(both - forth, 0.0), "bytes": 6.0 * activations, "operations": 3.0 * products}
-    out["field, forward and backward"] = {"samples": count, "seconds": both, "bytes": corners * 24 + 6.0 * activations, "operations": 3.0 * products}
+    both = best(lambda: field(points).backward(towards), seconds)
+    return {
+        "encode": row(count, forth, corners * 8 + features.nbytes, corners * 4),
+        "encode backward": row(count, back, corners * 16 + features.nbytes, corners * 4),
+        "network, forward and backward": row(count, max(both - forth - back, 0.0), 6.0 * activations, 3.0 * products),
+        "field, forward and backward": row(count, both, corners * 24 + 6.0 * activations, 3.0 * products),
+    }
 
-    raw, length, first = torch.randn(count, outputs), torch.full((count,), 0.02), torch.arange(0, count + 1, PER_RAY)
-    harmonics = basis(torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1), s.degree)
-    behind = torch.rand(RAYS, 3)
-    packed = [t.numpy() for t in (raw, length, first, harmonics, behind)]
+
+def compositing_kernels(seconds: float) -> dict[str, Any]:
+    import numpy as np
+    import torch
+
+    from efficientnerf.harmonics import basis, harmonics_count
+    from efficientnerf.kernels import cpu
+    from efficientnerf.settings import TrainSettings
+
+    degree, count = TrainSettings().degree, RAYS * PER_RAY
+    raw, length, first = torch.randn(count, 1 + 3 * harmonics_count(degree)), torch.full((count,), 0.02), torch.arange(0, count + 1, PER_RAY)
+    harmonics = basis(torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1), degree)
+    packed = [t.numpy() for t in (raw, length, first, harmonics, torch.rand(RAYS, 3))]
     colour, opacity, spread = np.empty((RAYS, 3), np.float32), np.empty(RAYS, np.float32), np.empty(RAYS, np.float32)
-    weight, rgb = np.empty(count, np.float32), np.empty((count, 3), np.float32)
+    seen = np.empty(count, np.float32), np.empty((count, 3), np.float32)  # weights and colours of samples
     grad_raw, grad_behind, ones = np.empty(raw.shape, np.float32), np.empty((RAYS, 3), np.float32), np.ones(count, np.float32)
-    seen = (weight, rgb)
-    add("composite", count, lambda: cpu.composite(*packed, True, colour, opacity, spread, *seen), packed[0].nbytes + 16 * count)
-    add(
-        "composite backward", count,
-        lambda: cpu.composite_backward(*packed, True, *seen, colour, opacity, spread, ones, grad_raw, grad_behind), 2 * packed[0].nbytes + 16 * count,
-    )  # fmt: skip
+    forth = best(lambda: cpu.composite(*packed, True, colour, opacity, spread, *seen), seconds)
+    back = best(lambda: cpu.composite_backward(*packed, True, *seen, colour, opacity, spread, ones, grad_raw, grad_behind), seconds)
+    return {
+        "composite": row(count, forth, packed[0].nbytes + 16 * count),
+        "composite backward": row(count, back, 2 * packed[0].nbytes + 16 * count),
+    }
 
+
+def march_kernel(seconds: float) -> dict[str, Any]:
+    """Rays through voxels that hold a shell."""
+    import numpy as np
+    import torch
+
+    from efficientnerf.grid import Space
+    from efficientnerf.kernels import dispatch
+    from efficientnerf.settings import TrainSettings
+
+    s = TrainSettings()
     side = s.voxels or 128
     axis = (torch.arange(side) + 0.5) / side * 2 - 1
     away = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
     voxels = ((away - 0.6).abs() < 0.04).float()
-    from efficientnerf.grid import Space
-
-    space = Space(np.array([[-1.0] * 3, [1.0] * 3]), False)
     origins = torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1) * 4
     directions = torch.nn.functional.normalize(torch.rand(RAYS, 3) - 0.5 - origins, dim=1)
     near, far, offset = torch.full((RAYS,), 2.0), torch.full((RAYS,), 6.0), torch.rand(RAYS)
-    step = 2 * 3**0.5 / s.coarse_samples
+    space, step = Space(np.array([[-1.0] * 3, [1.0] * 3]), False), 2 * 3**0.5 / s.coarse_samples
     marched = (space, origins, directions, near, far, offset, step, s.coarse_samples + 1, voxels, 0.5)
-    samples = dispatch.valid_samples(*marched)
-    add("march (intervals)", samples.tried, lambda: dispatch.valid_samples(*marched), samples.tried * 4 + len(samples.start) * 24)
+    found = dispatch.valid_samples(*marched)
+    took = best(lambda: dispatch.valid_samples(*marched), seconds)
+    return {"march (intervals)": row(found.tried, took, found.tried * 4 + len(found.start) * 24)}
 
-    value, first_moment, second_moment = (np.zeros(table.size, np.float32) for _ in range(3))
-    kept = np.where(np.repeat(rng.random(table.size // 2) < 0.65, 2), 1.0, 0.0).astype(np.float32)
+
+def adam_kernel(seconds: float) -> dict[str, Any]:
+    """A step on the table of which two thirds of the entries have a gradient, which it clears: the time to fill it again is taken off."""
+    import numpy as np
+
+    from efficientnerf.kernels import cpu_network
+
+    entries, size = default_field().table.shape[0], default_field().table.numel()
+    value, first_moment, second_moment = (np.zeros(size, np.float32) for _ in range(3))
+    touched = np.random.default_rng(0).random(entries) < 0.65
+    kept = np.repeat(np.where(touched, 1.0, 0.0), size // entries).astype(np.float32)
     grad = kept.copy()
     refill = best(lambda: np.copyto(grad, kept), seconds / 4)
     numbers = [np.float32(x) for x in (0.01, 0.9, 0.99, 0.5, 0.5, 1e-15)]
@@ -162,8 +198,7 @@ def kernels(seconds: float) -> dict[str, Any]:
         np.copyto(grad, kept)
         cpu_network.adam(value, grad, first_moment, second_moment, *numbers, True)
 
-    out["Adam (entries of the table)"] = {"samples": len(table), "seconds": best(adam, seconds) - refill, "bytes": 7.0 * grad.nbytes, "operations": 0.0}
-    return out
+    return {"Adam (entries of the table)": row(entries, best(adam, seconds) - refill, 7.0 * grad.nbytes)}
 
 
 def measured(seconds: float) -> dict[str, Any]:

@@ -86,19 +86,26 @@ def _thickness(index, density, base, fx, fy, fz, live, units, BRICK: tl.constexp
 
 
 @triton.jit
+def _rays(origins, directions, looking, rays, nx, ny, nz, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """This program's rays: numbers, which of them there are, origins, directions, harmonics of each column of a row (BLOCK, ROW); and `entry`."""
+    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    live = r < rays
+    x0, y0, z0 = vectors(origins, r, live)
+    dx, dy, dz = vectors(directions, r, live)
+    sx, sy, sz = vectors(looking, r, live)
+    basis = harmonics_along(sx, sy, sz, tl.arange(0, ROW) // 3, K)
+    ix, iy, iz, begin, end = entry(x0, y0, z0, dx, dy, dz, nx, ny, nz, BRICK)
+    return r, live, x0, y0, z0, dx, dy, dz, basis, ix, iy, iz, begin, end
+
+
+@triton.jit
 def _see(  # type: ignore[no-untyped-def]
     origins, directions, looking, grid, index, density, sh, colour, rest, rays, nx, ny, nz, units,
     NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Premultiplied colour (R, 3) of rays, and the light left (R,)."""
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = r < rays
     column = tl.arange(0, ROW)
-    x0, y0, z0 = vectors(origins, r, live)
-    dx, dy, dz = vectors(directions, r, live)
-    sx, sy, sz = vectors(looking, r, live)
-    basis = harmonics_along(sx, sy, sz, column // 3, K)
-    ix, iy, iz, begin, end = entry(x0, y0, z0, dx, dy, dz, nx, ny, nz, BRICK)
+    r, live, x0, y0, z0, dx, dy, dz, basis, ix, iy, iz, begin, end = _rays(origins, directions, looking, rays, nx, ny, nz, BRICK, K, ROW, BLOCK)
     light = tl.full((BLOCK,), 1.0, tl.float32)
     cr, cg, cb = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     k = tl.zeros((BLOCK,), tl.int32)
@@ -130,15 +137,9 @@ def _pull(  # type: ignore[no-untyped-def]
     NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds `ones` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as whole numbers; `stamp` of voxels that were met."""
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    live = r < rays
     column = tl.arange(0, ROW)
     channel = column % 3
-    x0, y0, z0 = vectors(origins, r, live)
-    dx, dy, dz = vectors(directions, r, live)
-    sx, sy, sz = vectors(looking, r, live)
-    basis = harmonics_along(sx, sy, sz, column // 3, K)
-    ix, iy, iz, begin, end = entry(x0, y0, z0, dx, dy, dz, nx, ny, nz, BRICK)
+    r, live, x0, y0, z0, dx, dy, dz, basis, ix, iy, iz, begin, end = _rays(origins, directions, looking, rays, nx, ny, nz, BRICK, K, ROW, BLOCK)
     # The colour that is still to come.
     cr, cg, cb = vectors(colour, r, live)
     pr, pg, pb = vectors(by_colour, r, live)

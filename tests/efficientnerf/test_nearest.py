@@ -1,4 +1,4 @@
-"""Nearest lookup: the values of the voxel that holds a point, in the loop, in torch, in the kernels, in files and in the fit."""
+"""Nearest lookup: the values of the voxel that holds a point, in the kernels, in files and in the fit; torch against the loop is in `test_render`."""
 
 from __future__ import annotations
 
@@ -67,20 +67,6 @@ def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
     assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
     other = replace(tree, lookup="trilinear").render_rays(origins, directions)
     assert np.abs(other.colour - seen.colour).max() > 0.05
-
-
-@pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
-def test_the_torch_function_is_the_loop(brick: int, degree: int) -> None:
-    tree = nearest(brick, degree)
-    origins, directions = rays_at(tree, 24)
-    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
-    depth = tree.render_rays(origins, directions).depth
-    for r in range(24):
-        wanted_colour, wanted_opacity, wanted_depth = reference.tree_ray(tree, origins[r], directions[r])
-        np.testing.assert_allclose(colour[r], wanted_colour, atol=1e-6)
-        assert float(opacity[r]) == pytest.approx(wanted_opacity, abs=1e-6)
-        if abs(wanted_opacity - 0.5) > 1e-3:
-            assert depth[r] == pytest.approx(wanted_depth, abs=1e-3)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3])

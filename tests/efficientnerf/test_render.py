@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from efficientnerf.cameras import Camera
-from efficientnerf.nerftree.tree import NerfTree, Rendering
+from efficientnerf.nerftree.tree import LOOKUPS, NerfTree, Rendering
 from efficientnerf.render import FieldRenderer, render_tree_reference
 from tests import reference
 from tests.efficientnerf.balls import pose, untrained
@@ -41,9 +41,10 @@ def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
     assert seen.opacity.max() > 0.8
 
 
+@pytest.mark.parametrize("lookup", LOOKUPS)
 @pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
-def test_the_torch_function_is_the_loop(brick: int, degree: int) -> None:
-    tree = random_tree(brick, brick=brick, degree=degree)
+def test_the_torch_function_is_the_loop(brick: int, degree: int, lookup: str) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, lookup=lookup)
     origins, directions = rays_at(tree, 24)
     colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
     depth = tree.render_rays(origins, directions).depth
