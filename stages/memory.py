@@ -12,6 +12,19 @@ def needed(voxels: int, harmonics: int) -> int:
     return COPIES * 4 * (1 + 3 * harmonics) * voxels
 
 
+def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int) -> int:
+    """Bytes that such a tree takes on a device while it is fitted there (`efficientnerf.nerftree.optimising_device`): values and means of squares in
+    float32, visits and stamps, sums of gradients in 64 bits; of bricks their voxels with a border; of the grid's cells three numbers while it is sent."""
+    return (28 + 36 * harmonics) * voxels + 4 * (brick + 2) ** 3 * bricks + 12 * cells
+
+
+def free_on_device(device: str) -> int:
+    """Bytes that can be had on a CUDA device: those nobody has, and those that this process has reserved and not in use."""
+    import torch
+
+    return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+
+
 def installed() -> int | None:
     """Bytes of memory that the machine has, or that its control group allows; None where that can't be told."""
     try:

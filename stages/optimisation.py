@@ -36,7 +36,7 @@ def optimised(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[Ne
     settings = job.settings
     facts: dict[str, Any] = {"steps": settings.optimise, "psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(SAMPLE, 4 * len(targets.pixels))
-    targets = targets.to(job.device)
+    targets = _where_there_is_room(job, tree, targets)
     before = optimising.error(tree, targets, sample, settings.seed)
     o, pruned = _restored(job, tree) or (optimising.optimiser(tree, optimising.OPAQUE if settings.optimise else math.inf), False)
     del tree  # the optimiser has values of its own
@@ -46,10 +46,26 @@ def optimised(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[Ne
         o = _without_unseen(job, o, targets, most)
         _checkpoint(job, o, True)
     _fit(job, o, targets, settings.optimise, True)
-    o.fetch()
+    o.leave()
     tree = o.tree
     facts["psnr_before"], facts["psnr_after"] = _decibels(before), _decibels(optimising.error(tree, targets, sample, settings.seed))
     return tree, facts
+
+
+def _where_there_is_room(job: Job, tree: NerfTree, targets: Targets) -> Targets:
+    """The targets on the run's device, where the tree is fitted then; on the host where the device's memory would not do."""
+    from stages.memory import free_on_device, needed_on_device
+
+    needed = needed_on_device(len(tree.density_values), tree.harmonics_count, len(tree.voxel_index), tree.brick_index.size, tree.brick)
+    if targets.pixels.images is not None:
+        needed += targets.pixels.images.nbytes
+    if job.device == "cpu" or needed <= (free := free_on_device(job.device)):
+        return targets.to(job.device)
+    job.warn(
+        f"fitting {len(tree.density_values):,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} are free there:"
+        " they are fitted on the CPU, which takes longer (lower bake.max_mib or bake.resolution for the device)"
+    )
+    return targets
 
 
 def _decibels(error: float) -> float:
@@ -85,7 +101,7 @@ def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Opti
     from efficientnerf.nerftree import baking, optimising
 
     settings = job.settings
-    o.fetch()
+    o.leave()
     count = min(max(settings.pixels, WEIGHED * len(o.density)), 4 * len(targets.pixels))
 
     def looked(done: int, total: int) -> None:

@@ -171,24 +171,24 @@ def voxel_values(
         jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32)) if jittered else torch.full((len(block), 1, 3), 0.5)
         world = (block[:, None] + jitter) * voxel + low
         point = m.space.grid(world.reshape(-1, 3)).to(m.device)
-        raw = m.fine(m.asked(point)).cpu()
-        valid = (m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold).cpu()
+        raw = m.fine(m.asked(point))
+        valid = m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold
         density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
         density = density * _looked_into(m, (block + 0.5) * voxel + low)[:, None]
         share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
-        yield density.mean(dim=1).numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().numpy()
+        yield density.mean(dim=1).cpu().numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().cpu().numpy()
 
 
 def _looked_into(m: Model, world: torch.Tensor) -> torch.Tensor:
-    """(n,) bool: whether the coarse field at these points absorbs as much over an interval as a valid density voxel has to.
+    """(n,) bool on the model's device: whether the coarse field at these points absorbs as much over an interval as a valid density voxel has to.
 
     Where it says less a pivot is among the lightest of its ray and dropped before the subject, but not before the sky: the network hides what
     the fine field has there just where it would be seen, and nothing in the asset could.
     """
     if m.coarse is None or m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
-        return torch.ones(len(world), dtype=torch.bool)
-    raw = m.coarse(m.asked(m.space.grid(world.float()).to(m.device)))[:, 0].cpu()
+        return torch.ones(len(world), dtype=torch.bool, device=m.device)
+    raw = m.coarse(m.asked(m.space.grid(world.float()).to(m.device)))[:, 0]
     return activate(raw, m.coarse.activation) > m.voxels.threshold
 
 

@@ -142,6 +142,11 @@ class Optimiser:
             for name in SQUARES:
                 setattr(self, name, found[name])
 
+    def leave(self) -> None:
+        """Have the arrays as they are after the last step, and nothing on a device any more: what comes next needs the room there."""
+        self.fetch()
+        self.away = None
+
     @property
     def density(self) -> np.ndarray:
         """(N,) float32, the tree's own."""
@@ -171,7 +176,7 @@ def optimiser(tree: NerfTree, thickest: float = np.inf) -> Optimiser:
 
 
 def kept(o: Optimiser, keep: np.ndarray, tree: NerfTree) -> Optimiser:
-    """The optimiser that goes on with `tree`, which is `o.tree` after `fetch` with some of its voxels alone, (N,) bool, in their order."""
+    """The optimiser that goes on with `tree`, which is `o.tree` after `leave` with some of its voxels alone, (N,) bool, in their order."""
     return Optimiser(tree, **{name: getattr(o, name)[keep] for name in SQUARES}, step=o.step)
 
 

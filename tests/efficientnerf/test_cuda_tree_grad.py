@@ -141,6 +141,17 @@ def test_interrupted_or_not_the_bytes_are_the_same() -> None:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 
 
+def test_the_room_that_a_fit_takes_is_known_before() -> None:
+    from stages.memory import needed_on_device
+
+    tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
+    fit = device.DeviceFit(optimiser(tree), torch.device(DEVICE))
+    tensors = [*fit.values.values(), fit.by_thickness, fit.by_sh, fit.stamp, fit.grid.index, fit.grid.grid]
+    taken = sum(t.numel() * t.element_size() for t in tensors)
+    # The grid is there once then; three times while it is sent.
+    assert needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4) == taken + 8 * tree.brick_index.size
+
+
 def test_weights_are_those_of_the_cpu() -> None:
     tree = replace(random_tree(4, shape=(5, 5, 5), brick=4, degree=1, share=0.5, sigma=20.0), voxel=2 / 20, bounds_min=BOUNDS[0])
     targets = Targets(pixels(4, 12), (1.0, 1.0, 1.0))

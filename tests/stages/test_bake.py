@@ -17,7 +17,7 @@ from efficientnerf.nerftree import baking, format, writing
 from efficientnerf.nerftree.tree import NerfTree
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
-from stages import bake, memory, resolution, train
+from stages import bake, memory, optimisation, resolution, train
 from stages.bake import ASSET, BakeSettings
 from stages.evaluate import truth_of
 from stages.field import FILE, load_renderer, save_model
@@ -149,6 +149,25 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
     truth = truth_of(inputs["poses"], view, white).colour
     assert np.sqrt(((field - raw) ** 2).mean()) < 0.08
     assert ((fitted - truth) ** 2).mean() < 0.5 * ((raw - truth) ** 2).mean()
+
+
+def test_a_device_without_room_leaves_the_fit_to_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from efficientnerf.nerftree.optimising import Targets
+    from tests.efficientnerf.balls import pixels
+    from tests.efficientnerf.trees import random_tree
+
+    tree, targets, there = random_tree(degree=3), Targets(pixels(2, 8), (1.0, 1.0, 1.0)), object()
+    monkeypatch.setattr(Targets, "to", lambda self, device: self if device == "cpu" else there)
+    events: list[dict[str, Any]] = []
+    made = job(tmp_path, QUICK, events=events)
+    made.device = "cuda"
+    needed = 604 * len(tree.density_values) + 4 * 5**3 * len(tree.voxel_index) + 12 * 60 + 2 * 64 * 4
+    for free, where in ((needed, there), (needed - 1, targets)):
+        monkeypatch.setattr(memory, "free_on_device", lambda device, free=free: free)
+        assert optimisation._where_there_is_room(made, tree, targets) is where
+    assert ["fitted on the CPU" in event["text"] for event in events if event["event"] == "warning"] == [True]
+    made.device = "cpu"
+    assert optimisation._where_there_is_room(made, tree, targets) is targets
 
 
 def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
