@@ -1,6 +1,7 @@
 """A CUDA device at work: tests, kernels, pictures, training steps, a bake and the whole pipeline, written to benchmarks/results/gpu.json after each part.
 
-    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,pictures,training,asset,pipeline] [--seconds 570] [--preset standard] [--asset FILE] [--json FILE]
+    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,pictures,training,asset,pipeline,paper] [--seconds 570] [--preset standard] [--asset FILE]
+                             [--json FILE]
 
 Says so and does nothing where torch has no CUDA device. Each part runs in a process of its own, for what goes wrong on a device may take all that comes
 after with it; what has not ended after its share of --seconds is stopped and noted as such. All but the pipeline need torch, triton, numba, scipy and
@@ -25,7 +26,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 # Seconds at most. Most of the tests' time goes into building kernels.
-PARTS = {"tests": 200.0, "kernels": 60.0, "pictures": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0}
+PARTS = {"tests": 200.0, "kernels": 60.0, "pictures": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
 TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
 TESTS = ["tests/efficientnerf", "--ignore=tests/efficientnerf/test_cuda_builds.py", "-k", "cuda or late or device or gpu"]
 PIPELINE = [
@@ -98,6 +99,8 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
 
         tree = NerfTree.load(given.asset) if given.asset else gpu_kernels.shell(384)
         return gpu_kernels.frame_rates("cuda", tree, 800, 10, TILES)
+    if part == "paper":
+        return gpu_kernels.paper_rates("cuda", 300, 400, 40)
     if part == "asset":
         return gpu_asset.asset_rates("cuda", steps=2000, side=400, views=60, resolution=256, pixels=1_000_000, fit_steps=160, rays=32768, samples=2**18)
     return gpu_kernels.training_rates("cuda", 1500, 400, 40, samples=2**18, rays=2**16, levels=16, log2_table=19, finest=2048)

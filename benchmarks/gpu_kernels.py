@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import tomllib
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -175,9 +176,10 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
     """Steps and samples a second on the ball, the second half of the steps timed; and which lines still waited for the device in 32 steps more."""
     from efficientnerf.training import train, trainer
 
-    s = TrainSettings(iterations=steps + 32, **settings)
-    t = trainer(model(Space(BOUNDS, False), s, (1.0, 1.0, 1.0), device))
-    running = train(t, ball(orbit(side, views)))
+    s = TrainSettings(**{**settings, "iterations": steps + 32})
+    pixels = ball(orbit(side, views))
+    t = trainer(model(Space(BOUNDS, False), s, (1.0, 1.0, 1.0), device, (float(pixels.near[0]), float(pixels.far[0]))))
+    running = train(t, pixels)
     samples, started, done = 0, 0.0, None
     for number in range(steps):
         done = next(running)
@@ -194,8 +196,7 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
         warnings.simplefilter("always")
         if device == "cuda":
             torch.cuda.set_sync_debug_mode("warn")
-        for _ in range(32):
-            next(running)
+        left_out = sum(next(running).left_out for _ in range(32))
         if device == "cuda":
             torch.cuda.set_sync_debug_mode("default")
     waits.update(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message))
@@ -203,5 +204,19 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
     assert done is not None
     return {
         "steps_per_second": round(timed / took, 1), "samples_per_second": round(samples / took), "psnr": round(done.psnr, 2), "rays": done.rays,
-        "waits_in_32_steps": dict(waits),
+        "waits_in_32_steps": dict(waits), "rays_left_out_in_32_steps": left_out,
     }  # fmt: skip
+
+
+def paper_rates(device: str, steps: int, side: int, views: int, **changes: Any) -> dict[str, Any]:
+    """`training_rates` of the rows of table 5, and of uniform sampling, with the settings of the preset paper-n4, a short warm-up apart."""
+    from workflows.paper_tables import IMPORTANCE, LARGE, NERF
+
+    rows: dict[str, dict[str, Any]] = {
+        "nerf": NERF, "uniform": {**NERF, "sampling": "uniform"}, "sh": {"sampling": "hierarchical", **IMPORTANCE, **LARGE},
+        "light": {"sampling": "hierarchical", **IMPORTANCE}, "valid": {"sampling": "valid", **IMPORTANCE}, "n4": {},
+    }  # fmt: skip
+    path = Path(__file__).resolve().parents[1] / "workflows" / "presets" / "paper-n4.toml"
+    preset = tomllib.loads(path.read_text(encoding="utf-8"))["train"]
+    short = {"warm_up": steps // 4, "crop_steps": 0, "voxel_beta": 0.5}  # so many steps prune little with the paper's 0.1
+    return {name: training_rates(device, steps, side, views, **{**preset, **short, **row, **changes}) for name, row in rows.items()}

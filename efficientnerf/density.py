@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from efficientnerf import transfer
 from efficientnerf.compositing import sample_weights
 from efficientnerf.transfer import sent
 
@@ -39,7 +40,11 @@ class DensityVoxels:
     @property
     def occupied(self) -> float:
         """Share of valid voxels."""
-        return int(torch.count_nonzero(self.values > self.threshold)) / self.values.numel()
+        return int(self.count_occupied()) / self.values.numel()
+
+    def count_occupied(self) -> Tensor:
+        """Number of valid voxels, where they lie."""
+        return torch.count_nonzero(self.values > self.threshold)
 
 
 def density_voxels(
@@ -59,27 +64,42 @@ def cell_of(points: Tensor, side: int) -> Tensor:
     return (cell[:, 0] * side + cell[:, 1]) * side + cell[:, 2]
 
 
-def update(voxels: DensityVoxels, cell: Tensor, density: Tensor) -> None:
+def update(voxels: DensityVoxels, cell: Tensor, density: Tensor, count: Tensor | None = None) -> None:
     """Tell the voxels the density at some cells, in place.
 
         momentum   V[i] <- (1 - beta) V[i] + beta mean(density in i)     equation 7; several samples in one voxel make one update
         maximum    V[i] <- max(V[i], max(density in i))
 
-    cell (N,) flat indices, density (N,): raw for "momentum", activated for "maximum".
+    cell (N,) flat indices, density (N,): raw for "momentum", activated for "maximum"; count, a number of the device: only so many are meant, and what
+    follows is padding.
     """
     flat = voxels.values.view(-1)
     density = density.to(flat.dtype)
+    real = None if count is None else torch.arange(len(cell), device=flat.device) < count
     if voxels.rule == "maximum":
+        density = density if real is None else torch.where(real, density, -torch.inf)
         flat.scatter_reduce_(0, cell, density, reduce="amax", include_self=True)
         return
-    if flat.is_cuda:  # finding out how many voxels were seen would make the host wait
-        counts = torch.zeros_like(flat).index_add_(0, cell, torch.ones_like(density))
-        mean = torch.zeros_like(flat).index_add_(0, cell, density) / counts.clamp(min=1)
-        flat.copy_(torch.where(counts > 0, (1 - voxels.beta) * flat + voxels.beta * mean, flat))
+    if real is not None or transfer.remote(flat):
+        _blend(flat, voxels.beta, cell, density, torch.ones_like(cell, dtype=torch.bool) if real is None else real)
         return
     seen, index, counts = torch.unique(cell, return_inverse=True, return_counts=True)
     mean = torch.zeros(len(seen), dtype=flat.dtype, device=flat.device).index_add_(0, index, density) / counts
     flat[seen] = (1 - voxels.beta) * flat[seen] + voxels.beta * mean
+
+
+def _blend(flat: Tensor, beta: float, cell: Tensor, density: Tensor, real: Tensor) -> None:
+    """Equation 7 without finding out how many voxels were seen, for which the host would wait, and without touching others: samples of one voxel are
+    brought together by sorting, and all of them write the same value. Padding (N,) ~real counts for nothing, and leaves values as they are."""
+    if not len(cell):
+        return
+    cell, order = torch.sort(cell)
+    group = torch.cumsum(torch.cat([cell.new_zeros(1), (cell[1:] != cell[:-1]).long()]), dim=0)
+    counted, told = real[order], torch.where(real[order], density[order], 0)
+    counts = flat.new_zeros(len(cell)).index_add(0, group, counted.to(flat.dtype))[group]
+    mean = flat.new_zeros(len(cell)).index_add(0, group, told)[group] / counts.clamp(min=1)
+    old = flat[cell]
+    flat.index_put_((cell,), torch.where(counts > 0, (1 - beta) * old + beta * mean, old))
 
 
 DEEPEST = 1.0  # optical depth of an interval at most, where voxels alone say what hides what
@@ -127,7 +147,7 @@ def _chosen_on_device(valid: Tensor, count: int, generator: torch.Generator) -> 
 def refresh_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Cells to ask about anew, half anywhere and half among the valid, and a random point in each: (count,), (count, 3) grid coordinates."""
     flat = voxels.values.view(-1)
-    if flat.is_cuda:
+    if transfer.remote(flat):
         cell = _chosen_on_device(flat > voxels.threshold, count, generator)
         return cell, _point_in(cell, voxels.side, generator)
     anywhere = torch.randint(len(flat), (count - count // 2,), generator=generator).to(flat.device)

@@ -26,7 +26,7 @@ from efficientnerf.grid import FrameRays, Space, voxel_centres
 from efficientnerf.harmonics import basis, harmonics_count
 from efficientnerf.kernels import dispatch
 from efficientnerf.late import Room
-from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples, united
+from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples
 from efficientnerf.settings import TrainSettings
 from efficientnerf.transfer import sent
 
@@ -186,48 +186,50 @@ def look(
                          share of the valid intervals is looked at by the fine field too. Without that the fine field would be
                          free to put matter where this ray has no pivot and another has one, and the baked asset, which has no coarse
                          stage to hide it, would show it.
-    room                 on CUDA, with sampling "efficient": samples are padded to this many, and their number is not waited for
+    room                 on CUDA: samples are padded to this many at most, and their number is not waited for
     """
     rays = m.space.rays(origins, directions, near, far)
     bundle = (rays.origins, rays.directions, rays.near, rays.far)
     if m.settings.sampling == "uniform":
-        samples, _ = _even_samples(m, *bundle, offset, m.settings.coarse_samples + m.settings.importance_samples, rng)
+        count = m.settings.coarse_samples + m.settings.importance_samples
+        samples, _ = _even_samples(m, *bundle, offset, count, rng, None if room is None else room.fine)
         raw, out = _seen(m, m.fine, directions, samples, behind)
         nothing = samples.start[:0]
         none = Samples(torch.zeros_like(samples.first), nothing, nothing, nothing, samples.point[:0], samples.tried)
         return Look(rays, none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
+    for_coarse, for_fine = (None, None) if room is None else room
     if m.settings.sampling == "hierarchical":
-        coarse, at = _even_samples(m, *bundle, offset, m.settings.coarse_samples, rng)
+        coarse, at = _even_samples(m, *bundle, offset, m.settings.coarse_samples, rng, for_coarse)
     else:
-        coarse = _valid_samples(m, *bundle, offset, prune=prune, rng=rng, capacity=None if room is None else room.coarse)
-        at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent
+        coarse, at = _valid_samples(m, *bundle, offset, prune=prune, rng=rng, capacity=for_coarse), None
     if m.coarse is None:
-        return _looked_by_voxels(m, rays, directions, offset, behind, coarse, prune=prune, rng=rng)
+        return _looked_by_voxels(m, rays, directions, offset, behind, coarse, prune=prune, rng=rng, capacity=for_fine)
     coarse_raw, seen = _seen(m, m.coarse, directions, coarse, behind)
     weight = seen.weight.detach()
     pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
     if m.settings.sampling == "efficient":
         if rng is not None and m.settings.explored > 0:
             pivotal = pivotal | _chance(len(pivotal), m.settings.explored, rng, pivotal.device)
-        capacity = None if room is None else room.fine
-        fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, m.settings.fine_samples, capacity)
+        fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, m.settings.fine_samples, for_fine)
     else:
         quantile = _strata(len(origins), m.settings.importance_samples, rng, offset.device)
-        fine = importance_samples(m.space, *bundle[:2], coarse, at, weight, quantile)
+        at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent if at is None else at
+        fine = importance_samples(m.space, *bundle[:2], coarse, at, weight, quantile, for_fine)
     fine_raw, out = _seen(m, m.fine, directions, fine, behind)
     return Look(rays, coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
 
 
 def _looked_by_voxels(
-    m: Model, rays: FrameRays, directions: Tensor, offset: Tensor, behind: Tensor, coarse: Samples, *, prune: bool, rng: np.random.Generator | None
-) -> Look:
+    m: Model, rays: FrameRays, directions: Tensor, offset: Tensor, behind: Tensor, coarse: Samples, *, prune: bool, rng: np.random.Generator | None,
+    capacity: int | None,
+) -> Look:  # fmt: skip
     """Pivots by what the density voxels hold, without a coarse field; while nothing is pruned, all intervals, with one sample each."""
     weight = voxel_weights(m.voxels, coarse.point, coarse.length, coarse.first)
     if prune:
         pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
         if rng is not None and m.settings.explored > 0:
             pivotal = pivotal | _chance(len(pivotal), m.settings.explored, rng, pivotal.device)
-        fine = dispatch.pivotal_samples(m.space, rays.origins, rays.directions, offset, coarse, pivotal, m.settings.fine_samples)
+        fine = dispatch.pivotal_samples(m.space, rays.origins, rays.directions, offset, coarse, pivotal, m.settings.fine_samples, capacity)
     else:
         pivotal, fine = torch.ones(len(weight), dtype=torch.bool, device=weight.device), coarse
     fine_raw, out = _seen(m, m.fine, directions, fine, behind)
@@ -263,35 +265,28 @@ def _valid_samples(
     capacity: int | None,
 ) -> Samples:  # fmt: skip
     """Coarse samples where the voxels say that something is; of the first rays, which are as random as any, all, where the settings say so."""
-
-    def of(rays: slice, threshold: float) -> Samples:
-        return dispatch.valid_samples(
-            m.space, origins[rays], directions[rays], near[rays], far[rays], offset[rays], m.step, m.slots, m.voxels.values, threshold, capacity
-        )
-
-    if not prune:
-        return of(slice(None), -math.inf)
+    threshold = m.voxels.threshold if prune else -math.inf
     whole = math.ceil(m.settings.refresh_rays * len(origins)) if rng is not None else 0
-    if whole == 0:
-        return of(slice(None), m.voxels.threshold)
-    return united(of(slice(whole), -math.inf), of(slice(whole, None), m.voxels.threshold))
+    bundle = (origins, directions, near, far, offset)
+    return dispatch.valid_samples(m.space, *bundle, m.step, m.slots, m.voxels.values, threshold, capacity, whole=whole)
 
 
 def _even_samples(
-    m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, count: int, rng: np.random.Generator | None
-) -> tuple[Samples, Tensor]:
+    m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, count: int, rng: np.random.Generator | None,
+    capacity: int | None,
+) -> tuple[Samples, Tensor]:  # fmt: skip
     """`count` stratified samples between near and far, or between where the ray enters the box and leaves it; their distances (N,)."""
     if m.space.contracted:  # intervals that grow with the distance, all of them
         step = m.step * m.settings.coarse_samples / count
         slots = math.ceil(m.slots * count / m.settings.coarse_samples)
-        samples = dispatch.valid_samples(m.space, origins, directions, near, far, offset, step, slots, m.voxels.values, -math.inf)
+        samples = dispatch.valid_samples(m.space, origins, directions, near, far, offset, step, slots, m.voxels.values, -math.inf, capacity)
         return samples, samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
     if m.span is None:
         near, far = clip_to_space(m.space, origins, directions, near, far)
     jitter = offset[:, None].expand(-1, count)
     if rng is not None:
         jitter = sent(torch.from_numpy(rng.random((len(origins), count), np.float32)), offset.device)
-    return stratified_samples(m.space, origins, directions, near, far, jitter, outside=m.settings.field != "hash")
+    return stratified_samples(m.space, origins, directions, near, far, jitter, outside=m.settings.field != "hash", capacity=capacity)
 
 
 def _strata(rays: int, count: int, rng: np.random.Generator | None, device: torch.device) -> Tensor:

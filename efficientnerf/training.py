@@ -99,6 +99,7 @@ class Progress:
     rays        in the step
     tried       coarse intervals, valid or not
     valid, pivotal, fine   how many samples of each kind
+    left_out    rays that found no room for their samples, and taught nothing; on CUDA alone
     """
 
     step: int
@@ -108,6 +109,7 @@ class Progress:
     valid: int
     pivotal: int
     fine: int
+    left_out: int = 0
 
     @property
     def psnr(self) -> float:
@@ -188,9 +190,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
     m = t.model
     device = m.device
     transparent = pixels.images.shape[1] == 4
-    # On CUDA nothing waits for the device where numbers of samples can be told ahead; see `efficientnerf.late`.
-    known_ahead = m.coarse is not None and m.settings.sampling == "efficient" and m.settings.refresh_rays == 0
-    late = Late() if dispatch.on_device(m.voxels.values) and known_ahead else None
+    late = Late() if dispatch.on_device(m.voxels.values) else None  # then nothing waits for the device
     there = DevicePixels(pixels, device) if device.type == "cuda" else pixels
     while t.step < m.settings.iterations:
         number, settings = t.step + 1, m.settings
@@ -213,9 +213,11 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
 
         # Both stages, both losses (weighted equally, as in the authors' release).
+        if late is not None and number == settings.warm_up + 1:
+            late.forget()
         room = None if late is None else late.room(count)
         seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up, rng=rng, room=room)
-        whole = None if room is None else whole_rays(seen.coarse, seen.fine, room)
+        whole = whole_rays(seen.coarse, seen.fine)
         fine_colour, coarse_colour = seen.fine_colour, seen.coarse_colour
         if t.exposure is not None:
             view = sent(torch.from_numpy(pixels.view_of(chosen)), device)
@@ -228,7 +230,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         if m.space.contracted or m.space.ndc is not None:
             # In normalised device coordinates it grows from nothing: at first it would gather all matter on the near plane, where cameras overlap least.
             share = 1.0 if m.space.contracted else way
-            loss = loss + share * settings.distortion * seen.distortion.mean()
+            loss = loss + share * settings.distortion * mean_over(seen.distortion, whole)
             if m.space.contracted:  # in normalised device coordinates rays do not crowd together before the cameras
                 _quieten_near_cameras(m, origins, seen)
             strength = settings.anchors * max(0.0, 1 - 2 * way)
@@ -243,7 +245,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         with torch.no_grad():
             if m.prunes:
                 told, raw = (seen.fine, seen.fine_raw) if m.coarse is None else (seen.coarse, seen.coarse_raw)
-                remember(m, told.point, raw[:, 0].detach())
+                remember(m, told.point, raw[:, 0].detach(), count=None if room is None else told.first[-1])
             if m.prunes and number % settings.refresh_every == 0:
                 refresh(m, number, rng)
             # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
@@ -255,12 +257,12 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         t.step = number
         if late is not None:
             counted = late.note(count, fine_loss, seen.coarse, seen.pivotal, seen.fine)
-            t.samples_per_ray = max(late.valid_per_ray + late.fine_per_ray, 1.0)
+            t.samples_per_ray = max(late.fine_per_ray + (0.0 if m.coarse is None else late.valid_per_ray), 1.0)
         else:
             counted = Counted(float(fine_loss.detach()), seen.coarse.tried, len(seen.coarse.start), int(seen.pivotal.sum()), len(seen.fine.start))
             asked = counted.fine if m.coarse is None else counted.fine + counted.valid  # of a network
             t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max(asked / count, 1.0)
-        yield Progress(number, counted.loss, count, counted.tried, counted.valid, counted.pivotal, counted.fine)
+        yield Progress(number, counted.loss, count, *counted[1:])
 
 
 def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator, late: Late | None = None, *, prune: bool) -> Tensor:
@@ -277,7 +279,7 @@ def anchor_loss(m: Model, anchors: Anchors, count: int, rng: np.random.Generator
     near, far = 0.1 * distance, 4 * distance
     room = None if late is None else late.room(2 * count)  # they begin closer to the camera, and end farther away
     seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng, room=room)
-    whole = None if room is None else whole_rays(seen.coarse, seen.fine, room)
+    whole = whole_rays(seen.coarse, seen.fine)
     distance = seen.rays.frame(distance)
     loss = origins.new_zeros(())
     for samples, weight, share in ((seen.coarse, seen.coarse_weight, 1), (seen.fine, seen.fine_weight, m.settings.fine_samples)):
@@ -320,7 +322,7 @@ def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
         remember(m, point[part : part + 2**17], m.scout.density(m.asked(point[part : part + 2**17])), cell[part : part + 2**17])
 
 
-def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None) -> None:
-    """Update the density voxels with what the coarse field said, before its activation, at points in grid coordinates."""
+def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:
+    """Update the density voxels with what the coarse field said, before its activation, at points in grid coordinates; `count` as for `update`."""
     cell = cell_of(point, m.voxels.side) if cell is None else cell
-    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.scout.activation))
+    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.scout.activation), count)

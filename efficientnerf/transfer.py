@@ -17,6 +17,11 @@ def sent(values: Tensor, device: torch.device) -> Tensor:
     return values.pin_memory().to(device, non_blocking=True)
 
 
+def remote(values: Tensor) -> bool:
+    """Whether a host that asks for one of these values has to wait: they are a device's."""
+    return values.is_cuda
+
+
 def fetched(values: Tensor) -> tuple[Tensor, Any]:
     """A tensor of a device on its way to the host, and the event at whose end it has arrived; None where there is nothing to wait for."""
     if not values.is_cuda:

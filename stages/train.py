@@ -39,6 +39,7 @@ NOWHERE = 1e-9  # scene is 2 across: nearer to a camera than this, a point has n
 
 def run(job: Job) -> None:
     from efficientnerf import training
+    from efficientnerf.late import LateShare
     from efficientnerf.model import model
     from efficientnerf.render import FieldRenderer
     from stages import field, scene
@@ -66,6 +67,7 @@ def run(job: Job) -> None:
     lines: list[str] = []
     started, first, loss = clock(), t.step, 0.0
     held_back: float | None = None
+    occupied = LateShare(m.voxels)
     pace: dict[str, Any] = {}
     working, logged, resumed = 0.0, first, clock()  # seconds of steps alone, since the last line of the log
     for done in training.train(t, pixels, anchors_of(folder, s)):
@@ -77,12 +79,15 @@ def run(job: Job) -> None:
         drawn = _preview(renderer, watched, folder, job, done.step, settings)
         held_back = drawn or held_back
         seconds = spent + clock() - started
-        if done.step % LOG_EVERY == 0 or last or drawn is not None:
-            lines.append(json.dumps(_line(done, loss, m.voxels.occupied, seconds, working / (done.step - logged), drawn), sort_keys=True))
+        shown = done.step % LOG_EVERY == 0 or last
+        if shown or drawn is not None or not pace:
+            share = occupied()
+        if shown or drawn is not None:
+            lines.append(json.dumps(_line(done, loss, share, seconds, working / (done.step - logged), drawn), sort_keys=True))
             working, logged = 0.0, done.step
         goal = settings.warm_up + TIMED if m.settings.iterations == MOST else m.settings.iterations
-        if done.step % LOG_EVERY == 0 or last or not pace:
-            pace = _pace(done, m.voxels.occupied, seconds - spent, done.step - first, goal)
+        if shown or not pace:
+            pace = _pace(done, share, seconds - spent, done.step - first, goal)
         facts = {"loss": loss, "psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), **({} if held_back is None else {"held_back_psnr": held_back})}
         job.progress(min(done.step, goal), goal, "training", **facts, **pace)
         if drawn is not None:
@@ -281,7 +286,8 @@ def _pace(done: Progress, occupied: float, seconds: float, steps: int, goal: int
 
 
 def _line(done: Progress, loss: float, occupied: float, seconds: float, step_seconds: float, held_back: float | None) -> dict[str, Any]:
-    """seconds: of the stage, pictures and checkpoints included; step_seconds: of a step alone, the mean since the last line."""
+    """seconds: of the stage, pictures and checkpoints included; step_seconds: of a step alone, the mean since the last line; left_out: of the step's rays,
+    those that found no room for their samples; on CUDA counts and shares are those of some steps before (`efficientnerf.late`)."""
     return {
         "step_seconds": round(step_seconds, 6),
         "held_back_psnr": held_back,
@@ -293,6 +299,7 @@ def _line(done: Progress, loss: float, occupied: float, seconds: float, step_sec
         "valid": done.valid,
         "pivotal": done.pivotal,
         "fine": done.fine,
+        "left_out": done.left_out,
         "occupied": occupied,
         "seconds": round(seconds, 3),
     }

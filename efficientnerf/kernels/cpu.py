@@ -67,12 +67,15 @@ def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, s
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _find_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, counts, tried, leave, begins):  # type: ignore[no-untyped-def]
+def _find_valid(  # type: ignore[no-untyped-def]
+    origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, whole, counts, tried, leave, begins
+):
+    never = np.float32(-np.inf)
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
             counts[r], tried[r], leave[r] = _walk(
                 origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r], offset[r],
-                centre, half, contracted, step, slots, voxels, threshold, begins[r],
+                centre, half, contracted, step, slots, voxels, never if r < whole else threshold, begins[r],
             )  # fmt: skip
 
 
@@ -104,13 +107,14 @@ def _write_valid(origins, directions, offset, centre, half, contracted, step, le
                 point[n, 0], point[n, 1], point[n, 2] = (px + shift) * scale, (py + shift) * scale, (pz + shift) * scale
 
 
-def valid_samples(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold):  # type: ignore[no-untyped-def]
+def valid_samples(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, whole=0):  # type: ignore[no-untyped-def]
     """`efficientnerf.sampling.valid_samples` on float32 arrays: (first, start, extent, length, point, tried)."""
     rays = len(origins)
     counts, tried, leave = np.zeros(rays, np.int64), np.zeros(rays, np.int64), np.empty(rays, np.float32)
     begins = np.empty((rays, slots), np.float32)  # of a row only as much is touched as the ray has valid samples
     step = np.float32(step)
-    _find_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, np.float32(threshold), counts, tried, leave, begins)
+    limits = (np.float32(threshold), whole)
+    _find_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, *limits, counts, tried, leave, begins)
     first = np.zeros(rays + 1, np.int64)
     np.cumsum(counts, out=first[1:])
     n = int(first[-1])

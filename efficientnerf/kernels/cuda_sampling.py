@@ -1,9 +1,8 @@
 """Valid and pivotal samples on CUDA (Triton): one lane a ray when marching, one lane a sample after.
 
 How many samples a bundle has is known to the device alone. Without a capacity the host waits once for the number, to make arrays of that length. With
-`capacity` it never waits: the arrays have that length, `first` says how far they are filled, and the rest is padding of length zero that belongs to no
-ray. Where a bundle has more samples than fit, its last rays lose theirs: `first[r + 1] < capacity` tells that ray r has all of its samples, and
-training leaves the others out of its loss.
+`capacity` it never waits: the arrays have that length, and are filled as `efficientnerf.sampling` says. Training leaves rays that have not all of their
+samples out of its loss.
 """
 
 from __future__ import annotations
@@ -53,10 +52,10 @@ def _slab(u, v):  # type: ignore[no-untyped-def]
     return tl.minimum(one, other), tl.maximum(one, other)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["whole"])
 def _march(  # type: ignore[no-untyped-def]
     origins, directions, near, far, offset, cx, cy, cz, hx, hy, hz, voxels, first, counts, tried, start, extent, length, point,
-    rays, slots, step, threshold, side, CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
+    rays, slots, step, threshold, whole, side, CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Counts the valid samples of each ray, or writes them from `first` on."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -76,6 +75,7 @@ def _march(  # type: ignore[no-untyped-def]
     if WRITE:
         at = tl.load(first + r, live, other=0)
         end = tl.load(first + r + 1, live, other=0)
+    limit = tl.where(r < whole, float("-inf"), threshold)
     valid = tl.zeros((BLOCK,), tl.int32)
     seen = tl.zeros((BLOCK,), tl.int32)
     alive = live & (t < leave)
@@ -95,7 +95,7 @@ def _march(  # type: ignore[no-untyped-def]
         i = tl.minimum(tl.maximum(gx * side, 0.0), side - 1.0).to(tl.int32)
         j = tl.minimum(tl.maximum(gy * side, 0.0), side - 1.0).to(tl.int32)
         l = tl.minimum(tl.maximum(gz * side, 0.0), side - 1.0).to(tl.int32)
-        found = alive & (tl.load(voxels + (i * side + j) * side + l, alive, other=0.0) > threshold)
+        found = alive & (tl.load(voxels + (i * side + j) * side + l, alive, other=0.0) > limit)
         if WRITE:
             put = found & (at < end)
             tl.store(start + at, t, put)
@@ -130,7 +130,7 @@ def _offsets(counts: Tensor) -> Tensor:
 
 def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
-    capacity: int | None = None,
+    capacity: int | None = None, *, whole: int = 0,
 ) -> Samples:  # fmt: skip
     """See `efficientnerf.sampling.valid_samples`; with `capacity` see the module, and `tried` is then a tensor on the device."""
     origins, directions, near, far, offset, voxels = (t.detach().contiguous() for t in (origins, directions, near, far, offset, voxels))
@@ -138,21 +138,22 @@ def valid_samples(
     device = origins.device
     counts, tried = (torch.zeros(rays, dtype=torch.int32, device=device) for _ in range(2))
     bundle = (origins, directions, near, far, offset, *_box(space), voxels)
-    rest = (rays, slots, float(step), float(threshold), side)
+    rest = (rays, slots, float(step), float(threshold), whole, side)
     grid, shape = (blocks(rays, RAYS),), {"CONTRACTED": space.contracted, "BLOCK": RAYS, "num_warps": 1}
     nothing = origins.new_empty(0)
     _march[grid](*bundle, counts, counts, tried, nothing, nothing, nothing, nothing, *rest, WRITE=False, **shape)
     first = _offsets(counts)
     total_tried = tried.sum(dtype=torch.int64)
+    complete = None
     if capacity is None:
         samples, all_tried = torch.stack([first[-1], total_tried]).tolist()
     else:
-        samples, all_tried = capacity, total_tried
+        samples, all_tried, complete = capacity, total_tried, first[1:] <= capacity
         first.clamp_(max=capacity)
     # Zeros: the padding, and what the two passes, compiled on their own, might disagree about by a rounding.
     start, extent, length, point = (origins.new_zeros(samples), origins.new_zeros(samples), origins.new_zeros(samples), origins.new_zeros(samples, 3))
     _march[grid](*bundle, first, counts, tried, start, extent, length, point, *rest, WRITE=True, **shape)
-    return Samples(first, start, extent, length, point, all_tried)
+    return Samples(first, start, extent, length, point, all_tried, complete)
 
 
 @triton.jit
@@ -238,10 +239,11 @@ def pivotal_samples(
     pivotal = pivotal & (torch.arange(samples, device=origins.device) < coarse.first[-1])  # padding may have been marked by chance
     before = _offsets(pivotal)  # (N + 1,) pivotal samples before each
     first = before[coarse.first] * per_pivot
+    complete = None
     if capacity is None:
         total = int(first[-1])
     else:
-        total = capacity
+        total, complete = capacity, first[1:] <= capacity
         first.clamp_(max=capacity)
     start, extent, length, point = (origins.new_zeros(total), origins.new_zeros(total), origins.new_zeros(total), origins.new_zeros(total, 3))
     if rays and samples and total:
@@ -250,4 +252,4 @@ def pivotal_samples(
             start, extent, length, point, rays, samples, total,
             CONTRACTED=space.contracted, PER_PIVOT=per_pivot, BITS=rays.bit_length(), BLOCK=LANES,
         )  # fmt: skip
-    return Samples(first, start, extent, length, point, coarse.tried)
+    return Samples(first, start, extent, length, point, coarse.tried, complete)

@@ -58,22 +58,22 @@ def _box(space: Space) -> tuple[np.ndarray, np.ndarray, bool]:
 
 def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
-    capacity: int | None = None,
+    capacity: int | None = None, *, whole: int = 0,
 ) -> Samples:  # fmt: skip
     """See `efficientnerf.sampling.valid_samples`; `capacity` is for the Triton kernels alone, see `efficientnerf.kernels.cuda_sampling`."""
     if on_device(origins, directions, near, far, offset, voxels):
         from efficientnerf.kernels import cuda_sampling
 
-        return cuda_sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, capacity)
+        return cuda_sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, capacity, whole=whole)
     _refuse(capacity)
     if not _fast(origins, directions, near, far, offset, voxels):
-        return sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold)
+        return sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, whole=whole)
     from efficientnerf.kernels import cpu
 
     *packed, tried = cpu.valid_samples(
-        _array(origins), _array(directions), _array(near), _array(far), _array(offset), *_box(space), step, slots, _array(voxels), threshold
+        _array(origins), _array(directions), _array(near), _array(far), _array(offset), *_box(space), step, slots, _array(voxels), threshold, whole
     )
-    return Samples._make([*(torch.from_numpy(a) for a in packed), tried])
+    return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
 
 
 def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
@@ -108,7 +108,7 @@ def pivotal_samples(
         _array(origins), _array(directions), _array(offset), *_box(space),
         _array(coarse.first), _array(coarse.start), _array(coarse.extent), _array(coarse.length), _array(pivotal), per_pivot,
     )  # fmt: skip
-    return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried])
+    return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 
 def tree_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, looking: np.ndarray | None = None) -> tuple[np.ndarray, ...]:

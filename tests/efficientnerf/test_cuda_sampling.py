@@ -22,7 +22,7 @@ def there(rays: Rays) -> Rays:
 
 
 def here(samples: Samples) -> Samples:
-    return Samples(*(t.cpu() for t in samples[:5]), int(samples.tried))
+    return Samples(*(t.cpu() for t in samples[:5]), int(samples.tried), None if samples.complete is None else samples.complete.cpu())
 
 
 def of_ray(samples: Samples, r: int) -> list[torch.Tensor]:
@@ -55,6 +55,9 @@ def test_a_capacity_cuts_off_the_end_or_pads_it(contracted: bool, room: int) -> 
     args = (space, *rays, STEP, 60, voxels_of().to(DEVICE), 0.4)
     whole, cut = cuda.valid_samples(*args), cuda.valid_samples(*args, capacity=room)
     total = int(whole.first[-1])
+    assert whole.complete is None
+    assert cut.complete is not None
+    assert torch.equal(cut.complete, whole.first[1:] <= room)
     assert 100 < total < 4000
     kept = min(room, total)
     assert torch.equal(cut.first, whole.first.clamp(max=room))
@@ -64,6 +67,24 @@ def test_a_capacity_cuts_off_the_end_or_pads_it(contracted: bool, room: int) -> 
         assert not a[kept:].any()
     assert isinstance(cut.tried, torch.Tensor)
     assert int(cut.tried) == whole.tried
+
+
+@pytest.mark.parametrize("room", [None, 300, 4000])
+@pytest.mark.parametrize("contracted", [False, True])
+def test_the_first_rays_can_be_looked_at_whole(contracted: bool, room: int | None) -> None:
+    rays, space = there(make_rays("outside")), Space(BOUNDS, contracted)
+    args = (space, *rays, STEP, 60, voxels_of().to(DEVICE))
+    some = here(cuda.valid_samples(*args, 0.4, room, whole=5))
+    every, pruned = (here(cuda.valid_samples(*args, threshold)) for threshold in (-math.inf, 0.4))
+    for r in range(len(rays.origins)):
+        begin, end = some.first[r : r + 2].tolist()
+        if room is not None and end == room:  # no more than this finds room
+            break
+        for ours, theirs in zip(of_ray(some, r), of_ray(every if r < 5 else pruned, r), strict=True):
+            assert torch.equal(ours, theirs)
+        assert begin < end or r >= 5
+    assert r > 5
+    assert some.tried == every.tried
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -82,6 +103,7 @@ def test_pivotal_samples_are_those_of_torch(contracted: bool, per_pivot: int, ro
     ours = here(cuda.pivotal_samples(space, at.origins, at.directions, at.offset, on_device, marked.to(DEVICE), per_pivot, room))
     kept = len(theirs.start) if room is None else min(room, len(theirs.start))
     assert torch.equal(ours.first, theirs.first.clamp(max=kept))
+    assert (ours.complete is None) == (room is None)
     for a, b in zip(ours[1:5], theirs[1:5], strict=True):
         assert len(a) == (kept if room is None else room)
         torch.testing.assert_close(a[:kept], b[:kept], rtol=1e-4, atol=1e-5)

@@ -30,6 +30,22 @@ def test_momentum_is_equation_seven_with_one_update_to_a_voxel() -> None:
     assert voxels.values.reshape(-1)[-1] == 10.0  # never asked about
 
 
+@pytest.mark.parametrize("rule", ["momentum", "maximum"])
+@pytest.mark.parametrize("padding", [0, 1, 30])
+def test_padding_tells_the_voxels_nothing(rule: str, padding: int) -> None:
+    """Neither those that nothing else was told of, nor those that were."""
+    plain, padded = (density_voxels(SIDE, rule, initial=10.0, beta=0.1, threshold=1.0) for _ in range(2))
+    for count in (80, 1, 200):
+        cell, density = samples(count)
+        update(plain, cell, density)
+        nowhere = torch.tensor([0, int(cell[0]), SIDE**3 - 1])[torch.arange(padding) % 3]
+        more = torch.where(torch.arange(padding) % 2 == 0, torch.inf, torch.nan)
+        update(padded, torch.cat([cell, nowhere]), torch.cat([density, more]), torch.tensor(count))
+    torch.testing.assert_close(padded.values, plain.values, rtol=1e-6, atol=1e-6)
+    assert padded.values.reshape(-1)[-1] == padded.start
+    update(padded, cell[:0], density[:0], torch.tensor(0))
+
+
 def test_a_voxel_of_raw_density_minus_five_is_pruned_at_its_eleventh_visit() -> None:
     voxels = density_voxels(1, "momentum", initial=10.0, beta=0.1)
     visits = 0

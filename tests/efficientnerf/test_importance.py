@@ -13,7 +13,7 @@ from efficientnerf.compositing import composite
 from efficientnerf.grid import Space
 from efficientnerf.model import look
 from efficientnerf.render import valid_count
-from efficientnerf.sampling import IMPORTANCE_FLOOR, Samples, importance_samples, stratified_samples, united, valid_samples
+from efficientnerf.sampling import IMPORTANCE_FLOOR, Samples, importance_samples, stratified_samples, valid_samples
 from tests.efficientnerf.balls import pixels, untrained
 
 BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])
@@ -92,12 +92,48 @@ def test_importance_is_the_inverse_of_the_distribution() -> None:
     torch.testing.assert_close(SPACE.world(fine.point)[:, 0], torch.tensor(expected, dtype=torch.float64))
 
 
-def test_bundles_unite() -> None:
-    coarse, _ = pruned()
-    both = united(coarse, coarse)
-    assert len(both.first) == 2 * len(coarse.first) - 1
-    assert both.first[-1] == len(both.start) == 2 * len(coarse.start)
-    assert torch.equal(both.point[len(coarse.point) :], coarse.point)
+def same_up_to(capacity: int, padded: Samples, exact: Samples) -> None:
+    """Filled from the beginning on, zeros behind; rays that end beyond the capacity are not complete."""
+    kept = min(capacity, len(exact.start))
+    assert torch.equal(padded.first, exact.first.clamp(max=kept))
+    assert padded.complete is not None
+    assert torch.equal(padded.complete, exact.first[1:] <= capacity)
+    last = int(padded.first[:-1][padded.complete.logical_not()].min()) if not padded.complete.all() else kept  # a ray that is cut ends elsewhere
+    for ours, theirs in zip(padded[1:5], exact[1:5], strict=True):
+        assert len(ours) <= capacity
+        torch.testing.assert_close(ours[:last], theirs[:last], rtol=0, atol=1e-12)
+        assert not ours[kept:].any()
+
+
+@pytest.mark.parametrize("capacity", [30, 70, 120, 5000])
+@pytest.mark.parametrize("outside", [False, True])
+def test_a_capacity_pads_or_cuts_even_samples(outside: bool, capacity: int) -> None:
+    o, d, near, far = rays()
+    jitter = torch.rand(len(o), 10, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    exact, at = stratified_samples(SPACE, o, d, near, far, jitter, outside=outside)
+    padded, also_at = stratified_samples(SPACE, o, d, near, far, jitter, outside=outside, capacity=capacity)
+    same_up_to(capacity, padded, exact)
+    assert torch.equal(also_at[: len(at)], at[:capacity])
+    if outside and capacity >= 120:  # nothing is left out, so nothing is padded
+        assert len(padded.start) == 120
+
+
+@pytest.mark.parametrize("capacity", [40, 90, 5000])
+@pytest.mark.parametrize("padding", [0, 9])
+def test_a_capacity_pads_or_cuts_samples_by_importance(padding: int, capacity: int) -> None:
+    """Of coarse samples that are padded themselves, or not; some rays have none, also the last."""
+    coarse, at = pruned()
+    o, d, _, _ = rays()
+    generator = torch.Generator().manual_seed(4)
+    weight = torch.rand(len(at) + padding, generator=generator, dtype=torch.float64)
+    quantile = torch.rand(len(o), 7, generator=generator, dtype=torch.float64)
+    exact = importance_samples(SPACE, o, d, coarse, at, weight[: len(at)], quantile)
+    more = Samples(coarse.first, *(torch.cat([t, t.new_zeros(padding, *t.shape[1:])]) for t in coarse[1:5]), coarse.tried)
+    padded = importance_samples(SPACE, o, d, more, torch.cat([at, at.new_zeros(padding)]), weight, quantile, capacity)
+    assert 90 < len(exact.start) < 5000
+    same_up_to(capacity, padded, exact)
+    if capacity == 5000 and not padding and (coarse.first.diff() > 0).all():
+        assert len(padded.start) == len(exact.start)
 
 
 def test_where_samples_lie_is_differentiable_in_the_rays() -> None:

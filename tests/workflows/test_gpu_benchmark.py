@@ -33,6 +33,19 @@ def test_an_asset_is_made_without_files() -> None:
     assert found["held_back_psnr"]["fitted"] > found["held_back_psnr"]["network"]
 
 
+def test_steps_of_the_papers_rows_are_timed() -> None:
+    import gpu_kernels
+
+    few = {"hidden": 16, "layers": 2, "coarse_hidden": 16, "coarse_layers": 2, "coarse_samples": 8, "importance_samples": 8, "rays": 16, "voxels": 16}
+    found = gpu_kernels.paper_rates("cpu", 4, 16, 3, **few)
+    assert list(found) == ["nerf", "uniform", "sh", "light", "valid", "n4"]
+    for row in found.values():
+        assert row["rays"] == 16
+        assert row["samples_per_second"] > 0
+        assert row["waits_in_32_steps"] == {}
+        assert row["rays_left_out_in_32_steps"] == 0
+
+
 def test_a_part_that_fails_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if torch.cuda.is_available():
         pytest.skip("there is a CUDA device, on which nothing fails")
