@@ -25,13 +25,11 @@ def paper(table: str, data: Path | None, out: Path, scale: float, device: str | 
     """
     from workflows.device import resolve_device
     from workflows.paper import Request, make
-    from workflows.progress import write_json
+    from workflows.progress import display, write_json
 
-    def say(text: str) -> None:
-        if not quiet and not as_json:
-            click.echo(text, err=True)
-
-    written = make(table, Request(data, out, scale, resolve_device(device or "auto"), say))
+    with display(as_json=as_json, quiet=quiet) as show:
+        say = lambda text: show({"event": "message", "text": text})  # noqa: E731
+        written = make(table, Request(data, out, scale, resolve_device(device or "auto"), say, show))
     if as_json:
         write_json({"event": "summary", "ok": True, "table": table, "files": {kind: str(path) for kind, path in written.items()}, "exit_code": 0})
     elif not quiet:

@@ -19,6 +19,7 @@ class Request:
     scale   1: as in the paper; less: iterations, resolution, networks and grids shrunk together
     device  "cpu" or "cuda"
     say     tells the user what is going on
+    report  takes the events of the stages, which for hours are all that is to be seen; None: nobody listens
     """
 
     data: Path | None
@@ -26,6 +27,7 @@ class Request:
     scale: float = 1.0
     device: str = "cpu"
     say: Callable[[str], None] = print
+    report: Callable[[dict[str, Any]], None] | None = None
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,7 @@ def measured(request: Request, scene: Path, row: Row) -> Figures:
         run = Run.create(folder, scene.resolve(), settings, preset=PRESET, device=request.device)
     request.say(f"{scene.name}, {row.name}: training {settings['train']['iterations']} steps")
     stages = [stage for stage in asset.STAGES if stage.name in (("poses", "train", "bake") if row.bakes else ("poses", "train"))]
-    outcomes = run_stages(run, stages, device=request.device)
+    outcomes = run_stages(run, stages, device=request.device, report=request.report)
     request.say(f"{scene.name}, {row.name}: measuring")
     quality = _quality(run, str(outcomes[1].digest), settings, request.device)
     lines = [json.loads(line) for line in (run.folder("train") / "log.jsonl").read_text(encoding="utf-8").splitlines()]

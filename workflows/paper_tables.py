@@ -196,7 +196,7 @@ def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
 def _quiet(request: Request) -> Request:
     import dataclasses
 
-    return dataclasses.replace(request, say=lambda text: None)
+    return dataclasses.replace(request, say=lambda text: None, report=None)
 
 
 def _data(request: Request) -> Any:

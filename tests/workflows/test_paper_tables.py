@@ -102,10 +102,15 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         assert document["rows"][0]["valid %" + PAPER] == 9.58
 
 
-def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path) -> None:
+def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, out = ball(tmp_path / "ball"), tmp_path / "out"
-    command = ["paper", "1", "--data", str(data), "--out", str(out), "--scale", "0.00001", "--device", "cpu", "--quiet"]
+    command = ["paper", "1", "--data", str(data), "--out", str(out), "--scale", "0.00001", "--device", "cpu", "--json"]
     assert main(command) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert events[-1]["event"] == "summary"
+    assert sum(event["event"] == "stage_done" and event["stage"] == "train" for event in events) == 2
+    assert any(event["event"] == "progress" and event["stage"] == "train" for event in events)  # hours go by without a word otherwise
+    assert any("training 60 steps" in event.get("text", "") for event in events if event["event"] == "message")
     nerf, ours = json.loads((out / "table_1.json").read_text())["rows"]
     assert 0 < ours["pivotal %"] <= ours["valid %"] < 100
     assert 0 < nerf["pivotal %"] < 100
