@@ -6,12 +6,14 @@ import traceback
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from efficientnerf import compositing, late, training, transfer
 from efficientnerf.density import density_voxels
+from efficientnerf.device_pixels import DevicePixels
 from efficientnerf.grid import Space
 from efficientnerf.kernels import dispatch
 from efficientnerf.late import Late, LateShare, Room, mean_over, whole_rays
@@ -208,6 +210,29 @@ def test_lines_that_wait_are_found() -> None:
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_no_line_of_a_step_waits(strategy: str, interpreted: None) -> None:
     running = training.train(training.trainer(model_of(strategy, iterations=9)), pixels(3, 8))
+    for _ in range(4):
+        next(running)
+    with Waits() as waits:
+        for _ in range(2):
+            next(running)
+    assert waits.lines == []
+
+
+def test_no_line_that_makes_a_bundle_waits() -> None:
+    there = DevicePixels(pixels(3, 8), "cpu")
+    with Waits() as waits:
+        assert len(there.bundle(np.arange(20))[0]) == 20
+    assert waits.lines == []
+
+
+@pytest.mark.parametrize("discretise", [0, 12])
+def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With exposures, anchors, and explored intervals."""
+    monkeypatch.setattr(dispatch, "composite", compositing.composite)
+    m = model_of("contracted", iterations=9, exposure="gain", explored=0.1, discretise=discretise)
+    origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
+    anchors = training.Anchors(origins, directions, np.full(8, 3.0, np.float32))
+    running = training.train(training.trainer(m, 3), pixels(3, 8), anchors)
     for _ in range(4):
         next(running)
     with Waits() as waits:
