@@ -87,11 +87,11 @@ def default_field() -> Any:
     import torch
 
     from efficientnerf.fields.hash import HashField
-    from efficientnerf.settings import TrainSettings
+    from efficientnerf.settings import FINEST, LOG2_TABLE, TrainSettings
 
     s = TrainSettings()
     return HashField(
-        levels=s.levels, log2_table=s.log2_table, coarsest=16, finest=s.finest, hidden=s.hidden, layers=s.layers, degree=s.degree,
+        levels=s.levels, log2_table=LOG2_TABLE, coarsest=16, finest=FINEST, hidden=s.hidden, layers=s.layers, degree=s.degree,
         initial_density=s.initial_density, generator=torch.Generator().manual_seed(0), precision=s.precision,
     )  # fmt: skip
 

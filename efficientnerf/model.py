@@ -27,11 +27,14 @@ from efficientnerf.harmonics import basis, harmonics_count
 from efficientnerf.kernels import dispatch
 from efficientnerf.late import Room
 from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples
-from efficientnerf.settings import TrainSettings
+from efficientnerf.settings import FINEST, LOG2_TABLE, TrainSettings
 from efficientnerf.transfer import sent
 
 SKY_DEGREE = 2
 COARSEST = 16
+# Where train.distortion says none. In normalised device coordinates depths crowd less, and fog is a smaller part of them: held-back views of LLFF fern at
+# 504x378 after 1000 steps at 0.01: 21.8 dB; 0.002: 22.0; 0: 21.9.
+DISTORTION, DISTORTION_NDC = 0.01, 0.002
 UNSEEN = 0.5  # grey: what is drawn behind a space that reaches to infinity, where nothing can lie
 
 AnyField = HashField | MlpField | NerfField
@@ -74,6 +77,12 @@ class Model:
     def prunes(self) -> bool:
         """Whether the density voxels are used."""
         return self.settings.sampling in ("efficient", "valid")
+
+    @property
+    def distortion(self) -> float:
+        """Weight of the loss on spread-out densities."""
+        given = self.settings.distortion
+        return given if given is not None else DISTORTION if self.space.ndc is None else DISTORTION_NDC
 
     @property
     def device(self) -> torch.device:
@@ -153,12 +162,13 @@ def model(
 
 def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField | None, AnyField]:
     """The coarse field, if there is one, and the fine one, untrained."""
+    log2_table, finest = s.log2_table or LOG2_TABLE, s.finest or FINEST
     if s.field == "hash":
         return None if s.coarse == "voxels" else HashField(
-            levels=max(1, s.levels // 2), log2_table=max(8, s.log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, s.finest // 4),
+            levels=max(1, s.levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
             hidden=s.coarse_hidden, layers=s.coarse_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
         ), HashField(
-            levels=s.levels, log2_table=s.log2_table, coarsest=COARSEST, finest=s.finest,
+            levels=s.levels, log2_table=log2_table, coarsest=COARSEST, finest=finest,
             hidden=s.hidden, layers=s.layers, degree=s.degree, initial_density=s.initial_density, generator=generator, precision=s.precision,
         )  # fmt: skip
     if s.field == "nerf":

@@ -9,6 +9,10 @@ from typing import Any
 def _setting(default: Any, doc: str, **limits: Any) -> Any:
     return field(default=default, metadata={"doc": doc, **limits})
 
+# Where train.log2_table and train.finest are 0.
+LOG2_TABLE = 17
+FINEST = 1024
+
 
 @dataclass(frozen=True)
 class TrainSettings:
@@ -42,8 +46,14 @@ class TrainSettings:
     )  # fmt: skip
     degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
     levels: int = _setting(12, "hash: levels", minimum=1, maximum=24)
-    log2_table: int = _setting(17, "hash: entries of a level's table, as a power of two", minimum=8, maximum=24)
-    finest: int = _setting(1024, "hash: lattice points a side of the finest level", minimum=16, maximum=16384)
+    log2_table: int = _setting(
+        0, "hash: entries of a level's table, as a power of two, at least 8; 0: 17, and more in normalised device coordinates, one for six pixels, up to 19",
+        minimum=0, maximum=24,
+    )  # fmt: skip
+    finest: int = _setting(
+        0, "hash: lattice points a side of the finest level, at least 16; 0: 1024, and more in normalised device coordinates, one for a pixel, up to 4096",
+        minimum=0, maximum=16384,
+    )  # fmt: skip
     hidden: int = _setting(64, "width of the fine network (the paper: 256, with field mlp)", minimum=8, maximum=1024)
     layers: int = _setting(2, "hidden layers of the fine network (the paper: 8)", minimum=1, maximum=16)
     coarse_hidden: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
@@ -69,7 +79,10 @@ class TrainSettings:
         choices=("field", "voxels"),
     )  # fmt: skip
     explored: float = _setting(0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0)
-    distortion: float = _setting(0.01, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog", minimum=0.0)
+    distortion: float | None = _setting(
+        None, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog; none: 0.01, in normalised device coordinates 0.002",
+        minimum=0.0,
+    )  # fmt: skip
     anchors: float = _setting(0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0)
     exposure: str = _setting(
         "off", "gain: a factor for each colour and photograph is learned beside the field and left out of it, where surroundings are learned; off: none",

@@ -230,7 +230,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         if m.space.contracted or m.space.ndc is not None:
             # In normalised device coordinates it grows from nothing: at first it would gather all matter on the near plane, where cameras overlap least.
             share = 1.0 if m.space.contracted else way
-            loss = loss + share * settings.distortion * mean_over(seen.distortion, whole)
+            loss = loss + share * m.distortion * mean_over(seen.distortion, whole)
             if m.space.contracted:  # in normalised device coordinates rays do not crowd together before the cameras
                 _quieten_near_cameras(m, origins, seen)
             strength = settings.anchors * max(0.0, 1 - 2 * way)

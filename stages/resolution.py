@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from stages.forward import Forward
     from stages.scene import Scene
 
 LEAST = 32  # voxels along the longest side
@@ -41,7 +42,7 @@ def finest_resolution(s: Scene, most: int | None) -> Choice:
     In normalised device coordinates, where a pixel is as wide at any depth, a voxel is as wide as 4/3 of a pixel.
     """
     if s.forward is not None:
-        wide, share = s.forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views])), SURROUNDED
+        wide, share = ndc_pixel(s, s.forward), SURROUNDED
         side = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
     else:
         centre = np.asarray(s.bounds, np.float64).mean(axis=0)
@@ -54,6 +55,11 @@ def finest_resolution(s: Scene, most: int | None) -> Choice:
     if told > most:
         return Choice(most, f"bake.max_resolution; pixels would tell {told} apart")
     return Choice(told, f"a voxel covers {share:.2g} of a pixel")
+
+
+def ndc_pixel(s: Scene, forward: Forward) -> float:
+    """How wide a pixel of the median camera is in normalised device coordinates, at any depth."""
+    return forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
 
 
 def affordable_resolution(finest: Choice, count: Callable[[int], int], room: Callable[[int], int]) -> Choice:

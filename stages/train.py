@@ -43,15 +43,16 @@ def run(job: Job) -> None:
     from efficientnerf.model import model
     from efficientnerf.render import FieldRenderer
     from stages import field, scene
+    from stages.lattice import sized
 
-    settings: TrainSettings = job.settings
-    _check(settings)
+    _check(job.settings)
     use_all_cores()
     folder = job.inputs["poses"]
     s = scene.load(folder)
     views = scene.views_of(s, "train")
-    job.progress(0, settings.iterations, "reading images")
+    job.progress(0, job.settings.iterations, "reading images")
     pixels = pixels_of(folder, views)
+    settings = sized(job.settings, s, len(pixels))
     near, far = _range(s, pixels, settings)
     m = model(field.space_of(s), settings, s.background, job.device, (near, far))
     t = training.trainer(m, len(views))
@@ -113,6 +114,9 @@ def _check(settings: TrainSettings) -> None:
 
     if len(settings.rate_aims) % 2:
         raise UsageError(f"train.rate_aims={list(settings.rate_aims)}: expected pairs, a number of steps and the step up to which it was aimed at.")
+    for name, least in (("log2_table", 8), ("finest", 16)):
+        if 0 < (found := getattr(settings, name)) < least:
+            raise UsageError(f"train.{name}={found}: expected at least {least}, or 0 for a size chosen from the photographs.")
     if settings.coarse == "voxels" and (settings.field, settings.sampling, settings.voxel_rule) != ("hash", "efficient", "maximum"):
         raise UsageError("train.coarse=voxels needs train.field=hash, train.sampling=efficient and train.voxel_rule=maximum.")
 
@@ -145,6 +149,8 @@ def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> No
         "seconds": round(seconds, 1),
         "held_back_psnr": held_back,
         "occupied": t.model.voxels.occupied,
+        "log2_table": reached.log2_table,
+        "finest": reached.finest,
         "again": _again(reached),
     }
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")

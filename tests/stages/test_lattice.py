@@ -1,0 +1,87 @@
+"""The size of the hash field: as many entries as photographs ask for in normalised device coordinates, what the settings say wherever they do."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.cameras import rays
+from efficientnerf.settings import FINEST, LOG2_TABLE, TrainSettings
+from pipeline.errors import UsageError
+from stages import train
+from stages.field import load_renderer
+from stages.forward import forward_of
+from stages.lattice import LARGEST, MOST, sized
+from stages.resolution import ndc_pixel
+from stages.scene import Scene, View
+from stages.scene import load as load_scene
+from tests.efficientnerf.balls import settings
+from tests.stages.balls import job, poses
+from tests.stages.test_forward import depths, row
+
+
+def forward_facing(side: int) -> Scene:
+    """A capture of nine cameras in a plane, pictures of `side` pixels."""
+    cameras = [_resized(camera, side) for camera in row()]
+    found = forward_of(cameras, depths(cameras))
+    assert not isinstance(found, str), found
+    views = tuple(View(f"images/{c.name}", None, "train", c, c, 3.0, 40.0) for c in cameras)
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    from tests.stages.balls import ORBIT, SIMILARITY
+
+    return Scene("llff", views, box, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found)
+
+
+def _resized(camera, side: int):  # type: ignore[no-untyped-def]
+    scale = side / camera.width
+    height = round(camera.height * scale)
+    return dataclasses.replace(camera, width=side, height=height, params=tuple(p * scale for p in camera.params))
+
+
+def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
+    for side in (400, 1000):
+        s = forward_facing(side)
+        assert s.forward is not None
+        pixels = sum(v.camera.width * v.camera.height for v in s.views)
+        found = sized(TrainSettings(), s, pixels)
+        wide = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
+        assert found.finest == max(FINEST, min(MOST, math.ceil(wide / ndc_pixel(s, s.forward))))
+        # What is called a pixel is one: two points a lattice step apart, at any depth, are seen a pixel apart.
+        camera = s.views[0].camera
+        middle = np.array([[camera.width / 2, camera.height / 2], [camera.width / 2 + 1, camera.height / 2]])
+        origins, directions = rays(camera, middle)
+        for depth in (4.0, 30.0):
+            at = s.forward.ndc.points(origins + directions * (depth / (directions @ camera.forward))[:, None])
+            assert np.linalg.norm(at[1, :2] - at[0, :2]) == pytest.approx(ndc_pixel(s, s.forward), rel=0.15)
+
+
+def test_tables_grow_with_the_photographs_between_limits() -> None:
+    s = forward_facing(400)
+    assert sized(TrainSettings(), s, 1000).log2_table == LOG2_TABLE
+    assert sized(TrainSettings(), s, 6 << 18).log2_table == 18
+    assert sized(TrainSettings(), s, 10**9).log2_table == LARGEST
+    given = sized(TrainSettings(log2_table=14, finest=512), s, 10**9)
+    assert (given.log2_table, given.finest) == (14, 512)
+
+
+def test_other_spaces_keep_the_usual_size(tmp_path: Path) -> None:
+    s = load_scene(poses(tmp_path))
+    assert sized(TrainSettings(), s, 10**9) == dataclasses.replace(TrainSettings(), log2_table=LOG2_TABLE, finest=FINEST)
+
+
+def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
+    made = job(tmp_path, settings(log2_table=0, finest=0, iterations=2, samples=256), poses=poses(tmp_path / "poses"))
+    train.run(made)
+    m = load_renderer(made.out).model
+    assert (m.settings.log2_table, m.settings.finest) == (LOG2_TABLE, FINEST)
+    assert max(m.fine.sides) == FINEST
+
+
+@pytest.mark.parametrize("wrong", [{"log2_table": 5}, {"finest": 9}])
+def test_a_table_too_small_is_refused(tmp_path: Path, wrong: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match=f"train.{next(iter(wrong))}={next(iter(wrong.values()))}: expected at least"):
+        train.run(job(tmp_path, settings(**wrong), poses=poses(tmp_path / "poses")))
