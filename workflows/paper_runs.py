@@ -224,7 +224,7 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
 
 
 def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None) -> float:
-    """Seconds of a picture; on a device it stays there, as on the paper's."""
+    """Seconds of a picture; on a device it stays there."""
     import time
 
     from efficientnerf.kernels import dispatch
