@@ -26,6 +26,7 @@ from efficientnerf.kernels.lanes import (
     four_at,
     nothing,
     one_over_root,
+    ones,
     plus_each_scaled,
     plus_scaled,
     pointer,
@@ -74,7 +75,7 @@ class View(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A `Packed`, arrays as pointers, and sizes: of a brick, of the coarse level, W, K, G and P; `coded` is whether there are codes."""
+    """A `Packed`, arrays as pointers, and sizes: of a brick, of the coarse level, W, V, B, K, G and P; `coded` is whether there are codes."""
 
     brick: int
     nx: int
@@ -83,6 +84,9 @@ class Grid(NamedTuple):
     leap: Any
     live: Any
     words: int
+    stored: Any
+    spans: int
+    bricks: int
     place: Any
     brick_index: Any
     voxel_index: Any
@@ -136,9 +140,9 @@ def grid_of(packed, brick):  # type: ignore[no-untyped-def]
     """The arrays of a Packed as pointers."""
     return Grid(
         brick, packed.leap.shape[0], packed.leap.shape[1], packed.leap.shape[2], pointer(packed.leap), pointer(packed.live), packed.live.shape[1],
-        pointer(packed.place), pointer(packed.brick_index), pointer(packed.voxel_index), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0,
-        pointer(packed.sh), pointer(packed.base), pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1],
-        pointer(packed.palette), packed.palette.shape[1], pointer(packed.column),
+        pointer(packed.stored), packed.stored.shape[1], len(packed.place), pointer(packed.place), pointer(packed.brick_index),
+        pointer(packed.voxel_index), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh), pointer(packed.base),
+        pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1], pointer(packed.column),
     )  # fmt: skip
 
 
@@ -180,19 +184,27 @@ def basis_into(x, y, z, degree, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _beside(owner, a, e, c, grid):  # type: ignore[no-untyped-def]
-    """The brick (a, e, c) cells away from one, or -1."""
+    """The brick (a, e, c) cells away from one, or B."""
     x, y, z = grid.place[3 * owner] + a, grid.place[3 * owner + 1] + e, grid.place[3 * owner + 2] + c
     other = np.int64(-1)
     if 0 <= x < grid.nx and 0 <= y < grid.ny and 0 <= z < grid.nz:
         other = np.int64(grid.brick_index[(x * grid.ny + y) * grid.nz + z])
-    return other
+    return other if other >= 0 else grid.bricks
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _voxel(owner, n, grid):  # type: ignore[no-untyped-def]
+    """Which stored voxel the n-th of a brick is, or -1."""
+    at = 2 * (owner * grid.spans + (n >> 6))
+    bits, bit = grid.stored[at], np.int64(1) << (n & 63)
+    number = grid.stored[at + 1] + ones(bits & (bit - 1))
+    return np.int32(number if bits & bit != 0 else -1)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _voxels_into(owner, grid, voxels):  # type: ignore[no-untyped-def]
     """Which stored voxels a block is of, or -1, into ((b + 2)^3,)."""
-    brick, side, index, none = grid.brick, grid.brick + 2, grid.voxel_index, np.int32(-1)
-    cube = brick * brick * brick
+    brick, side = grid.brick, grid.brick + 2
     for n in range(9):
         p, q = n // 3, n % 3
         before, here, after = _beside(owner, p - 1, q - 1, -1, grid), _beside(owner, p - 1, q - 1, 0, grid), _beside(owner, p - 1, q - 1, 1, grid)
@@ -203,14 +215,10 @@ def _voxels_into(owner, grid, voxels):  # type: ignore[no-untyped-def]
             for j in range(j0, j1):
                 at = (i * side + j) * side
                 row = ((i - 1 - (p - 1) * brick) * brick + j - 1 - (q - 1) * brick) * brick
-                voxels[at] = index[before * cube + row + brick - 1] if before >= 0 else none
-                voxels[at + side - 1] = index[after * cube + row] if after >= 0 else none
-                if here >= 0:
-                    for k in range(brick):
-                        voxels[at + k + 1] = index[here * cube + row + k]
-                else:
-                    for k in range(brick):
-                        voxels[at + k + 1] = none
+                voxels[at] = _voxel(before, row + brick - 1, grid)
+                voxels[at + side - 1] = _voxel(after, row, grid)
+                for k in range(brick):
+                    voxels[at + k + 1] = _voxel(here, row + k, grid)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)

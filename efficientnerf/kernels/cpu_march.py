@@ -122,12 +122,47 @@ def _density(u, v, w, grid, view, pool):  # type: ignore[no-untyped-def]
     return _trilinear(pool.values, at, 4 * side, 4 * side * side, x - np.float32(i), y - np.float32(j), z - np.float32(k))
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _difference(x, stride, at, row, layer, fx, fy, fz, brick, pool):  # type: ignore[no-untyped-def]
+    """What the density changes by from a voxel before a point to a voxel after it, along the axis of that stride; no-number where one lies in another cell.
+
+    x                 where the point lies in its block along that axis, voxels
+    at, fx, fy, fz    where the first of its eight voxels lies, and where it lies itself between them
+    """
+    change = np.float32(np.nan)
+    if _ONE + _HALF <= x < np.float32(brick) - _HALF:
+        change = _trilinear(pool.values, at + stride, row, layer, fx, fy, fz) - _trilinear(pool.values, at - stride, row, layer, fx, fy, fz)
+    return change
+
+
 @numba.njit(cache=True, error_model="numpy")
 def normal_into(u, v, w, grid, view, pool, out):  # type: ignore[no-untyped-def]
     """Unit normal (down the gradient, central differences of one voxel) into `out`; zero where the density is flat."""
-    gx = _density(u + _ONE, v, w, grid, view, pool) - _density(u - _ONE, v, w, grid, view, pool)
-    gy = _density(u, v + _ONE, w, grid, view, pool) - _density(u, v - _ONE, w, grid, view, pool)
-    gz = _density(u, v, w + _ONE, grid, view, pool) - _density(u, v, w - _ONE, grid, view, pool)
+    brick = grid.brick
+    side, part = brick + 2, np.float32(1 / brick)
+    gx = gy = gz = np.float32(np.nan)
+    a, e, c = min(max(int(u * part), 0), grid.nx - 1), min(max(int(v * part), 0), grid.ny - 1), min(max(int(w * part), 0), grid.nz - 1)
+    there = (a * grid.ny + e) * grid.nz + c
+    if grid.leap[there] == 0:
+        owner = np.int64(grid.brick_index[there])
+        slot = np.int64(pool.slot[owner])
+        if slot < 0:
+            slot = fill(owner, grid, view, pool)
+        x, y, z = u - np.float32(a * brick) + _HALF, v - np.float32(e * brick) + _HALF, w - np.float32(c * brick) + _HALF
+        i, j, k = min(max(int(x), 0), brick), min(max(int(y), 0), brick), min(max(int(z), 0), brick)
+        fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+        row, layer = 4 * side, 4 * side * side
+        at = slot * pool.size + i * layer + j * row + 4 * k
+        gx = _difference(x, layer, at, row, layer, fx, fy, fz, brick, pool)
+        gy = _difference(y, row, at, row, layer, fx, fy, fz, brick, pool)
+        gz = _difference(z, 4, at, row, layer, fx, fy, fz, brick, pool)
+    # Beyond the cell's faces lies another block, or nothing whatever this one holds.
+    if gx != gx:
+        gx = _density(u + _ONE, v, w, grid, view, pool) - _density(u - _ONE, v, w, grid, view, pool)
+    if gy != gy:
+        gy = _density(u, v + _ONE, w, grid, view, pool) - _density(u, v - _ONE, w, grid, view, pool)
+    if gz != gz:
+        gz = _density(u, v, w + _ONE, grid, view, pool) - _density(u, v, w - _ONE, grid, view, pool)
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     if length > 0:
         out[0], out[1], out[2] = -gx / length, -gy / length, -gz / length
@@ -233,9 +268,10 @@ def _composited(kind, count, grid, view, pool, bench, look_x, look_y, look_z):  
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=LOOSE)
-def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, pool, bench, out):  # type: ignore[no-untyped-def]
-    """What lies on a ray from its k-th to its last-th sample.
+def march(ex, ey, ez, dx, dy, dz, first, end, grid, view, look_x, look_y, look_z, pool, bench, out):  # type: ignore[no-untyped-def]
+    """What lies on a ray from one of its samples to the one before another.
 
+    first, end              these two, from 0 on; below 2^24
     ex, ey, ez, dx, dy, dz  float32: where it enters the box, voxel coordinates, and its unit direction
     view, pool              see `cpu_blocks`; the view's scale is the length of a step, units of the frame, times log2(e)
     look_x, look_y, look_z  float32: the direction that the harmonics are asked for
@@ -247,44 +283,45 @@ def march(ex, ey, ez, dx, dy, dz, k, last, grid, view, look_x, look_y, look_z, p
     step, width, per_brick = np.float32(STEP), np.float32(brick), np.float32(1 / brick)
     big, none = np.float32(1e30), np.float32(0)
     row, layer = np.float32(side), np.float32(side * side)
-    # The parameter at which a face at x is crossed: x * slope + shift; never, along an axis that the ray does not move on.
+    # A face at x is crossed at (x - ex) * slope + never, and lies beside cell a, `far` cells ahead, at (a + beside + far * ahead) * width.
     slope_x, slope_y, slope_z = (_ONE / dx if dx != 0 else none), (_ONE / dy if dy != 0 else none), (_ONE / dz if dz != 0 else none)
+    never_x, never_y, never_z = (none if dx != 0 else big), (none if dy != 0 else big), (none if dz != 0 else big)
+    ahead_x, ahead_y, ahead_z = (_ONE if dx > 0 else -_ONE), (_ONE if dy > 0 else -_ONE), (_ONE if dz > 0 else -_ONE)
+    beside_x, beside_y, beside_z = (none if dx > 0 else _ONE), (none if dy > 0 else _ONE), (none if dz > 0 else _ONE)
+    most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)
     for n in range(10):
         state[n] = none
     state[LIGHT], state[HIT] = _ONE, np.float32(np.inf)
     waiting, kind = 0, np.int64(COLOURS)
-    cells = tested = 0
+    cells, tested = 0, none
+    # Whole numbers are kept as float32: each step waits for the one before, and conversions would take a good part of that time.
+    k, last = np.float32(first), np.float32(end)
     while k < last:
-        s = (np.float32(k) + _HALF) * step
-        u, v, w = ex + s * dx, ey + s * dy, ez + s * dz
-        a = min(max(int(u * per_brick), 0), grid.nx - 1)
-        e = min(max(int(v * per_brick), 0), grid.ny - 1)
-        c = min(max(int(w * per_brick), 0), grid.nz - 1)
-        there = (a * grid.ny + e) * grid.nz + c
-        leap = np.int64(grid.leap[there])
+        s = (k + _HALF) * step
+        a = min(max(np.floor((ex + s * dx) * per_brick), none), most_x)
+        e = min(max(np.floor((ey + s * dy) * per_brick), none), most_y)
+        c = min(max(np.floor((ez + s * dz) * per_brick), none), most_z)
+        there = (np.int64(a) * grid.ny + np.int64(e)) * grid.nz + np.int64(c)
+        leap = grid.leap[there]
         cells += 1
-        far = max(leap, 1)
         # To the end of the cell, or of the empty cube round it: the nearest of its three far faces.
-        x = np.float32(a + far if dx > 0 else a - far + 1) * width
-        y = np.float32(e + far if dy > 0 else e - far + 1) * width
-        z = np.float32(c + far if dz > 0 else c - far + 1) * width
-        tx = (x - ex) * slope_x if dx != 0 else big
-        ty = (y - ey) * slope_y if dy != 0 else big
-        tz = (z - ez) * slope_z if dz != 0 else big
-        end = min(min(tx, ty, tz) * np.float32(1 / STEP) - np.float32(0.5 + ROUNDING), np.float32(last))
-        until = min(max(int(np.ceil(end)), k + 1), last)
+        far = np.float32(max(leap, np.uint8(1)))
+        tx = ((a + beside_x + far * ahead_x) * width - ex) * slope_x + never_x
+        ty = ((e + beside_y + far * ahead_y) * width - ey) * slope_y + never_y
+        tz = ((c + beside_z + far * ahead_z) * width - ez) * slope_z + never_z
+        until = min(max(np.ceil(min(tx, ty, tz) * np.float32(1 / STEP) - np.float32(0.5 + ROUNDING)), k + _ONE), last)
         if leap > 0:
             k = until
             continue
         owner, begin = np.int64(grid.brick_index[there]), np.int64(-1)
         tested -= k
-        bx, by, bz = ex - np.float32(a) * width + _HALF, ey - np.float32(e) * width + _HALF, ez - np.float32(c) * width + _HALF
+        bx, by, bz = ex - a * width + _HALF, ey - e * width + _HALF, ez - c * width + _HALF
         while k < until:
-            s = (np.float32(k) + _HALF) * step
+            s = (k + _HALF) * step
             x, y, z = bx + s * dx, by + s * dy, bz + s * dz
             i, j, l = np.floor(x), np.floor(y), np.floor(z)
             voxel = np.int64(np.int32(i * layer + j * row + l))
-            k += 1
+            k += _ONE
             if not _lives(owner, voxel, grid):
                 continue
             if begin < 0:

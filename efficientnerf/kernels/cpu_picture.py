@@ -16,6 +16,7 @@ from efficientnerf.kernels.cpu_march import STEP, Bench, march, normal_into
 from efficientnerf.kernels.lanes import pointer
 
 TILE = 8  # rays along each side of a tile
+PART = 4  # rays along each side of a part of one
 RUNS = 32  # of neighbouring tiles that a thread takes
 LEAST_ADVANCE = 0.5  # voxels: a cone that advances by less has arrived
 MOST_ADVANCES = 64
@@ -127,16 +128,16 @@ def _free(x, y, z, grid):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _clear_until(ox, oy, oz, dx, dy, dz, spread, widening, grid):  # type: ignore[no-untyped-def]
+def _clear_until(ox, oy, oz, dx, dy, dz, spread, widening, t, grid):  # type: ignore[no-untyped-def]
     """The parameter up to which rays see nothing; infinity where they never do.
 
     o, d      a ray, voxel coordinates
     spread    how far the other rays' origins lie from o at most
     widening  how far their directions lie from d at most
+    t         until where this is known
     """
     nx, ny, nz = grid.nx * grid.brick / 2, grid.ny * grid.brick / 2, grid.nz * grid.brick / 2
     beyond = np.sqrt((ox - nx) ** 2 + (oy - ny) ** 2 + (oz - nz) ** 2) + np.sqrt(nx * nx + ny * ny + nz * nz) + 2 * spread
-    t = 0.0
     for _ in range(MOST_ADVANCES):
         # At t + a a ray is no farther than spread + (t + a) * widening + a from the point here.
         advance = (_free(ox + t * dx, oy + t * dy, oz + t * dz, grid) - spread - t * widening) / (1 + widening)
@@ -163,7 +164,7 @@ def _sight(x, y, rays):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile_of_pinhole(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
+def _tile_of_pinhole(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
     """`_clear_until` of the rays of some rows and columns: those in the corners lie farthest from the middle."""
     ax, ay, az, _ = _sight((left + right) / 2 * rays.pitch, (top + low) / 2 * rays.pitch, rays)
     most = 0.0
@@ -171,11 +172,11 @@ def _tile_of_pinhole(top, low, left, right, rays, grid):  # type: ignore[no-unty
         row, column = top if n & 1 else low, left if n & 2 else right
         dx, dy, dz, _ = _sight(column * rays.pitch, row * rays.pitch, rays)
         most = max(most, (dx - ax) ** 2 + (dy - ay) ** 2 + (dz - az) ** 2)
-    return _clear_until(rays.x, rays.y, rays.z, ax, ay, az, 0.0, np.sqrt(most), grid)
+    return _clear_until(rays.x, rays.y, rays.z, ax, ay, az, 0.0, np.sqrt(most), since, grid)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile_of_sights(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
+def _tile_of_sights(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
     """The same of directions in the camera's frame."""
     sights = rays.sights
     m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
@@ -185,11 +186,11 @@ def _tile_of_sights(top, low, left, right, rays, grid):  # type: ignore[no-untyp
             s = 3 * (row * rays.width + column)
             most = max(most, (sights[s] - sights[m]) ** 2 + (sights[s + 1] - sights[m + 1]) ** 2 + (sights[s + 2] - sights[m + 2]) ** 2)
     ax, ay, az = _turned(rays.turn, sights[m], sights[m + 1], sights[m + 2])
-    return _clear_until(rays.x, rays.y, rays.z, ax, ay, az, 0.0, np.sqrt(most), grid)
+    return _clear_until(rays.x, rays.y, rays.z, ax, ay, az, 0.0, np.sqrt(most), since, grid)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile_of_rays(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
+def _tile_of_rays(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
     """The same of rays as they come."""
     o, d = rays.starts, rays.alongs
     m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
@@ -199,17 +200,17 @@ def _tile_of_rays(top, low, left, right, rays, grid):  # type: ignore[no-untyped
             s = 3 * (row * rays.width + column)
             spread = max(spread, (o[s] - o[m]) ** 2 + (o[s + 1] - o[m + 1]) ** 2 + (o[s + 2] - o[m + 2]) ** 2)
             widening = max(widening, (d[s] - d[m]) ** 2 + (d[s + 1] - d[m + 1]) ** 2 + (d[s + 2] - d[m + 2]) ** 2)
-    return _clear_until(o[m], o[m + 1], o[m + 2], d[m], d[m + 1], d[m + 2], np.sqrt(spread), np.sqrt(widening), grid)
+    return _clear_until(o[m], o[m + 1], o[m + 2], d[m], d[m + 1], d[m + 2], np.sqrt(spread), np.sqrt(widening), since, grid)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _tile(top, low, left, right, rays, grid):  # type: ignore[no-untyped-def]
-    """The parameter up to which the rays of some rows and columns see nothing."""
+def _tile(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+    """The parameter up to which the rays of some rows and columns see nothing, at least `since`."""
     if rays.kind == FREE:
-        return _tile_of_rays(top, low, left, right, rays, grid)
+        return _tile_of_rays(top, low, left, right, since, rays, grid)
     if rays.kind == SIGHTS:
-        return _tile_of_sights(top, low, left, right, rays, grid)
-    return _tile_of_pinhole(rays.first + top + 0.5, rays.first + low - 0.5, left + 0.5, right - 0.5, rays, grid)
+        return _tile_of_sights(top, low, left, right, since, rays, grid)
+    return _tile_of_pinhole(rays.first + top + 0.5, rays.first + low - 0.5, left + 0.5, right - 0.5, since, rays, grid)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -259,25 +260,30 @@ def _side_of_runs(down, across, threads):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy")
 def _draw_tile(top, low, left, right, rays, behind, grid, view, units, pool, bench, seen, face, colour, opacity, depth, normal, work):  # type: ignore[no-untyped-def]
     """The pixels of some rows and columns into the pictures of `trace`."""
-    clear = _tile(top, low, left, right, rays, grid)
-    for row in range(top, low):
-        for column in range(left, right):
-            if clear == np.inf:
-                for m in range(9):
-                    seen[m] = np.float32(0)
-                seen[4] = np.float32(np.inf)
-                face[0] = face[1] = face[2] = np.float32(0)
-            else:
-                _seen(row, column, clear, rays, grid, view, pool, bench, seen, face)
-            through = np.float32(1) - seen[3]
-            for c in range(3):
-                colour[row, column, c] = seen[c] + through * behind[c]
-                if len(normal) > 0:
-                    normal[row, column, c] = face[c]
-            opacity[row, column], depth[row, column] = seen[3], seen[4] * units
-            if len(work) > 0:
-                for m in range(4):
-                    work[row, column, m] = seen[5 + m]
+    known = _tile(top, low, left, right, 0.0, rays, grid)
+    parts = (right - left + PART - 1) // PART
+    for part in range((low - top + PART - 1) // PART * parts):
+        upper, first = top + part // parts * PART, left + part % parts * PART
+        lower, last = min(upper + PART, low), min(first + PART, right)
+        clear = _tile(upper, lower, first, last, known, rays, grid) if known < np.inf else known
+        for row in range(upper, lower):
+            for column in range(first, last):
+                if clear == np.inf:
+                    for m in range(9):
+                        seen[m] = np.float32(0)
+                    seen[4] = np.float32(np.inf)
+                    face[0] = face[1] = face[2] = np.float32(0)
+                else:
+                    _seen(row, column, clear, rays, grid, view, pool, bench, seen, face)
+                through = np.float32(1) - seen[3]
+                for c in range(3):
+                    colour[row, column, c] = seen[c] + through * behind[c]
+                    if len(normal) > 0:
+                        normal[row, column, c] = face[c]
+                opacity[row, column], depth[row, column] = seen[3], seen[4] * units
+                if len(work) > 0:
+                    for m in range(4):
+                        work[row, column, m] = seen[5 + m]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -103,6 +103,12 @@ def pointer(typing_context: Any, array: Any) -> Any:
 
 
 @intrinsic
+def ones(typing_context: Any, bits: Any) -> Any:
+    """How many bits of an int64 are set."""
+    return types.int64(types.int64), lambda context, builder, signature, args: builder.ctpop(args[0])
+
+
+@intrinsic
 def four_at(typing_context: Any, address: Any, index: Any) -> Any:
     """p[index], p[index + 1], p[index + 2], p[index + 3] of a pointer to float32."""
 

@@ -25,6 +25,9 @@ class Packed(NamedTuple):
     leap      (X, Y, Z) uint8: as `NerfTree.leap`, but a brick near which nothing absorbs light is none
     live      (B, W) int64: bit n % 64 of word n // 64 is set where any of eight voxels has density, of which the first is voxel (i - 1, j - 1, k - 1) of the
               brick and n = (i (b + 2) + j) (b + 2) + k
+    stored    (B + 1, V, 2) int64: which voxels of a brick are stored, a bit each, 64 in a word; and the number of the first of them in a word, from which
+              on those of the word are numbered. A sixteenth of `voxel_index`, which blocks take whatever way they find it: it stays in a cache. The last
+              brick has none
     place     (B, 3) int32: the coarse cell of a brick
     brick_index, voxel_index, density  the tree's own
     sh        (N, K, 3) float32: the tree's own
@@ -37,6 +40,7 @@ class Packed(NamedTuple):
 
     leap: np.ndarray
     live: np.ndarray
+    stored: np.ndarray
     place: np.ndarray
     brick_index: np.ndarray
     voxel_index: np.ndarray
@@ -52,7 +56,7 @@ class Packed(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Of the arrays that are not the tree's own."""
-        return self.leap.nbytes + self.live.nbytes + self.place.nbytes + self.palette.nbytes
+        return self.leap.nbytes + self.live.nbytes + self.stored.nbytes + self.place.nbytes + self.palette.nbytes
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -100,6 +104,22 @@ def _live(place, brick, brick_index, voxel_index, values, out):  # type: ignore[
                         out[owner, n >> 6] |= np.int64(dense[i, j, k] | dense[i + 1, j, k]) << (n & 63)
 
 
+def _stored(voxel_index: np.ndarray) -> np.ndarray:
+    """`Packed.stored`. ValueError where voxels are not numbered brick by brick, in order."""
+    bricks, cube = voxel_index.shape
+    there = voxel_index.reshape(-1) >= 0
+    if not np.array_equal(voxel_index.reshape(-1)[there], np.arange(np.count_nonzero(there))):
+        raise ValueError("voxels are not numbered in the order of their bricks, and inside a brick in that of the places; build the tree by `tree_from_voxels`")
+    words = (cube + 63) // 64
+    bits = np.zeros((bricks + 1, 64 * words), bool)
+    bits[:bricks, :cube] = there.reshape(bricks, cube)
+    out = np.zeros((bricks + 1, words, 2), np.int64)
+    out[..., 0] = np.packbits(bits, axis=1, bitorder="little").view(np.int64)
+    count = bits.reshape(-1, 64).sum(axis=1)
+    out[..., 1] = (np.cumsum(count) - count).reshape(bricks + 1, words)
+    return out
+
+
 def _slope(tree: NerfTree) -> float:
     """`Packed.slope`, of voxels from all over the tree."""
     from efficientnerf.harmonics import squared_slopes
@@ -134,4 +154,4 @@ def pack(tree: NerfTree) -> Packed:
     else:
         none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
         coded = np.ascontiguousarray(harmonics, np.float32), *none
-    return Packed(leaps(full), live, place, tree.brick_index, tree.voxel_index, tree.density_values, *coded, _slope(tree))
+    return Packed(leaps(full), live, _stored(tree.voxel_index), place, tree.brick_index, tree.voxel_index, tree.density_values, *coded, _slope(tree))

@@ -407,3 +407,12 @@ def test_directions_that_are_no_numbers_see_nothing() -> None:
     bad = np.array([[np.nan, 0, 1], [0, 0, 0], [np.inf, 0, 0]])
     seen = tree.render_rays(np.zeros((3, 3)), bad)
     assert np.isfinite(seen.opacity).all()
+
+
+def test_voxels_out_of_order_are_refused_by_name() -> None:
+    tree = random_tree(1, brick=2)
+    swapped = tree.voxel_index.copy()
+    first, second = np.argwhere(swapped >= 0)[:2]
+    swapped[tuple(first)], swapped[tuple(second)] = 1, 0
+    with pytest.raises(ValueError, match="not numbered in the order of their bricks"):
+        replace(tree, voxel_index=swapped).packed  # noqa: B018
