@@ -65,7 +65,11 @@ class BakeSettings:
     )  # fmt: skip
     points: int = setting(8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256)
     seed: int = setting(0, "seed of the jitter, and of the pixels of the optimisation", minimum=0)
-    optimise: int = setting(160, "steps in which the baked values are fitted to the training images; 0: they stay as the network says", minimum=0)
+    optimise: int | None = setting(
+        None, "steps in which the baked values are fitted to the training images; 0: they stay as the network says; none: so many that five rays come to a"
+        " voxel, 320 at least, and for photographs, whose noise would be learned too, 160",
+        minimum=0,
+    )  # fmt: skip
     optimise_rays: int = setting(32768, "training pixels of a step of the optimisation", minimum=1, maximum=1 << 22)
     density_rate: float = setting(0.3, "optimisation: rate of RMSprop for the logarithm of a voxel's optical thickness", minimum=0.0)
     colour_rate: float = setting(0.03, "optimisation: rate of RMSprop for the harmonics", minimum=0.0)

@@ -20,6 +20,7 @@ from pipeline.stage import Job
 if TYPE_CHECKING:
     from efficientnerf.nerftree.optimising import Optimiser, Targets
     from efficientnerf.nerftree.tree import NerfTree
+    from stages.bake import BakeSettings
 
 CHECKPOINT = "optimisation.safetensors"
 CHECKPOINT_SECONDS = 30.0
@@ -34,18 +35,18 @@ def optimised(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[Ne
     from efficientnerf.nerftree import optimising
 
     settings = job.settings
-    facts: dict[str, Any] = {"steps": settings.optimise, "psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
+    steps = steps_of(settings, min(len(tree.density_values), most), tree.background is not None)
+    facts: dict[str, Any] = {"steps": steps, "psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(SAMPLE, 4 * len(targets.pixels))
     targets = _where_there_is_room(job, tree, targets)
     before = optimising.error(tree, targets, sample, settings.seed)
-    o, pruned = _restored(job, tree) or (optimising.optimiser(tree, optimising.OPAQUE if settings.optimise else math.inf), False)
+    o, pruned = _restored(job, tree) or (optimising.optimiser(tree, optimising.OPAQUE if steps else math.inf), False)
     del tree  # the optimiser has values of its own
-    half = settings.optimise // 2
     if not pruned:
-        _fit(job, o, targets, half, pruned)
+        _fit(job, o, targets, steps, steps // 2, pruned)
         o = _without_unseen(job, o, targets, most)
         _checkpoint(job, o, True)
-    _fit(job, o, targets, settings.optimise, True)
+    _fit(job, o, targets, steps, steps, True)
     o.leave()
     tree = o.tree
     facts["psnr_before"], facts["psnr_after"] = _decibels(before), _decibels(optimising.error(tree, targets, sample, settings.seed))
@@ -72,20 +73,27 @@ def _decibels(error: float) -> float:
     return round(-10 * math.log10(max(error, 1e-10)), 3)
 
 
-def _fit(job: Job, o: Optimiser, targets: Targets, until: int, pruned: bool) -> None:
-    """Steps up to `until`, with a checkpoint now and then, and where it is stopped."""
+def steps_of(settings: BakeSettings, voxels: int, cut_out: bool) -> int:
+    """Steps of the optimisation of so many voxels, of a cut-out object or of photographs with surroundings."""
+    if settings.optimise is not None:
+        return settings.optimise
+    return max(LEAST_STEPS, math.ceil(RAYS_PER_VOXEL * voxels / settings.optimise_rays)) if cut_out else PHOTOGRAPHED_STEPS
+
+
+def _fit(job: Job, o: Optimiser, targets: Targets, steps: int, until: int, pruned: bool) -> None:
+    """Steps up to `until` of `steps`, with a checkpoint now and then, and where it is stopped."""
     from efficientnerf.nerftree import optimising
 
     settings = job.settings
     written, smooth = time.monotonic(), 0.0
     run = optimising.optimise(
-        o, targets, until=until, steps=settings.optimise, rays=settings.optimise_rays, density_rate=settings.density_rate,
+        o, targets, until=until, steps=steps, rays=settings.optimise_rays, density_rate=settings.density_rate,
         colour_rate=settings.colour_rate, final=settings.final_rate, seed=settings.seed,
         view_share=settings.view_share if settings.view_share is not None else 1.0 if o.tree.background is not None else PHOTOGRAPHS,
     )  # fmt: skip
     for error in run:
         smooth = error if not smooth else 0.9 * smooth + 0.1 * error
-        job.progress(o.step, settings.optimise, "fitting to the images", psnr=round(_decibels(smooth), 2), voxels=len(o.density))
+        job.progress(o.step, steps, "fitting to the images", psnr=round(_decibels(smooth), 2), voxels=len(o.density))
         if time.monotonic() - written > CHECKPOINT_SECONDS:
             _checkpoint(job, o, pruned)
             written = time.monotonic()

@@ -200,6 +200,18 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
     assert sizes[20_000][2] <= 20_000 < sizes[10**7][2]
 
 
+def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
+    chosen = BakeSettings(optimise_rays=1000)
+    assert [optimisation.steps_of(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
+    assert {optimisation.steps_of(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
+    asked = dataclasses.replace(chosen, optimise=7)
+    assert {optimisation.steps_of(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
+    made = job(tmp_path, dataclasses.replace(QUICK, optimise=None, optimise_rays=64), **inputs)
+    run(made)
+    report = json.loads((made.out / "report.json").read_text())["optimisation"]
+    assert report["steps"] == max(320, -(-5 * report["voxels_baked"] // 64))
+
+
 @pytest.mark.parametrize("layout", ["compact", "sparse"])
 def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: dict[str, Path], tmp_path: Path, layout: str) -> None:
     sizes = {}
