@@ -184,7 +184,7 @@ def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField | No
 
 def look(
     m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, behind: Tensor, *,
-    prune: bool = True, rng: np.random.Generator | None = None, room: Room | None = None,
+    prune: bool = True, rng: np.random.Generator | None = None, room: Room | None = None, fine_samples: int = 0,
 ) -> Look:  # fmt: skip
     """Both stages along a bundle of rays: valid samples through the coarse field, pivotal ones through the fine one, or as `settings.sampling` says.
 
@@ -197,7 +197,9 @@ def look(
                          free to put matter where this ray has no pivot and another has one, and the baked asset, which has no coarse
                          stage to hide it, would show it.
     room                 on CUDA: samples are padded to this many at most, and their number is not waited for
+    fine_samples         N_s of this bundle; 0: as the settings say
     """
+    fine_samples = fine_samples or m.settings.fine_samples
     rays = m.space.rays(origins, directions, near, far)
     bundle = (rays.origins, rays.directions, rays.near, rays.far)
     if m.settings.sampling == "uniform":
@@ -213,14 +215,14 @@ def look(
     else:
         coarse, at = _valid_samples(m, *bundle, offset, prune=prune, rng=rng, capacity=for_coarse), None
     if m.coarse is None:
-        return _looked_by_voxels(m, rays, directions, offset, behind, coarse, prune=prune, rng=rng, capacity=for_fine)
+        return _looked_by_voxels(m, rays, directions, offset, behind, coarse, prune=prune, rng=rng, capacity=for_fine, fine_samples=fine_samples)
     coarse_raw, seen = _seen(m, m.coarse, directions, coarse, behind)
     weight = seen.weight.detach()
     pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
     if m.settings.sampling == "efficient":
         if rng is not None and m.settings.explored > 0:
             pivotal = pivotal | _chance(len(pivotal), m.settings.explored, rng, pivotal.device)
-        fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, m.settings.fine_samples, for_fine)
+        fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, fine_samples, for_fine)
     else:
         quantile = _strata(len(origins), m.settings.importance_samples, rng, offset.device)
         at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent if at is None else at
@@ -231,7 +233,7 @@ def look(
 
 def _looked_by_voxels(
     m: Model, rays: FrameRays, directions: Tensor, offset: Tensor, behind: Tensor, coarse: Samples, *, prune: bool, rng: np.random.Generator | None,
-    capacity: int | None,
+    capacity: int | None, fine_samples: int,
 ) -> Look:  # fmt: skip
     """Pivots by what the density voxels hold, without a coarse field; while nothing is pruned, all intervals, with one sample each."""
     weight = voxel_weights(m.voxels, coarse.point, coarse.length, coarse.first)
@@ -239,7 +241,7 @@ def _looked_by_voxels(
         pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
         if rng is not None and m.settings.explored > 0:
             pivotal = pivotal | _chance(len(pivotal), m.settings.explored, rng, pivotal.device)
-        fine = dispatch.pivotal_samples(m.space, rays.origins, rays.directions, offset, coarse, pivotal, m.settings.fine_samples, capacity)
+        fine = dispatch.pivotal_samples(m.space, rays.origins, rays.directions, offset, coarse, pivotal, fine_samples, capacity)
     else:
         pivotal, fine = torch.ones(len(weight), dtype=torch.bool, device=weight.device), coarse
     fine_raw, out = _seen(m, m.fine, directions, fine, behind)

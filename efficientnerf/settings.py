@@ -47,7 +47,7 @@ class TrainSettings:
     degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
     levels: int = _setting(12, "hash: levels", minimum=1, maximum=24)
     log2_table: int = _setting(
-        0, "hash: entries of a level's table, as a power of two, at least 8; 0: 17, and more in normalised device coordinates, one for six pixels, up to 19",
+        0, "hash: entries of a level's table, as a power of two, at least 8; 0: from 17 to 19, by the number of training pixels",
         minimum=0, maximum=24,
     )  # fmt: skip
     finest: int = _setting(
@@ -59,7 +59,10 @@ class TrainSettings:
     coarse_hidden: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
     coarse_layers: int = _setting(1, "hidden layers of the coarse network (the paper: 4)", minimum=1, maximum=16)
     coarse_samples: int = _setting(128, "N_c: intervals over the diagonal of the box, or between near and far", minimum=8, maximum=1024)
-    fine_samples: int = _setting(2, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
+    fine_samples: int = _setting(4, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
+    first_fine_samples: int = _setting(
+        2, "N_s in the first half of the steps, when more rays are worth more than more samples on each; 0: fine_samples", minimum=0, maximum=16
+    )
     importance_samples: int = _setting(
         128, "N_f: fine samples of a ray by importance, beside the coarse ones (sampling valid, hierarchical; uniform adds them to N_c)",
         minimum=1, maximum=4096,

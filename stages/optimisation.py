@@ -27,6 +27,7 @@ CHECKPOINT_SECONDS = 30.0
 SAMPLE = 2**16  # training pixels that the report's figures are taken from
 WEIGHED = 1  # training pixels per voxel that are looked at to see which voxels show; not fewer than bake.pixels. Four kept a tenth more that no picture missed
 
+LEAST_STEPS, RAYS_PER_VOXEL, PHOTOGRAPHED_STEPS = 320, 5, 160  # see `steps_of`
 PHOTOGRAPHS = 0.2  # view_share where surroundings are learned. Held-back views of still_life, 384 voxels a side: at 1, 28.57 dB; 0.2: 28.65; 0.05: 28.59
 
 

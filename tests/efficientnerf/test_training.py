@@ -13,7 +13,8 @@ import torch
 from efficientnerf import training
 from efficientnerf.model import Model, look
 from efficientnerf.pixels import Pixels
-from efficientnerf.training import Adam, Anchors, Progress, anchor_loss, learning_rate, restore, state_of, train, trainer
+from efficientnerf.settings import TrainSettings
+from efficientnerf.training import Adam, Anchors, Progress, anchor_loss, fine_samples_at, learning_rate, restore, share_of_fall, state_of, train, trainer
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
 
 MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_rate": 1e-2}
@@ -43,6 +44,17 @@ def test_it_learns(field: str, rule: str) -> None:
     assert all(step.fine == m.settings.fine_samples * step.pivotal and step.pivotal <= step.valid <= step.tried for step in steps)
     for step in steps[: m.settings.warm_up]:
         assert step.valid == step.tried  # nothing is pruned in the warm-up
+
+
+def test_intervals_are_sampled_more_finely_in_the_second_half_of_the_schedule() -> None:
+    steps = run(untrained(iterations=40, fine_samples=5, first_fine_samples=2))
+    assert [step.fine for step in steps] == [(2 if step.step < 20 else 5) * step.pivotal for step in steps]
+    constant = run(untrained(iterations=40, fine_samples=5, first_fine_samples=0))
+    assert all(step.fine == 5 * step.pivotal > 0 for step in constant)
+    # A schedule that was settled anew counts by its own share, not by steps over all steps: of 40 steps to step 10, then of 20.
+    settled = TrainSettings(fine_samples=5, first_fine_samples=2, iterations=20, rate_aims=(40, 10))
+    found = [fine_samples_at(settled, share_of_fall(n, settled.iterations, settled.rate_hold, settled.rate_aims)) for n in range(1, 21)]
+    assert found == [2] * 13 + [5] * 7  # a quarter by step 10, and the rest in ten steps
 
 
 def test_surroundings_are_learned_too() -> None:

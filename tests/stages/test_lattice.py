@@ -68,9 +68,12 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
     assert (given.log2_table, given.finest) == (14, 512)
 
 
-def test_other_spaces_keep_the_usual_size(tmp_path: Path) -> None:
+def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path: Path) -> None:
     s = load_scene(poses(tmp_path))
-    assert sized(TrainSettings(), s, 10**9) == dataclasses.replace(TrainSettings(), log2_table=LOG2_TABLE, finest=FINEST)
+    found = [sized(TrainSettings(), s, pixels) for pixels in (1, 2**22, 2**24, 2**26, 2**34)]
+    assert [each.log2_table for each in found] == [17, 17, 18, 19, 19]
+    assert {each.finest for each in found} == {FINEST}
+    assert sized(TrainSettings(log2_table=14, finest=512), s, 2**26) == TrainSettings(log2_table=14, finest=512)
 
 
 def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
