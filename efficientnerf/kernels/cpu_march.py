@@ -22,7 +22,6 @@ from efficientnerf.kernels.lanes import (
     EXP2,
     apart,
     exp2_minus,
-    firsts,
     four_at,
     interpolated,
     logistic,
@@ -207,11 +206,10 @@ def _composite(count, grid, pool, bench):  # type: ignore[no-untyped-def]
     side, spent = grid.brick + 2, np.float32(SPENT)
     for n in range(count, QUEUE):
         at[n] = pool.blocks * pool.size
-    mix = interpolated(
+    sigma, mix = interpolated(
         pool.values, at[0], at[1], at[2], at[3], 4 * side, 4 * side * side, together(x[0], x[1], x[2], x[3]), together(y[0], y[1], y[2], y[3]),
         together(z[0], z[1], z[2], z[3]),
     )  # fmt: skip
-    sigma = firsts(mix)
     e0, e1, e2, e3 = apart(exp2_minus(sigma))
     c0, c1, c2, c3 = quarters(logistic(mix))
     # A ray that is spent ends at once, wherever its samples are cut into groups.

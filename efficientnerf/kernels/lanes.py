@@ -228,19 +228,20 @@ def exp2_minus(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def interpolated(typing_context: Any, address: Any, a: Any, b: Any, c: Any, d: Any, j: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
-    """Trilinear interpolation at four points at once, each of four numbers, as sixteen: those of the first point, of the second, ...
+    """Trilinear interpolation at four points at once, each of four numbers: the first number of each point, as four; and all, as sixteen, point after point.
 
     address     of float32
     a, b, c, d  where, for each point, the first of its eight neighbours' four numbers lie; the next along z lie 4 on, along y j, and along x i
     x, y, z     four fractions each, of the points
 
-    No-numbers are left out, and the others' weights divided by their sum; where there is nothing else the result is zero.
+    No-numbers are left out of the sixteen, and the others' weights divided by their sum; where there is nothing else the result is zero. The first four,
+    which must be numbers, do not wait for that division.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         values, starts, (row, layer), fractions = args[0], args[1:5], args[5:7], args[7:]
         sides = [(builder.fsub(_constant(_LANES, 1), f), f) for f in fractions]
-        total, share = _constant(_ALL, 0), _constant(_ALL, 0)
+        sums, shares = [], []
         for p in range(2):
             for q in range(2):
                 edge = _times(builder, sides[0][p], sides[1][q])
@@ -251,13 +252,16 @@ def interpolated(typing_context: Any, address: Any, a: Any, b: Any, c: Any, d: A
                         ahead = builder.add(ahead, stride) if use else ahead
                     value = _joined(builder, [_load(builder, values, builder.add(start, ahead)) for start in starts])
                     there = builder.fcmp_ordered("ord", value, value)
-                    total = _plus(builder, total, _times(builder, weight, builder.select(there, value, _constant(_ALL, 0))))
-                    share = _plus(builder, share, builder.select(there, weight, _constant(_ALL, 0)))
+                    sums.append(_times(builder, weight, builder.select(there, value, _constant(_ALL, 0))))
+                    shares.append(builder.select(there, weight, _constant(_ALL, 0)))
+        total, share = _sum(builder, sums), _sum(builder, shares)
         some = builder.fcmp_ordered(">", share, _constant(_ALL, 0))
-        return builder.fdiv(total, builder.select(some, share, _constant(_ALL, 1)))
+        mean = builder.fdiv(total, builder.select(some, share, _constant(_ALL, 1)))
+        return context.make_tuple(builder, signature.return_type, [_chosen(builder, total, total, (0, 4, 8, 12)), mean])
 
     index = types.int64
-    return sixteen(types.CPointer(types.float32), index, index, index, index, index, index, four, four, four), codegen
+    both = types.Tuple((four, sixteen))
+    return both(types.CPointer(types.float32), index, index, index, index, index, index, four, four, four), codegen
 
 
 @intrinsic
@@ -279,16 +283,6 @@ def plus_each_scaled(typing_context: Any, total: Any, factor: Any, address: Any,
 
 
 @intrinsic
-def firsts(typing_context: Any, value: Any) -> Any:
-    """The first of each four of sixteen, as four."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _chosen(builder, args[0], args[0], (0, 4, 8, 12))
-
-    return four(sixteen), codegen
-
-
-@intrinsic
 def quarters(typing_context: Any, value: Any) -> Any:
     """Sixteen as a tuple of four Fours."""
 
@@ -305,6 +299,13 @@ def _times(builder: Any, x: Any, y: Any) -> Any:
 
 def _plus(builder: Any, x: Any, y: Any) -> Any:
     return builder.fadd(x, y, flags=_FUSED)
+
+
+def _sum(builder: Any, values: list[Any]) -> Any:
+    """Of an even number of vectors, in pairs: no sum waits for all others."""
+    while len(values) > 1:
+        values = [builder.fadd(one, other, flags=("contract", "nsz")) for one, other in zip(values[::2], values[1::2], strict=True)]
+    return values[0]
 
 
 def _constant(kind: Any, x: float) -> Any:

@@ -8,6 +8,7 @@ B bricks, N stored voxels, K harmonics, P entries of a palette; b = brick.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba
@@ -29,7 +30,7 @@ class Packed(NamedTuple):
               on those of the word are numbered. A sixteenth of `voxel_index`, which blocks take whatever way they find it: it stays in a cache. The last
               brick has none
     place     (B, 3) int32: the coarse cell of a brick
-    brick_index, voxel_index, density  the tree's own
+    brick_index, voxel_index, density  the tree's own, where its voxels are in order, and so the harmonics
     sh        (N, K, 3) float32: the tree's own
     base, base_table, codes  as in PaletteHarmonics: the tree's own
     palette   (K - 1, P, 4) float32: the tree's, with a zero before red
@@ -105,14 +106,11 @@ def _live(place, brick, brick_index, voxel_index, values, out):  # type: ignore[
 
 
 def _stored(voxel_index: np.ndarray) -> np.ndarray:
-    """`Packed.stored`. ValueError where voxels are not numbered brick by brick, in order."""
+    """`Packed.stored` of voxels that are in order."""
     bricks, cube = voxel_index.shape
-    there = voxel_index.reshape(-1) >= 0
-    if not np.array_equal(voxel_index.reshape(-1)[there], np.arange(np.count_nonzero(there))):
-        raise ValueError("voxels are not numbered in the order of their bricks, and inside a brick in that of the places; build the tree by `tree_from_voxels`")
     words = (cube + 63) // 64
     bits = np.zeros((bricks + 1, 64 * words), bool)
-    bits[:bricks, :cube] = there.reshape(bricks, cube)
+    bits[:bricks, :cube] = voxel_index >= 0
     out = np.zeros((bricks + 1, words, 2), np.int64)
     out[..., 0] = np.packbits(bits, axis=1, bitorder="little").view(np.int64)
     count = bits.reshape(-1, 64).sum(axis=1)
@@ -131,6 +129,20 @@ def _slope(tree: NerfTree) -> float:
     return float(np.sqrt(np.einsum("nkc,nkc,k->nc", some, some, squared_slopes(tree.degree))).max(axis=1).mean())
 
 
+def _in_order(tree: NerfTree) -> NerfTree:
+    """The tree, its voxels numbered brick by brick and along each: as files and `tree_from_voxels` have them, or else as a copy."""
+    from efficientnerf.nerftree.palettes import PaletteHarmonics
+
+    there = tree.voxel_index >= 0
+    order = tree.voxel_index[there]
+    if np.array_equal(order, np.arange(len(order))):
+        return tree
+    index = np.full_like(tree.voxel_index, -1)
+    index[there] = np.arange(len(order))
+    harmonics = tree.harmonics.chosen(order) if isinstance(tree.harmonics, PaletteHarmonics) else tree.harmonics[order]
+    return replace(tree, voxel_index=index, density_values=tree.density_values[order], harmonics=harmonics)
+
+
 def pack(tree: NerfTree) -> Packed:
     """The packed form of a tree; see the module. ValueError where the tree is not interpolated, as the kernel that reads it does."""
     from efficientnerf.nerftree.palettes import PaletteHarmonics
@@ -139,6 +151,7 @@ def pack(tree: NerfTree) -> Packed:
     if tree.lookup != "trilinear":
         raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; draw it by `efficientnerf.kernels.cpu_nearest`")
 
+    tree = _in_order(tree)
     cells = np.argwhere(tree.brick_index >= 0)
     place = np.empty(cells.shape, np.int32)
     place[tree.brick_index[tree.brick_index >= 0]] = cells
