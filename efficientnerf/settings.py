@@ -9,9 +9,10 @@ from typing import Any
 def _setting(default: Any, doc: str, **limits: Any) -> Any:
     return field(default=default, metadata={"doc": doc, **limits})
 
-# Where train.log2_table and train.finest are 0.
+# Where train.log2_table, train.finest and train.coarse_samples are 0.
 LOG2_TABLE = 17
 FINEST = 1024
+COARSE_SAMPLES, COARSE_SAMPLES_NDC = 128, 96
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,10 @@ class TrainSettings:
     layers: int = _setting(2, "hidden layers of the fine network (the paper: 8)", minimum=1, maximum=16)
     coarse_hidden: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
     coarse_layers: int = _setting(1, "hidden layers of the coarse network (the paper: 4)", minimum=1, maximum=16)
-    coarse_samples: int = _setting(128, "N_c: intervals over the diagonal of the box, or between near and far", minimum=8, maximum=1024)
+    coarse_samples: int = _setting(
+        0, "N_c: intervals over the diagonal of the box, or between near and far, at least 8; 0: 128, and 96 in normalised device coordinates",
+        minimum=0, maximum=1024,
+    )  # fmt: skip
     fine_samples: int = _setting(4, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
     first_fine_samples: int = _setting(
         2, "N_s in the first half of the steps, when more rays are worth more than more samples on each; 0: fine_samples", minimum=0, maximum=16
@@ -99,7 +103,10 @@ class TrainSettings:
     voxel_beta: float = _setting(0.1, "beta of equation 7", minimum=0.0, maximum=1.0)
     voxel_initial: float = _setting(10.0, "density that the voxels start with", minimum=0.0)
     voxel_decay: float = _setting(0.95, "maximum: what a voxel keeps at each refresh", minimum=0.0, maximum=1.0)
-    voxel_absorption: float = _setting(0.01, "maximum: share of light that an interval of a valid voxel absorbs at least", minimum=0.0, maximum=1.0)
+    voxel_absorption: float | None = _setting(
+        None, "maximum: share of light that an interval of a valid voxel absorbs at least; none: 0.01, and 0.05 in normalised device coordinates",
+        minimum=0.0, maximum=1.0,
+    )  # fmt: skip
     refresh_every: int = _setting(16, "steps between looks at random voxels, which let pruned space return", minimum=1)
     refresh_share: float = _setting(0.03125, "share of the voxels looked at in a refresh; in the warm-up an eighth, unless 0", minimum=0.0, maximum=1.0)
     refresh_rays: float = _setting(

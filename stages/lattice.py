@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.settings import FINEST, LOG2_TABLE, TrainSettings
+from efficientnerf.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
 from stages.resolution import ndc_pixel
 
 if TYPE_CHECKING:
@@ -31,14 +31,20 @@ MOST = 4096  # lattice points a side
 
 
 def sized(settings: TrainSettings, s: Scene, pixels: int) -> TrainSettings:
-    """The settings with `log2_table` and `finest` where these leave them to be chosen.
+    """The settings with `log2_table`, `finest` and `coarse_samples` where these leave them to be chosen.
 
     pixels  how many the training images have
     """
     finest, entries = FINEST, LOG2_TABLE + math.log2(max(pixels, 1) / PIXELS_OF_LEAST) / 2
+    coarse_samples = COARSE_SAMPLES if s.forward is None else COARSE_SAMPLES_NDC
     if s.forward is not None:
         entries = math.log2(max(pixels, 1) / PIXELS_AN_ENTRY)
         longest = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
         finest = int(np.clip(math.ceil(longest / ndc_pixel(s, s.forward)), FINEST, MOST))
     log2_table = int(np.clip(round(entries), LOG2_TABLE, LARGEST))
-    return replace(settings, log2_table=settings.log2_table or log2_table, finest=settings.finest or finest)
+    return replace(
+        settings,
+        log2_table=settings.log2_table or log2_table,
+        finest=settings.finest or finest,
+        coarse_samples=settings.coarse_samples or coarse_samples,
+    )

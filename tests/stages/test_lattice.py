@@ -10,17 +10,19 @@ import numpy as np
 import pytest
 
 from efficientnerf.cameras import rays
-from efficientnerf.settings import FINEST, LOG2_TABLE, TrainSettings
+from efficientnerf.grid import Space
+from efficientnerf.model import model
+from efficientnerf.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
 from pipeline.errors import UsageError
 from stages import train
-from stages.field import load_renderer
+from stages.field import load_renderer, space_of
 from stages.forward import forward_of
 from stages.lattice import LARGEST, MOST, sized
 from stages.resolution import ndc_pixel
 from stages.scene import Scene, View
 from stages.scene import load as load_scene
-from tests.efficientnerf.balls import settings
-from tests.stages.balls import job, poses
+from tests.efficientnerf.balls import BOUNDS, settings
+from tests.stages.balls import ORBIT, SIMILARITY, job, poses
 from tests.stages.test_forward import depths, row
 
 
@@ -30,10 +32,7 @@ def forward_facing(side: int) -> Scene:
     found = forward_of(cameras, depths(cameras))
     assert not isinstance(found, str), found
     views = tuple(View(f"images/{c.name}", None, "train", c, c, 3.0, 40.0) for c in cameras)
-    box = np.array([[-1.0] * 3, [1.0] * 3])
-    from tests.stages.balls import ORBIT, SIMILARITY
-
-    return Scene("llff", views, box, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found)
+    return Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found)
 
 
 def _resized(camera, side: int):  # type: ignore[no-untyped-def]
@@ -64,8 +63,22 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
     assert sized(TrainSettings(), s, 1000).log2_table == LOG2_TABLE
     assert sized(TrainSettings(), s, 6 << 18).log2_table == 18
     assert sized(TrainSettings(), s, 10**9).log2_table == LARGEST
-    given = sized(TrainSettings(log2_table=14, finest=512), s, 10**9)
-    assert (given.log2_table, given.finest) == (14, 512)
+    given = sized(TrainSettings(log2_table=14, finest=512, coarse_samples=77), s, 10**9)
+    assert (given.log2_table, given.finest, given.coarse_samples) == (14, 512, 77)
+
+
+def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_them_and_fog_weighs_less() -> None:
+    s = forward_facing(400)
+    small = TrainSettings(log2_table=8, levels=2, voxels=8)
+    m, usual = model(space_of(s), small, None), model(Space(BOUNDS, False), small, None)
+    assert m.settings.coarse_samples == sized(TrainSettings(), s, 1000).coarse_samples == COARSE_SAMPLES_NDC
+    assert m.step == pytest.approx(2 * math.sqrt(3) / COARSE_SAMPLES_NDC, rel=1e-6)  # the box is 2 deep
+    assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.05)
+    assert 1 - math.exp(-usual.voxels.threshold * usual.step) == pytest.approx(0.01)
+    assert (m.distortion, usual.distortion) == (0.002, 0.01)
+    stated = model(space_of(s), dataclasses.replace(small, coarse_samples=64, voxel_absorption=0.2, distortion=0.0), None)
+    assert (stated.settings.coarse_samples, stated.distortion) == (64, 0.0)
+    assert 1 - math.exp(-stated.voxels.threshold * stated.step) == pytest.approx(0.2)
 
 
 def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path: Path) -> None:
@@ -73,7 +86,7 @@ def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path:
     found = [sized(TrainSettings(), s, pixels) for pixels in (1, 2**22, 2**24, 2**26, 2**34)]
     assert [each.log2_table for each in found] == [17, 17, 18, 19, 19]
     assert {each.finest for each in found} == {FINEST}
-    assert sized(TrainSettings(log2_table=14, finest=512), s, 2**26) == TrainSettings(log2_table=14, finest=512)
+    assert sized(TrainSettings(log2_table=14, finest=512), s, 2**26) == TrainSettings(log2_table=14, finest=512, coarse_samples=COARSE_SAMPLES)
 
 
 def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
@@ -84,7 +97,7 @@ def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
     assert max(m.fine.sides) == FINEST
 
 
-@pytest.mark.parametrize("wrong", [{"log2_table": 5}, {"finest": 9}])
+@pytest.mark.parametrize("wrong", [{"log2_table": 5}, {"finest": 9}, {"coarse_samples": 3}])
 def test_a_table_too_small_is_refused(tmp_path: Path, wrong: dict[str, int]) -> None:
     with pytest.raises(UsageError, match=f"train.{next(iter(wrong))}={next(iter(wrong.values()))}: expected at least"):
         train.run(job(tmp_path, settings(**wrong), poses=poses(tmp_path / "poses")))
