@@ -73,11 +73,13 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     from stages import scene
     from stages.budget import MOST, TIMED
     from stages.field import space_of
+    from stages.lattice import sized
     from stages.train import anchors_of, pixels_of, stated_range
 
     s, settings = scene.load(poses), settings_of(preset)
     views = scene.views_of(s, "train")
     pixels = pixels_of(poses, views)
+    settings = sized(settings, s, len(pixels))
     near, far = min(view.near for view in s.views), max(view.far for view in s.views)
     if settings.far > 0:
         near, far = stated_range(s, settings)
