@@ -9,6 +9,7 @@ from typing import Any
 def _setting(default: Any, doc: str, **limits: Any) -> Any:
     return field(default=default, metadata={"doc": doc, **limits})
 
+
 # Where train.log2_table, train.finest and train.coarse_samples are 0.
 LOG2_TABLE = 17
 FINEST = 1024

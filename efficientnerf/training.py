@@ -25,7 +25,7 @@ from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, upd
 from efficientnerf.device_pixels import DevicePixels
 from efficientnerf.exposure import exposed, exposure_loss
 from efficientnerf.kernels import dispatch
-from efficientnerf.late import Counted, Late, mean_over, whole_rays
+from efficientnerf.late import Counted, Late, Room, mean_over, whole_rays
 from efficientnerf.model import Look, Model, look
 from efficientnerf.pixels import Pixels
 from efficientnerf.settings import TrainSettings
@@ -246,18 +246,7 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         rate = learning_rate(number, settings.learning_rate, settings.final_rate, *ends)
         t.adam.step(number, rate)
 
-        # The voxels remember what the coarse field said on the rays, and are refreshed at random.
-        with torch.no_grad():
-            if m.prunes:
-                told, raw = (seen.fine, seen.fine_raw) if m.coarse is None else (seen.coarse, seen.coarse_raw)
-                remember(m, told.point, raw[:, 0].detach(), count=None if room is None else told.first[-1])
-            if m.prunes and number % settings.refresh_every == 0:
-                refresh(m, number, rng)
-            # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
-            if m.prunes and late is not None and number % settings.refresh_every == 0:
-                m.voxels.values.copy_(torch.where((m.voxels.values > m.voxels.threshold).any(), m.voxels.values, m.voxels.start))
-            elif m.prunes and late is None and len(seen.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
-                m.voxels.values.fill_(m.voxels.start)
+        _tell_voxels(m, seen, number, rng, room, waits=late is None)
 
         t.step = number
         if late is not None:
@@ -268,6 +257,27 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             asked = counted.fine if m.coarse is None else counted.fine + counted.valid  # of a network
             t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max(asked / count, 1.0)
         yield Progress(number, counted.loss, count, *counted[1:])
+
+
+def _tell_voxels(m: Model, seen: Look, number: int, rng: np.random.Generator, room: Room | None, *, waits: bool) -> None:
+    """The voxels remember what the coarse field said on the rays of a step, and are refreshed at random.
+
+    room   what samples were padded to
+    waits  whether the device may be asked for numbers
+    """
+    if not m.prunes:
+        return
+    with torch.no_grad():
+        told, raw = (seen.fine, seen.fine_raw) if m.coarse is None else (seen.coarse, seen.coarse_raw)
+        remember(m, told.point, raw[:, 0].detach(), count=None if room is None else told.first[-1])
+        due = number % m.settings.refresh_every == 0
+        if due:
+            refresh(m, number, rng)
+        # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
+        if not waits and due:
+            m.voxels.values.copy_(torch.where((m.voxels.values > m.voxels.threshold).any(), m.voxels.values, m.voxels.start))
+        elif waits and len(seen.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
+            m.voxels.values.fill_(m.voxels.start)
 
 
 def fine_samples_at(settings: TrainSettings, way: float) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import traceback
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from efficientnerf.late import Late, LateShare, Room, mean_over, whole_rays
 from efficientnerf.model import Model, model
 from efficientnerf.sampling import Samples
 from tests.efficientnerf.balls import BOUNDS, pixels, settings
+from tests.efficientnerf.device import DEVICE
 
 
 def samples(counts: list[int], tried: int = 50, room: int | None = None) -> Samples:
@@ -128,7 +130,6 @@ EMPTY = -1.0  # what half of the voxels begin with
 
 def model_of(strategy: str, **changes: Any) -> Model:
     """On a device where there is one."""
-    from tests.efficientnerf.device import DEVICE
 
     wanted = {**STRATEGIES[strategy], "samples": 0, "rays": 6, "warm_up": 1, "refresh_every": 3, "explored": 0.0, **changes}
     contracted = strategy == "contracted"
@@ -140,8 +141,6 @@ def model_of(strategy: str, **changes: Any) -> Model:
 @pytest.fixture
 def interpreted(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """The path of a device on the CPU: Triton's kernels interpreted, steps padded from the fourth on, two after pruning began."""
-    from tests.efficientnerf.device import DEVICE
-
     monkeypatch.setattr(late, "SETTLED", 2)
     monkeypatch.setattr(late, "LAG", 1)
     monkeypatch.setattr(late, "GRAIN", 64)
@@ -196,6 +195,16 @@ class Waits(TorchDispatchMode):
         return func(*args, **kwargs)
 
 
+def lines_that_wait(running: Iterator[training.Progress]) -> list[str]:
+    """Of two steps, after the first four."""
+    for _ in range(4):
+        next(running)
+    with Waits() as waits:
+        for _ in range(2):
+            next(running)
+    return waits.lines
+
+
 def test_lines_that_wait_are_found() -> None:
     from efficientnerf.sampling import pivotal_samples
 
@@ -210,12 +219,7 @@ def test_lines_that_wait_are_found() -> None:
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_no_line_of_a_step_waits(strategy: str, interpreted: None) -> None:
     running = training.train(training.trainer(model_of(strategy, iterations=9)), pixels(3, 8))
-    for _ in range(4):
-        next(running)
-    with Waits() as waits:
-        for _ in range(2):
-            next(running)
-    assert waits.lines == []
+    assert lines_that_wait(running) == []
 
 
 def test_no_line_that_makes_a_bundle_waits() -> None:
@@ -233,12 +237,7 @@ def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: No
     origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
     anchors = training.Anchors(origins, directions, np.full(8, 3.0, np.float32))
     running = training.train(training.trainer(m, 3), pixels(3, 8), anchors)
-    for _ in range(4):
-        next(running)
-    with Waits() as waits:
-        for _ in range(2):
-            next(running)
-    assert waits.lines == []
+    assert lines_that_wait(running) == []
 
 
 @pytest.mark.gpu
