@@ -24,6 +24,7 @@ def limits(info: SettingInfo) -> str:
         return ", ".join(f"`{shown(choice)}`" for choice in info.choices)
     bounds = [f"at least {info.minimum}"] if info.minimum is not None else []
     bounds += [f"at most {info.maximum}"] if info.maximum is not None else []
+    bounds += [f"or {shown(number)}" for number in info.besides]
     return ", ".join([info.type_name, *bounds])
 
 

@@ -49,20 +49,20 @@ class TrainSettings:
     degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
     levels: int = _setting(12, "hash: levels", minimum=1, maximum=24)
     log2_table: int = _setting(
-        0, "hash: entries of a level's table, as a power of two, at least 8; 0: from 17 to 19, by the number of training pixels",
-        minimum=0, maximum=24,
+        0, "hash: entries of a level's table, as a power of two; 0: from 17 to 19, by the number of training pixels",
+        minimum=8, maximum=24, besides=(0,),
     )  # fmt: skip
     finest: int = _setting(
-        0, "hash: lattice points a side of the finest level, at least 16; 0: 1024, and more in normalised device coordinates, one for a pixel, up to 4096",
-        minimum=0, maximum=16384,
+        0, "hash: lattice points a side of the finest level; 0: 1024, and more in normalised device coordinates, one for a pixel, up to 4096",
+        minimum=16, maximum=16384, besides=(0,),
     )  # fmt: skip
     hidden: int = _setting(64, "width of the fine network (the paper: 256, with field mlp)", minimum=8, maximum=1024)
     layers: int = _setting(2, "hidden layers of the fine network (the paper: 8)", minimum=1, maximum=16)
     coarse_hidden: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
     coarse_layers: int = _setting(1, "hidden layers of the coarse network (the paper: 4)", minimum=1, maximum=16)
     coarse_samples: int = _setting(
-        0, "N_c: intervals over the diagonal of the box, or between near and far, at least 8; 0: 128, and 96 in normalised device coordinates",
-        minimum=0, maximum=1024,
+        0, "N_c: intervals over the diagonal of the box, or between near and far; 0: 128, and 96 in normalised device coordinates",
+        minimum=8, maximum=1024, besides=(0,),
     )  # fmt: skip
     fine_samples: int = _setting(4, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
     first_fine_samples: int = _setting(

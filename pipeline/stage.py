@@ -131,8 +131,9 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
     where  put before names in errors, e.g. "train": `train.iterations: ...`
 
     Types are int, float (an int will do), bool, str, None, Literal, tuples (lists will do) and unions of these. A field's metadata may
-    hold "choices", "minimum" and "maximum" (of a tuple: of each of its numbers). Raises UnknownSetting, which names the
-    nearest, and UsageError for a wrong type or value.
+    hold "choices", "minimum" and "maximum" (of a tuple: of each of its numbers), and "besides", numbers outside of these limits that
+    are admitted all the same, such as a 0 for "choose". Raises UnknownSetting, which names the nearest, and UsageError for a wrong type
+    or value.
     """
     prefix = f"{where}." if where else ""
     if not isinstance(mapping, Mapping):
@@ -214,12 +215,15 @@ def _check_range(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
         near = difflib.get_close_matches(str(value), [str(choice) for choice in choices], n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise UsageError(f"{name}: found {_shown(value)}, expected one of {', '.join(map(str, choices))}.{hint}")
-    least, most = metadata.get("minimum"), metadata.get("maximum")
+    least, most, besides = metadata.get("minimum"), metadata.get("maximum"), metadata.get("besides", ())
+    otherwise = "".join(f", or {number}" for number in besides)
     for number in _numbers(value):
+        if number in besides:
+            continue
         if least is not None and number < least:
-            raise UsageError(f"{name}: found {_shown(value)}, expected at least {least}")
+            raise UsageError(f"{name}: found {_shown(value)}, expected at least {least}{otherwise}")
         if most is not None and number > most:
-            raise UsageError(f"{name}: found {_shown(value)}, expected at most {most}")
+            raise UsageError(f"{name}: found {_shown(value)}, expected at most {most}{otherwise}")
 
 
 def _numbers(value: Any) -> list[float]:

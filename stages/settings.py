@@ -20,6 +20,7 @@ def setting(
     choices: Sequence[Any] | None = None,
     minimum: float | None = None,
     maximum: float | None = None,
+    besides: Sequence[float] | None = None,
     unit: str | None = None,
 ) -> Any:
     """A field of a settings dataclass.
@@ -28,9 +29,11 @@ def setting(
     doc                one sentence: what the setting does
     choices            the values it may take
     minimum, maximum   inclusive limits of a number; of a tuple, of each of its numbers
+    besides            numbers outside of these limits that it may be all the same: 0 where that means "choose"
     unit               of the number, as printed in the documentation
     """
-    about = {"doc": doc, "choices": None if choices is None else tuple(choices), "minimum": minimum, "maximum": maximum, "unit": unit}
+    about = {"doc": doc, "choices": None if choices is None else tuple(choices), "minimum": minimum, "maximum": maximum}
+    about |= {"besides": None if besides is None else tuple(besides), "unit": unit}
     return dataclasses.field(default=default, metadata={name: value for name, value in about.items() if value is not None})
 
 
@@ -45,6 +48,7 @@ class SettingInfo:
     choices: tuple[Any, ...] | None
     minimum: float | None
     maximum: float | None
+    besides: tuple[float, ...]
     unit: str | None
 
     @property
@@ -67,6 +71,7 @@ def describe_settings(settings_type: type) -> list[SettingInfo]:
                 choices=about.get("choices"),
                 minimum=about.get("minimum"),
                 maximum=about.get("maximum"),
+                besides=about.get("besides", ()),
                 unit=about.get("unit"),
             )
         )

@@ -114,9 +114,6 @@ def _check(settings: TrainSettings) -> None:
 
     if len(settings.rate_aims) % 2:
         raise UsageError(f"train.rate_aims={list(settings.rate_aims)}: expected pairs, a number of steps and the step up to which it was aimed at.")
-    for name, least in (("log2_table", 8), ("finest", 16), ("coarse_samples", 8)):
-        if 0 < (found := getattr(settings, name)) < least:
-            raise UsageError(f"train.{name}={found}: expected at least {least}, or 0 for what suits the photographs.")
     if settings.coarse == "voxels" and (settings.field, settings.sampling, settings.voxel_rule) != ("hash", "efficient", "maximum"):
         raise UsageError("train.coarse=voxels needs train.field=hash, train.sampling=efficient and train.voxel_rule=maximum.")
 

@@ -133,7 +133,7 @@ class Settings:
             except UsageError as error:
                 refused = refused or error
         text = f"{origin}: {refused}"
-        raise UsageError(text if text.endswith((".", "?")) else f"{text}.")
+        raise UsageError(f"{text if text.endswith(('.', '?')) else f'{text}.'} 'enerf presets {stage}' says what it means.")
 
     def put_table(self, table: Table, origin: str) -> None:
         for stage, entries in table.items():

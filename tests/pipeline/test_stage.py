@@ -19,6 +19,7 @@ class Settings:
     up: str = field(default="auto", metadata={"choices": ("auto", "x", "y", "z")})
     colour: tuple[float, float, float] | None = None
     sizes: tuple[int, ...] = field(default=(1, 2), metadata={"minimum": 0})
+    table: int = field(default=0, metadata={"minimum": 8, "maximum": 24, "besides": (0,)})
     limit: int | float | None = None
     mode: Literal["a", "b"] = "a"
 
@@ -28,6 +29,11 @@ def test_values_as_json_gives_them_become_the_settings_own_types() -> None:
     assert made == Settings(rate=2.0, colour=(1.0, 0.5, 0.0), sizes=(3,), mode="b", limit=3)
     assert type(made.rate) is float
     assert type(made.limit) is int
+
+
+@pytest.mark.parametrize("table", [0, 8, 24])
+def test_a_number_that_is_admitted_besides_the_limits_stands(table: int) -> None:
+    assert settings_from(Settings, {"table": table}).table == table
 
 
 def test_plain_values_and_back() -> None:
@@ -52,6 +58,9 @@ def test_plain_values_and_back() -> None:
         ({"colour": "red"}, "or none"),
         ({"sizes": [1, -1]}, "expected at least 0"),
         ({"sizes": 3}, "expected a list"),
+        ({"table": 7}, "train.table: found 7 (int), expected at least 8, or 0"),
+        ({"table": -1}, "expected at least 8, or 0"),
+        ({"table": 25}, "expected at most 24, or 0"),
         ({"mode": "c"}, "one of 'a', 'b'"),
         ({"strict": None}, "found none"),
     ],

@@ -14,6 +14,7 @@ from efficientnerf.grid import Space
 from efficientnerf.model import model
 from efficientnerf.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
 from pipeline.errors import UsageError
+from pipeline.stage import settings_from
 from stages import train
 from stages.field import load_renderer, space_of
 from stages.forward import forward_of
@@ -97,7 +98,10 @@ def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
     assert max(m.fine.sides) == FINEST
 
 
-@pytest.mark.parametrize("wrong", [{"log2_table": 5}, {"finest": 9}, {"coarse_samples": 3}])
-def test_a_table_too_small_is_refused(tmp_path: Path, wrong: dict[str, int]) -> None:
-    with pytest.raises(UsageError, match=f"train.{next(iter(wrong))}={next(iter(wrong.values()))}: expected at least"):
-        train.run(job(tmp_path, settings(**wrong), poses=poses(tmp_path / "poses")))
+@pytest.mark.parametrize(("name", "least"), [("log2_table", 8), ("finest", 16), ("coarse_samples", 8)])
+def test_a_table_too_small_is_refused_when_settings_are_read(name: str, least: int) -> None:
+    for wrong in (-1, 1, least - 1):
+        with pytest.raises(UsageError, match=rf"train\.{name}: found {wrong} \(int\), expected at least {least}, or 0$"):
+            settings_from(TrainSettings, {name: wrong}, where="train")
+    for right in (0, least):
+        assert getattr(settings_from(TrainSettings, {name: right}), name) == right

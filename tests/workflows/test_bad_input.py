@@ -213,6 +213,15 @@ def test_a_source_that_is_not_there(enerf: Enerf, tmp_path: Path) -> None:
     assert (result.code, "is a file" in result.err) == (2, True)
 
 
+@pytest.mark.parametrize(("name", "least"), [("log2_table", 8), ("finest", 16), ("coarse_samples", 8)])
+def test_a_setting_too_small_for_training_is_refused_before_the_poses(enerf: Enerf, tmp_path: Path, name: str, least: int) -> None:
+    blender(tmp_path / "source")
+    result = enerf("run", tmp_path / "source", "--out", tmp_path / "run", "--set", f"train.{name}=3")
+    expected = f"enerf: --set train.{name}=3: train.{name}: found 3 (int), expected at least {least}, or 0. 'enerf presets train' says what it means."
+    assert (result.code, result.err.strip()) == (2, expected)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_folder_that_is_no_run(enerf: Enerf, tmp_path: Path) -> None:
     blender(tmp_path / "source")
     (tmp_path / "run").mkdir()
