@@ -7,7 +7,8 @@ Two readings of the paper, and two rules of update, are named settings, because 
 - "maximum" keeps a decayed maximum of the activated density, v <- max(decay v, new), and calls a voxel valid whose density would absorb more
   than about one percent of the light over an interval. It needs far fewer visits and heals itself.
 
-With both, pruned space can come back: `refresh` asks the field about random cells.
+With both, pruned space can come back: `refresh` asks the field about random cells. Voxels that are closed hold minus infinity, which no rule
+changes: they are never valid, not even while nothing is pruned.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def update(voxels: DensityVoxels, cell: Tensor, density: Tensor, count: Tensor |
     follows is padding.
     """
     flat = voxels.values.view(-1)
-    density = density.to(flat.dtype)
+    density = torch.where(torch.isneginf(flat[cell]), -torch.inf, density.to(flat.dtype))
     real = None if count is None else torch.arange(len(cell), device=flat.device) < count
     if voxels.rule == "maximum":
         density = density if real is None else torch.where(real, density, -torch.inf)
@@ -85,7 +86,21 @@ def update(voxels: DensityVoxels, cell: Tensor, density: Tensor, count: Tensor |
         return
     seen, index, counts = torch.unique(cell, return_inverse=True, return_counts=True)
     mean = torch.zeros(len(seen), dtype=flat.dtype, device=flat.device).index_add_(0, index, density) / counts
-    flat[seen] = (1 - voxels.beta) * flat[seen] + voxels.beta * mean
+    old = flat[seen]
+    flat[seen] = torch.where(torch.isneginf(old), old, (1 - voxels.beta) * old + voxels.beta * mean)
+
+
+def close(voxels: DensityVoxels, chosen: Tensor) -> None:
+    """No matter may be in these voxels, (D, D, D) bool, from now on."""
+    voxels.values.masked_fill_(chosen.to(voxels.values.device), -torch.inf)
+
+
+def reopen(voxels: DensityVoxels, wanted: Tensor | None = None) -> None:
+    """Have all voxels but the closed ones as they were at first; only if `wanted`, a bool that may lie on a device, says so."""
+    as_they_are = torch.isneginf(voxels.values)
+    if wanted is not None:
+        as_they_are |= ~wanted
+    voxels.values.copy_(torch.where(as_they_are, voxels.values, voxels.start))
 
 
 def _blend(flat: Tensor, beta: float, cell: Tensor, density: Tensor, real: Tensor) -> None:
@@ -99,7 +114,7 @@ def _blend(flat: Tensor, beta: float, cell: Tensor, density: Tensor, real: Tenso
     counts = flat.new_zeros(len(cell)).index_add(0, group, counted.to(flat.dtype))[group]
     mean = flat.new_zeros(len(cell)).index_add(0, group, told)[group] / counts.clamp(min=1)
     old = flat[cell]
-    flat.index_put_((cell,), torch.where(counts > 0, (1 - beta) * old + beta * mean, old))
+    flat.index_put_((cell,), torch.where((counts > 0) & ~torch.isneginf(old), (1 - beta) * old + beta * mean, old))
 
 
 DEEPEST = 1.0  # optical depth of an interval at most, where voxels alone say what hides what
@@ -117,10 +132,13 @@ def voxel_weights(voxels: DensityVoxels, point: Tensor, length: Tensor, first: T
     return sample_weights((density * length).clamp(max=DEEPEST), first)
 
 
+LEAST_DECAY = 1e-30  # nothing is kept either, but what is closed stays so
+
+
 def fade(voxels: DensityVoxels) -> None:
     """Forget a little, where the rule is "maximum": v <- decay v."""
     if voxels.rule == "maximum":
-        voxels.values.mul_(voxels.decay)
+        voxels.values.mul_(max(voxels.decay, LEAST_DECAY))
 
 
 def sweep_cells(voxels: DensityVoxels, part: int, parts: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.compositing import activate, ray_of_sample
-from efficientnerf.density import cell_of, fade, refresh_cells, sweep_cells, update
+from efficientnerf.density import cell_of, fade, refresh_cells, reopen, sweep_cells, update
 from efficientnerf.device_pixels import DevicePixels
 from efficientnerf.exposure import exposed, exposure_loss
 from efficientnerf.kernels import dispatch
@@ -275,9 +275,9 @@ def _tell_voxels(m: Model, seen: Look, number: int, rng: np.random.Generator, ro
             refresh(m, number, rng)
         # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
         if not waits and due:
-            m.voxels.values.copy_(torch.where((m.voxels.values > m.voxels.threshold).any(), m.voxels.values, m.voxels.start))
+            reopen(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
         elif waits and len(seen.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
-            m.voxels.values.fill_(m.voxels.start)
+            reopen(m.voxels)
 
 
 def fine_samples_at(settings: TrainSettings, way: float) -> int:

@@ -55,6 +55,7 @@ def run(job: Job) -> None:
     settings = sized(job.settings, s, len(pixels))
     near, far = _range(s, pixels, settings)
     m = model(field.space_of(s), settings, s.background, job.device, (near, far))
+    _close(m, views, job)
     t = training.trainer(m, len(views))
     log = job.work / "log.jsonl"
     spent = _resume(t, job, log)
@@ -116,6 +117,19 @@ def _check(settings: TrainSettings) -> None:
         raise UsageError(f"train.rate_aims={list(settings.rate_aims)}: expected pairs, a number of steps and the step up to which it was aimed at.")
     if settings.coarse == "voxels" and (settings.field, settings.sampling, settings.voxel_rule) != ("hash", "efficient", "maximum"):
         raise UsageError("train.coarse=voxels needs train.field=hash, train.sampling=efficient and train.voxel_rule=maximum.")
+
+
+def _close(m: Model, views: tuple[View, ...], job: Job) -> None:
+    """Close the voxels whose matter would be seen by too few photographs for them to tell where it is."""
+    import torch
+
+    from efficientnerf.density import close
+    from stages.observed import seldom_seen
+
+    if not m.space.contracted or m.settings.observers == 0:
+        return
+    job.progress(0, m.settings.iterations, "looking for what few photographs show")
+    close(m.voxels, torch.from_numpy(seldom_seen(m.space, [view.camera for view in views], m.settings.observers, m.voxels.side)))
 
 
 def gains_of(t: Trainer, views: tuple[View, ...]) -> dict[str, np.ndarray] | None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.density import DEEPEST, cell_of, density_voxels, fade, refresh_cells, sweep_cells, update, voxel_weights
+from efficientnerf.density import DEEPEST, cell_of, close, density_voxels, fade, refresh_cells, reopen, sweep_cells, update, voxel_weights
 from tests import reference
 
 SIDE = 3
@@ -77,6 +77,38 @@ def test_fresh_voxels_are_all_valid_and_those_at_the_threshold_are_not() -> None
         assert voxels.occupied == 1.0
         voxels.values[0] = threshold
         assert voxels.occupied == pytest.approx(2 / 3)
+
+
+@pytest.mark.parametrize("padded", [False, True])
+@pytest.mark.parametrize(("rule", "beta", "decay"), [("momentum", 1.0, 0.5), ("momentum", 0.1, 0.5), ("maximum", 0.1, 0.0), ("maximum", 0.1, 0.95)])
+def test_closed_voxels_stay_closed_whatever_they_are_told_and_others_do_not_notice(rule: str, beta: float, decay: float, padded: bool) -> None:
+    voxels, plain = (density_voxels(SIDE, rule, threshold=1.0, beta=beta, decay=decay) for _ in range(2))
+    closed = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
+    closed[1] = True
+    close(voxels, closed)
+    for _ in range(3):
+        cell, density = samples()
+        for each in (voxels, plain):
+            update(each, cell, density, torch.tensor(len(cell)) if padded else None)
+            fade(each)
+    assert torch.isneginf(voxels.values[closed]).all()
+    assert torch.equal(voxels.values[~closed], plain.values[~closed])
+    assert voxels.occupied == float((plain.values[~closed] > plain.threshold).sum()) / SIDE**3
+
+
+def test_beginning_anew_leaves_closed_voxels_closed() -> None:
+    voxels = density_voxels(SIDE, "maximum", threshold=1.0)
+    closed = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
+    closed[0, 1] = True
+    close(voxels, closed)
+    voxels.values[~closed] = 0.25
+    reopen(voxels, torch.tensor(False))
+    assert (voxels.values[~closed] == 0.25).all()
+    for wanted in (None, torch.tensor(True)):
+        voxels.values[~closed] = 0.25
+        reopen(voxels, wanted)
+        assert (voxels.values[~closed] == voxels.start).all()
+        assert torch.isneginf(voxels.values[closed]).all()
 
 
 def test_an_unknown_rule_is_refused() -> None:

@@ -1,0 +1,131 @@
+"""Where few photographs look no matter is learned: what counts as few, that it is told camera by camera, and that training keeps to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.cameras import Camera, project
+from efficientnerf.grid import Space
+from efficientnerf.model import look
+from efficientnerf.pixels import Pixels
+from stages import train
+from stages.field import load_renderer, space_of
+from stages.observed import seldom_seen, spread_order
+from stages.scene import Scene, views_of
+from stages.scene import load as load_scene
+from stages.scene import save as save_scene
+from tests.efficientnerf import balls
+from tests.stages.balls import job, poses
+
+SPACE = Space(np.array([[-1.0, -0.8, -1.0], [1.0, 0.9, 1.2]]), contracted=True)
+SIDE = 24
+
+
+def centres(side: int = SIDE) -> tuple[np.ndarray, np.ndarray]:
+    """World coordinates (D, D, D, 3) of the voxels' centres, and which of these lie in the box."""
+    grid = (np.stack(np.meshgrid(*(np.arange(side),) * 3, indexing="ij"), axis=-1) + 0.5) / side
+    world = SPACE.world(torch.from_numpy(grid).reshape(-1, 3)).numpy().reshape(grid.shape)
+    return world, (np.abs(grid * 4 - 2) <= 1).all(axis=-1)
+
+
+def narrow(camera: Camera, factor: float) -> Camera:
+    return replace(camera, params=(camera.params[0] * factor, *camera.params[1:]))
+
+
+def aimed(at: np.ndarray, count: int) -> list[Camera]:
+    """Cameras round a point that see little else."""
+    out = []
+    for camera in balls.cameras(count):
+        moved = camera.world_from_camera.copy()
+        moved[:3, 3] += at
+        out.append(replace(narrow(camera, 4), world_from_camera=moved))
+    return out
+
+
+@pytest.mark.parametrize("side", [24, 17])
+@pytest.mark.parametrize("observers", [2, 3])
+def test_it_is_the_voxels_in_the_box_that_few_cameras_project_into_their_pictures(side: int, observers: int) -> None:
+    cameras = [narrow(camera, 1.8) for camera in balls.cameras(12)]
+    world, inside = centres(side)
+    expected = np.zeros_like(inside)
+    for at in np.argwhere(inside):
+        views = 0
+        for camera in cameras:
+            pixel, depth = project(camera, world[tuple(at)][None])
+            views += int(depth[0] > 0 and 0 <= pixel[0, 0] <= camera.width and 0 <= pixel[0, 1] <= camera.height)
+        expected[tuple(at)] = views < observers
+    assert 0.05 < expected[inside].mean() < 0.95
+    np.testing.assert_array_equal(seldom_seen(SPACE, cameras, observers, side), expected)
+
+
+@pytest.mark.parametrize(("watching", "closed"), [(0, True), (1, True), (2, True), (3, False)])
+def test_a_place_that_three_cameras_see_is_open_and_one_that_fewer_see_is_not(watching: int, closed: bool) -> None:
+    """Twelve cameras look at the middle; a place beside it is seen by those alone that look there."""
+    beside = np.array([0.85, 0.8, 1.05])
+    cameras = [*aimed(np.zeros(3), 12), *aimed(beside, watching)]
+    found = seldom_seen(SPACE, cameras, 3, SIDE)
+    world, inside = centres()
+    (lump,) = np.argwhere(inside)[[np.argmin(np.linalg.norm(world[inside] - beside, axis=-1))]]
+    (middle,) = np.argwhere(inside)[[np.argmin(np.linalg.norm(world[inside], axis=-1))]]
+    assert found[tuple(lump)] == closed
+    assert not found[tuple(middle)]
+    assert not found[~inside].any()
+
+
+@pytest.mark.parametrize(("count", "needed"), [(1, 1), (4, 1), (5, 2), (8, 2), (9, 3), (40, 3)])
+def test_no_more_are_asked_for_than_a_quarter_of_the_cameras(count: int, needed: int) -> None:
+    """All look at the middle, and `needed` or one less of them at a place beside it."""
+    beside = np.array([0.85, 0.8, 1.05])
+    world, inside = centres()
+    lump = tuple(np.argwhere(inside)[np.argmin(np.linalg.norm(world[inside] - beside, axis=-1))])
+    for watching in (needed - 1, needed):
+        cameras = [*aimed(np.zeros(3), count - watching), *aimed(beside, watching)]
+        assert seldom_seen(SPACE, cameras, 3, SIDE)[lump] == (1 < needed > watching)
+    assert not seldom_seen(SPACE, cameras, 0, SIDE).any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
+def test_cameras_are_asked_once_each_far_ones_first(count: int) -> None:
+    order = spread_order(count)
+    assert sorted(order) == list(range(count))
+    assert count < 3 or abs(order[1] - order[0]) >= count // 2
+
+
+def narrow_scene(folder: Path) -> Scene:
+    """Photographs of a ball, of which nine are for training, whose corners of the box few of them show."""
+    s = load_scene(poses(folder, count=10, photographs=True))
+    s = replace(s, views=tuple(replace(view, camera=narrow(view.camera, 1.6)) for view in s.views))
+    save_scene(s, folder)
+    return s
+
+
+def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_path: Path) -> None:
+    s = narrow_scene(tmp_path / "poses")
+    made = job(tmp_path, balls.settings(iterations=30, refresh_rays=0.1), poses=tmp_path / "poses")
+    train.run(made)
+    m = load_renderer(made.out).model
+    cameras = [view.camera for view in views_of(s, "train")]
+    closed = torch.from_numpy(seldom_seen(space_of(s), cameras, 3, m.voxels.side))
+    assert 0.01 < float(closed.float().mean()) < 0.1
+    assert torch.equal(torch.isneginf(m.voxels.values), closed)
+    for prune in (False, True):
+        pixels = Pixels(cameras, [balls.photograph(c) for c in cameras], [None] * len(cameras), np.full(len(cameras), 1.0), np.full(len(cameras), 50.0))
+        rays = [torch.from_numpy(np.ascontiguousarray(a)) for a in pixels.bundle(np.arange(len(pixels)))[:4]]
+        seen = look(m, *rays, torch.full_like(rays[2], 0.5), m.behind(rays[1]), prune=prune, rng=np.random.default_rng(0))
+        at = (seen.coarse.point * m.voxels.side).long().clamp(0, m.voxels.side - 1)
+        assert len(at) > 100
+        assert not closed[at[:, 0], at[:, 1], at[:, 2]].any()
+
+
+def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_the_box(tmp_path: Path) -> None:
+    narrow_scene(tmp_path / "poses")
+    anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, observers=0), poses=tmp_path / "poses")
+    cut_out = job(tmp_path / "cut_out", balls.settings(iterations=2), poses=poses(tmp_path / "cut", count=10))
+    for made in (anywhere, cut_out):
+        train.run(made)
+        assert not torch.isneginf(load_renderer(made.out).model.voxels.values).any()
