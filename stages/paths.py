@@ -137,16 +137,27 @@ def occupied_points(tree: NerfTree) -> np.ndarray:
     return np.asarray(tree.ndc.world(near))
 
 
-def half_extent_seen(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> float:
-    """Tangent of half the vertical field of view in which all poses see the points (N, 3), but for a few strays; infinite where they stand among them.
+def extent_seen(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> tuple[float, float]:
+    """Tangents of half the vertical field of view in which all poses see the points (N, 3), but for a few strays, and of how far below the middle of their
+    view its middle has to lie for that; infinite and 0 where they stand among the points.
+
+    From above the near side of what lies flat takes up more of a picture than the far side does, which would be left empty as far up.
 
     aspect  width over height of the picture
     """
     local = np.stack([(points - pose[:3, 3]) @ pose[:3, :3] for pose in poses])  # (C, N, 3)
-    across, depth = np.maximum(np.abs(local[..., 0]) / aspect, np.abs(local[..., 1])), local[..., 2]
-    near = depth <= 0.02 * np.abs(local).max()
-    tangents = np.divide(across, depth, out=np.full_like(depth, np.inf), where=~near).max(axis=0)  # (N,)
-    return float(np.sort(tangents)[math.ceil((1.0 - STRAYS) * len(tangents)) - 1])
+    near = local[..., 2] <= 0.02 * np.abs(local).max()
+    depth = np.where(near, 1.0, local[..., 2])
+    x, y = local[..., 0] / depth, local[..., 1] / depth
+
+    def most(tangents: np.ndarray) -> float:
+        return float(np.sort(np.where(near, np.inf, tangents).max(axis=0))[math.ceil((1.0 - STRAYS) * len(points)) - 1])
+
+    above, below = most(-y), most(y)
+    if not math.isfinite(above + below):
+        return math.inf, 0.0
+    drop = 0.5 * (below - above)
+    return most(np.maximum(np.abs(x) / aspect, np.abs(y - drop))), drop
 
 
 def turntable_cameras(
@@ -164,7 +175,7 @@ def turntable_cameras(
 
     elevation  degrees; None: as the capture's cameras stood
     radius     distance from the centre in the capture's units; None: as the capture's cameras stood, or further where the asset would not fit
-    fov        vertical, degrees; None: so that the asset fits from everywhere
+    fov        vertical, degrees, about the centre; None: so that the asset fits from everywhere, with as much room below it as above
     sway       degrees; see turntable_poses
 
     For a forward-facing asset the path is a spiral among the capture's cameras, unless an elevation or a radius is asked for.
@@ -178,7 +189,7 @@ def turntable_cameras(
     widest = math.tan(math.radians(WIDEST_FIT / 2))
 
     def needed(poses: list[np.ndarray]) -> float:
-        return ROOM * half_extent_seen(poses, points, width / height)
+        return ROOM * extent_seen(poses, points, width / height)[0]
 
     poses = turntable_poses(orbit, frames, sway=sway)
     # Captures from one side show nothing of what lies beyond their pictures, so there the camera stays and the asset may leave the picture.
@@ -188,9 +199,11 @@ def turntable_cameras(
                 break
             orbit = Orbit(orbit.centre, 1.1 * orbit.radius, orbit.elevation, orbit.forward_facing, orbit.heading)
             poses = turntable_poses(orbit, frames, sway=sway)
-    half = min(widest, needed(poses)) if fov is None else math.tan(math.radians(fov / 2))
+    half, drop = extent_seen(poses, points, width / height)
+    half, drop = (min(widest, ROOM * half), drop) if fov is None else (math.tan(math.radians(fov / 2)), 0.0)
     focal = 0.5 * height / half
-    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]
+    lens = (focal, width / 2, height / 2 - focal * drop)
+    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
 
 
 def _spiral_cameras(tree: NerfTree, ndc: Ndc, frames: int, width: int, height: int, fov: float | None) -> list[Camera]:

@@ -20,7 +20,7 @@ class TurntableSettings:
     background: str = setting("white", "Colour behind the asset: white, black, transparent or #rrggbb. With transparent the video lies on white.")
     elevation: float | None = setting(None, "Angle above the horizon; none: as the capture's cameras stood.", minimum=-90, maximum=90, unit="degrees")
     radius: float | None = setting(None, "Distance from the centre in the capture's units; none: as the cameras stood, further if needed.", minimum=1e-9)
-    fov: float | None = setting(None, "Vertical field of view; none: so that the asset fits.", minimum=1, maximum=160, unit="degrees")
+    fov: float | None = setting(None, "Vertical field of view; none: so that the asset fits, its middle in the middle.", minimum=1, maximum=160, unit="degrees")
     sway: float = setting(10.0, "How far the camera swings about the middle for captures taken from one side.", minimum=0, maximum=90, unit="degrees")
     supersample: int = setting(1, "Rays along each side of a pixel.", minimum=1, maximum=8)
     crf: int = setting(18, "Quality of the video: 0 is lossless, 51 the worst.", minimum=0, maximum=51)
@@ -54,4 +54,4 @@ def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # a
         shutil.copyfile(path, job.out / path.name)
 
 
-STAGE = Stage(name="turntable", version=1, settings=TurntableSettings, needs=("bake",), run=run)
+STAGE = Stage(name="turntable", version=2, settings=TurntableSettings, needs=("bake",), run=run)

@@ -53,6 +53,32 @@ def test_turntable_shows_the_whole_asset_without_wasting_the_picture(tree: BallT
     assert math.degrees(azimuths[0]) == pytest.approx(90.0)
 
 
+@pytest.mark.parametrize("layer", [3, 8, 12])
+@pytest.mark.parametrize("forward_facing", [False, True])
+def test_what_lies_flat_is_seen_with_as_much_room_above_as_below(layer: int, forward_facing: bool) -> None:
+    """A floor at any height of the box, and the picture no wider than it is high: the room at the sides decides nothing."""
+
+    class Floor(BallTree):
+        @property
+        def brick_index(self) -> np.ndarray:
+            index = np.full(self.shape, -1, np.int32)
+            index[:, 5:11, layer] = np.arange(16 * 6).reshape(16, 6)
+            return index
+
+    tree = Floor(forward_facing=forward_facing)
+    cells = np.argwhere(tree.brick_index >= 0)
+    points = tree.bounds_min + (cells + 0.5) * tree.brick * tree.voxel
+    for size in ((400, 100), (100, 100)):
+        cameras = turntable_cameras(tree, frames=12, width=size[0], height=size[1], sway=5.0)
+        seen = np.stack([project(camera, points)[0] for camera in cameras]) / size
+        above, below = seen[..., 1].min(), 1 - seen[..., 1].max()
+        assert above == pytest.approx(below, abs=0.01)
+        assert 0 < min(above, seen[..., 0].min(), 1 - seen[..., 0].max()) < 0.06, "and fills it one way or the other"
+        assert {camera.params[2] for camera in cameras} == {cameras[0].params[2]}, "the picture does not sway"
+    asked = turntable_cameras(tree, frames=1, width=64, height=48, fov=50.0)[0]
+    assert asked.params[1:] == (32, 24)
+
+
 def test_turntable_of_a_capture_from_one_side_stays_near_the_heading() -> None:
     cameras = turntable_cameras(BallTree(forward_facing=True), frames=20, width=64, height=48, sway=10.0)
     azimuths = np.degrees([math.atan2(*camera.centre[1::-1]) for camera in cameras])
