@@ -97,12 +97,12 @@ def default_field() -> Any:
 
 
 def field_kernels(seconds: float) -> dict[str, Any]:
-    """The encoding, and the field's passes as a whole; the network is what is left of these."""
+    """The encoding, the network, and the field's passes as a whole."""
     import numpy as np
     import torch
 
     from efficientnerf.fields.hash import FEATURES
-    from efficientnerf.kernels import cpu_hash
+    from efficientnerf.kernels import cpu_hash, cpu_mlp
     from efficientnerf.kernels.mlp import has_bfloat16
 
     field, rng = default_field(), np.random.default_rng(0)
@@ -120,16 +120,22 @@ def field_kernels(seconds: float) -> dict[str, Any]:
     forth = best(lambda: cpu_hash.encode(across, field.table.detach().numpy(), *levels, features), seconds)
     back = best(lambda: cpu_hash.encode_backward(across, pull, *levels, table_grad), seconds)
 
-    towards = torch.randn(count, field.weights[-1].shape[0])
-    products = 2 * count * sum(w.numel() for w in field.weights)
     wide = 2 if has_bfloat16("cpu") and field.precision != "float32" else 4
-    activations = wide * count * sum(w.shape[1] for w in field.weights)
-    both = best(lambda: field(points).backward(towards), seconds)
+    weights = [weight.detach().numpy() for weight in field.weights]
+    products, activations = 2 * count * sum(w.size for w in weights), wide * count * sum(len(w) for w in weights[:-1])
+    out, towards = np.empty((count, len(weights[-1])), np.float32), rng.normal(size=(count, len(weights[-1]))).astype(np.float32)
+    prepared = cpu_mlp.prepared(weights, bfloat16=wide == 2)
+    kept = cpu_mlp.forward(features, prepared, 0.0, out, keep=True)
+    through = best(lambda: cpu_mlp.forward(features, prepared, 0.0, out, keep=True), seconds)
+    again = best(lambda: cpu_mlp.backward(towards, features, prepared, kept, [w.shape for w in weights]), seconds)
+    both = best(lambda: field(points).backward(torch.from_numpy(towards)), seconds)
+    ends = features.nbytes + out.nbytes
     return {
         "encode": row(count, forth, corners * 8 + features.nbytes, corners * 4),
         "encode backward": row(count, back, corners * 16 + features.nbytes, corners * 4),
-        "network, forward and backward": row(count, max(both - forth - back, 0.0), 6.0 * activations, 3.0 * products),
-        "field, forward and backward": row(count, both, corners * 24 + 6.0 * activations, 3.0 * products),
+        "network": row(count, through, ends + activations, products),
+        "network backward": row(count, again, ends + features.nbytes + activations, 2.0 * products),
+        "field, forward and backward": row(count, both, corners * 24 + 2 * ends + 2 * features.nbytes + 2 * activations, 3.0 * products),
     }
 
 
@@ -184,7 +190,7 @@ def adam_kernel(seconds: float) -> dict[str, Any]:
     """A step on the table of which two thirds of the entries have a gradient, which it clears: the time to fill it again is taken off."""
     import numpy as np
 
-    from efficientnerf.kernels import cpu_network
+    from efficientnerf.kernels import cpu_adam
 
     entries, size = default_field().table.shape[0], default_field().table.numel()
     value, first_moment, second_moment = (np.zeros(size, np.float32) for _ in range(3))
@@ -196,7 +202,7 @@ def adam_kernel(seconds: float) -> dict[str, Any]:
 
     def adam() -> None:
         np.copyto(grad, kept)
-        cpu_network.adam(value, grad, first_moment, second_moment, *numbers, True)
+        cpu_adam.adam(value, grad, first_moment, second_moment, *numbers, True)
 
     return {"Adam (entries of the table)": row(entries, best(adam, seconds) - refill, 7.0 * grad.nbytes)}
 

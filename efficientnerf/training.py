@@ -3,9 +3,9 @@
 Every random choice of step n is drawn from a generator seeded by (seed, n), so a resumed run makes the choices of an uninterrupted one without
 any state to restore. What is restored: parameters, Adam's moments, density voxels, the running average that sets the number of rays.
 
-On a CPU the same seed gives the same bytes again with the same number of threads of torch. Our own kernels do not depend on the number; matrix products
-(oneDNN, MKL) may sum in another order with another one, and are in bfloat16 only where the processor has it, so that another machine's result is another
-one of the same quality.
+On a CPU the same seed gives the same bytes again with the same number of threads of torch. Our own kernels, the hash field's network among them, do not
+depend on the number; matrix products of the paper's networks (oneDNN, MKL) may sum in another order with another one. Either are in bfloat16 only where the
+processor has it, so that another machine's result is another one of the same quality.
 
 R rays, C views.
 """
@@ -71,10 +71,10 @@ class Adam:
             first, second = self.moments[name]
             sparse = name.endswith("table")
             if p.device.type == "cpu":
-                from efficientnerf.kernels import cpu_network
+                from efficientnerf.kernels import cpu_adam
 
                 flat = [t.detach().view(-1).numpy() for t in (p, p.grad.contiguous(), first, second)]
-                cpu_network.adam(*flat, *(np.float32(x) for x in (rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
+                cpu_adam.adam(*flat, *(np.float32(x) for x in (rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
             elif dispatch.on_device(p, p.grad):
                 from efficientnerf.kernels import cuda
 

@@ -17,12 +17,9 @@ from torch import Tensor, nn
 from efficientnerf.harmonics import harmonics_count
 from efficientnerf.kernels.cpu import PRIME_Y, PRIME_Z
 from efficientnerf.kernels.dispatch import on_device
-from efficientnerf.kernels.mlp import precision_of, product
-from efficientnerf.kernels.rows import chunks_of, side_by_side
+from efficientnerf.kernels.mlp import precision_of
 
 FEATURES = 2
-ROWS = 4096  # in a chunk at most: activations 64 wide of one layer take 512 KiB in bfloat16
-GRAIN = 256  # to a multiple of which a chunk is padded
 
 
 class HashField(nn.Module):
@@ -131,85 +128,29 @@ class _Encode(torch.autograd.Function):
 
 
 class _Network(torch.autograd.Function):
-    """Encoding and network: (N, 3) to (N, O), products in `precision`, the logarithm of the density to begin with added to the first output.
-
-    Rows go through all layers in chunks, side by side (`efficientnerf.kernels.rows`). Features stay in columns, as the encoding wants them: the first
-    product reads them turned, and the gradient of its weights and theirs come out turned back.
-    """
+    """Encoding and network: (N, 3) to (N, O), products in `precision`, the logarithm of the density to begin with added to the first output."""
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, field: HashField, precision: torch.dtype, *weights: Tensor) -> Tensor:
-        from efficientnerf.kernels import cpu_network
+        from efficientnerf.kernels import cpu_mlp
 
         at, features = _encoded(points, table, field)
-        count, wide = len(points), precision == torch.float32
-        small = [weight.detach().to(precision) for weight in weights]
-        out = torch.empty(count, len(small[-1]))
-        shown, offset = out.numpy(), np.float32(field.log_initial_density)
-        keep = any(ctx.needs_input_grad)
-
-        def pass_on(chunk: slice) -> list[Tensor]:
-            x = _padded(features[:, chunk], precision)  # (2L, M)
-            layers, y = [x], x.t()
-            if len(small) > 1:
-                y = torch.mm(y, small[0].t())
-                cpu_network.relu(_bits(y).reshape(-1))
-                layers.append(y)
-            for weight in small[1:-1]:
-                y = product(y, weight, None, True)
-                layers.append(y)
-            cpu_network.widen(_bits(torch.mm(y, small[-1].t())), wide, offset, shown[chunk])
-            return layers if keep else []
-
-        chunks = chunks_of(count, ROWS)
-        kept = side_by_side(pass_on, chunks)
-        if keep:
-            ctx.at, ctx.chunks, ctx.kept, ctx.small, ctx.table, ctx.field, ctx.wide = at, chunks, kept, small, table, field, wide
+        prepared = cpu_mlp.prepared([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
+        out = torch.empty(len(points), len(weights[-1]))
+        kept = cpu_mlp.forward(features.numpy(), prepared, field.log_initial_density, out.numpy(), keep=any(ctx.needs_input_grad))
+        if any(ctx.needs_input_grad):
+            ctx.at, ctx.features, ctx.kept, ctx.prepared, ctx.table, ctx.field = at, features, kept, prepared, table, field
+            ctx.shapes = [tuple(weight.shape) for weight in weights]
         return out
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        from efficientnerf.kernels import cpu_network
+        from efficientnerf.kernels import cpu_mlp
 
-        small, wide = ctx.small, ctx.wide
-        features = torch.empty(small[0].shape[1], len(grad))
-        given = _bits(grad.contiguous())
-
-        def pass_back(chunk: tuple[slice, list[Tensor]]) -> list[Tensor]:
-            rows, (x, *layers) = chunk
-            pull = torch.empty(x.shape[1], grad.shape[1], dtype=x.dtype)
-            cpu_network.narrow(given[rows], wide, _bits(pull))
-            of_weights = []
-            for y, weight in zip(reversed(layers), reversed(small[1:]), strict=True):
-                of_weights.append(torch.mm(pull.t(), y))
-                pull = torch.mm(pull, weight)
-                cpu_network.relu_backward(_bits(y).reshape(-1), _bits(pull).reshape(-1))
-            of_weights.append(torch.mm(x, pull).t())
-            features[:, rows] = torch.mm(small[0].t(), pull.t())[:, : rows.stop - rows.start]
-            return of_weights[::-1]
-
-        of_weights = [torch.zeros(weight.shape) for weight in small]
-        for of_chunk in side_by_side(pass_back, list(zip(ctx.chunks, ctx.kept, strict=True))):
-            for total, part in zip(of_weights, of_chunk, strict=True):
-                total += part
-        _add_table_gradient(ctx.at, features, ctx.table, ctx.field)
-        return None, None, None, None, *of_weights
-
-
-def _padded(x: Tensor, dtype: torch.dtype) -> Tensor:
-    """Columns (C, N) filled up with zeros to a multiple of `GRAIN`.
-
-    oneDNN prepares code for each new shape, which costs more than the product itself, and each step has another number of samples.
-    """
-    out = torch.empty(len(x), -(-x.shape[1] // GRAIN) * GRAIN, dtype=dtype)
-    out[:, : x.shape[1]] = x
-    out[:, x.shape[1] :] = 0
-    return out
-
-
-def _bits(x: Tensor) -> np.ndarray:
-    """The memory of a contiguous tensor of 16 or 32-bit floats as whole numbers."""
-    return x.view(torch.int16 if x.element_size() == 2 else torch.int32).numpy()
+        pull, of_weights = cpu_mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
+        ctx.kept = None
+        _add_table_gradient(ctx.at, torch.from_numpy(pull), ctx.table, ctx.field)
+        return None, None, None, None, *map(torch.from_numpy, of_weights)
 
 
 def encode_reference(points: Tensor, table: Tensor, sides: np.ndarray, dense: np.ndarray, starts: np.ndarray, mask: int) -> Tensor:

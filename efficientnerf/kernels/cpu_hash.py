@@ -2,7 +2,8 @@
 
 Features lie by level and not by sample, (2L, N), and so do points, (3, N): the places and weights of a block of samples are then computed in
 vector registers into a small buffer, and what is left for each corner is one load (or one addition) in the table. A thread goes through all its
-samples level by level, so that the part of the table in use, about 1 MiB at 2^17 entries, stays in its cache.
+samples level by level, so that the part of the table in use, 1 MiB at 2^17 entries and 4 at 2^19, stays in a cache. Adam leaves none of it there; as
+samples jump about in it, the first of them would wait for memory one after the other. So a level is read once in the order of memory before.
 
 Forward, each sample is on its own. Backward, a level belongs to one thread, and its samples are added in their order. So the bytes depend neither on
 timing nor on the number of threads.
@@ -14,8 +15,11 @@ import numba
 import numpy as np
 
 from efficientnerf.kernels.cpu import PRIME_Y, PRIME_Z
+from efficientnerf.kernels.entries import LINE, add_to_entries, interpolated_entry, touch
+from efficientnerf.kernels.lanes import pointer
 
 BLOCK = 128  # samples whose places and weights are computed together
+LINES_TOUCHED = 4  # by a sample in a level, about: neighbours along x are mostly in one cache line
 SHARE = 2**15  # samples of a task, at most: 24 features of as many take 3 MiB
 
 
@@ -47,14 +51,25 @@ def _places(points, first, count, side, begin, dense, mask, place, weight):  # t
             place[6, n], place[7, n] = start + ((x1 ^ y1 ^ z0) & mask), start + ((x1 ^ y1 ^ z1) & mask)
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _load_level(entries, side, dense, start, mask, samples):  # type: ignore[no-untyped-def]
+    """Bring a level into the caches in the order of memory, if samples touch about all of it."""
+    count = side**3 if dense else np.int64(mask) + 1
+    if LINES_TOUCHED * samples * LINE >= count:
+        for at in range(start, start + count, LINE):
+            touch(entries, 2 * at)
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _encode(points, table, sides, dense, starts, mask, tasks, out):  # type: ignore[no-untyped-def]
     samples = points.shape[1]
-    share = (samples + tasks - 1) // tasks
+    share, entries = (samples + tasks - 1) // tasks, pointer(table)
     for task in numba.prange(tasks):
         place, weight = np.empty((8, BLOCK), np.uint32), np.empty((8, BLOCK), np.float32)
+        p_place, p_weight = pointer(place), pointer(weight)
         end = min(samples, (task + 1) * share)
         for level in range(len(sides)):
+            _load_level(entries, sides[level], dense[level], starts[level], mask, end - task * share)
             for first in range(task * share, end, BLOCK):
                 count = min(BLOCK, end - first)
                 # Two calls, so that the inner loop of each is free of branches.
@@ -63,11 +78,7 @@ def _encode(points, table, sides, dense, starts, mask, tasks, out):  # type: ign
                 else:
                     _places(points, first, count, sides[level], starts[level], False, mask, place, weight)
                 for n in range(count):
-                    a = b = np.float32(0)
-                    for c in range(8):
-                        at = place[c, n]
-                        a += weight[c, n] * table[at, 0]
-                        b += weight[c, n] * table[at, 1]
+                    a, b = interpolated_entry(entries, p_place, p_weight, n, BLOCK)
                     out[2 * level, first + n], out[2 * level + 1, first + n] = a, b
 
 
@@ -80,10 +91,12 @@ def encode(points: np.ndarray, table: np.ndarray, sides: np.ndarray, dense: np.n
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _encode_backward(points, grad, sides, dense, starts, mask, order, table_grad):  # type: ignore[no-untyped-def]
-    samples = points.shape[1]
+    samples, entries = points.shape[1], pointer(table_grad)
     for task in numba.prange(len(order)):
         level = order[task]
         place, weight = np.empty((8, BLOCK), np.uint32), np.empty((8, BLOCK), np.float32)
+        p_place, p_weight = pointer(place), pointer(weight)
+        _load_level(entries, sides[level], dense[level], starts[level], mask, samples)
         for first in range(0, samples, BLOCK):
             count = min(BLOCK, samples - first)
             if dense[level]:
@@ -91,11 +104,7 @@ def _encode_backward(points, grad, sides, dense, starts, mask, order, table_grad
             else:
                 _places(points, first, count, sides[level], starts[level], False, mask, place, weight)
             for n in range(count):
-                a, b = grad[2 * level, first + n], grad[2 * level + 1, first + n]
-                for c in range(8):
-                    at = place[c, n]
-                    table_grad[at, 0] += weight[c, n] * a
-                    table_grad[at, 1] += weight[c, n] * b
+                add_to_entries(entries, p_place, p_weight, n, BLOCK, grad[2 * level, first + n], grad[2 * level + 1, first + n])
 
 
 def encode_backward(

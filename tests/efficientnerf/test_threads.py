@@ -16,6 +16,7 @@ import numpy as np
 
 from efficientnerf.training import state_of, train, trainer
 from tests.efficientnerf.balls import pixels, untrained
+from tests.efficientnerf.test_cpu_mlp import passes, weights_of
 from tests.efficientnerf.trees import random_tree, rays_at
 
 print(numba.get_num_threads())
@@ -23,6 +24,12 @@ t = trainer(untrained(contracted=True, iterations=5, warm_up=2))
 list(train(t, pixels()))
 for name, tensor in sorted(state_of(t).items()):
     print(name, hashlib.sha256(tensor.numpy().tobytes()).hexdigest())
+rng = np.random.default_rng(2)
+weights = weights_of(24, 64, 2, 28, rng)
+features, grad = rng.normal(size=(24, 9001)).astype(np.float32), rng.normal(size=(9001, 28)).astype(np.float32)
+for bfloat16 in (False, True):
+    for values in passes(features, weights, grad, bfloat16):
+        print(hashlib.sha256(values.tobytes()).hexdigest())
 tree = random_tree()
 seen = tree.render_rays(*rays_at(tree, 3000))
 points = np.random.default_rng(0).uniform(tree.bounds_min, tree.bounds_max, (5000, 3))

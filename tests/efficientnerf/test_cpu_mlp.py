@@ -1,0 +1,219 @@
+"""The hash field's network in tiles: products and passes are those of numpy and autograd, in both precisions, for every size, on any processor."""
+
+from __future__ import annotations
+
+import copy
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.fields import hash as hash_module
+from efficientnerf.kernels import cpu_mlp, tiles
+from efficientnerf.kernels.lanes import pointer
+
+ROOT = Path(__file__).resolve().parents[2]
+SHAPES = [(24, 64, 2, 28), (24, 32, 1, 1), (6, 8, 1, 13), (2, 40, 3, 4), (10, 20, 4, 49), (34, 100, 2, 16)]  # inputs, width, hidden layers, outputs
+
+
+def weights_of(inputs: int, width: int, layers: int, outputs: int, rng: np.random.Generator) -> list[np.ndarray]:
+    shapes = [(width, inputs), *[(width, width)] * (layers - 1), (outputs, width)]
+    return [(rng.normal(size=shape) * np.sqrt(2 / shape[1])).astype(np.float32) for shape in shapes]
+
+
+class Rounding(torch.autograd.Function):
+    """To bfloat16, as the kernels round: values on the way forward, and what comes back if `both`."""
+
+    @staticmethod
+    def forward(ctx: Any, value: torch.Tensor, both: bool) -> torch.Tensor:
+        ctx.both = both
+        return value.bfloat16().double()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return grads[0].bfloat16().double() if ctx.both else grads[0], None
+
+
+def expected(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, bfloat16: bool) -> list[torch.Tensor]:
+    """Outputs, and gradients of features and weights, in float64 but for bfloat16's roundings."""
+
+    def narrow(value: torch.Tensor, both: bool = False) -> torch.Tensor:
+        return Rounding.apply(value, both) if bfloat16 else value  # type: ignore[no-any-return, no-untyped-call]
+
+    x = torch.tensor(features, dtype=torch.float64, requires_grad=True)
+    parameters = [torch.tensor(weight, dtype=torch.float64, requires_grad=True) for weight in weights]
+    y = narrow(x.t())
+    for weight in parameters[:-1]:
+        y = torch.relu(narrow(y @ narrow(weight).t(), both=True))
+    out = y @ narrow(parameters[-1]).t()
+    out.backward(narrow(torch.tensor(grad, dtype=torch.float64)))
+    return [out.detach(), x.grad, *(w.grad for w in parameters)]  # type: ignore[list-item]
+
+
+def passes(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, bfloat16: bool, offset: float = 0.0) -> list[np.ndarray]:
+    prepared = cpu_mlp.prepared(weights, bfloat16)
+    out = np.full((features.shape[1], len(weights[-1])), np.nan, np.float32)
+    kept = cpu_mlp.forward(features, prepared, offset, out, keep=True)
+    pull, of_weights = cpu_mlp.backward(grad, features, prepared, kept, [w.shape for w in weights])
+    return [out, pull, *of_weights]
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_passes_are_those_of_autograd(shape: tuple[int, int, int, int], bfloat16: bool) -> None:
+    """With as many samples as fill no block, one block, blocks and a rest, and chunks and a rest."""
+    rng = np.random.default_rng(0)
+    weights = weights_of(*shape, rng)
+    for samples in (1, 64, 64 + 16, 2 * cpu_mlp.CHUNK + 129):
+        features, grad = rng.normal(size=(shape[0], samples)).astype(np.float32), rng.normal(size=(samples, shape[3])).astype(np.float32)
+        for ours, theirs in zip(passes(features, weights, grad, bfloat16), expected(features, weights, grad, bfloat16), strict=True):
+            error = np.linalg.norm(ours - theirs.numpy()) / np.linalg.norm(theirs.numpy())
+            # bfloat16: sums that round to either side, and ReLUs close to zero that fall to the other.
+            assert error < (1e-2 if bfloat16 else 1e-6), (samples, ours.shape)
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_nothing_beside_the_outputs_is_written_and_none_left_out(bfloat16: bool) -> None:
+    rng = np.random.default_rng(1)
+    for inputs, width, layers, outputs in SHAPES:
+        weights = weights_of(inputs, width, layers, outputs, rng)
+        for samples in (0, 1, 63, 64, 65, cpu_mlp.CHUNK + 1):
+            features = rng.normal(size=(inputs, samples)).astype(np.float32)
+            around = np.full((samples + 2 * outputs + 32, outputs), 7, np.float32)
+            out = around[outputs : outputs + samples]
+            out[:] = np.nan
+            prepared = cpu_mlp.prepared(weights, bfloat16)
+            assert cpu_mlp.forward(features, prepared, 0.5, out, keep=False).size == 0
+            assert (around[:outputs] == 7).all()
+            assert (around[outputs + samples :] == 7).all()
+            kept = np.full((samples, outputs), np.nan, np.float32)
+            cpu_mlp.forward(features, prepared, 0.5, kept, keep=True)
+            assert np.isfinite(out).all()
+            assert np.array_equal(out, kept)
+
+
+def test_the_offset_is_added_to_the_first_output_alone() -> None:
+    rng = np.random.default_rng(3)
+    weights, features, grad = weights_of(8, 16, 1, 5, rng), rng.normal(size=(8, 100)).astype(np.float32), np.ones((100, 5), np.float32)
+    without, with_it = passes(features, weights, grad, False)[0], passes(features, weights, grad, False, 2.5)[0]
+    np.testing.assert_allclose(with_it - without, np.tile([2.5, 0, 0, 0, 0], (100, 1)), atol=1e-5)
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_what_is_no_number_stays_none(bfloat16: bool) -> None:
+    """A loss that is lost must show, and not be hidden by a ReLU or a rounding."""
+    rng = np.random.default_rng(4)
+    weights, features, grad = weights_of(8, 16, 2, 5, rng), rng.normal(size=(8, 100)).astype(np.float32), np.ones((100, 5), np.float32)
+    features[3, 70] = np.nan
+    grad[20, 2] = np.nan
+    out, pull, *of_weights = passes(features, weights, grad, bfloat16)
+    assert np.isnan(out[70]).all()
+    assert np.isfinite(np.delete(out, 70, axis=0)).all()
+    assert np.isnan(pull[:, 20]).all()
+    assert all(np.isnan(w).any() for w in of_weights)
+
+
+@numba.njit
+def _narrow(x, out):  # type: ignore[no-untyped-def]
+    tiles.narrowed(pointer(x), 0, x.shape[1], x.shape[1], pointer(out), out.shape[0], out.shape[1])
+
+
+@numba.njit
+def _pair(x, out):  # type: ignore[no-untyped-def]
+    tiles.pairs_of_rows(pointer(x), 0, x.shape[1], x.shape[1], pointer(out), out.shape[0], out.shape[1])
+
+
+@numba.njit
+def _turn(x, out):  # type: ignore[no-untyped-def]
+    tiles.turn(pointer(x), 0, x.shape[1], pointer(out), 0, out.shape[1])
+
+
+def test_narrowing_rounds_as_torch_does() -> None:
+    special = torch.tensor([0.0, -0.0, 1.0, float("inf"), -float("inf"), float("nan"), 3.3895e38, 2.0**-126, -1.0039062, 1.0117188])
+    x = torch.cat([special, torch.randn(998, generator=torch.Generator().manual_seed(0))]).reshape(21, 48)
+    x.view(torch.int32)[20, 46:] = torch.tensor([0x7FFFFFFF, -1], dtype=torch.int32)  # none, whose bits a rounding would carry over into numbers
+    out = np.full(x.shape, 7, np.int16)
+    _narrow(x.numpy(), out)
+    torch.testing.assert_close(torch.from_numpy(out).view(torch.bfloat16), x.bfloat16(), rtol=0, atol=0, equal_nan=True)
+    paired = np.empty((10, 48), np.int32)
+    _pair(x.numpy(), paired)
+    assert np.array_equal(paired.view(np.int16).reshape(10, 48, 2), np.stack([out[:20:2], out[1:20:2]], axis=2))
+    again = np.empty((10, 48), np.int32)
+    _pair(out, again)
+    assert np.array_equal(again, paired)
+
+
+def test_rows_are_filled_with_zeros() -> None:
+    x = np.arange(1, 1 + 8 * 5, dtype=np.float32).reshape(8, 5)
+    expected = np.pad(x[:4], ((0, 0), (0, 11)))
+    wide = np.full((4, 16), 7, np.float32)  # whole vectors reach into the rows after these
+    _narrow(x, wide)
+    assert np.array_equal(wide, expected)
+    narrow = np.full((4, 16), 7, np.int16)
+    _narrow(x, narrow)
+    assert np.array_equal(narrow, torch.from_numpy(expected).bfloat16().view(torch.int16).numpy())
+    paired = np.full((2, 16), 7, np.int32)
+    _pair(x, paired)
+    assert np.array_equal(paired.view(np.int16).reshape(2, 16, 2), np.stack([narrow[::2], narrow[1::2]], axis=2))
+
+
+def test_turning() -> None:
+    x = np.arange(16 * 20, dtype=np.float32).reshape(16, 20)
+    out = np.zeros((16, 30), np.float32)
+    _turn(x, out)
+    assert np.array_equal(out[:, :16], x[:, :16].T)
+    assert not out[:, 16:].any()
+
+
+PROGRAM = """
+import sys
+import numpy as np
+from efficientnerf.kernels import tiles
+from tests.efficientnerf.test_cpu_mlp import passes, weights_of
+
+assert not tiles.DOTS and tiles.VECTORS == 1
+rng = np.random.default_rng(5)
+weights = weights_of(24, 64, 2, 28, rng)
+features, grad = rng.normal(size=(24, 200)).astype(np.float32), rng.normal(size=(200, 28)).astype(np.float32)
+np.savez(sys.argv[1], *passes(features, weights, grad, True))
+"""
+
+
+def test_a_processor_without_wide_registers_says_the_same(tmp_path: Path) -> None:
+    """Compiled for the oldest there is of this kind: pairs are multiplied in float32, and tiles are small."""
+    environment = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
+    subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path / "out.npz")], cwd=ROOT, env=environment, check=True)
+    rng = np.random.default_rng(5)
+    weights = weights_of(24, 64, 2, 28, rng)
+    features, grad = rng.normal(size=(24, 200)).astype(np.float32), rng.normal(size=(200, 28)).astype(np.float32)
+    with np.load(tmp_path / "out.npz") as there:
+        for here, other in zip(passes(features, weights, grad, True), there.values(), strict=True):
+            assert np.linalg.norm(here - other) < 1e-2 * np.linalg.norm(here)
+
+
+@pytest.mark.parametrize(("precision", "near"), [("float32", 1e-5), ("bfloat16", 3e-2)])
+@pytest.mark.parametrize("layers", [1, 2, 3])
+def test_the_field_is_that_of_plain_torch(precision: str, near: float, layers: int) -> None:
+    """The same field in float64 goes through autograd alone."""
+    generator = torch.Generator().manual_seed(0)
+    field = hash_module.HashField(
+        levels=3, log2_table=10, coarsest=4, finest=16, hidden=16, layers=layers, degree=1, initial_density=0.5, generator=generator, precision=precision
+    )
+    field.table.data.normal_(generator=generator)
+    plain = copy.deepcopy(field).double()
+    at = torch.rand(777, 3, generator=generator)
+    towards = torch.randn(777, 13, generator=generator)
+    ours, theirs = field(at), plain(at.double())
+    (ours * towards).sum().backward()
+    (theirs * towards).sum().backward()
+    assert (ours - theirs).norm() < near * theirs.norm()
+    for mine, its in zip(field.parameters(), plain.parameters(), strict=True):
+        assert mine.grad is not None
+        assert its.grad is not None
+        assert (mine.grad - its.grad).norm() < 5 * near * its.grad.norm()  # ReLUs close to zero fall to the other side
