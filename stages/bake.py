@@ -19,6 +19,7 @@ from pipeline.stage import Job, Stage
 from stages.settings import setting
 
 if TYPE_CHECKING:
+    from efficientnerf.grid import Space
     from efficientnerf.nerftree.baking import Visible
     from efficientnerf.pixels import Pixels
     from stages.forward import Forward
@@ -42,14 +43,19 @@ class BakeSettings:
     )  # fmt: skip
     max_resolution: int | None = setting(
         None, "the most voxels along the longest side that are chosen by themselves; none: 1024 for cut-out objects, 384 where surroundings are learned"
-        " (512 in normalised device coordinates)",
+        " (1024 in normalised device coordinates)",
         minimum=32, maximum=4096,
+    )  # fmt: skip
+    ndc_depth: float | None = setting(
+        None, "in normalised device coordinates, how many times as deep as wide a voxel is; none: 2, or 1 where train.discretise has voxels of its own",
+        minimum=1.0, maximum=8.0,
     )  # fmt: skip
     brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
     pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
     weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
-    max_mib: int = setting(
-        24, "how large the asset may get; its resolution follows, and the time about in proportion; where that is set, the lightest voxels are left out",
+    max_mib: int | None = setting(
+        None, "how large the asset may get; its resolution follows, and the time about in proportion; where that is set, the lightest voxels are left out;"
+        " none: 24, and in normalised device coordinates 36 bytes for each pixel that the cameras show, but 24 at least and 56 at most",
         minimum=1, unit="MiB",
     )  # fmt: skip
     layout: str = setting(
@@ -91,6 +97,7 @@ def run(job: Job) -> None:
     from stages.field import load_renderer
     from stages.memory import refuse_more_than_fits
     from stages.optimisation import optimised
+    from stages.resolution import budget_of
     from stages.train import pixels_of, use_all_cores
 
     settings: BakeSettings = job.settings
@@ -101,10 +108,12 @@ def run(job: Job) -> None:
 
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
-    bounds = m.space.bounds
+    depth, mib = _depth_of(job, m), budget_of(s, settings.max_mib)
+    space = m.space if depth == 1 else baking.flattened(m.space, depth)
+    bounds = space.bounds
     low = np.asarray(bounds[0], np.float64)
     pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
-    choice, seen, indices = _chosen(job, m, s, pixels)
+    choice, seen, indices = _chosen(job, m, s, pixels, space, mib)
     resolution = choice.resolution
     if settings.lookup == "nearest" and m.settings.discretise not in (0, resolution):
         job.warn(f"bake.resolution={resolution}, but the field was trained on train.discretise={m.settings.discretise}: on other voxels than are baked")
@@ -113,23 +122,23 @@ def run(job: Job) -> None:
 
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
-    refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, resolution, settings.max_mib)
+    refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, resolution, mib)
     shape, voxel = baking.grid_of(bounds, resolution, settings.brick)
     job.say(f"{resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
-    points = 0 if m.settings.discretise == resolution else settings.points
+    points = 0 if m.settings.discretise == resolution and depth == 1 else settings.points
     facts = metadata_of(s, settings, m)
     plain = behind_of(s)
     if plain is None:
         targets = Targets(pixels, None, seen.chosen, seen.before, seen.behind)
     else:
         targets = Targets(pixels, plain, infinite=s.background is None)
-    most = writing.most_voxels(settings.max_mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
+    most = writing.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
     # The raw values go in without a name here: they are large, and not needed once the fitting has its own.
     tree, fitted = optimised(
         job,
         tree_from_voxels(
-            shape, voxel, low, indices, *_values(job, m, indices, voxel, low, points),
-            brick=settings.brick, background=s.background, metadata=facts, ndc=m.space.ndc, lookup=settings.lookup,
+            shape, voxel, low, indices, *_values(job, m, indices, voxel, low, points, space),
+            brick=settings.brick, background=s.background, metadata=facts, ndc=space.ndc, lookup=settings.lookup,
         ),
         targets, most,
     )  # fmt: skip
@@ -137,7 +146,7 @@ def run(job: Job) -> None:
     format.save(tree.with_metadata(provenance=provenance), job.out / ASSET, settings.layout)
     size = (job.out / ASSET).stat().st_size
     report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size, "optimisation": fitted}
-    report |= {"voxels_along_longest_side": resolution, "resolution_decided_by": choice.why}
+    report |= {"voxels_along_longest_side": resolution, "resolution_decided_by": choice.why, "max_mib": mib}
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
@@ -193,33 +202,53 @@ def spiral_of(forward: Forward) -> dict[str, Any]:
     }
 
 
+# How much deeper than wide voxels are in normalised device coordinates, where a cube's depth means a voxel's width of parallax between the outermost
+# cameras. Held-back views of fern_4 in 24 MiB with 1: 23.32 dB; 2: 23.50. With 4 training pixels were behind those of 2
+# by 0.15 dB halfway through the fit.
+NDC_DEPTH = 2.0
+
+
+def _depth_of(job: Job, m: Any) -> float:
+    """How many times as deep as wide voxels are; 1 but in normalised device coordinates."""
+    given, discretise = job.settings.ndc_depth, m.settings.discretise
+    if m.space.ndc is None:
+        if given is not None:
+            job.warn("bake.ndc_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes")
+        return 1.0
+    if given is None:
+        return 1.0 if discretise else NDC_DEPTH
+    if discretise and given != 1:
+        job.warn(f"bake.ndc_depth={given:g}, but the field was trained on train.discretise={discretise}: on other voxels than are baked")
+    return float(given)
+
+
 SPARE = 2  # so many times the voxels that there is room for are baked at most: the tree itself then shows which of them matter
 # And so many at a resolution that is chosen: few of the grown voxels show. More are too many where the budget is large: chair_200 in 1 MiB with 1.7 times
 # 35.4 dB, 2.4: 36.2; but chair_800 in 24 MiB with 1.4 times 31.9 dB, 2.4: 31.8.
 DENSE = 1.7
 
 
-def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels) -> tuple[Choice, Visible, np.ndarray]:
+def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) -> tuple[Choice, Visible, np.ndarray]:
     """The resolution, what the network shows, and the coordinates of the voxels to bake."""
     from efficientnerf.nerftree import baking, writing
     from stages.resolution import Choice, affordable_resolution, finest_resolution
 
     settings: BakeSettings = job.settings
-    bounds, brick = m.space.bounds, settings.brick
+    bounds, brick = space.bounds, settings.brick
 
     def room(resolution: int) -> int:
         shape, _ = baking.grid_of(bounds, resolution, brick)
-        return writing.most_voxels(settings.max_mib * 2**20, settings.layout, m.fine.degree, shape, brick)
+        return writing.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, brick)
 
     if settings.resolution or m.settings.discretise:
         choice = Choice(settings.resolution, "bake.resolution") if settings.resolution else Choice(m.settings.discretise, "train.discretise")
         shape, voxel = baking.grid_of(bounds, choice.resolution, brick)
-        seen = _seen(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64))
+        seen = _seen(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         return choice, seen, _kept(job, seen, shape, SPARE * room(choice.resolution))
 
     finest = finest_resolution(s, settings.max_resolution)
     top_shape, top_voxel = baking.grid_of(bounds, finest.resolution, brick)
-    seen = _seen(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64))
+    seen = _seen(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64), space)
     last: tuple[int, Visible, np.ndarray] | None = None
 
     def look(resolution: int) -> tuple[int, Visible, np.ndarray]:
@@ -240,7 +269,7 @@ def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels) -> tuple[Choice, Visible
     return choice, coarse, indices
 
 
-def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray) -> Visible:
+def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visible:
     """What the network shows of the voxels, from scratch or from an earlier attempt."""
     from efficientnerf.nerftree import baking
 
@@ -255,7 +284,7 @@ def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: 
         job.progress(done, total, "finding the voxels that matter")
         job.safe_point()
 
-    seen = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked)
+    seen = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked, space)
     for name in names:
         part = getattr(seen, name)
         _write_npy(np.empty(0, np.float16) if part is None else part, job.work / f"seen_{name}.npy")
@@ -278,7 +307,7 @@ def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], most: int) -> np
     return indices
 
 
-def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
+def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space) -> tuple[np.ndarray, np.ndarray]:
     """Baked values of all voxels; blocks of an earlier attempt are taken as they are."""
     from efficientnerf.nerftree import baking
 
@@ -295,7 +324,7 @@ def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray
 
     while done < blocks and (stored := _read_npy(job.work / f"block_{done:06d}.npy")) is not None:
         take(stored)
-    for some, colours in baking.voxel_values(m, indices, voxel, low, points, settings.seed, first=done):
+    for some, colours in baking.voxel_values(m, indices, voxel, low, points, settings.seed, first=done, space=space):
         part = np.concatenate([some[:, None], colours.reshape(len(some), -1)], axis=1)
         _write_npy(part, job.work / f"block_{done:06d}.npy")
         take(part)

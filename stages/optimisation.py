@@ -124,7 +124,7 @@ def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Opti
         keep = np.zeros(len(keep), bool)
         keep[order[:most]] = True
         left_out = float(greatest[order[most]])
-        job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out, to keep the asset within {settings.max_mib} MiB (bake.max_mib)")
+        job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib has room for {most:,}")
     if not keep.any():
         return o
     if o.tree.background is None:

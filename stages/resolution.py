@@ -22,7 +22,11 @@ LEAST = 32  # voxels along the longest side
 PIXELS = 0.5  # of a pixel's width that a voxel is at least wide. Held-back views of chair_200 at 1: 36.5 dB; 0.75: 37.4; 0.5: 37.6, at three times the bytes
 SURROUNDED = 4 / 3  # likewise where surroundings are learned: photographs hold noise, and finer voxels learn it. Held-back views of still_life at
 # 1.31 pixels (384 voxels a side): 28.57 dB; 0.98 (512): 28.44, and 28.36 after twice the steps
-MOST = {"cut out": 1024, "surrounded": 384, "ndc": 512}  # finer voxels took photographs longer than they were seen to gain
+MOST = {"cut out": 1024, "surrounded": 384, "ndc": 1024}  # finer voxels took photographs longer than they were seen to gain
+MIB = 24  # an asset's size at most
+# For a pixel of what the cameras of a forward-facing capture show, and at most. Held-back views of fern_4, of which the network has 24.08 dB, in 24 MiB
+# (2.8 pixels to a voxel's width): 23.50 dB; 50 (2.1): 23.98, in 1.6 times the processor time.
+NDC_BYTES, NDC_MIB = 36, 56
 CLOSE = 0.93  # of the room that is used, at least
 TRIES = 4
 
@@ -43,7 +47,7 @@ def finest_resolution(s: Scene, most: int | None) -> Choice:
     """
     if s.forward is not None:
         wide, share = ndc_pixel(s, s.forward), SURROUNDED
-        side = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
+        side = float((s.forward.bounds[1] - s.forward.bounds[0])[:2].max())
     else:
         centre = np.asarray(s.bounds, np.float64).mean(axis=0)
         wide = float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
@@ -55,6 +59,15 @@ def finest_resolution(s: Scene, most: int | None) -> Choice:
     if told > most:
         return Choice(most, f"bake.max_resolution; pixels would tell {told} apart")
     return Choice(told, f"a voxel covers {share:.2g} of a pixel")
+
+
+def budget_of(s: Scene, given: int | None) -> int:
+    """MiB that an asset may have: those given, or else MIB. In normalised device coordinates, where nothing is empty and each pixel needs voxels
+    of its own, NDC_BYTES to each pixel of the box's face, where that is more; at most NDC_MIB."""
+    if given is not None or s.forward is None:
+        return MIB if given is None else given
+    across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
+    return int(np.clip(NDC_BYTES * across * down / 2**20, MIB, NDC_MIB))
 
 
 def ndc_pixel(s: Scene, forward: Forward) -> float:

@@ -20,6 +20,7 @@ import torch
 
 from efficientnerf.compositing import activate
 from efficientnerf.density import cell_of
+from efficientnerf.grid import Space
 from efficientnerf.model import Model, look
 from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
 from efficientnerf.pixels import Pixels
@@ -35,6 +36,17 @@ def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int,
     voxel = float(extent.max()) / resolution
     x, y, z = (max(1, math.ceil(round(side / (voxel * brick), 6))) for side in extent)
     return (x, y, z), voxel
+
+
+def flattened(space: Space, depth: float) -> Space:
+    """A space in normalised device coordinates whose x and y are stretched, so that a cube there is `depth` times as deep as it was wide, per depth.
+
+    Grid coordinates are the same in both. So are lengths along z', which rays nearly run along, and with them densities; what a slanted ray meets more of
+    is left to the fit.
+    """
+    if space.ndc is None:
+        raise ValueError("only normalised device coordinates can be flattened: elsewhere rays come from all sides")
+    return replace(space, bounds=np.asarray(space.bounds, np.float64) * (depth, depth, 1.0), ndc=space.ndc.stretched(depth))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +69,15 @@ class Visible:
 
 @torch.no_grad()
 def visible_voxels(
-    m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, bounds_min: np.ndarray, brick: int, count: int, done: Callable[[int, int], None]
-) -> Visible:
+    m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, bounds_min: np.ndarray, brick: int, count: int, done: Callable[[int, int], None],
+    space: Space | None = None,
+) -> Visible:  # fmt: skip
     """Greatest weight of each voxel over about `count` training pixels, evenly spread. Memory grows with the cells that are met, not with the grid.
 
-    done  called with pixels looked at and their number
+    done   called with pixels looked at and their number
+    space  the network's, in the frame that the voxels are cubes of: see `flattened`; None: the network's own
     """
+    space = space or m.space
     size = torch.tensor(shape) * brick
     row_of = torch.full((math.prod(shape),), -1, dtype=torch.int32)
     greatest = torch.zeros(1024, brick**3)
@@ -78,7 +93,7 @@ def visible_voxels(
         if m.background is None:
             parts = split_by_box(m, origins, directions, torch.ones_like(near), seen, behind)
             surroundings.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
-        at = torch.floor((m.space.world(seen.fine.point).cpu() - low) / voxel).long()
+        at = torch.floor((space.world(seen.fine.point).cpu() - low) / voxel).long()
         inside = ((at >= 0) & (at < size)).all(dim=1)
         at, weight = at[inside], seen.fine_weight.cpu()[inside]
         cell = at // brick
@@ -153,15 +168,17 @@ def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, thresh
 
 @torch.no_grad()
 def voxel_values(
-    m: Model, indices: np.ndarray, voxel: float, bounds_min: np.ndarray, points: int, seed: int, first: int = 0
+    m: Model, indices: np.ndarray, voxel: float, bounds_min: np.ndarray, points: int, seed: int, first: int = 0, space: Space | None = None
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Density (n,) and harmonics (n, K, 3) of the voxels, block by block from the `first`-th block on.
 
     points  jittered points to a voxel: one in each of so many slices along a diagonal permutation, averaged; densities as they are,
             harmonics weighted by density; 0: the centre of the voxel alone, for fields that were trained on these (`train.discretise`)
+    space   as in `visible_voxels`
 
     Where the density voxels or the coarse field say that space is empty the density is zero: the fine field is hardly asked there and may say anything.
     """
+    space = space or m.space
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
     jittered, points = points > 0, max(1, points)
     per_block = POINTS_PER_BLOCK // points or 1
@@ -170,25 +187,25 @@ def voxel_values(
         rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 1, number]))
         jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32)) if jittered else torch.full((len(block), 1, 3), 0.5)
         world = (block[:, None] + jitter) * voxel + low
-        point = m.space.grid(world.reshape(-1, 3)).to(m.device)
+        point = space.grid(world.reshape(-1, 3)).to(m.device)
         raw = m.fine(m.asked(point))
         valid = m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold
         density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
-        density = density * _looked_into(m, (block + 0.5) * voxel + low)[:, None]
+        density = density * _looked_into(m, space.grid((block + 0.5) * voxel + low))[:, None]
         share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
         yield density.mean(dim=1).cpu().numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().cpu().numpy()
 
 
-def _looked_into(m: Model, world: torch.Tensor) -> torch.Tensor:
-    """(n,) bool on the model's device: whether the coarse field at these points absorbs as much over an interval as a valid density voxel has to.
+def _looked_into(m: Model, grid: torch.Tensor) -> torch.Tensor:
+    """(n,) bool on the model's device: whether the coarse field at grid coordinates (n, 3) absorbs as much over an interval as a valid density voxel has to.
 
     Where it says less a pivot is among the lightest of its ray and dropped before the subject, but not before the sky: the network hides what
     the fine field has there just where it would be seen, and nothing in the asset could.
     """
     if m.coarse is None or m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
-        return torch.ones(len(world), dtype=torch.bool, device=m.device)
-    raw = m.coarse(m.asked(m.space.grid(world.float()).to(m.device)))[:, 0]
+        return torch.ones(len(grid), dtype=torch.bool, device=m.device)
+    raw = m.coarse(m.asked(grid.float().to(m.device)))[:, 0]
     return activate(raw, m.coarse.activation) > m.voxels.threshold
 
 

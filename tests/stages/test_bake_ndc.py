@@ -1,0 +1,132 @@
+"""Baking in normalised device coordinates: voxels deeper than wide, and a budget that follows the pixels."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.cameras import rays
+from efficientnerf.nerftree.baking import flattened
+from efficientnerf.nerftree.tree import NerfTree
+from stages import bake, train
+from stages.bake import ASSET, NDC_DEPTH, BakeSettings
+from stages.exporters.frames import write_png
+from stages.field import load_renderer
+from stages.forward import forward_of
+from stages.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
+from stages.scene import Scene, View, load, save
+from tests.efficientnerf.balls import BOUNDS, settings
+from tests.stages.balls import ORBIT, SIMILARITY, job, poses
+from tests.stages.test_forward import depths, row
+from tests.stages.test_lattice import forward_facing
+
+QUICK: dict[str, Any] = {"resolution": 64, "pixels": 4000, "weight": 0.0, "max_mib": 8, "points": 4, "optimise": 0}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A painted wall before nine cameras, and a network that has seen a little of it."""
+    folder = tmp_path_factory.mktemp("ndc")
+    cameras = [dataclasses.replace(c, width=32, height=24, params=tuple(p * 32 / c.width for p in c.params)) for c in row()]
+    found = forward_of(cameras, depths(cameras))
+    assert not isinstance(found, str), found
+    (folder / "poses" / "images").mkdir(parents=True)
+    for camera in cameras:
+        origins, directions = rays(camera)
+        at = origins + directions * ((6.0 - origins[:, 1]) / directions[:, 1])[:, None]
+        colour = 0.5 + 0.4 * np.sin(at[:, [0, 2, 0]] * (1.0, 1.5, 2.0))
+        write_png(np.round(255 * colour).astype(np.uint8).reshape(camera.height, camera.width, 3), folder / "poses" / "images" / camera.name)
+    views = tuple(View(f"images/{c.name}", None, "test" if k == 0 else "train", c, c, 3.0, 40.0) for k, c in enumerate(cameras))
+    save(Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found), folder / "poses")
+    train.run(job(folder / "train", settings(iterations=80, samples=4096, warm_up=10), poses=folder / "poses"))
+    return {"poses": folder / "poses", "train": folder / "train" / "out"}
+
+
+def baked(folder: Path, inputs: dict[str, Path], told: list[dict[str, Any]] | None = None, **changes: Any) -> NerfTree:
+    made = job(folder, BakeSettings(**{**QUICK, **changes}), events=told, **inputs)
+    bake.run(made)
+    return NerfTree.load(made.out / ASSET)
+
+
+def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path) -> None:
+    cubes, deep = baked(tmp_path / "cubes", inputs, ndc_depth=1.0), baked(tmp_path / "deep", inputs)
+    space = load_renderer(inputs["train"], "cpu").model.space
+    assert cubes.ndc is not None
+    assert deep.ndc is not None
+    assert space.ndc is not None
+    assert cubes.ndc.to_json() == space.ndc.to_json()
+    assert deep.ndc.slopes == pytest.approx(tuple(NDC_DEPTH * slope for slope in space.ndc.slopes))
+    # As many voxels across, half as many in depth.
+    assert deep.resolution[:2] == cubes.resolution[:2]
+    assert deep.resolution[2] == pytest.approx(cubes.resolution[2] / NDC_DEPTH, abs=4)
+    view = load(inputs["poses"]).views[0]
+    one, other = (tree.render(view.camera, background=(0.5, 0.5, 0.5)) for tree in (cubes, deep))
+    assert one.colour.std() > 0.1
+    assert np.abs(one.colour - other.colour).mean() < 0.01
+    hit = np.isfinite(one.depth) & np.isfinite(other.depth)
+    assert hit.mean() > 0.9
+    assert np.median(np.abs(other.depth[hit] / one.depth[hit] - 1)) < 0.05
+
+
+def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], tmp_path: Path) -> None:
+    import json
+
+    told: list[dict[str, Any]] = []
+    baked(tmp_path, inputs, told, optimise=20, optimise_rays=2048)
+    fitted = json.loads((tmp_path / "out" / "report.json").read_text())["optimisation"]
+    assert fitted["psnr_after"] > fitted["psnr_before"] + 0.5
+    assert not [event for event in told if event["event"] == "warning"]
+
+
+def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path], tmp_path: Path) -> None:
+    made = job(tmp_path / "train", settings(iterations=12, samples=2048, warm_up=4, discretise=48), poses=inputs["poses"])
+    train.run(made)
+    on_voxels = {**inputs, "train": made.out}
+    told: list[dict[str, Any]] = []
+    tree = baked(tmp_path / "own", on_voxels, told, resolution=48)
+    assert tree.ndc is not None
+    assert tree.ndc.to_json() == load_renderer(made.out, "cpu").model.space.ndc.to_json()
+    assert not [event for event in told if event["event"] == "warning"]
+    baked(tmp_path / "other", on_voxels, told, resolution=48, ndc_depth=2.0)
+    assert any("bake.ndc_depth=2" in event["text"] and "train.discretise=48" in event["text"] for event in told if event["event"] == "warning")
+
+
+def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
+    scene = poses(tmp_path / "poses")
+    train.run(job(tmp_path / "train", settings(iterations=12, samples=2048, warm_up=4), poses=scene))
+    told: list[dict[str, Any]] = []
+    tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_depth=2.0)
+    assert tree.ndc is None
+    assert len(set(tree.resolution)) == 1
+    assert any("bake.ndc_depth" in event["text"] for event in told if event["event"] == "warning")
+    m = load_renderer(tmp_path / "train" / "out", "cpu").model
+    with pytest.raises(ValueError, match="normalised device coordinates"):
+        flattened(m.space, 2.0)
+
+
+def test_a_flattened_space_has_the_same_grid_coordinates(inputs: dict[str, Path]) -> None:
+    space = load_renderer(inputs["train"], "cpu").model.space
+    flat = flattened(space, 3.0)
+    assert space.ndc is not None
+    assert flat.ndc is not None
+    world = space.ndc.world(np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3)))
+    np.testing.assert_allclose(flat.ndc.points(world), space.ndc.points(world) * (3, 3, 1), rtol=1e-9, atol=1e-12)
+    one, other = (s.grid(torch.from_numpy(s.ndc.points(world))) for s in (space, flat))  # type: ignore[union-attr]
+    torch.testing.assert_close(one, other)
+
+
+def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:
+    small, large, huge = (forward_facing(side) for side in (200, 1000, 4000))
+    assert budget_of(small, None) == MIB
+    assert budget_of(huge, None) == NDC_MIB
+    assert large.forward is not None
+    across, down = (large.forward.bounds[1] - large.forward.bounds[0])[:2] / ndc_pixel(large, large.forward)
+    assert budget_of(large, None) == int(np.clip(NDC_BYTES * across * down / 2**20, MIB, NDC_MIB))
+    assert budget_of(huge, 7) == 7
+    assert budget_of(load(poses(tmp_path)), None) == MIB
+    assert finest_resolution(huge, None).resolution == 1024
