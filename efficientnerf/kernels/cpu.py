@@ -10,20 +10,22 @@ import numba
 import numpy as np
 
 from efficientnerf.compositing import LARGEST_LOGIT
+from efficientnerf.kernels import intervals
+from efficientnerf.kernels.intervals import RAYS
+from efficientnerf.kernels.lanes import pointer
 from efficientnerf.sampling import FARTHEST
 
 BLOCK = 64  # rays per task
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Mueller et al. 2022, section 3
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=False)
-def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, begins):  # type: ignore[no-untyped-def]
-    """One ray: where its valid intervals begin, into `begins` (slots,). Returns (valid, tried, where the ray leaves)."""
-    side = voxels.shape[0]
+@numba.njit(cache=True, error_model="numpy")
+def _enter(ox, oy, oz, dx, dy, dz, near, far, centre, half, contracted, state, lane):  # type: ignore[no-untyped-def]
+    """A ray into a lane of the state of `next_intervals`."""
     ux, uy, uz = (ox - centre[0]) / half[0], (oy - centre[1]) / half[1], (oz - centre[2]) / half[2]
     vx, vy, vz = dx / half[0], dy / half[1], dz / half[2]
     tiny = np.float32(1e-12)
-    one, two = np.float32(1), np.float32(2)
+    one = np.float32(1)
     t, leave = near, far
     if not contracted:
         sx = vx if abs(vx) >= tiny else tiny
@@ -34,49 +36,43 @@ def _walk(ox, oy, oz, dx, dy, dz, near, far, offset, centre, half, contracted, s
         az, bz = (-one - uz) / sz, (one - uz) / sz
         t = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), near))
         leave = min(min(max(ax, bx), max(ay, by)), min(max(az, bz), far))
-    reach = np.float32(1)
-    scale = np.float32(0.25) if contracted else np.float32(0.5)
-    shift = two if contracted else one
-    valid = tried = 0
-    for _ in range(slots):
-        stretch = one
-        if contracted:
-            reach = max(max(abs(ux + t * vx), abs(uy + t * vy)), max(abs(uz + t * vz), one))
-            stretch = reach * reach
-            if reach * np.float32(FARTHEST) > one:
-                break
-        if t >= leave:
-            break
-        tried += 1
-        size = min(step * stretch, leave - t)
-        at = t + offset * size
-        px, py, pz = ux + at * vx, uy + at * vy, uz + at * vz
-        if contracted:
-            m = max(max(abs(px), abs(py)), max(abs(pz), one))
-            f = (two - one / m) / m
-            px, py, pz = px * f, py * f, pz * f
-        gx, gy, gz = (px + shift) * scale, (py + shift) * scale, (pz + shift) * scale
-        i = min(max(int(gx * side), 0), side - 1)
-        j = min(max(int(gy * side), 0), side - 1)
-        k = min(max(int(gz * side), 0), side - 1)
-        if voxels[i, j, k] > threshold:
-            begins[valid] = t
-            valid += 1
-        t = t + step * stretch
-    return valid, tried, leave
+    state[intervals.UX, lane], state[intervals.UY, lane], state[intervals.UZ, lane] = ux, uy, uz
+    state[intervals.VX, lane], state[intervals.VY, lane], state[intervals.VZ, lane] = vx, vy, vz
+    state[intervals.T, lane], state[intervals.LEAVE, lane] = t, leave
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _find_valid(  # type: ignore[no-untyped-def]
     origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, whole, counts, tried, leave, begins
 ):
-    never = np.float32(-np.inf)
-    for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
-        for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
-            counts[r], tried[r], leave[r] = _walk(
-                origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r], offset[r],
-                centre, half, contracted, step, slots, voxels, never if r < whole else threshold, begins[r],
+    """Sixteen rays side by side, a lane each, until the last of them is at its end."""
+    least, never, side, grid = np.float32(FARTHEST), np.float32(-np.inf), voxels.shape[0], pointer(voxels)
+    for block in numba.prange((len(origins) + RAYS - 1) // RAYS):
+        begin, end = block * RAYS, min(len(origins), (block + 1) * RAYS)
+        state = np.zeros((intervals.ROWS, RAYS), np.float32)  # lanes without a ray are at their end
+        for r in range(begin, end):
+            _enter(
+                origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r],
+                centre, half, contracted, state, r - begin,
             )  # fmt: skip
+            state[intervals.OFFSET, r - begin], state[intervals.LIMIT, r - begin] = offset[r], never if r < whole else threshold
+        lanes = pointer(state)
+        for _ in range(slots):
+            if contracted:
+                found = intervals.next_intervals_contracted(lanes, grid, side, step, least)
+            else:
+                found = intervals.next_intervals_in_box(lanes, grid, side, step, least)
+            if found == 0:
+                break
+            found >>= RAYS
+            while found != 0:
+                lane = intervals.lowest_bit(found)
+                found &= found - 1
+                r = begin + lane
+                begins[r, counts[r]] = state[intervals.BEGAN, lane]
+                counts[r] += 1
+        for r in range(begin, end):
+            tried[r], leave[r] = np.int64(state[intervals.TRIED, r - begin]), state[intervals.LEAVE, r - begin]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -92,6 +92,21 @@ def test_both_try_the_same_number(contracted: bool) -> None:
     assert len(fast.start) < fast.tried
 
 
+@pytest.mark.parametrize("contracted", [False, True])
+@pytest.mark.parametrize("lost", [float("nan"), float("inf"), 3e38])
+def test_a_ray_that_is_nowhere_leaves_its_neighbours_alone(contracted: bool, lost: float) -> None:
+    """The kernel takes rays sixteen at a time; none may make it look at voxels that there are not."""
+    rays, space = make_rays("outside"), Space(BOUNDS, contracted)
+    alone = dispatch.valid_samples(space, *rays, STEP, 60, voxels_of(), 0.4)
+    odd = Rays(rays.origins.clone(), rays.directions.clone(), *rays[2:])
+    odd.origins[20, 1] = odd.directions[40] = lost
+    found = dispatch.valid_samples(space, *odd, STEP, 60, voxels_of(), 0.4)
+    for r in set(range(60)) - {20, 40}:
+        ours, theirs = slice(*found.first[r : r + 2].tolist()), slice(*alone.first[r : r + 2].tolist())
+        assert torch.equal(found.start[ours], alone.start[theirs])
+        assert torch.equal(found.point[ours], alone.point[theirs])
+
+
 @pytest.mark.parametrize("finder", FINDERS)
 @pytest.mark.parametrize("contracted", [False, True])
 def test_the_first_rays_can_be_looked_at_whole(contracted: bool, finder: str) -> None:
