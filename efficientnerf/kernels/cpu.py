@@ -188,7 +188,7 @@ def pivotal_samples(origins, directions, offset, centre, half, contracted, first
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _activate(x, exponential):  # type: ignore[no-untyped-def]
+def density_of(x, exponential):  # type: ignore[no-untyped-def]
     """Density and its derivative."""
     one = np.float32(1)
     if exponential:
@@ -213,7 +213,7 @@ def composite(raw, length, first, harmonics, background, exponential, colour, op
             c0 = c1 = c2 = np.float32(0)
             at = spread = near_weight = near_moment = np.float32(0)
             for n in range(first[r], first[r + 1]):
-                density, _ = _activate(raw[n, 0], exponential)
+                density, _ = density_of(raw[n, 0], exponential)
                 alpha = one - np.exp(-density * length[n])
                 w = light * alpha
                 light *= one - alpha
@@ -284,7 +284,7 @@ def composite_backward(  # type: ignore[no-untyped-def]
             before = one
             at = near_weight = near_moment = np.float32(0)
             for n in range(first[r], first[r + 1]):
-                density, slope = _activate(raw[n, 0], exponential)
+                density, slope = density_of(raw[n, 0], exponential)
                 w = weight[n]
                 middle = at + np.float32(0.5) * length[n]
                 own = grad_weight[n] + _pull(g0, g1, g2, rgb[n], gs, w, length[n], middle, near_weight, near_moment, all_weight, all_moment)

@@ -1,4 +1,5 @@
-"""Sets of voxels on the CPU (numba): growing them, and carrying weights over to a coarser grid. One core; tens of millions of voxels a second.
+"""Voxels on the CPU (numba): what samples say of them, growing sets of them, and carrying weights over to a coarser grid. Tens of millions
+of voxels a second on a core.
 
 B cells that have room for their voxels, N voxels.
 """
@@ -7,6 +8,10 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+
+from efficientnerf.kernels.cpu import density_of
+
+TOLD = 1024  # samples of a task
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -74,3 +79,24 @@ def carry(cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tupl
                 at = (x % brick * brick + y % brick) * brick + z % brick
                 into[to, at] = max(into[to, at], weight)
     return rows
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def tell_largest(point, raw, exponential, values):  # type: ignore[no-untyped-def]
+    """Raise `values` (D, D, D) to the density of samples at `point` (N, 3) in grid coordinates, which is `raw` (N,) activated; closed voxels stay closed.
+
+    All cores find voxels and densities, then one takes the largest.
+    """
+    side, count = values.shape[0], len(raw)
+    cell, density = np.empty(count, np.int32), np.empty(count, np.float32)
+    for block in numba.prange((count + TOLD - 1) // TOLD):
+        for n in range(block * TOLD, min(count, (block + 1) * TOLD)):
+            i = min(max(int(point[n, 0] * side), 0), side - 1)
+            j = min(max(int(point[n, 1] * side), 0), side - 1)
+            k = min(max(int(point[n, 2] * side), 0), side - 1)
+            cell[n], density[n] = (i * side + j) * side + k, density_of(raw[n], exponential)[0]
+    flat = values.reshape(-1)
+    for n in range(count):
+        old = flat[cell[n]]
+        if density[n] > old and old != -np.inf:
+            flat[cell[n]] = density[n]

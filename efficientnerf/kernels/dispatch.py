@@ -76,6 +76,16 @@ def valid_samples(
     return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
 
 
+def tell_largest(values: Tensor, point: Tensor, raw: Tensor, activation: str) -> bool:
+    """What `efficientnerf.density.update` does under "maximum", with samples at `point` (N, 3) in grid coordinates; False where there is no kernel for it."""
+    if not _fast(values, point, raw):
+        return False
+    from efficientnerf.kernels import cpu_voxels
+
+    cpu_voxels.tell_largest(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
+    return True
+
+
 def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
     """See `efficientnerf.sampling.pivots`."""
     if on_device(weight):

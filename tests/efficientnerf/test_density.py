@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from efficientnerf.compositing import activate
 from efficientnerf.density import DEEPEST, cell_of, close, density_voxels, fade, refresh_cells, reopen, sweep_cells, update, voxel_weights
+from efficientnerf.kernels import dispatch
 from tests import reference
 
 SIDE = 3
@@ -28,6 +30,22 @@ def test_momentum_is_equation_seven_with_one_update_to_a_voxel() -> None:
         expected = reference.momentum(expected, cell.tolist(), density.tolist(), 0.1)
     np.testing.assert_allclose(voxels.values.reshape(-1), expected, rtol=1e-5)
     assert voxels.values.reshape(-1)[-1] == 10.0  # never asked about
+
+
+@pytest.mark.parametrize("activation", ["exp", "softplus"])
+def test_samples_tell_the_largest_in_one_go_as_they_do_step_by_step(activation: str) -> None:
+    rng = np.random.default_rng(0)
+    side = 7
+    ours, theirs = (density_voxels(side, "maximum", threshold=0.2) for _ in range(2))
+    for voxels in (ours, theirs):
+        close(voxels, torch.arange(side**3).reshape(side, side, side) % 5 == 0)
+    for count in (0, 1, 3000):
+        point = torch.from_numpy(rng.uniform(-0.05, 1.05, (count, 3)).astype(np.float32))  # beyond the faces, too: the outermost voxels are told
+        raw = torch.from_numpy(rng.normal(size=(count, 4)).astype(np.float32) * 6)[:, 0]
+        assert dispatch.tell_largest(ours.values, point, raw, activation)
+        update(theirs, cell_of(point, side), activate(raw, activation))
+        torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-6)
+    assert not dispatch.tell_largest(ours.values, point.double(), raw.double(), activation)
 
 
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
