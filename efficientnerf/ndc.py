@@ -116,6 +116,15 @@ class Ndc:
         local = _stack([ndc[..., 0] * z / a, ndc[..., 1] * z / b, z])
         return local @ _like(self.world_from_camera[:3, :3].T.copy(), ndc) + _like(self.world_from_camera[:3, 3], ndc)
 
+    def sights(self, eye: np.ndarray) -> np.ndarray:
+        """(3, 4): takes (x', y', z', 1) to the world direction, of any length, along which that place is seen from `eye` (3,), world.
+
+        With W = (1 - z') / (2 n) a place is R (x'/a, y'/b, 1) / W + t, for the camera's rotation R and position t; times W, less the eye, it is linear.
+        """
+        rotation, beside = self.world_from_camera[:3, :3], (self.world_from_camera[:3, 3] - eye) / (2 * self.near)
+        a, b = self.slopes
+        return np.stack([rotation[:, 0] / a, rotation[:, 1] / b, -beside, rotation[:, 2] + beside], axis=1)
+
     def rays(self, origins: Any, directions: Any) -> WarpedRays:
         """World rays (R, 3), unit directions, to rays in normalised device coordinates.
 

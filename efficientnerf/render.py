@@ -46,17 +46,39 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
     return Rendering(*render_picture(tree, camera, supersample, behind, normals=True, rays_per_band=RAYS_PER_BAND))
 
 
+def _rays_as_they_are(tree: NerfTree, camera: Camera, behind: np.ndarray) -> Rendering:
+    """`_render_by_rays` of one ray to a pixel, where nothing has to be merged."""
+    from efficientnerf.nerftree.tree import Rendering
+
+    height, width = camera.height, camera.width
+    colour, opacity = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
+    depth, normal = np.empty_like(opacity), np.empty_like(colour)
+    step = max(1, RAYS_PER_BAND // 2 // width)
+    for top in range(0, height, step):
+        y, x = np.mgrid[top : min(height, top + step), 0:width]
+        origins, directions = rays(camera, np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5)
+        part = tree.render_rays(origins, directions, eye=camera.centre, columns=width)
+        to, hit = slice(top, top + len(y)), part.opacity >= 0.5
+        depth[to] = np.where(hit, part.depth * (directions @ camera.forward), np.inf).reshape(y.shape)
+        normal[to] = (part.normal * hit[:, None]).reshape(*y.shape, 3)
+        opacity[to] = part.opacity.reshape(y.shape)
+        colour[to] = (part.colour + (1 - part.opacity[:, None]) * behind).reshape(*y.shape, 3)
+    return Rendering(colour, opacity, depth, normal)
+
+
 def _render_by_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, supersample: int) -> Rendering:
     """A picture band by band of `NerfTree.render_rays`: of a tree whose frame is not the world, where rays of one camera part, or that is not interpolated."""
     from efficientnerf.nerftree.tree import Rendering
 
     height, width, n = camera.height, camera.width, supersample
+    if n == 1:
+        return _rays_as_they_are(tree, camera, behind)
     bands = []
-    step = max(1, RAYS_PER_BAND // 4 // (width * n**2))
+    step = max(1, RAYS_PER_BAND // 2 // (width * n**2))
     for top in range(0, height, step):
         y, x = np.mgrid[top * n : min(height, top + step) * n, 0 : width * n]
         origins, directions = rays(camera, (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) / n)
-        part = tree.render_rays(origins, directions)
+        part = tree.render_rays(origins, directions, eye=camera.centre, columns=width * n)
         along = (part.depth * (directions @ camera.forward)).astype(np.float32)
         values = np.concatenate([part.colour, part.opacity[:, None], along[:, None], part.normal], axis=1, dtype=np.float32)
         rows = len(y) // n

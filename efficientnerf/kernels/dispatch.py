@@ -121,7 +121,14 @@ def pivotal_samples(
     return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
 
 
-def tree_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, looking: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
+def tree_rays(
+    tree: NerfTree,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    looking: np.ndarray | None = None,
+    eye: np.ndarray | None = None,
+    columns: int | None = None,
+) -> tuple[np.ndarray, ...]:
     """Colour, opacity, distance and normal of rays of a tree's frame, where the tree is to be drawn; see `efficientnerf.kernels.cpu_tree.render_rays`."""
     if tree.device != "cpu" and triton_usable():
         from efficientnerf.kernels import cuda_tree
@@ -135,7 +142,7 @@ def tree_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, looki
         return cpu_nearest.render_rays(tree, origins, directions, looking)
     from efficientnerf.kernels.cpu_tree import render_rays
 
-    return render_rays(tree, origins, directions, looking)
+    return render_rays(tree, origins, directions, looking, eye, columns)
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:

@@ -169,15 +169,23 @@ class NerfTree:
 
         return render_tree(self, camera, background=background, supersample=supersample)
 
-    def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> Rendering:
-        """What rays see: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray."""
+    def render_rays(self, origins: np.ndarray, directions: np.ndarray, *, eye: np.ndarray | None = None, columns: int | None = None) -> Rendering:
+        """What rays see: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray.
+
+        What is known of all rays makes them faster on the CPU, and changes colours by less than 1e-3 (2e-3 in normalised device coordinates):
+
+        eye      (3,) the point that all come from
+        columns  how many make a row, where they are the rows of a picture
+        """
         from efficientnerf.kernels.dispatch import tree_rays
 
         if self.ndc is None:
-            return Rendering(*tree_rays(self, origins, directions))
-        rays = self.frame_rays(origins, directions)
-        colour, opacity, along, normal = tree_rays(self, rays.origins, rays.directions, looking=np.asarray(directions))
-        return Rendering(colour, opacity, *self._in_world(rays, along, normal))
+            return Rendering(*tree_rays(self, origins, directions, None, eye, columns))
+        from efficientnerf.kernels import cpu_ndc
+
+        rays = cpu_ndc.rays(self.ndc, origins, directions)
+        colour, opacity, along, normal = tree_rays(self, rays.origins, rays.directions, np.asarray(directions), eye, columns)
+        return Rendering(colour, opacity, *cpu_ndc.hits(self.ndc, rays, along, normal))
 
     def frame_rays(self, origins: Any, directions: Any) -> WarpedRays:
         """World rays (R, 3), unit directions, as rays of the tree's frame: what anything that walks the grid itself has to do first.
@@ -192,18 +200,6 @@ class NerfTree:
             return self.ndc.rays(origins, directions)
         none = origins[..., 0] * 0
         return WarpedRays(origins, directions, none, none + 1, none)
-
-    def _in_world(self, rays: WarpedRays, along: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (R,) and normals (R, 3) of hits on rays of the frame, in the world."""
-        from efficientnerf.ndc import world_distance
-
-        assert self.ndc is not None
-        hit = np.isfinite(along)
-        s, distance, normals = np.where(hit, along, 0).astype(np.float64), np.full(len(along), np.inf), np.zeros_like(normal)
-        distance[hit] = world_distance(s, rays.begin, rays.pace, rays.bend)[hit]
-        at = (rays.origins + s[:, None] * rays.directions)[hit]
-        normals[hit] = self.ndc.world_normals(at, normal[hit].astype(np.float64))
-        return distance.astype(np.float32), normals
 
     def _in_frame(self, points: np.ndarray) -> np.ndarray:
         return points if self.ndc is None else self.ndc.points(np.asarray(points, np.float64))

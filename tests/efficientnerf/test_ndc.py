@@ -40,6 +40,15 @@ def appendix(ndc: Ndc, points: np.ndarray) -> np.ndarray:
     return np.stack([x, -y, z], -1)
 
 
+def test_sights_point_from_the_eye_to_the_places(ndc: Ndc) -> None:
+    rng = np.random.default_rng(2)
+    points, eye = before(ndc, rng, 100), ndc.world_from_camera[:3, 3] + rng.normal(size=3)
+    sights = ndc.points(points) @ ndc.sights(eye)[:, :3].T + ndc.sights(eye)[:, 3]
+    expected = points - eye
+    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (sights, expected)]
+    np.testing.assert_allclose(*unit, atol=1e-9)
+
+
 def test_points_are_the_appendix_s_and_come_back(ndc: Ndc) -> None:
     points = before(ndc, np.random.default_rng(0), 500)
     warped = ndc.points(points)
@@ -137,3 +146,33 @@ def test_a_space_warps_rays_and_is_not_contracted(ndc: Ndc) -> None:
     assert same.warp is None
     assert same.origins is origins
     assert torch.equal(same.world(distance, torch.arange(20)), distance)
+
+
+def test_the_kernels_are_the_functions(ndc: Ndc) -> None:
+    """Rays that begin before and beyond the near plane, that never come to it, that look back, or along it; hits near, at infinity, and none."""
+    from efficientnerf.kernels import cpu_ndc
+
+    rng = np.random.default_rng(5)
+    origins = ndc.world_from_camera[:3, 3] + rng.normal(size=(10_000, 3)) * 3
+    directions = rng.normal(size=(10_000, 3))
+    directions[:100] = ndc.world_from_camera[:3, 0]
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    expected, found = ndc.rays(origins, directions), cpu_ndc.rays(ndc, origins, directions)
+    nowhere = expected.origins[:, 2] == BEYOND
+    assert 0.1 < nowhere.mean() < 0.9
+    for one, other in zip(expected, found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-11)
+    along = rng.uniform(0, 2, 10_000).astype(np.float32)
+    along[::7] = np.inf
+    normal = rng.normal(size=(10_000, 3)).astype(np.float32)
+    normal[::5] = 0
+    distance, turned = cpu_ndc.hits(ndc, found, along, normal)
+    hit = np.isfinite(along)
+    assert np.isinf(distance[~hit]).all()
+    assert (turned[~hit] == 0).all()
+    s = along[hit].astype(np.float64)
+    far = world_distance(s, *(part[hit] for part in expected[2:]))
+    assert 0 < np.isinf(far).mean() < 1
+    np.testing.assert_allclose(distance[hit], far.astype(np.float32), rtol=1e-5)
+    at = (expected.origins + np.where(hit, along, 0)[:, None].astype(np.float64) * expected.directions)[hit]
+    np.testing.assert_allclose(turned[hit], ndc.world_normals(at, normal[hit].astype(np.float64)), atol=1e-5)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera
+from efficientnerf.cameras import Camera, rays
 from efficientnerf.harmonics import harmonics_count
+from efficientnerf.kernels import cpu_tree
 from efficientnerf.ndc import Ndc
 from efficientnerf.nerftree import format
+from efficientnerf.nerftree.baking import voxel_coordinates
 from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
 from efficientnerf.render import render_tree_reference
 
@@ -108,6 +110,39 @@ def test_the_kernel_is_the_reference() -> None:
     colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
     np.testing.assert_allclose(seen.opacity, opacity.numpy(), atol=1e-3)
     np.testing.assert_allclose(seen.colour, colour.numpy(), atol=1e-3)
+
+
+PLACES = {"reference": (0.0, 0.0, 0.0), "beside and behind": (0.8, -0.5, -0.4), "beyond the near plane": (0.2, 2.5, 0.1), "close": (0.1, 5.5, 0.0)}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) -> None:
+    """Close before the wall, where a voxel's direction is not its samples', voxels are not painted."""
+    tree = wall(0.4, voxels=144, degree=2)
+    # Voxels that have nothing in common with their neighbours.
+    tree = tree.with_values(tree.density_values, np.random.default_rng(3).normal(0, 0.1, tree.sh.shape).astype(np.float32))
+    camera = camera_at(*PLACES[place])
+    toward = cpu_tree._sights_of_voxels(tree, camera.centre)
+    away = np.linalg.norm(voxel_coordinates(tree) @ toward[:, :3].T + toward[:, 3], axis=1) / np.linalg.norm(toward[:, :3], 2)
+    assert (away > cpu_tree._nearest_painted(tree)).mean() == pytest.approx(0 if place == "close" else 1, abs=0.1)
+    y, x = np.mgrid[: camera.height, : camera.width]
+    origins, directions = rays(camera, np.stack([x.ravel(), y.ravel()], -1) + 0.5)
+    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    seen = tree.render(camera)
+    np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour.numpy(), atol=2e-3)
+    np.testing.assert_allclose(seen.opacity.reshape(-1), opacity.numpy(), atol=1e-3)
+    # Rays of which nothing is known are summed sample by sample.
+    alone = tree.render_rays(origins, directions)
+    np.testing.assert_allclose(seen.colour.reshape(-1, 3), alone.colour, atol=2e-3)
+    np.testing.assert_allclose(seen.opacity.reshape(-1), alone.opacity, atol=1e-5)
+    np.testing.assert_allclose(seen.normal.reshape(-1, 3), np.where(alone.opacity[:, None] >= 0.5, alone.normal, 0), atol=1e-4)
+    assert (seen.colour.reshape(-1, 3) != alone.colour).any() == (place != "close")
+
+
+def test_rays_in_rows_have_to_fill_them() -> None:
+    origins, directions = np.zeros((7, 3)), np.tile([0.0, 1.0, 0.0], (7, 1))
+    with pytest.raises(ValueError, match="7 rays in rows of 3"):
+        wall(voxels=24).render_rays(origins, directions, columns=3)
 
 
 def test_frame_rays_are_where_the_grid_is() -> None:
