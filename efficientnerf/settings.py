@@ -99,8 +99,8 @@ class TrainSettings:
     initial_density: float = _setting(0.1, "hash: density that the fields start with, per world unit", minimum=1e-6, maximum=1e3)
     voxels: int = _setting(0, "D: side of the density voxels; 0 chooses 128, or 192 where surroundings are learned too", minimum=0, maximum=512)
     observers: int = _setting(
-        3, "training photographs that must have a place in the box in view for matter to be learned there, where surroundings are learned: what fewer show"
-        " could be at any distance, and is left to the surroundings; no more than a quarter of the photographs; 0: matter may be anywhere",
+        2, "training photographs that must have a place in the box in view for matter to be learned there, where surroundings are learned: what fewer show"
+        " could be at any distance, and is left to the surroundings; at most a quarter of the photographs, so that up to four ask for nothing; 0: anywhere",
         minimum=0, maximum=64,
     )  # fmt: skip
     voxel_rule: str = _setting(

@@ -115,6 +115,7 @@ def run(job: Job) -> None:
     pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
     choice, seen, indices = _chosen(job, m, s, pixels, space, mib)
     resolution = choice.resolution
+    indices = _seen_by_enough(m, s, indices, resolution)
     if settings.lookup == "nearest" and m.settings.discretise not in (0, resolution):
         job.warn(f"bake.resolution={resolution}, but the field was trained on train.discretise={m.settings.discretise}: on other voxels than are baked")
     if not len(indices):
@@ -307,6 +308,25 @@ def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], most: int) -> np
     return indices
 
 
+CENTRES = 2**20  # that are looked for in the pictures at once
+
+
+def _seen_by_enough(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
+    """The voxels that as many photographs have in view as training asked for, where surroundings are learned: its own voxels, which it closed to
+    matter elsewhere (`stages.observed`), are larger, and what they hold sticks out as a rim."""
+    from stages import scene
+    from stages.observed import often_seen
+
+    if not m.space.contracted or m.settings.observers == 0:
+        return indices
+    cameras = [view.camera for view in scene.views_of(s, "train")]
+    low, high = np.asarray(m.space.bounds, np.float64)
+    voxel = float((high - low).max()) / resolution
+    parts = (indices[at : at + CENTRES] for at in range(0, len(indices), CENTRES))
+    keep = [often_seen((part + 0.5) * voxel + low, cameras, m.settings.observers) for part in parts]
+    return indices[np.concatenate(keep)] if keep else indices
+
+
 def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space) -> tuple[np.ndarray, np.ndarray]:
     """Baked values of all voxels; blocks of an earlier attempt are taken as they are."""
     from efficientnerf.nerftree import baking
@@ -350,4 +370,4 @@ def _read_npy(path: Path) -> np.ndarray | None:
         return None
 
 
-STAGE = Stage(name="bake", version=3, settings=BakeSettings, needs=("poses", "train"), run=run)
+STAGE = Stage(name="bake", version=4, settings=BakeSettings, needs=("poses", "train"), run=run)
