@@ -7,7 +7,7 @@ Cameras are asked for what they have in view, whatever stands between: a side of
 outlines in all others, and stays.
 
 3000 steps of the preset `preview`, one seed. *banana_photos*, 13 training photographs: something black at the edge of one became a scrap in the air over
-the carpet, of 27,000 voxels of the asset, 21,000 of which no other has in view. With such places closed, 3 % of the box, it is gone, and held-back views
+the carpet, of 27,000 voxels of the asset, 21,000 of which no other has in view. With such places closed, 2.5 % of the box, it is gone, and held-back views
 gained, since one of them had it before its lens: the network's from 26.7 to 27.6 dB, the asset's from 27.4 to 27.9. *lund_door_colmap*, 10 training
 photographs, 12 % of the box: 26.3 and 26.4 dB, the asset 27.6 dB with and without, and 27.5 dB without the rim, up to a density voxel wide, that hung before
 the wall where these were closed: so the bake looks at its own voxels once more. With three cameras rather than two, walls that two had shown well

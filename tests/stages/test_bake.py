@@ -130,6 +130,7 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
         "resolution": [24, 24, 24],
         "voxels_along_longest_side": 24,
         "resolution_decided_by": "bake.resolution",
+        "max_mib": 24,
         "voxels": len(tree.density_values),
         "bricks": len(tree.voxel_index),
         "bytes": (made.out / ASSET).stat().st_size,
