@@ -18,6 +18,7 @@ from stages.bake import ASSET, NDC_DEPTH, BakeSettings
 from stages.exporters.frames import write_png
 from stages.field import load_renderer
 from stages.forward import forward_of
+from stages.optimisation import WEIGHED_NDC
 from stages.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
 from stages.scene import Scene, View, load, save
 from tests.efficientnerf.balls import BOUNDS, settings
@@ -77,9 +78,12 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     import json
 
     told: list[dict[str, Any]] = []
-    baked(tmp_path, inputs, told, optimise=20, optimise_rays=2048)
+    baked(tmp_path, inputs, told, optimise=20, optimise_rays=2048, pixels=1000)
     fitted = json.loads((tmp_path / "out" / "report.json").read_text())["optimisation"]
     assert fitted["psnr_after"] > fitted["psnr_before"] + 0.5
+    looked = {event["total"] for event in told if event.get("text") == "dropping what does not show"}
+    assert looked == {min(int(WEIGHED_NDC * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
+    assert max(looked) > 1000
     assert not [event for event in told if event["event"] == "warning"]
 
 
