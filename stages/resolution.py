@@ -25,7 +25,7 @@ SURROUNDED = 4 / 3  # likewise where surroundings are learned: photographs hold 
 MOST = {"cut out": 1024, "surrounded": 384, "ndc": 1024}  # finer voxels took photographs longer than they were seen to gain
 MIB = 24  # an asset's size at most
 # For a pixel of what the cameras of a forward-facing capture show, and at most. Held-back views of fern_4, of which the network has 24.08 dB, in 24 MiB
-# (2.8 pixels to a voxel's width): 23.50 dB; 50 (2.1): 23.98, in 1.6 times the processor time.
+# (2.8 pixels to a voxel's width): 23.50 dB; 50 (2.1): 23.97, from twice as many voxels.
 NDC_BYTES, NDC_MIB = 36, 56
 CLOSE = 0.93  # of the room that is used, at least
 TRIES = 4
