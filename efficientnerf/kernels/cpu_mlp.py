@@ -117,13 +117,31 @@ def _forward(features, first, middle, last, offset, half, chunk, kept, out):  # 
                     out[begin + n, column] = shown[n, column]
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _through(p_above, at, p_above_pairs, outputs, p_kept, there, p_below_pairs, p_weight, weight, p_of_weight, place, p_pull, to, width, per):  # type: ignore[no-untyped-def]
+    """Back through a layer of `width` inputs: adds to the gradient of its weights, and hands on the pull on what the ReLU below it gave."""
+    pairs, words = BLOCK // per, outputs // per
+    pairs_of_rows(p_kept, there, width, width, p_below_pairs, pairs, width)
+    product_added(p_above_pairs, 0, 1, outputs, p_below_pairs, 0, width, pairs, p_of_weight, place, width, outputs, width)
+    product_masked(p_above, at // per, words, 1, p_weight, weight, width, words, p_pull, to, width, BLOCK, width, p_kept, there)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _to_features(p_pull, at, words, p_across, p_first, deep, p_to, place, row, inputs):  # type: ignore[no-untyped-def]
+    """The pull on features, whose samples are neighbours, from that on the first layer's outputs, whose outputs are."""
+    for i in range(0, words, LANES):
+        for n in range(0, BLOCK, LANES):
+            turn(p_pull, at + n * words + i, words, p_across, i * BLOCK + n, BLOCK)
+    product(p_first, 0, 1, deep, p_across, 0, BLOCK, words, p_to, place, row, inputs, BLOCK)
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _backward(grad, features, first_back, middle_back, last_back, half, chunk, kept, of_first, of_middle, of_last, of_features):  # type: ignore[no-untyped-def]
     """of_first (C, I up to ROWS, W), of_middle (C, L - 1, W, W), of_last (C, V, W): of the weights, turned in the first, for each chunk."""
     (inputs, samples), outputs = features.shape, grad.shape[1]
     layers, width, wide, deep = len(middle_back) + 1, last_back.shape[1], of_last.shape[1], first_back.shape[1]
     per = 2 if half.itemsize == 2 else 1
-    outer, words, pairs, filled, ahead = wide // per, width // per, BLOCK // per, of_first.shape[1], kept.shape[1] * width
+    words, pairs, filled, ahead = width // per, BLOCK // per, of_first.shape[1], kept.shape[1] * width
     p_grad, p_features, p_kept, p_to = pointer(grad), pointer(features), pointer(kept), pointer(of_features)
     p_first, p_middle, p_last = pointer(first_back), pointer(middle_back), pointer(last_back)
     p_of_first, p_of_middle, p_of_last = pointer(of_first), pointer(of_middle), pointer(of_last)
@@ -133,51 +151,40 @@ def _backward(grad, features, first_back, middle_back, last_back, half, chunk, k
         pull, across = np.empty((2, BLOCK, width), half.dtype), np.empty((words, BLOCK), first_back.dtype)
         pull_pairs, layer_pairs = np.empty((pairs, width), first_back.dtype), np.empty((pairs, width), first_back.dtype)
         p_columns, p_x, p_given, p_above, p_pull, p_across = pointer(columns), pointer(x), pointer(given), pointer(above), pointer(pull), pointer(across)
-        p_above_pairs, p_pull_pairs, p_layer_pairs = pointer(above_pairs), pointer(pull_pairs), pointer(layer_pairs)
+        p_above_pairs, p_pairs, p_layer = pointer(above_pairs), pointer(pull_pairs), pointer(layer_pairs)
         of_first[task], of_middle[task], of_last[task] = 0, 0, 0
         for begin in range(task * chunk, min(samples, (task + 1) * chunk), BLOCK):
             count = min(BLOCK, samples - begin)
-            # Through the last layer. Whole vectors reach beyond a row, and beyond the last one there is nothing to be read.
+            # Whole vectors reach beyond a row of the gradient, and beyond the last one there is nothing to be read.
             p_from, start, row = p_grad, begin * outputs, outputs
             if begin + BLOCK + wide // outputs >= samples:
                 _corner(grad, begin, 0, count, outputs, given)
                 p_from, start, row = p_given, 0, wide
             narrowed(p_from, start, row, outputs, p_above, BLOCK, wide)
             pairs_of_rows(p_from, start, row, outputs, p_above_pairs, pairs, wide)
-            there, at = (layers - 1) * ahead + begin * width, 0
-            pairs_of_rows(p_kept, there, width, width, p_layer_pairs, pairs, width)
-            place = task * wide * width
-            product_added(p_above_pairs, 0, 1, wide, p_layer_pairs, 0, width, pairs, p_of_last, place, width, wide, width)
-            product_masked(p_above, 0, outer, 1, p_last, 0, width, outer, p_pull, at, width, BLOCK, width, p_kept, there)
-            # Through those between.
+            there, at, place = (layers - 1) * ahead + begin * width, 0, task * wide * width
+            _through(p_above, 0, p_above_pairs, wide, p_kept, there, p_layer, p_last, 0, p_of_last, place, p_pull, at, width, per)
+            pairs_of_rows(p_pull, at, width, width, p_pairs, pairs, width)
             for layer in range(layers - 2, -1, -1):
                 there, to = layer * ahead + begin * width, BLOCK * width - at
-                pairs_of_rows(p_pull, at, width, width, p_pull_pairs, pairs, width)
-                pairs_of_rows(p_kept, there, width, width, p_layer_pairs, pairs, width)
-                place = (task * (layers - 1) + layer) * width * width
-                product_added(p_pull_pairs, 0, 1, width, p_layer_pairs, 0, width, pairs, p_of_middle, place, width, width, width)
-                weight = layer * words * width
-                product_masked(p_pull, at // per, words, 1, p_middle, weight, width, words, p_pull, to, width, BLOCK, width, p_kept, there)
+                place, weight = (task * (layers - 1) + layer) * width * width, layer * words * width
+                _through(p_pull, at, p_pairs, width, p_kept, there, p_layer, p_middle, weight, p_of_middle, place, p_pull, to, width, per)
                 at = to
-            # Through the first, whose features have samples for neighbours.
+                pairs_of_rows(p_pull, at, width, width, p_pairs, pairs, width)
             p_from, start, row = p_features, begin, samples
-            if count < BLOCK or inputs < filled:
+            whole = count == BLOCK and inputs == filled
+            if not whole:
                 _corner(features, 0, begin, inputs, count, columns)
                 p_from, start, row = p_columns, 0, BLOCK
             narrowed(p_from, start, row, BLOCK, p_x, filled, BLOCK)
-            pairs_of_rows(p_pull, at, width, width, p_pull_pairs, pairs, width)
-            place = task * filled * width
-            product_added(p_x, 0, pairs, 1, p_pull_pairs, 0, width, pairs, p_of_first, place, width, filled, width)
-            for i in range(0, words, LANES):
-                for n in range(0, BLOCK, LANES):
-                    turn(p_pull, at // per + n * words + i, words, p_across, i * BLOCK + n, BLOCK)
-            if count == BLOCK and inputs == filled:
-                product(p_first, 0, 1, deep, p_across, 0, BLOCK, words, p_to, begin, samples, filled, BLOCK)
-            else:
-                product(p_first, 0, 1, deep, p_across, 0, BLOCK, words, p_columns, 0, BLOCK, filled, BLOCK)
-                for i in range(inputs):
-                    for n in range(count):
-                        of_features[i, begin + n] = columns[i, n]
+            product_added(p_x, 0, pairs, 1, p_pairs, 0, width, pairs, p_of_first, task * filled * width, width, filled, width)
+            if whole:
+                _to_features(p_pull, at // per, words, p_across, p_first, deep, p_to, begin, samples, filled)
+                continue
+            _to_features(p_pull, at // per, words, p_across, p_first, deep, p_columns, 0, BLOCK, filled)
+            for i in range(inputs):
+                for n in range(count):
+                    of_features[i, begin + n] = columns[i, n]
 
 
 def _chunk(samples: int) -> int:
