@@ -3,7 +3,7 @@
     python benchmarks/end_to_end.py SOURCE... --runs FOLDER [--json FILE]
 
 Each source gets a run of its own, FOLDER/<name of the source>; one that stands already is only read, with the seconds that its stages took when they
-were made. Beside the figures stand the machine, the versions and the load, for seconds mean nothing without them.
+were made. Beside the figures stand the machine and the versions, and of runs made here the load, for seconds mean nothing without them.
 """
 
 from __future__ import annotations
@@ -54,9 +54,10 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = []
     for source in arguments.sources:
-        before = os.getloadavg()
+        before, stood = os.getloadavg(), (arguments.runs / source.name).exists()
         row = row_of(source, arguments.runs / source.name)
-        row["load"] = {"before": before, "after": os.getloadavg()}
+        if not stood:
+            row["load"] = {"before": before, "after": os.getloadavg()}
         rows.append(row)
         total = sum(row["seconds"].values())
         quality = f"network {row['network']['psnr']:.2f} dB  asset {row['asset']['psnr']:.2f} dB, {row['asset_bytes'] / 1e6:.1f} MB"

@@ -352,7 +352,7 @@ def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
 
 def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:
     """Update the density voxels with what the coarse field said, before its activation, at points in grid coordinates; `count` as for `update`."""
-    if cell is None and m.voxels.rule == "maximum" and dispatch.tell_largest(m.voxels.values, point, raw, m.scout.activation):
+    if cell is None and count is None and m.voxels.rule == "maximum" and dispatch.tell_largest(m.voxels.values, point, raw, m.scout.activation):
         return
     cell = cell_of(point, m.voxels.side) if cell is None else cell
     update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.scout.activation), count)
