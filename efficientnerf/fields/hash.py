@@ -93,10 +93,10 @@ def _encoded(points: Tensor, table: Tensor, field: HashField) -> tuple[Tensor, T
     """Points (3, N) and features (2L, N): the order that the kernels want."""
     from efficientnerf.kernels import cpu_hash
 
-    points = points.t().contiguous()
-    out = torch.empty(FEATURES * len(field.sides), points.shape[1])
-    cpu_hash.encode(points.numpy(), table.detach().numpy(), field.sides, field.dense, field.starts, field.mask, out.numpy())
-    return points, out
+    turned, out = torch.empty(3, len(points)), torch.empty(FEATURES * len(field.sides), len(points))
+    cpu_hash.across(points.detach().contiguous().numpy(), turned.numpy())
+    cpu_hash.encode(turned.numpy(), table.detach().numpy(), field.sides, field.dense, field.starts, field.mask, out.numpy())
+    return turned, out
 
 
 def _add_table_gradient(points: Tensor, grad: Tensor, table: Tensor, field: HashField) -> None:

@@ -19,6 +19,7 @@ from efficientnerf.kernels.entries import LINE, add_to_entries, interpolated_ent
 from efficientnerf.kernels.lanes import pointer
 
 BLOCK = 128  # samples whose places and weights are computed together
+TURNED = 4096  # points of a task
 LINES_TOUCHED = 4  # by a sample in a level, about: neighbours along x are mostly in one cache line
 SHARE = 2**15  # samples of a task, at most: 24 features of as many take 3 MiB
 
@@ -58,6 +59,15 @@ def _load_level(entries, side, dense, start, mask, samples):  # type: ignore[no-
     if LINES_TOUCHED * samples * LINE >= count:
         for at in range(start, start + count, LINE):
             touch(entries, 2 * at)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def across(points, out):  # type: ignore[no-untyped-def]
+    """Points (N, 3) as (3, N)."""
+    count = len(points)
+    for task in numba.prange((count + TURNED - 1) // TURNED):
+        for n in range(task * TURNED, min(count, (task + 1) * TURNED)):
+            out[0, n], out[1, n], out[2, n] = points[n, 0], points[n, 1], points[n, 2]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
