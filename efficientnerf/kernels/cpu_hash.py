@@ -21,7 +21,7 @@ from efficientnerf.kernels.lanes import pointer
 BLOCK = 128  # samples whose places and weights are computed together
 TURNED = 4096  # points of a task
 LINES_TOUCHED = 4  # by a sample in a level, about: neighbours along x are mostly in one cache line
-SHARE = 2**15  # samples of a task, at most: 24 features of as many take 3 MiB
+SHARE = 2**15  # samples of a task, at most: 32 features of as many take 4 MiB
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
