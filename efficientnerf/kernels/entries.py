@@ -11,11 +11,12 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from efficientnerf.kernels.lanes import spread
+
 CORNERS = 8
 LINE = 8  # entries of a cache line of 64 bytes
 
 _ENTRY = ir.VectorType(ir.FloatType(), 2)
-_BOTH = ir.Constant(ir.VectorType(ir.IntType(32), 2), [0, 0])
 _FUSED = ("contract", "reassoc", "nsz")
 
 
@@ -25,12 +26,7 @@ def _corners(builder: Any, table: Any, place: Any, weight: Any, n: Any, row: Any
         at = builder.add(n, builder.mul(row, ir.Constant(ir.IntType(64), corner)))
         index = builder.zext(builder.load(builder.gep(place, [at])), ir.IntType(64))
         entry = builder.bitcast(builder.gep(table, [builder.shl(index, ir.Constant(ir.IntType(64), 1))]), _ENTRY.as_pointer())
-        yield entry, _twice(builder, builder.load(builder.gep(weight, [at])))
-
-
-def _twice(builder: Any, value: Any) -> Any:
-    one = builder.insert_element(ir.Constant(_ENTRY, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, one, _BOTH)
+        yield entry, spread(builder, builder.load(builder.gep(weight, [at])), 2)
 
 
 @intrinsic
@@ -56,7 +52,7 @@ def add_to_entries(typing_context: Any, table: Any, place: Any, weight: Any, n: 
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         *where, first, second = args
-        pull = builder.insert_element(_twice(builder, first), second, ir.Constant(ir.IntType(32), 1))
+        pull = builder.insert_element(spread(builder, first, 2), second, ir.Constant(ir.IntType(32), 1))
         for entry, factor in _corners(builder, *where):
             product = builder.fmul(factor, pull, flags=_FUSED)
             builder.store(builder.fadd(builder.load(entry, align=4), product, flags=_FUSED), entry, align=4)
@@ -92,8 +88,7 @@ def adam_of_line(
         zero = ir.Constant(line, None)
 
         def every(x: Any) -> Any:
-            one = builder.insert_element(ir.Constant(line, ir.Undefined), x, ir.Constant(ir.IntType(32), 0))
-            return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), 2 * LINE), None))
+            return spread(builder, x, 2 * LINE)
 
         g = builder.load(grad, align=4)
         there = builder.fcmp_unordered("!=", g, zero)

@@ -11,6 +11,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from efficientnerf.kernels.lanes import spread
+
 RAYS = 16
 # Rows of the state, (ROWS, RAYS) float32: position and velocity in the space's unit box, the distance along the ray, where the ray leaves, the offset of
 # samples in their intervals, the density that voxels must exceed, how many intervals were looked at, and where the last of them began.
@@ -30,8 +32,7 @@ class _Vectors:
         return ir.Constant(_FLOATS, [x] * RAYS)
 
     def every(self, x: Any) -> Any:
-        one = self.builder.insert_element(ir.Constant(ir.VectorType(x.type, RAYS), ir.Undefined), x, ir.Constant(ir.IntType(32), 0))
-        return self.builder.shuffle_vector(one, one, ir.Constant(_WORDS, None))
+        return spread(self.builder, x, RAYS)
 
     def larger(self, x: Any, y: Any) -> Any:
         return self.builder.select(self.builder.fcmp_ordered(">", x, y), x, y)

@@ -59,7 +59,7 @@ def _arithmetic(operation: Any, name: str) -> None:
     @intrinsic
     def each(typing_context: Any, a: Any, b: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            one, other = (arg if isinstance(kind, Four) else _spread(builder, arg) for kind, arg in zip(signature.args, args, strict=True))
+            one, other = (arg if isinstance(kind, Four) else spread(builder, arg, 4) for kind, arg in zip(signature.args, args, strict=True))
             return getattr(builder, name)(one, other, flags=_FUSED)
 
         return four(a, b), codegen
@@ -123,7 +123,7 @@ def scaled(typing_context: Any, factor: Any, value: Any) -> Any:
     """A float32 times each of four."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fmul(_spread(builder, args[0]), args[1], flags=_FUSED)
+        return builder.fmul(spread(builder, args[0], 4), args[1], flags=_FUSED)
 
     return four(types.float32, four), codegen
 
@@ -133,7 +133,7 @@ def plus_scaled(typing_context: Any, total: Any, factor: Any, value: Any) -> Any
     """Four plus a float32 times four others, each to its own."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        product = builder.fmul(_spread(builder, args[1]), args[2], flags=_FUSED)
+        product = builder.fmul(spread(builder, args[1], 4), args[2], flags=_FUSED)
         return builder.fadd(args[0], product, flags=_FUSED)
 
     return four(four, types.float32, four), codegen
@@ -293,6 +293,12 @@ def quarters(typing_context: Any, value: Any) -> Any:
     return types.UniTuple(four, 4)(sixteen), codegen
 
 
+def spread(builder: Any, value: Any, lanes: int) -> Any:
+    """A number in all lanes of a vector."""
+    one = builder.insert_element(ir.Constant(ir.VectorType(value.type, lanes), ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), lanes), None))
+
+
 def _times(builder: Any, x: Any, y: Any) -> Any:
     return builder.fmul(x, y, flags=_FUSED)
 
@@ -343,9 +349,3 @@ def _joined(builder: Any, parts: list[Any]) -> Any:
 
 def _load(builder: Any, address: Any, index: Any) -> Any:
     return builder.load(builder.bitcast(builder.gep(address, [index]), _LANES.as_pointer()), align=4)
-
-
-def _spread(builder: Any, value: Any) -> Any:
-    """A float32 four times."""
-    one = builder.insert_element(ir.Constant(_LANES, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    return _chosen(builder, one, one, (0, 0, 0, 0))

@@ -22,6 +22,8 @@ from numba.core import cgutils, config
 from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic, overload
 
+from efficientnerf.kernels.lanes import spread
+
 LANES = 16
 # What numba compiles for; it has the same two settings.
 FEATURES = frozenset((get_host_cpu_features() if config.CPU_FEATURES is None else config.CPU_FEATURES).split(","))
@@ -55,13 +57,6 @@ float_pointer, pair_pointer, half_pointer = (types.CPointer(kind) for kind in (t
 
 def _all(kind: Any, x: float) -> Any:
     return ir.Constant(kind, [x] * LANES)
-
-
-def _spread(builder: Any, value: Any) -> Any:
-    """A number sixteen times."""
-    kind = ir.VectorType(value.type, LANES)
-    one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, one, _all(_WORDS, 0))
 
 
 def _load(builder: Any, address: Any, index: Any, kind: Any) -> Any:
@@ -158,7 +153,7 @@ def _product(finish: Callable[..., Any]) -> Any:
                     step, line = builder.mul(loop.index, a_step), builder.add(begin, builder.mul(loop.index, b_step))
                     lines = [_load(builder, b, builder.add(line, number(LANES * v)), vector) for v in range(vectors)]
                     for start, one in zip(starts, sums, strict=True):
-                        factor = _spread(builder, builder.load(builder.gep(start, [step]), align=4))
+                        factor = spread(builder, builder.load(builder.gep(start, [step]), align=4), LANES)
                         for place, value in zip(one, lines, strict=True):
                             builder.store(_plus_product(builder, builder.load(place), factor, value), place)
                 for r, one in enumerate(sums):
@@ -251,7 +246,7 @@ def put_pairs(typing_context: Any, source: Any, low: Any, high: Any, left: Any, 
 def _some(builder: Any, value: Any, left: Any) -> Any:
     """The first `left` of sixteen, then zeros."""
     lanes = ir.Constant(_WORDS, list(range(LANES)))
-    there = builder.icmp_signed("<", lanes, _spread(builder, builder.trunc(left, ir.IntType(32))))
+    there = builder.icmp_signed("<", lanes, spread(builder, builder.trunc(left, ir.IntType(32)), LANES))
     return builder.select(there, value, ir.Constant(value.type, None))
 
 
