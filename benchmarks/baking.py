@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from stage_runs import linked_copy, made, read_json
 
-from workflows.paper import hardware, versions
+from workflows.paper.document import hardware, versions
 
 
 def row_of(run: Path, resolution: int, settings: dict[str, str]) -> dict[str, Any]:

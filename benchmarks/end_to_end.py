@@ -24,7 +24,7 @@ LIBRARIES = ("torch", "numba", "numpy", "pycolmap")
 
 def summary_of(source: Path, run: Path) -> dict[str, Any]:
     """Run `enerf run` and return its summary, the last JSON object that it prints."""
-    command = [sys.executable, "-m", "workflows.cli", "run", str(source), "--out", str(run), "--json"]
+    command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(run), "--json"]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
     summary = json.loads(done.stdout.splitlines()[-1])
     if done.returncode != 0:
@@ -35,7 +35,7 @@ def summary_of(source: Path, run: Path) -> dict[str, Any]:
 def row_of(source: Path, run: Path) -> dict[str, Any]:
     summary = summary_of(source, run)
     metrics = json.loads((run / "evaluate" / "metrics.json").read_text(encoding="utf-8"))
-    status = json.loads(subprocess.run([sys.executable, "-m", "workflows.cli", "status", str(run), "--json"], stdout=subprocess.PIPE, check=True).stdout)
+    status = json.loads(subprocess.run([sys.executable, "-m", "workflows.cli.main", "status", str(run), "--json"], stdout=subprocess.PIPE, check=True).stdout)
     return {
         "source": source.name,
         "seconds": {stage["name"]: stage["seconds"] for stage in status["stages"]},

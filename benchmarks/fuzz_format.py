@@ -159,7 +159,7 @@ def changed(rng: Rng, seeds: list[bytes]) -> tuple[str, bytes]:
 
 def try_file(path: Path) -> str | None:
     """None if the file is read, and can be drawn and saved; else what it is refused for. Anything else is raised."""
-    from efficientnerf.nerftree.format import FormatError, describe, load, serialize
+    from efficientnerf.asset.format import FormatError, describe, load, serialize
 
     said = None
     try:

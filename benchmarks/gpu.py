@@ -40,7 +40,7 @@ def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
         return {"left_out": f"not installed here: {', '.join(missing)}"}
-    command = [sys.executable, "-m", "workflows.cli", "run", str(source), "--out", str(folder), "--device", "cuda", "--json", *options]
+    command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(folder), "--device", "cuda", "--json", *options]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=max(1.0, seconds), check=False)
     except subprocess.TimeoutExpired as late:
@@ -95,7 +95,7 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
     if part == "kernels":
         return {"copy_gb_per_second": round(gpu_kernels.copy_rate("cuda", 2048, 10)), **gpu_kernels.kernel_rates("cuda", 2**16, 19, 20)}
     if part == "pictures":
-        from efficientnerf.nerftree.tree import NerfTree
+        from efficientnerf.asset.tree import NerfTree
 
         tree = NerfTree.load(given.asset) if given.asset else gpu_kernels.shell(384)
         return gpu_kernels.frame_rates("cuda", tree, 800, 10, TILES)

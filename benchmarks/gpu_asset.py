@@ -16,16 +16,16 @@ import numpy as np
 import torch
 from gpu_kernels import BOUNDS, ball, orbit
 
-from efficientnerf.cameras import Camera
-from efficientnerf.grid import Space
+from efficientnerf.asset import bake, refinement
+from efficientnerf.asset.refinement import Targets
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, model
-from efficientnerf.nerftree import baking, optimising
-from efficientnerf.nerftree.optimising import Targets
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
-from efficientnerf.pixels import Pixels
-from efficientnerf.render import FieldRenderer
-from efficientnerf.settings import TrainSettings
-from efficientnerf.training import train, trainer
+from efficientnerf.rendering.render import FieldRenderer
+from efficientnerf.training.loop import train, trainer
+from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.settings import TrainSettings
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -57,20 +57,20 @@ def asset_rates(device: str, *, steps: int, side: int, views: int, resolution: i
     tree = baked(m, scene, resolution, pixels)
     clock.lap("bake")
     targets = Targets(scene, WHITE).to(device)
-    o = optimising.optimiser(tree, optimising.OPAQUE)
+    o = refinement.optimiser(tree, refinement.OPAQUE)
     told: dict[str, Any] = {"steps": fit_steps, "rays": rays, "density_rate": 0.3, "colour_rate": 0.03, "final": 0.3, "seed": 0}
-    for _ in optimising.optimise(o, targets, until=fit_steps // 4, **told):
+    for _ in refinement.optimise(o, targets, until=fit_steps // 4, **told):
         pass
     clock.lap("fit_begins")
-    for _ in optimising.optimise(o, targets, until=fit_steps, **told):
+    for _ in refinement.optimise(o, targets, until=fit_steps, **told):
         pass
     clock.lap("fit")
     pace = (fit_steps - fit_steps // 4) / clock.seconds["fit"]
     waits = waits_of(o, targets, device, {**told, "steps": fit_steps + 32, "until": fit_steps + 32})
     clock.lap("waits")
-    weights = optimising.greatest_weights(o.result(), targets, pixels, 0)
+    weights = refinement.greatest_weights(o.result(), targets, pixels, 0)
     clock.lap("weights")
-    errors = [optimising.error(each, targets, 2**16, 0) for each in (tree, o.result())]
+    errors = [refinement.error(each, targets, 2**16, 0) for each in (tree, o.result())]
     clock.lap("errors")
     return {
         "seconds": clock.seconds, "voxels": len(tree.density_values), "voxels_that_show": int((weights > 1e-3).sum()),
@@ -82,17 +82,17 @@ def asset_rates(device: str, *, steps: int, side: int, views: int, resolution: i
 
 def baked(m: Model, scene: Pixels, resolution: int, pixels: int) -> NerfTree:
     """The network's values in all voxels that it shows."""
-    shape, voxel = baking.grid_of(BOUNDS, resolution, 4)
-    seen = baking.visible_voxels(m, scene, shape, voxel, BOUNDS[0], 4, pixels, lambda done, total: None)
-    indices = baking.chosen_voxels(seen, shape, 4, 1e-3, 1)
-    parts = list(baking.voxel_values(m, indices, voxel, BOUNDS[0], 4, 0))
+    shape, voxel = bake.grid_of(BOUNDS, resolution, 4)
+    seen = bake.visible_voxels(m, scene, shape, voxel, BOUNDS[0], 4, pixels, lambda done, total: None)
+    indices = bake.chosen_voxels(seen, shape, 4, 1e-3, 1)
+    parts = list(bake.voxel_values(m, indices, voxel, BOUNDS[0], 4, 0))
     density, sh = (np.concatenate(part) for part in zip(*parts, strict=True))
     return tree_from_voxels(shape, voxel, BOUNDS[0], indices, density, sh, background=WHITE)
 
 
-def waits_of(o: optimising.Optimiser, targets: Targets, device: str, told: dict[str, Any]) -> dict[str, int]:
+def waits_of(o: refinement.Optimiser, targets: Targets, device: str, told: dict[str, Any]) -> dict[str, int]:
     """Lines that waited for the device in more steps, the first left out, which waits by design."""
-    running = optimising.optimise(o, targets, **told)
+    running = refinement.optimise(o, targets, **told)
     next(running)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

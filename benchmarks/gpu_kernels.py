@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from efficientnerf.cameras import Camera, rays
-from efficientnerf.grid import Space
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import model
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
-from efficientnerf.pixels import Pixels
-from efficientnerf.settings import TrainSettings
+from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.settings import TrainSettings
 
 BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])
 
@@ -53,8 +53,8 @@ def copy_rate(device: str, mebibytes: int, repeats: int) -> float:
 
 def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict[str, dict[str, float]]:
     """Each kernel of a step at the sizes of a bundle of `rays_` rays: milliseconds, samples a second, and the bytes that it cannot avoid over that time."""
-    from efficientnerf.harmonics import basis
-    from efficientnerf.kernels import cuda, cuda_compositing, cuda_sampling
+    from efficientnerf.backends.triton import compositing, hash_grid, sampling
+    from efficientnerf.rendering.harmonics import basis
 
     generator = torch.Generator().manual_seed(0)
     m = model(Space(BOUNDS, False), TrainSettings(levels=16, log2_table=log2_table, finest=2048), (1.0, 1.0, 1.0), device)
@@ -67,20 +67,20 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     origins = (3 * away).to(device)
     near, far, offset = (torch.full((rays_,), x, device=device) for x in (1.0, 6.0, 0.5))
     march = (m.space, origins, directions, near, far, offset, m.step, m.slots, voxels, 0.5)
-    coarse = cuda_sampling.valid_samples(*march)
+    coarse = sampling.valid_samples(*march)
     count = len(coarse.start)
     weight = torch.rand(count, generator=generator).to(device)
-    pivotal = cuda_sampling.pivots(weight, coarse.first, 1e-4, 8)
-    fine = cuda_sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2)
+    pivotal = sampling.pivots(weight, coarse.first, 1e-4, 8)
+    fine = sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2)
     samples = len(fine.start)
     field: Any = m.fine
     table, levels = field.table, len(field.sides)
-    encode = lambda: cuda.Encode.apply(fine.point, table, field.sides, field.dense, field.starts, int(field.mask))  # noqa: E731
+    encode = lambda: hash_grid.Encode.apply(fine.point, table, field.sides, field.dense, field.starts, int(field.mask))  # noqa: E731
     features = encode()
     pull = torch.randn(features.shape, generator=generator).to(device)
     raw = torch.randn(samples, 28, generator=generator).to(device).requires_grad_()
     harmonics, behind = basis(directions, 2), torch.ones(rays_, 3, device=device)
-    composite = lambda: cuda_compositing.composite(raw, fine.length, fine.first, harmonics, behind, "exp")  # noqa: E731
+    composite = lambda: compositing.composite(raw, fine.length, fine.first, harmonics, behind, "exp")  # noqa: E731
     colour = composite().colour
     grad, first, second = (torch.randn(table.shape, generator=generator).to(device) for _ in range(3))
     grad[torch.rand(len(table), generator=generator).to(device) < 0.5] = 0
@@ -89,14 +89,14 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     corner = 8 * levels * 8.0  # bytes of the table that a sample reads, two features of 4 bytes at 8 corners of each level
     room = math.ceil(1.3 * count / 4096) * 4096
     jobs: list[tuple[str, Callable[[], Any], int, float]] = [
-        ("march", lambda: cuda_sampling.valid_samples(*march, capacity=room), count, 32.0),
-        ("pivots", lambda: cuda_sampling.pivots(weight, coarse.first, 1e-4, 8), count, 5.0),
-        ("pivotal_samples", lambda: cuda_sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2, 2 * room), samples, 32.0),
+        ("march", lambda: sampling.valid_samples(*march, capacity=room), count, 32.0),
+        ("pivots", lambda: sampling.pivots(weight, coarse.first, 1e-4, 8), count, 5.0),
+        ("pivotal_samples", lambda: sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2, 2 * room), samples, 32.0),
         ("encode", encode, samples, 12 + corner + 8 * levels),
         ("encode_backward", lambda: torch.autograd.grad(features, table, pull, retain_graph=True), samples, 12 + 2 * corner + 8 * levels),
         ("composite", composite, samples, 28 * 4 + 4 + 16.0),
         ("composite_backward", lambda: torch.autograd.grad(colour.sum(), raw, retain_graph=True), samples, 2 * 28 * 4 + 4 + 16.0),
-        ("adam", lambda: cuda.adam(value, grad, first, second, 0.01, 0.9, 0.99, 0.5, 0.5, 1e-15, skip_zeros=True), table.numel(), 4 + 24 / 2.0),
+        ("adam", lambda: hash_grid.adam(value, grad, first, second, 0.01, 0.9, 0.99, 0.5, 0.5, 1e-15, skip_zeros=True), table.numel(), 4 + 24 / 2.0),
     ]
     out = {}
     for name, run, items, each in jobs:
@@ -136,7 +136,7 @@ def orbit(side: int, frames: int) -> list[Camera]:
 
 def frame_rates(device: str, tree: NerfTree, side: int, repeats: int, variants: list[tuple[tuple[int, int], int]]) -> dict[str, Any]:
     """Milliseconds of a picture of side x side pixels, mean over an orbit, for tiles of pixels and warps to a program; and how far it is from the CPU's."""
-    from efficientnerf.kernels import cuda_tree
+    from efficientnerf.backends.triton import tree as cuda_tree
 
     sent = cuda_tree.device_tree(tree, device)
     cameras = orbit(side, 8)
@@ -174,7 +174,7 @@ def ball(cameras: list[Camera]) -> Pixels:
 
 def training_rates(device: str, steps: int, side: int, views: int, **settings: Any) -> dict[str, Any]:
     """Steps and samples a second on the ball, the second half of the steps timed; and which lines still waited for the device in 32 steps more."""
-    from efficientnerf.training import train, trainer
+    from efficientnerf.training.loop import train, trainer
 
     s = TrainSettings(**{**settings, "iterations": steps + 32})
     pixels = ball(orbit(side, views))
@@ -210,7 +210,7 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
 
 def paper_rates(device: str, steps: int, side: int, views: int, **changes: Any) -> dict[str, Any]:
     """`training_rates` of the rows of table 5, and of uniform sampling, with the settings of the preset paper-n4, a short warm-up apart."""
-    from workflows.paper_tables import IMPORTANCE, LARGE, NERF
+    from workflows.paper.tables import IMPORTANCE, LARGE, NERF
 
     rows: dict[str, dict[str, Any]] = {
         "nerf": NERF, "uniform": {**NERF, "sampling": "uniform"}, "sh": {"sampling": "hierarchical", **IMPORTANCE, **LARGE},

@@ -87,7 +87,7 @@ def default_field() -> Any:
     import torch
 
     from efficientnerf.fields.hash import HashField
-    from efficientnerf.settings import FINEST, LOG2_TABLE, TrainSettings
+    from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 
     s = TrainSettings()
     return HashField(
@@ -101,9 +101,9 @@ def field_kernels(seconds: float) -> dict[str, Any]:
     import numpy as np
     import torch
 
+    from efficientnerf.backends.numba import hash_grid, mlp
+    from efficientnerf.backends.torch.linear_chain import has_bfloat16
     from efficientnerf.fields.hash import FEATURES
-    from efficientnerf.kernels import cpu_hash, cpu_mlp
-    from efficientnerf.kernels.mlp import has_bfloat16
 
     field, rng = default_field(), np.random.default_rng(0)
     # Samples lie one behind the other on rays that end on a sphere, as those of a trained scene do.
@@ -117,17 +117,17 @@ def field_kernels(seconds: float) -> dict[str, Any]:
     table_grad = np.zeros_like(field.table.detach().numpy())
     levels = (field.sides, field.dense, field.starts, field.mask)
     corners = count * len(field.sides) * 8
-    forth = best(lambda: cpu_hash.encode(across, field.table.detach().numpy(), *levels, features), seconds)
-    back = best(lambda: cpu_hash.encode_backward(across, pull, *levels, table_grad), seconds)
+    forth = best(lambda: hash_grid.encode(across, field.table.detach().numpy(), *levels, features), seconds)
+    back = best(lambda: hash_grid.encode_backward(across, pull, *levels, table_grad), seconds)
 
     wide = 2 if has_bfloat16("cpu") and field.precision != "float32" else 4
     weights = [weight.detach().numpy() for weight in field.weights]
     products, activations = 2 * count * sum(w.size for w in weights), wide * count * sum(len(w) for w in weights[:-1])
     out, towards = np.empty((count, len(weights[-1])), np.float32), rng.normal(size=(count, len(weights[-1]))).astype(np.float32)
-    prepared = cpu_mlp.prepared(weights, bfloat16=wide == 2)
-    kept = cpu_mlp.forward(features, prepared, 0.0, out, keep=True)
-    through = best(lambda: cpu_mlp.forward(features, prepared, 0.0, out, keep=True), seconds)
-    again = best(lambda: cpu_mlp.backward(towards, features, prepared, kept, [w.shape for w in weights]), seconds)
+    prepared = mlp.prepared(weights, bfloat16=wide == 2)
+    kept = mlp.forward(features, prepared, 0.0, out, keep=True)
+    through = best(lambda: mlp.forward(features, prepared, 0.0, out, keep=True), seconds)
+    again = best(lambda: mlp.backward(towards, features, prepared, kept, [w.shape for w in weights]), seconds)
     both = best(lambda: field(points).backward(torch.from_numpy(towards)), seconds)
     ends = features.nbytes + out.nbytes
     return {
@@ -143,9 +143,9 @@ def compositing_kernels(seconds: float) -> dict[str, Any]:
     import numpy as np
     import torch
 
-    from efficientnerf.harmonics import basis, harmonics_count
-    from efficientnerf.kernels import cpu
-    from efficientnerf.settings import TrainSettings
+    from efficientnerf.backends.numba import rays
+    from efficientnerf.rendering.harmonics import basis, harmonics_count
+    from efficientnerf.training.settings import TrainSettings
 
     degree, count = TrainSettings().degree, RAYS * PER_RAY
     raw, length, first = torch.randn(count, 1 + 3 * harmonics_count(degree)), torch.full((count,), 0.02), torch.arange(0, count + 1, PER_RAY)
@@ -154,8 +154,8 @@ def compositing_kernels(seconds: float) -> dict[str, Any]:
     colour, opacity, spread = np.empty((RAYS, 3), np.float32), np.empty(RAYS, np.float32), np.empty(RAYS, np.float32)
     seen = np.empty(count, np.float32), np.empty((count, 3), np.float32)  # weights and colours of samples
     grad_raw, grad_behind, ones = np.empty(raw.shape, np.float32), np.empty((RAYS, 3), np.float32), np.ones(count, np.float32)
-    forth = best(lambda: cpu.composite(*packed, True, colour, opacity, spread, *seen), seconds)
-    back = best(lambda: cpu.composite_backward(*packed, True, *seen, colour, opacity, spread, ones, grad_raw, grad_behind), seconds)
+    forth = best(lambda: rays.composite(*packed, True, colour, opacity, spread, *seen), seconds)
+    back = best(lambda: rays.composite_backward(*packed, True, *seen, colour, opacity, spread, ones, grad_raw, grad_behind), seconds)
     return {
         "composite": row(count, forth, packed[0].nbytes + 16 * count),
         "composite backward": row(count, back, 2 * packed[0].nbytes + 16 * count),
@@ -167,9 +167,9 @@ def march_kernel(seconds: float) -> dict[str, Any]:
     import numpy as np
     import torch
 
-    from efficientnerf.grid import Space
-    from efficientnerf.kernels import dispatch
-    from efficientnerf.settings import COARSE_SAMPLES, TrainSettings
+    from efficientnerf.backends import dispatch
+    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.training.settings import COARSE_SAMPLES, TrainSettings
 
     s = TrainSettings()
     side = s.voxels or 128
@@ -190,7 +190,7 @@ def adam_kernel(seconds: float) -> dict[str, Any]:
     """A step on the table of which two thirds of the entries have a gradient, which it clears: the time to fill it again is taken off."""
     import numpy as np
 
-    from efficientnerf.kernels import cpu_adam
+    from efficientnerf.backends.numba import adam as cpu_adam
 
     entries, size = default_field().table.shape[0], default_field().table.numel()
     value, first_moment, second_moment = (np.zeros(size, np.float32) for _ in range(3))
@@ -211,7 +211,7 @@ def measured(seconds: float) -> dict[str, Any]:
     """Both, with the threads of this process."""
     import torch
 
-    from efficientnerf.kernels.mlp import has_bfloat16
+    from efficientnerf.backends.torch.linear_chain import has_bfloat16
 
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
     rates = machine(seconds)

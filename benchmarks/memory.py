@@ -76,7 +76,7 @@ def measured(photographs: Path, run: Path, sets: list[str]) -> dict[str, dict[st
     rows = {}
     for stage in ("poses", "train", "bake"):
         source = [str(photographs)] if stage == "poses" else []
-        command = [sys.executable, "-m", "workflows.cli", "run", *source, "--out", str(run), "--until", stage, "--quiet"]
+        command = [sys.executable, "-m", "workflows.cli.main", "run", *source, "--out", str(run), "--until", stage, "--quiet"]
         for text in sets if stage == "poses" else []:
             command += ["--set", text]
         rows[stage] = cost_of(command)

@@ -28,7 +28,7 @@ def settings() -> Any:
     import dataclasses
 
     from workflows import asset
-    from workflows.resolve import Settings, read_preset
+    from workflows.cli.resolve import Settings, read_preset
 
     resolved = Settings({stage.name: stage.settings for stage in asset.STAGES})
     resolved.put_table(read_preset("paper-n4").table, "paper-n4")
@@ -39,8 +39,8 @@ def views() -> Any:
     """Pixels of some cameras round the box, whose colours are noise."""
     import numpy as np
 
-    from efficientnerf.cameras import Camera
-    from efficientnerf.training import Pixels
+    from efficientnerf.geometry.cameras import Camera
+    from efficientnerf.training.loop import Pixels
 
     rng = np.random.default_rng(0)
     cameras, images = [], []
@@ -60,9 +60,9 @@ def trainer_of(pixels: Any) -> Any:
     import numpy as np
     import torch
 
-    from efficientnerf.grid import Space
+    from efficientnerf.geometry.spaces import Space
     from efficientnerf.model import model
-    from efficientnerf.training import train, trainer
+    from efficientnerf.training.loop import train, trainer
 
     m = model(Space(np.array([[-1.0] * 3, [1.0] * 3]), False), settings(), (1.0, 1.0, 1.0), "cpu", (2.0, 6.0))
     axis = (torch.arange(m.voxels.side) + 0.5) / m.voxels.side * 2 - 1
@@ -83,7 +83,7 @@ def rate(kind: str, size: int = 256, rows: int = 32768) -> float:
     """GFLOP/s of products (rows x size) (size x size), the shape of the networks' layers; the best of several."""
     import torch
 
-    from efficientnerf.kernels.mlp import product
+    from efficientnerf.backends.torch.linear_chain import product
 
     a, b = (torch.randn(n, size, generator=torch.Generator().manual_seed(n)).to(getattr(torch, kind)) for n in (rows, size))
     seconds = []
@@ -103,8 +103,8 @@ def products(field: Any) -> int:
 def measure(steps: int) -> dict[str, Any]:
     import torch
 
-    from efficientnerf.kernels.mlp import precision_of
-    from efficientnerf.training import train
+    from efficientnerf.backends.torch.linear_chain import precision_of
+    from efficientnerf.training.loop import train
 
     pixels = views()
     t = trainer_of(pixels)
@@ -152,7 +152,7 @@ def main() -> None:
 
     import torch
 
-    from workflows.paper import hardware
+    from workflows.paper.document import hardware
 
     torch.set_num_threads(arguments.threads)
     figures = measure(arguments.steps)

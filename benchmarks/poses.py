@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.cameras import pose_from_opengl
-from stages.photographs import find_cameras
+from efficientnerf.geometry.cameras import pose_from_opengl
+from stages.sfm.reconstruction import find_cameras
 
 ROOT = Path(__file__).resolve().parents[1]
 

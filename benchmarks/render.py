@@ -64,7 +64,7 @@ def _seconds(what: Any) -> float:
 
 def cameras(tree: Any, width: int, height: int, count: int, fov: float) -> list[Any]:
     """`count` cameras on the asset's orbit."""
-    from stages.paths import turntable_cameras
+    from stages.framing.camera_paths import turntable_cameras
 
     return list(turntable_cameras(tree, frames=count, width=width, height=height, fov=fov))
 
@@ -94,7 +94,7 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
     """Means over the rays of some pictures: what the kernel looks up, and the bytes that it asks for, most of which lie in caches."""
     import numpy as np
 
-    from efficientnerf.kernels.cpu_tree import picture_work
+    from efficientnerf.backends.numba.tree.rendering import picture_work
 
     work = np.concatenate([picture_work(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
     cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
@@ -112,7 +112,7 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
 
 def memory(tree: Any, view: Any) -> dict[str, float]:
     """Bytes of all that lies in memory while a picture is drawn: the tree, what is packed of it, the threads' blocks, and the picture."""
-    from efficientnerf.kernels.cpu_tree import pool_bytes
+    from efficientnerf.backends.numba.tree.rendering import pool_bytes
 
     values = vars(tree) | vars(tree.harmonics) if hasattr(tree.harmonics, "__dict__") else vars(tree)
     own = sum(part.nbytes for part in values.values() if hasattr(part, "nbytes") and not isinstance(part, tuple))
@@ -141,7 +141,7 @@ def main() -> int:
 
     import numba
 
-    from efficientnerf.nerftree.tree import NerfTree
+    from efficientnerf.asset.tree import NerfTree
 
     before = os.getloadavg()
     begin = time.perf_counter()

@@ -16,7 +16,7 @@ from typing import Any
 
 from stage_runs import linked_copy, made, read_json
 
-from workflows.paper import hardware, versions
+from workflows.paper.document import hardware, versions
 
 
 def row_of(run: Path, size: int, settings: dict[str, str]) -> dict[str, Any]:

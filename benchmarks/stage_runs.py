@@ -37,7 +37,7 @@ def linked_copy(run: Path, copy: Path) -> Path:
 
 def made(run: Path, stage: str, settings: dict[str, Any]) -> dict[str, float]:
     """Make a stage whatever stands: `seconds` by the clock, `cpu_seconds` of all threads and `peak_mib` of resident memory, of the whole command."""
-    command = [sys.executable, "-m", "workflows.cli", "stage", stage, str(run), "--force", "--quiet"]
+    command = [sys.executable, "-m", "workflows.cli.main", "stage", stage, str(run), "--force", "--quiet"]
     for name, value in settings.items():
         command += ["--set", f"{name}={value}"]
     return cost_of(command)

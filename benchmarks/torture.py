@@ -54,7 +54,7 @@ def rename(source, destination):
     if (after == "aside" and destination.name == "old-" + target) or (after == "placed" and destination.name == target and source.name == "out"):
         os.kill(os.getpid(), signal.SIGKILL)
 files.rename = rename
-from workflows.cli import main
+from workflows.cli.main import main
 sys.exit(main(sys.argv[3:]))
 """
 
@@ -99,7 +99,7 @@ class Child:
             self.stage = ""
 
 
-def start(arguments: Sequence[str], program: Sequence[str] = ("-m", "workflows.cli")) -> tuple[Child, threading.Thread]:
+def start(arguments: Sequence[str], program: Sequence[str] = ("-m", "workflows.cli.main")) -> tuple[Child, threading.Thread]:
     command = [sys.executable, *program, *arguments]
     environment = {**os.environ, "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, env=environment)

@@ -59,7 +59,7 @@ class Contender:
 
 def settings_of(preset: str) -> Any:
     from workflows import asset
-    from workflows.resolve import Settings, read_preset
+    from workflows.cli.resolve import Settings, read_preset
 
     resolved = Settings({stage.name: stage.settings for stage in asset.STAGES})
     resolved.put_table(read_preset(preset).table, preset)
@@ -68,13 +68,13 @@ def settings_of(preset: str) -> Any:
 
 def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contender:
     from efficientnerf.model import model
-    from efficientnerf.render import FieldRenderer
-    from efficientnerf.training import train, trainer
-    from stages import scene
-    from stages.budget import MOST, TIMED
-    from stages.field import space_of
-    from stages.lattice import sized
+    from efficientnerf.rendering.render import FieldRenderer
+    from efficientnerf.training.loop import train, trainer
+    from stages.io import scene
+    from stages.io.field_file import space_of
     from stages.train import anchors_of, pixels_of, stated_range
+    from stages.training.budget import MOST, TIMED
+    from stages.training.hash_resolution import sized
 
     s, settings = scene.load(poses), settings_of(preset)
     views = scene.views_of(s, "train")
@@ -92,7 +92,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     warmed: list[tuple[int, float]] = []
 
     def plan(step: int, wall: float) -> Any:
-        """As `stages.budget` does, by the time of this contender alone."""
+        """As `stages.training.budget` does, by the time of this contender alone."""
         if not warmed and step >= settings.warm_up:
             warmed.append((step, wall))
         if step < hold:
@@ -105,8 +105,8 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
 
 def held_back(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
     """Cameras, their true pictures, and by how much they are thinned."""
-    from stages import scene
     from stages.evaluate import thinned, thinned_camera, truth_of
+    from stages.io import scene
 
     s = scene.load(poses)
     views = scene.views_of(s, "test") or scene.views_of(s, "val")
@@ -120,7 +120,7 @@ def held_back(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
 def measure(each: Contender, views: list[tuple[Any, Any, int]]) -> float:
     import numpy as np
 
-    from efficientnerf.metrics import psnr
+    from efficientnerf.evaluation.metrics import psnr
 
     found = [psnr(np.clip(each.renderer.render(camera).colour, 0, 1), truth) for camera, truth, _ in views]
     each.points.append((each.wall, each.processor, each.trainer.step, float(np.mean(found))))
@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
     run = arguments.runs / arguments.source.name
-    command = [sys.executable, "-m", "workflows.cli", "run", str(arguments.source), "--out", str(run), "--until", "poses", "--quiet"]
+    command = [sys.executable, "-m", "workflows.cli.main", "run", str(arguments.source), "--out", str(run), "--until", "poses", "--quiet"]
     subprocess.run(command, check=True)
     from stages.train import use_all_cores
 

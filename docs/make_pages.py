@@ -10,8 +10,8 @@ import click
 
 from stages.settings import SettingInfo, describe_settings
 from workflows.asset import STAGES
-from workflows.cli import enerf
-from workflows.resolve import meaning, preset_names, read_preset, shown
+from workflows.cli.main import enerf
+from workflows.cli.resolve import meaning, preset_names, read_preset, shown
 
 FOLDER = Path(__file__).parent
 sys.path.insert(0, str(FOLDER.parent))  # the tests are not installed
@@ -75,14 +75,14 @@ def commands_page() -> str:
 
 
 def hostile_page() -> str:
-    from efficientnerf.nerftree.format import FormatError, load
+    from efficientnerf.asset.format import FormatError, load
     from tests.efficientnerf.hostile import HOSTILE
 
     lines = [
         NOTE,
         "# Hostile asset files",
         "",
-        "A file for each rule of [FORMAT.md](../efficientnerf/nerftree/FORMAT.md), and what is said of it; `enerf` ends with exit code 4. The files are",
+        "A file for each rule of [FORMAT.md](../efficientnerf/asset/FORMAT.md), and what is said of it; `enerf` ends with exit code 4. The files are",
         "made by `tests/efficientnerf/hostile.py`. A file cut short at any byte, or with any bit of its tensors changed, is refused as well; files changed",
         "at random are refused or read, and nothing else happens: [100,000 of them](../benchmarks/results/fuzz_format.json).",
         "",

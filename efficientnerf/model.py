@@ -17,18 +17,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.compositing import Composite, ray_of_sample
-from efficientnerf.density import DensityVoxels, density_voxels, voxel_weights
+from efficientnerf.backends import dispatch
+from efficientnerf.backends.transfer import sent
 from efficientnerf.fields.hash import HashField
 from efficientnerf.fields.mlp import MlpField
 from efficientnerf.fields.nerf import NerfField
-from efficientnerf.grid import FrameRays, Space, voxel_centres
-from efficientnerf.harmonics import basis, harmonics_count
-from efficientnerf.kernels import dispatch
-from efficientnerf.late import Room
-from efficientnerf.sampling import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples
-from efficientnerf.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
-from efficientnerf.transfer import sent
+from efficientnerf.geometry.spaces import FrameRays, Space, voxel_centres
+from efficientnerf.rendering.compositing import Composite, ray_of_sample
+from efficientnerf.rendering.harmonics import basis, harmonics_count
+from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels, voxel_weights
+from efficientnerf.sampling.samples import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples
+from efficientnerf.training.readback import Room
+from efficientnerf.training.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
 
 SKY_DEGREE = 2
 COARSEST = 16

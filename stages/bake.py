@@ -1,6 +1,6 @@
 """The bake stage: a trained field in, the asset out.
 
-    asset.nerftree  see efficientnerf/nerftree/FORMAT.md
+    asset.nerftree  see efficientnerf/asset/FORMAT.md
     report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the optimisation
 
 What takes long is kept in the scratch folder: what the network shows of the voxels, each block of baked values, and the state of the optimisation.
@@ -19,12 +19,12 @@ from pipeline.stage import Job, Stage
 from stages.settings import setting
 
 if TYPE_CHECKING:
-    from efficientnerf.grid import Space
-    from efficientnerf.nerftree.baking import Visible
-    from efficientnerf.pixels import Pixels
-    from stages.forward import Forward
-    from stages.resolution import Choice
-    from stages.scene import Scene
+    from efficientnerf.asset.bake import Visible
+    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.training.pixels import Pixels
+    from stages.baking.resolution import Choice
+    from stages.framing.forward_facing import Forward
+    from stages.io.scene import Scene
 
 ASSET = "asset.nerftree"
 
@@ -89,15 +89,15 @@ class BakeSettings:
 
 
 def run(job: Job) -> None:
-    from efficientnerf.nerftree import baking, format, writing
-    from efficientnerf.nerftree.optimising import Targets
-    from efficientnerf.nerftree.tree import tree_from_voxels
-    from stages import scene
+    from efficientnerf.asset import bake, format, serialisation
+    from efficientnerf.asset.refinement import Targets
+    from efficientnerf.asset.tree import tree_from_voxels
+    from stages.baking.memory import refuse_more_than_fits
+    from stages.baking.refinement import optimised
+    from stages.baking.resolution import budget_of
     from stages.evaluate import behind_of
-    from stages.field import load_renderer
-    from stages.memory import refuse_more_than_fits
-    from stages.optimisation import optimised
-    from stages.resolution import budget_of
+    from stages.io import scene
+    from stages.io.field_file import load_renderer
     from stages.train import pixels_of, use_all_cores
 
     settings: BakeSettings = job.settings
@@ -109,7 +109,7 @@ def run(job: Job) -> None:
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
     depth, mib = _depth_of(job, m), budget_of(s, settings.max_mib)
-    space = m.space if depth == 1 else baking.flattened(m.space, depth)
+    space = m.space if depth == 1 else bake.flattened(m.space, depth)
     bounds = space.bounds
     low = np.asarray(bounds[0], np.float64)
     pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
@@ -124,7 +124,7 @@ def run(job: Job) -> None:
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
     refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, resolution, mib)
-    shape, voxel = baking.grid_of(bounds, resolution, settings.brick)
+    shape, voxel = bake.grid_of(bounds, resolution, settings.brick)
     job.say(f"{resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
     points = 0 if m.settings.discretise == resolution and depth == 1 else settings.points
     facts = metadata_of(s, settings, m)
@@ -133,7 +133,7 @@ def run(job: Job) -> None:
         targets = Targets(pixels, None, seen.chosen, seen.before, seen.behind)
     else:
         targets = Targets(pixels, plain, infinite=s.background is None)
-    most = writing.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
+    most = serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
     # The raw values go in without a name here: they are large, and not needed once the fitting has its own.
     tree, fitted = optimised(
         job,
@@ -154,7 +154,7 @@ def run(job: Job) -> None:
 def sources_of(job: Job) -> dict[str, str]:
     """SHA-256 of what the asset was made from: the cameras, and the network."""
     from pipeline.hashes import sha256_of
-    from stages.field import FILE
+    from stages.io.field_file import FILE
 
     return {path.name: sha256_of(path) for path in (job.inputs["poses"] / "scene.json", job.inputs["train"] / FILE)}
 
@@ -231,24 +231,24 @@ DENSE = 1.7
 
 def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) -> tuple[Choice, Visible, np.ndarray]:
     """The resolution, what the network shows, and the coordinates of the voxels to bake."""
-    from efficientnerf.nerftree import baking, writing
-    from stages.resolution import Choice, affordable_resolution, finest_resolution
+    from efficientnerf.asset import bake, serialisation
+    from stages.baking.resolution import Choice, affordable_resolution, finest_resolution
 
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick
 
     def room(resolution: int) -> int:
-        shape, _ = baking.grid_of(bounds, resolution, brick)
-        return writing.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, brick)
+        shape, _ = bake.grid_of(bounds, resolution, brick)
+        return serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, brick)
 
     if settings.resolution or m.settings.discretise:
         choice = Choice(settings.resolution, "bake.resolution") if settings.resolution else Choice(m.settings.discretise, "train.discretise")
-        shape, voxel = baking.grid_of(bounds, choice.resolution, brick)
+        shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
         seen = _seen(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         return choice, seen, _kept(job, seen, shape, SPARE * room(choice.resolution))
 
     finest = finest_resolution(s, settings.max_resolution)
-    top_shape, top_voxel = baking.grid_of(bounds, finest.resolution, brick)
+    top_shape, top_voxel = bake.grid_of(bounds, finest.resolution, brick)
     seen = _seen(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64), space)
     last: tuple[int, Visible, np.ndarray] | None = None
 
@@ -257,35 +257,35 @@ def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) 
         if last is None or last[0] != resolution:
             last = None
             job.safe_point()
-            shape, voxel = baking.grid_of(bounds, resolution, brick)
-            coarse = seen if resolution == finest.resolution else baking.coarsened(seen, top_shape, top_voxel, shape, voxel, brick, settings.weight)
-            last = resolution, coarse, baking.chosen_voxels(coarse, shape, brick, settings.weight, settings.dilate)
+            shape, voxel = bake.grid_of(bounds, resolution, brick)
+            coarse = seen if resolution == finest.resolution else bake.coarsened(seen, top_shape, top_voxel, shape, voxel, brick, settings.weight)
+            last = resolution, coarse, bake.chosen_voxels(coarse, shape, brick, settings.weight, settings.dilate)
         return last
 
     choice = affordable_resolution(finest, lambda at: len(look(at)[2]), lambda at: int(DENSE * room(at)))
     _, coarse, indices = look(choice.resolution)
     most = SPARE * room(choice.resolution)
     if len(indices) > most:
-        indices = _kept(job, coarse, baking.grid_of(bounds, choice.resolution, brick)[0], most)
+        indices = _kept(job, coarse, bake.grid_of(bounds, choice.resolution, brick)[0], most)
     return choice, coarse, indices
 
 
 def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visible:
     """What the network shows of the voxels, from scratch or from an earlier attempt."""
-    from efficientnerf.nerftree import baking
+    from efficientnerf.asset import bake
 
     settings: BakeSettings = job.settings
     names = ("cells", "greatest", "chosen", "before", "behind")
     stored = {name: part for name in names if (part := _read_npy(job.work / f"seen_{name}.npy")) is not None}
     if len(stored) == len(names):
         # What is not known of a space that ends with the box is kept as an empty array.
-        return baking.Visible(**{name: None if name in ("before", "behind") and not len(part) else part for name, part in stored.items()})  # type: ignore[arg-type]
+        return bake.Visible(**{name: None if name in ("before", "behind") and not len(part) else part for name, part in stored.items()})  # type: ignore[arg-type]
 
     def looked(done: int, total: int) -> None:
         job.progress(done, total, "finding the voxels that matter")
         job.safe_point()
 
-    seen = baking.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked, space)
+    seen = bake.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked, space)
     for name in names:
         part = getattr(seen, name)
         _write_npy(np.empty(0, np.float16) if part is None else part, job.work / f"seen_{name}.npy")
@@ -294,17 +294,17 @@ def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: 
 
 def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], most: int) -> np.ndarray:
     """Coordinates of the voxels to bake: not many more than `most`, and then those of greatest weight."""
-    from efficientnerf.nerftree import baking
+    from efficientnerf.asset import bake
 
     settings: BakeSettings = job.settings
     threshold = settings.weight
-    indices = baking.chosen_voxels(seen, shape, settings.brick, threshold, settings.dilate)
+    indices = bake.chosen_voxels(seen, shape, settings.brick, threshold, settings.dilate)
     weights = np.sort(seen.greatest[seen.greatest > threshold])
     while len(indices) > most and len(weights) > 1:
         job.safe_point()
         # Grown voxels are about in proportion to the kept ones; a little less, so that this ends soon.
         weights = weights[-max(1, int(0.95 * len(weights) * most / len(indices))) :]
-        indices = baking.chosen_voxels(seen, shape, settings.brick, float(weights[0]), settings.dilate)
+        indices = bake.chosen_voxels(seen, shape, settings.brick, float(weights[0]), settings.dilate)
     return indices
 
 
@@ -313,9 +313,9 @@ CENTRES = 2**20  # that are looked for in the pictures at once
 
 def _seen_by_enough(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
     """The voxels that as many photographs have in view as training asked for, where surroundings are learned: its own voxels, which it closed to
-    matter elsewhere (`stages.observed`), are larger, and what they hold sticks out as a rim."""
-    from stages import scene
-    from stages.observed import often_seen
+    matter elsewhere (`stages.framing.view_coverage`), are larger, and what they hold sticks out as a rim."""
+    from stages.framing.view_coverage import often_seen
+    from stages.io import scene
 
     if not m.space.contracted or m.settings.observers == 0:
         return indices
@@ -329,10 +329,10 @@ def _seen_by_enough(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> n
 
 def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space) -> tuple[np.ndarray, np.ndarray]:
     """Baked values of all voxels; blocks of an earlier attempt are taken as they are."""
-    from efficientnerf.nerftree import baking
+    from efficientnerf.asset import bake
 
     settings: BakeSettings = job.settings
-    blocks, harmonics = baking.blocks_of(len(indices), points), (m.fine.degree + 1) ** 2
+    blocks, harmonics = bake.blocks_of(len(indices), points), (m.fine.degree + 1) ** 2
     density, sh = np.empty(len(indices), np.float32), np.empty((len(indices), harmonics, 3), np.float32)
     done = rows = 0
 
@@ -344,7 +344,7 @@ def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray
 
     while done < blocks and (stored := _read_npy(job.work / f"block_{done:06d}.npy")) is not None:
         take(stored)
-    for some, colours in baking.voxel_values(m, indices, voxel, low, points, settings.seed, first=done, space=space):
+    for some, colours in bake.voxel_values(m, indices, voxel, low, points, settings.seed, first=done, space=space):
         part = np.concatenate([some[:, None], colours.reshape(len(some), -1)], axis=1)
         _write_npy(part, job.work / f"block_{done:06d}.npy")
         take(part)

@@ -21,14 +21,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from efficientnerf.cameras import MODELS, Camera
+from efficientnerf.geometry.cameras import MODELS, Camera
 from pipeline.stage import Job, Stage
+from stages.io.scene import Scene, View
 from stages.lpips_weights import load_lpips
-from stages.scene import Scene, View
 from stages.settings import setting
 
 if TYPE_CHECKING:
-    from efficientnerf.perceptual import Lpips
+    from efficientnerf.evaluation.lpips import Lpips
 
 FORMAT = 1
 NETWORK_SIDE = 400  # pixels: the longest side of what the network draws where evaluate.scale does not say
@@ -70,10 +70,10 @@ class Truth:
 
 
 def run(job: Job) -> None:
-    from efficientnerf.nerftree.tree import NerfTree
+    from efficientnerf.asset.tree import NerfTree
 
     def load_field() -> Any:
-        from stages.field import load_renderer
+        from stages.io.field_file import load_renderer
 
         return load_renderer(job.inputs["train"], job.device)
 
@@ -86,7 +86,7 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
     tree        with the interface of a NerfTree
     load_field  gives a FieldRenderer; called only where one is needed
     """
-    from stages.scene import load
+    from stages.io.scene import load
 
     settings: EvaluateSettings = job.settings
     scene = load(job.inputs["poses"])
@@ -122,7 +122,7 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
 
 def held_back(scene: Scene) -> tuple[tuple[View, ...], str]:
     """The views to report on and their split: test, else val, else train."""
-    from stages.scene import views_of
+    from stages.io.scene import views_of
 
     for split in ("test", "val", "train"):
         views = views_of(scene, split)
@@ -146,7 +146,7 @@ def background_stride(views: Sequence[View], pixels: int) -> int:
 
 def truth_of(folder: Path, view: View, background: tuple[float, float, float] | None) -> Truth:
     """The photograph of a view at working size."""
-    from stages.scene import read_image, read_mask
+    from stages.io.scene import read_image, read_mask
 
     pixels = read_image(folder, view).astype(np.float32) / 255.0
     mask = read_mask(folder, view)
@@ -201,7 +201,7 @@ def measure(
     stride      thinning of what the network draws
     perceptual  LPIPS by the names of their figures
     """
-    from stages.plots import eight_bits, error_picture
+    from stages.pictures.plots import eight_bits, error_picture
 
     truth = truth_of(job.inputs["poses"], view, scene.background)
     plain = behind_of(scene)
@@ -230,7 +230,7 @@ def measure(
 
 def perceived(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: Truth) -> dict[str, float | None]:
     """LPIPS by name; None for images too small for the networks."""
-    from efficientnerf.perceptual import SMALLEST
+    from efficientnerf.evaluation.lpips import SMALLEST
 
     large = min(image.shape[:2]) >= SMALLEST
     return {name: metric(image, truth.colour, truth.mask) if large else None for name, metric in perceptual.items()}
@@ -267,7 +267,7 @@ def asset_picture(tree: Any, scene: Scene, view: View, rendering: Any, stride: i
 
 def compare(image: np.ndarray, truth: Truth, inside: np.ndarray | None) -> dict[str, float | None]:
     """psnr, ssim and psnr_in_box, None where nothing can be compared (no pixel, or fewer than an SSIM window)."""
-    from efficientnerf.metrics import psnr, ssim
+    from efficientnerf.evaluation.metrics import psnr, ssim
 
     used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
     boxed = None if inside is None else used & inside
@@ -308,23 +308,23 @@ def _clean(image: np.ndarray, job: Job, what: str) -> np.ndarray:
 
 
 def _write_json(document: dict[str, Any], path: Path) -> None:
-    from stages.exporters.aside import written_aside
+    from stages.io.exporters.aside import written_aside
 
     with written_aside(path) as aside:
         aside.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _keep_pictures(pictures: Sequence[np.ndarray], folder: Path, k: int) -> None:
-    from stages.exporters.frames import write_png
-    from stages.plots import thumbnail_of
+    from stages.io.exporters.frames import write_png
+    from stages.pictures.plots import thumbnail_of
 
     for column, picture in enumerate(pictures):
         write_png(np.asarray(thumbnail_of(picture, SHEET_SIDE)), folder / f"picture_{k:05d}_{column}.png")
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
-    from stages.exporters.frames import read_png
-    from stages.plots import contact_sheet
+    from stages.io.exporters.frames import read_png
+    from stages.pictures.plots import contact_sheet
 
     def figure(found: dict[str, Any]) -> str:
         psnr = "no PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"

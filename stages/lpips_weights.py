@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import BadInput, UsageError
 
 if TYPE_CHECKING:
-    from efficientnerf.perceptual import Lpips
+    from efficientnerf.evaluation.lpips import Lpips
 
 BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 SITE = "https://download.pytorch.org/models/"
@@ -18,7 +18,7 @@ SITE = "https://download.pytorch.org/models/"
 
 def load_lpips(network: str, folder: str) -> Lpips:
     """The metric by "alex" or "vgg"; UsageError says what is missing and where to get it."""
-    from efficientnerf.perceptual import Lpips
+    from efficientnerf.evaluation.lpips import Lpips
 
     places = [Path(folder)] if folder else []
     hub = Path(os.environ.get("TORCH_HOME", Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")) / "torch")).expanduser() / "hub" / "checkpoints"

@@ -14,8 +14,8 @@ from pipeline.stage import Job, Stage
 from stages.settings import setting
 
 if TYPE_CHECKING:
-    from efficientnerf.mesh import Mesh
-    from stages.exporters import SourceFrame
+    from efficientnerf.surface.mesh import Mesh
+    from stages.io.exporters import SourceFrame
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class MeshSettings:
 
 def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:
     """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
-    from efficientnerf.surface import NoSurface, surface
+    from efficientnerf.surface.isosurface import NoSurface, surface
 
     try:
         return surface(
@@ -63,7 +63,7 @@ def remedy(stage: str, threshold: float | None) -> str:
 
 def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:
     """A mesh of the training frame in the capture's."""
-    from efficientnerf.mesh import moved
+    from efficientnerf.surface.mesh import moved
 
     back = frame.world_from_capture.inverse()
     return moved(mesh, back.scale, back.rotation, back.translation)
@@ -73,7 +73,7 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
     """What the report says of a mesh in the capture's frame: counts, whether it is closed, bounds, area, volume, and how it was made."""
     from dataclasses import asdict
 
-    from efficientnerf.mesh import face_areas, face_volumes, topology
+    from efficientnerf.surface.mesh import face_areas, face_volumes, topology
 
     found = topology(mesh.vertices, mesh.faces)
     return {
@@ -91,10 +91,10 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
 def run(job: Job) -> None:
     from PIL import Image
 
-    from efficientnerf.nerftree.format import load
-    from stages.exporters import MESH_EXPORTERS
-    from stages.exporters.writing import source_frame
-    from stages.shading import IN_FRONT, draw_sides
+    from efficientnerf.asset.format import load
+    from stages.io.exporters import MESH_EXPORTERS
+    from stages.io.exporters.writing import source_frame
+    from stages.pictures.shading import IN_FRONT, draw_sides
 
     tree = load(job.inputs["bake"] / "asset.nerftree")
     frame = source_frame(tree.metadata)

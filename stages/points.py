@@ -12,8 +12,8 @@ from stages.mesh import orbit_places, remedy
 from stages.settings import setting
 
 if TYPE_CHECKING:
-    from efficientnerf.mesh import PointCloud
-    from stages.exporters import SourceFrame
+    from efficientnerf.surface.mesh import PointCloud
+    from stages.io.exporters import SourceFrame
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class PointsSettings:
 
 def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None]) -> PointCloud:
     """Points on the tree's surface in the capture's frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
-    from efficientnerf.mesh import PointCloud
-    from efficientnerf.surface import NoSurface, points
+    from efficientnerf.surface.isosurface import NoSurface, points
+    from efficientnerf.surface.mesh import PointCloud
 
     try:
         cloud = points(
@@ -48,9 +48,9 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
 
 
 def run(job: Job) -> None:
-    from efficientnerf.nerftree.format import load
-    from stages.exporters import POINT_EXPORTERS
-    from stages.exporters.writing import source_frame
+    from efficientnerf.asset.format import load
+    from stages.io.exporters import POINT_EXPORTERS
+    from stages.io.exporters.writing import source_frame
 
     tree = load(job.inputs["bake"] / "asset.nerftree")
     frame = source_frame(tree.metadata)

@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from efficientnerf.cameras import resized
+from efficientnerf.geometry.cameras import resized
 from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
-from stages import importers
-from stages.capture import Capture, Photo, SparsePoints
-from stages.forward import SPACES
-from stages.importers.source import FEWEST, Source, listed
-from stages.scene import SPLITS, Scene, View, save, save_points
+from stages.framing.forward_facing import SPACES
+from stages.io import importers
+from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.importers.source import FEWEST, Source, listed
+from stages.io.scene import SPLITS, Scene, View, save, save_points
 from stages.settings import setting
 
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
@@ -65,8 +65,9 @@ class PosesSettings:
 
 def run(job: Job) -> None:
     """Write scene.json, images/, masks/, points.safetensors, contact_sheet.png and report.json. Raises BadInput."""
-    from stages import framing, working_images
-    from stages.contact_sheet import write_contact_sheet
+    from stages.framing import framing
+    from stages.io import working_images
+    from stages.pictures.contact_sheet import write_contact_sheet
 
     settings: PosesSettings = job.settings
     if job.source is None:
@@ -139,8 +140,8 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
 
 def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
-    from stages.importers.photographs import masks_of, photographs
-    from stages.photographs import find_cameras
+    from stages.io.importers.photographs import masks_of, photographs
+    from stages.sfm.reconstruction import find_cameras
 
     assert job.source is not None
     source = Source(job.source, settings.allow_outside)
@@ -166,8 +167,8 @@ def _format_of(capture: Capture) -> str:
 
 def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tuple[Capture, list[Any]]:
     """Write every working image; the capture without the images that cannot be decoded, and what was written for the others."""
-    from stages import working_images
-    from stages.upright import UnreadableImage
+    from stages.io import working_images
+    from stages.io.photo import UnreadableImage
 
     relative = working_images.relative_paths([photo.camera for photo in capture.photos])
     kept: list[int] = []

@@ -20,15 +20,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from efficientnerf.settings import TrainSettings
+from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job, Stage
-from stages.budget import MOST, TIMED, Budget
+from stages.training.budget import MOST, TIMED, Budget
 
 if TYPE_CHECKING:
     from efficientnerf.model import Model
-    from efficientnerf.pixels import Pixels
-    from efficientnerf.training import Anchors, Progress, Trainer
-    from stages.scene import Scene, View
+    from efficientnerf.training.loop import Anchors, Progress, Trainer
+    from efficientnerf.training.pixels import Pixels
+    from stages.io.scene import Scene, View
 
 LOG_EVERY = 10
 CHECKPOINTS_KEPT = 2
@@ -38,12 +38,12 @@ NOWHERE = 1e-9  # scene is 2 across: nearer to a camera than this, a point has n
 
 
 def run(job: Job) -> None:
-    from efficientnerf import training
-    from efficientnerf.late import LateShare
     from efficientnerf.model import model
-    from efficientnerf.render import FieldRenderer
-    from stages import field, scene
-    from stages.lattice import sized
+    from efficientnerf.rendering.render import FieldRenderer
+    from efficientnerf.training import loop
+    from efficientnerf.training.readback import LateShare
+    from stages.io import field_file, scene
+    from stages.training.hash_resolution import sized
 
     _check(job.settings)
     use_all_cores()
@@ -54,9 +54,9 @@ def run(job: Job) -> None:
     pixels = pixels_of(folder, views)
     settings = sized(job.settings, s, len(pixels))
     near, far = _range(s, pixels, settings)
-    m = model(field.space_of(s), settings, s.background, job.device, (near, far))
+    m = model(field_file.space_of(s), settings, s.background, job.device, (near, far))
     _close(m, views, job)
-    t = training.trainer(m, len(views))
+    t = loop.trainer(m, len(views))
     log = job.work / "log.jsonl"
     spent = _resume(t, job, log)
     budget = Budget(settings, job.work, spent, clock) if settings.budget else None
@@ -72,7 +72,7 @@ def run(job: Job) -> None:
     occupied = LateShare(m.voxels)
     pace: dict[str, Any] = {}
     working, logged, resumed = 0.0, first, clock()  # seconds of steps alone, since the last line of the log
-    for done in training.train(t, pixels, anchors_of(folder, s)):
+    for done in loop.train(t, pixels, anchors_of(folder, s)):
         working += clock() - resumed
         loss = done.loss if done.step == first + 1 else 0.95 * loss + 0.05 * done.loss
         if budget is not None:
@@ -104,7 +104,7 @@ def run(job: Job) -> None:
             raise
         resumed = clock()
     _append(log, lines)
-    field.save_model(m, near, far, job.out / field.FILE, gains_of(t, views))
+    field_file.save_model(m, near, far, job.out / field_file.FILE, gains_of(t, views))
     _report(job, t, spent + clock() - started, held_back)
     _publish_log(log, job)
 
@@ -123,8 +123,8 @@ def _close(m: Model, views: tuple[View, ...], job: Job) -> None:
     """Close the voxels whose matter would be seen by too few photographs for them to tell where it is."""
     import torch
 
-    from efficientnerf.density import close
-    from stages.observed import seldom_seen
+    from efficientnerf.sampling.occupancy import close
+    from stages.framing.view_coverage import seldom_seen
 
     if not m.space.contracted or m.settings.observers == 0:
         return
@@ -136,7 +136,7 @@ def gains_of(t: Trainer, views: tuple[View, ...]) -> dict[str, np.ndarray] | Non
     """The factors (3,) that were learned for each training view, by the name of its image; None where none were."""
     if t.exposure is None:
         return None
-    from efficientnerf.exposure import log_gains
+    from efficientnerf.training.exposure import log_gains
 
     return dict(zip((view.image for view in views), np.exp(log_gains(t.exposure.detach()).cpu().numpy()), strict=True))
 
@@ -195,8 +195,8 @@ def stated_range(s: Scene, settings: TrainSettings) -> tuple[float, float]:
 
 def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
     """All pixels of some views of a scene, as bytes; one image at a time is held beside them."""
-    from efficientnerf.pixels import Pixels
-    from stages import scene
+    from efficientnerf.training.pixels import Pixels
+    from stages.io import scene
 
     images = (scene.read_image(folder, view) for view in views)
     masks = (scene.read_mask(folder, view) for view in views)
@@ -208,15 +208,15 @@ def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
 def anchors_of(folder: Path, s: Scene) -> Anchors | None:
     """Rays of training cameras to the sparse points that were seen there; only points that three photographs or more agree on, and only
     from cameras they lie before: posed data sets name points behind a camera, or in it, too."""
-    from efficientnerf.training import Anchors
-    from stages import scene
+    from efficientnerf.training.loop import Anchors
+    from stages.io import scene
 
     if not s.points:
         return None
     points = scene.read_points(folder)
-    training = np.array([view.split == "train" for view in s.views])
+    loop = np.array([view.split == "train" for view in s.views])
     centres = np.array([view.camera.centre for view in s.views])
-    pairs = [(n, view) for n, seen in enumerate(points.observers) if len(seen) >= FEWEST_OBSERVERS for view in seen if training[view]]
+    pairs = [(n, view) for n, seen in enumerate(points.observers) if len(seen) >= FEWEST_OBSERVERS for view in seen if loop[view]]
     if not pairs:
         return None
     which, view = np.array(pairs, np.int64).T
@@ -244,8 +244,8 @@ def _checkpoints(job: Job) -> list[Path]:
 
 
 def _checkpoint(t: Trainer, job: Job, log: Path, lines: list[str], seconds: float) -> None:
-    from efficientnerf.training import state_of
-    from stages.field import write_tensors
+    from efficientnerf.training.loop import state_of
+    from stages.io.field_file import write_tensors
 
     _append(log, lines)
     lines.clear()
@@ -256,9 +256,9 @@ def _checkpoint(t: Trainer, job: Job, log: Path, lines: list[str], seconds: floa
 
 def _resume(t: Trainer, job: Job, log: Path) -> float:
     """Go on from the newest checkpoint that can be read, if there is one; the seconds that were trained up to it."""
-    from efficientnerf.training import restore
+    from efficientnerf.training.loop import restore
     from pipeline.errors import CorruptArtifact
-    from stages.field import read_tensors
+    from stages.io.field_file import read_tensors
 
     spent = 0.0
     for path in reversed(_checkpoints(job)):
@@ -304,7 +304,7 @@ def _pace(done: Progress, occupied: float, seconds: float, steps: int, goal: int
 
 def _line(done: Progress, loss: float, occupied: float, seconds: float, step_seconds: float, held_back: float | None) -> dict[str, Any]:
     """seconds: of the stage, pictures and checkpoints included; step_seconds: of a step alone, the mean since the last line; left_out: of the step's rays,
-    those that found no room for their samples; on CUDA counts and shares are those of some steps before (`efficientnerf.late`)."""
+    those that found no room for their samples; on CUDA counts and shares are those of some steps before (`efficientnerf.training.readback`)."""
     return {
         "step_seconds": round(step_seconds, 6),
         "held_back_psnr": held_back,
@@ -324,7 +324,7 @@ def _line(done: Progress, loss: float, occupied: float, seconds: float, step_sec
 
 def _watched(s: Scene) -> View | None:
     """The held-back view that previews show: one of val if there is any, so that the test views stay unseen until the end."""
-    from stages.scene import views_of
+    from stages.io.scene import views_of
 
     views = views_of(s, "val") or views_of(s, "test")
     return views[len(views) // 2] if views else None
@@ -337,10 +337,10 @@ def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int
     """Draw the watched view small, keep the picture, return its PSNR."""
     if view is None or settings.preview_every == 0 or step == 0 or step % settings.preview_every:
         return None
-    from efficientnerf.metrics import psnr
+    from efficientnerf.evaluation.metrics import psnr
     from stages.evaluate import thinned, thinned_camera, truth_of
-    from stages.exporters.frames import write_png
-    from stages.plots import eight_bits
+    from stages.io.exporters.frames import write_png
+    from stages.pictures.plots import eight_bits
 
     target = job.work / f"preview_{step:06d}.png"
     stride = max(1, math.ceil(max(view.camera.width, view.camera.height) / PREVIEW_SIDE))
@@ -352,7 +352,7 @@ def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int
 
 def _curve(lines: list[dict[str, Any]], path: Path) -> None:
     """PSNR over steps, of the training rays and of the held-back view: while it trains in the scratch folder, beside the previews, then in the artifact."""
-    from stages.plots import curve
+    from stages.pictures.plots import curve
 
     series = {"training rays, running mean": ([x["step"] for x in lines], [x["psnr"] for x in lines])}
     held_back = [(x["step"], x["held_back_psnr"]) for x in lines if x.get("held_back_psnr") is not None]

@@ -28,14 +28,14 @@ class TurntableSettings:
 
 
 def run(job: Job) -> None:
-    from efficientnerf.nerftree.tree import NerfTree
+    from efficientnerf.asset.tree import NerfTree
 
     draw_turntable(NerfTree.load(job.inputs["bake"] / "asset.nerftree").to(job.device), job)
 
 
 def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # anything with the interface of a NerfTree
     """Frames go to job.work one by one, so that a kill costs at most one of them; the video is made of the PNGs, so that it does not depend on where."""
-    from stages.paths import RenderOptions, draw_frames, encode_frames, turntable_cameras
+    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames, turntable_cameras
 
     s: TurntableSettings = job.settings
     cameras = turntable_cameras(

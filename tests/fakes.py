@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.cameras import Camera, Similarity, rays
-from efficientnerf.nerftree.tree import Rendering
-from efficientnerf.render import FieldRendering
+from efficientnerf.asset.tree import Rendering
+from efficientnerf.geometry.cameras import Camera, Similarity, rays
+from efficientnerf.rendering.render import FieldRendering
 
 WHITE = (1.0, 1.0, 1.0)
 

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.harmonics import harmonics_count
-from efficientnerf.kernels.cpu import PRIME_Y, PRIME_Z
-from efficientnerf.kernels.dispatch import on_device
-from efficientnerf.kernels.mlp import precision_of
+from efficientnerf.backends.dispatch import on_device
+from efficientnerf.backends.numba.rays import PRIME_Y, PRIME_Z
+from efficientnerf.backends.torch.linear_chain import precision_of
+from efficientnerf.rendering.harmonics import harmonics_count
 
 FEATURES = 2
 
@@ -83,7 +83,7 @@ def encode(points: Tensor, field: HashField) -> Tensor:
     if _by_kernel(points, field):
         return _Encode.apply(points, field.table, field)
     if on_device(points, field.table):
-        from efficientnerf.kernels import cuda
+        from efficientnerf.backends.triton import hash_grid as cuda
 
         return cuda.Encode.apply(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
     return encode_reference(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
@@ -91,11 +91,11 @@ def encode(points: Tensor, field: HashField) -> Tensor:
 
 def _encoded(points: Tensor, table: Tensor, field: HashField) -> tuple[Tensor, Tensor]:
     """Points (3, N) and features (2L, N): the order that the kernels want."""
-    from efficientnerf.kernels import cpu_hash
+    from efficientnerf.backends.numba import hash_grid
 
     turned, out = torch.empty(3, len(points)), torch.empty(FEATURES * len(field.sides), len(points))
-    cpu_hash.across(points.detach().contiguous().numpy(), turned.numpy())
-    cpu_hash.encode(turned.numpy(), table.detach().numpy(), field.sides, field.dense, field.starts, field.mask, out.numpy())
+    hash_grid.across(points.detach().contiguous().numpy(), turned.numpy())
+    hash_grid.encode(turned.numpy(), table.detach().numpy(), field.sides, field.dense, field.starts, field.mask, out.numpy())
     return turned, out
 
 
@@ -105,12 +105,12 @@ def _add_table_gradient(points: Tensor, grad: Tensor, table: Tensor, field: Hash
     It is added here, and not handed to autograd, because a step looks through a field more than once and each sum over the whole table costs as much
     as the encoding. The buffer is the one that `Adam` left cleared, if there is one.
     """
-    from efficientnerf.kernels import cpu_hash
+    from efficientnerf.backends.numba import hash_grid
 
     if table.grad is None:
         cleared = table.__dict__.pop("cleared_grad", None)
         table.grad = torch.zeros_like(table) if cleared is None else cleared
-    cpu_hash.encode_backward(points.numpy(), grad.numpy(), field.sides, field.dense, field.starts, field.mask, table.grad.numpy())
+    hash_grid.encode_backward(points.numpy(), grad.numpy(), field.sides, field.dense, field.starts, field.mask, table.grad.numpy())
 
 
 class _Encode(torch.autograd.Function):
@@ -132,12 +132,12 @@ class _Network(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, field: HashField, precision: torch.dtype, *weights: Tensor) -> Tensor:
-        from efficientnerf.kernels import cpu_mlp
+        from efficientnerf.backends.numba import mlp
 
         at, features = _encoded(points, table, field)
-        prepared = cpu_mlp.prepared([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
+        prepared = mlp.prepared([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
         out = torch.empty(len(points), len(weights[-1]))
-        kept = cpu_mlp.forward(features.numpy(), prepared, field.log_initial_density, out.numpy(), keep=any(ctx.needs_input_grad))
+        kept = mlp.forward(features.numpy(), prepared, field.log_initial_density, out.numpy(), keep=any(ctx.needs_input_grad))
         if any(ctx.needs_input_grad):
             ctx.at, ctx.features, ctx.kept, ctx.prepared, ctx.table, ctx.field = at, features, kept, prepared, table, field
             ctx.shapes = [tuple(weight.shape) for weight in weights]
@@ -145,9 +145,9 @@ class _Network(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        from efficientnerf.kernels import cpu_mlp
+        from efficientnerf.backends.numba import mlp
 
-        pull, of_weights = cpu_mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
+        pull, of_weights = mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
         ctx.kept = None
         _add_table_gradient(ctx.at, torch.from_numpy(pull), ctx.table, ctx.field)
         return None, None, None, None, *map(torch.from_numpy, of_weights)

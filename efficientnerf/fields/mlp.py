@@ -11,8 +11,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.harmonics import harmonics_count
-from efficientnerf.kernels.mlp import chain, precision_of
+from efficientnerf.backends.torch.linear_chain import chain, precision_of
+from efficientnerf.rendering.harmonics import harmonics_count
 
 FREQUENCIES = 10
 
@@ -48,7 +48,7 @@ def linear_layers(shapes: list[tuple[int, int]], generator: torch.Generator) -> 
 class MlpField(nn.Module):
     """`layers` of `hidden` units; the input enters again in the middle. See `efficientnerf.fields`.
 
-    precision  "auto", "float32" or "bfloat16": what products are computed in (`efficientnerf.kernels.mlp`)
+    precision  "auto", "float32" or "bfloat16": what products are computed in (`efficientnerf.backends.torch.linear_chain`)
     """
 
     activation = "softplus"

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from efficientnerf.backends.torch.linear_chain import chain, precision_of
 from efficientnerf.fields.mlp import FREQUENCIES, linear_layers, positional_encoding
-from efficientnerf.kernels.mlp import chain, precision_of
 
 DIRECTION_FREQUENCIES = 4
 

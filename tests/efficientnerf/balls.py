@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from efficientnerf.cameras import Camera, rays
-from efficientnerf.grid import Space
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, model
-from efficientnerf.pixels import Pixels
-from efficientnerf.settings import TrainSettings
+from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.settings import TrainSettings
 
 BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])
 CENTRE, RADIUS, SIGMA = np.array([0.1, -0.05, 0.0]), 0.55, 30.0

@@ -65,30 +65,30 @@ def build(self: JITFunction, *args: Any, grid: Any, warmup: bool, num_warps: int
 
 
 def training_step() -> None:
-    from efficientnerf.grid import Space
-    from efficientnerf.kernels import cuda, cuda_compositing, cuda_sampling
+    from efficientnerf.backends.triton import compositing, hash_grid, sampling
+    from efficientnerf.geometry.spaces import Space
 
     sides, dense, starts = np.array([4, 64]), np.array([True, False]), np.array([0, 64])
     table = torch.zeros(1000, 2, requires_grad=True)
-    cuda.Encode.apply(torch.zeros(8, 3), table, sides, dense, starts, 255).sum().backward()
+    hash_grid.Encode.apply(torch.zeros(8, 3), table, sides, dense, starts, 255).sum().backward()
     for skip_zeros in (False, True):
-        cuda.adam(*(torch.zeros(64) for _ in range(4)), 0.1, 0.9, 0.99, 1.0, 1.0, 1e-15, skip_zeros=skip_zeros)
+        hash_grid.adam(*(torch.zeros(64) for _ in range(4)), 0.1, 0.9, 0.99, 1.0, 1.0, 1e-15, skip_zeros=skip_zeros)
     for contracted in (False, True):
         space = Space(np.array([[-1.0] * 3, [1.0] * 3]), contracted)
         rays = (torch.zeros(8, 3), torch.ones(8, 3), torch.zeros(8), torch.ones(8), torch.zeros(8))
-        found = cuda_sampling.valid_samples(space, *rays, 0.1, 4, torch.ones(4, 4, 4), 0.0, capacity=32)
-        pivotal = cuda_sampling.pivots(found.start, found.first, 0.1, 4)
-        cuda_sampling.pivotal_samples(space, rays[0], rays[1], rays[4], found, pivotal, 2, capacity=64)
+        found = sampling.valid_samples(space, *rays, 0.1, 4, torch.ones(4, 4, 4), 0.0, capacity=32)
+        pivotal = sampling.pivots(found.start, found.first, 0.1, 4)
+        sampling.pivotal_samples(space, rays[0], rays[1], rays[4], found, pivotal, 2, capacity=64)
     for terms in (1, 9, 25):
         for activation in ("exp", "softplus"):
             raw, background = torch.zeros(32, 1 + 3 * terms, requires_grad=True), torch.ones(8, 3)
-            out = cuda_compositing.composite(raw, torch.ones(32), torch.zeros(9, dtype=torch.int64), torch.ones(8, terms), background, activation)
+            out = compositing.composite(raw, torch.ones(32), torch.zeros(9, dtype=torch.int64), torch.ones(8, terms), background, activation)
             out.colour.sum().backward()
 
 
 def pictures() -> None:
-    from efficientnerf.cameras import Camera
-    from efficientnerf.kernels import cuda_tree
+    from efficientnerf.backends.triton import tree as cuda_tree
+    from efficientnerf.geometry.cameras import Camera
     from tests.efficientnerf.trees import random_tree
 
     camera = Camera("view", 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), np.eye(4))
@@ -101,21 +101,21 @@ def pictures() -> None:
 
 
 def fit() -> None:
-    from efficientnerf.kernels import cuda_tree_grad
+    from efficientnerf.backends.triton import tree_gradients
     from tests.efficientnerf.trees import random_tree
 
-    rays = cuda_tree_grad.Rays(torch.zeros(8, 3), torch.ones(8, 3), torch.ones(8, 3))
+    rays = tree_gradients.Rays(torch.zeros(8, 3), torch.ones(8, 3), torch.ones(8, 3))
     for degree, lookup in [*((degree, "trilinear") for degree in range(5)), (2, "nearest")]:
         tree = random_tree(0, degree=degree, brick=4, lookup=lookup)
-        g, count, width = cuda_tree_grad.device_grid(tree, "cpu"), len(tree.density_values), 3 * tree.harmonics_count
+        g, count, width = tree_gradients.device_grid(tree, "cpu"), len(tree.density_values), 3 * tree.harmonics_count
         values, squares = (torch.zeros(count), torch.zeros(count, width)), (torch.zeros(count), torch.zeros(count))
         sums = torch.zeros(count, dtype=torch.int64), torch.zeros(count, width, dtype=torch.int64)
         visits, stamp = torch.zeros(count, dtype=torch.int32), torch.zeros(count, dtype=torch.int32)
-        seen_as = cuda_tree_grad.look(g, rays, *values)
-        cuda_tree_grad.pull(g, rays, *values, seen_as, (seen_as[0], seen_as[1]), sums, stamp, 7)
-        cuda_tree_grad.weigh(g, rays, values[0], seen_as[1], squares[0])
+        seen_as = tree_gradients.look(g, rays, *values)
+        tree_gradients.pull(g, rays, *values, seen_as, (seen_as[0], seen_as[1]), sums, stamp, 7)
+        tree_gradients.weigh(g, rays, values[0], seen_as[1], squares[0])
         told = {"number": 7, "rays": 8, "density_rate": 0.1, "colour_rate": 0.1, "view_share": 0.5, "decay": 0.9, "epsilon": 1e-10}
-        cuda_tree_grad.descend(g, values, sums, squares, visits, stamp, **told)
+        tree_gradients.descend(g, values, sums, squares, visits, stamp, **told)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.nerftree.container import DTYPES
-from efficientnerf.nerftree.format import LAYOUTS, serialize
-from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.asset.container import DTYPES
+from efficientnerf.asset.format import LAYOUTS, serialize
+from efficientnerf.asset.tree import NerfTree
 from tests.efficientnerf.trees import random_tree
 
 SIMILARITY = {"scale": 0.5, "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "translation": [1, 2, 3]}

@@ -1,4 +1,4 @@
-"""A reader of NerfTree files, all layouts, written from efficientnerf/nerftree/FORMAT.md alone in 100 lines: plain numpy, checks no more than it needs."""
+"""A reader of NerfTree files, all layouts, written from efficientnerf/asset/FORMAT.md alone in 100 lines: plain numpy, checks no more than it needs."""
 
 from __future__ import annotations
 

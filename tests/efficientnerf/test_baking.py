@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.compositing import activate
-from efficientnerf.grid import Space
+from efficientnerf.asset import bake
+from efficientnerf.asset.bake import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
+from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, look
-from efficientnerf.nerftree import baking
-from efficientnerf.nerftree.baking import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
-from efficientnerf.nerftree.tree import tree_from_voxels
+from efficientnerf.rendering.compositing import activate
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
 
@@ -89,7 +89,7 @@ def test_of_a_coarser_grid_what_was_seen_of_a_finer_one(resolution: int) -> None
     bounds = np.array([[0.0, 0.0, 0.0], [2.0, 1.5, 1.0]])
     (shape, voxel), (coarse_shape, coarse_voxel) = grid_of(bounds, 16, 4), grid_of(bounds, resolution, 4)
     fine = np.random.default_rng(3).random([4 * n for n in shape]).astype(np.float32) ** 8
-    made = dense(baking.coarsened(sparse(fine, 4), shape, voxel, coarse_shape, coarse_voxel, 4, 0.01), coarse_shape, 4)
+    made = dense(bake.coarsened(sparse(fine, 4), shape, voxel, coarse_shape, coarse_voxel, 4, 0.01), coarse_shape, 4)
     expected = np.zeros_like(made)
     for at in np.argwhere(fine > 0.01):
         to = tuple(np.floor((at + 0.5) * voxel / coarse_voxel).astype(int))
@@ -184,7 +184,7 @@ def test_values_are_means_over_the_voxel() -> None:
 
 @pytest.mark.parametrize("first", [0, 1, 2])
 def test_blocks_do_not_depend_on_where_one_begins(monkeypatch: pytest.MonkeyPatch, first: int) -> None:
-    monkeypatch.setattr(baking, "POINTS_PER_BLOCK", 40)
+    monkeypatch.setattr(bake, "POINTS_PER_BLOCK", 40)
     m = model_of_a_ball()
     indices = np.argwhere(np.ones((3, 3, 3), bool)).astype(np.int32)
     assert blocks_of(27, 4) == 3

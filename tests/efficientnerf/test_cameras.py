@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from efficientnerf.cameras import (
+from efficientnerf.geometry.cameras import (
     MODELS,
     Camera,
     Similarity,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf import compositing
-from efficientnerf.compositing import activate, sample_weights
-from efficientnerf.harmonics import basis
-from efficientnerf.kernels import dispatch
+from efficientnerf.backends import dispatch
+from efficientnerf.rendering import compositing
+from efficientnerf.rendering.compositing import activate, sample_weights
+from efficientnerf.rendering.harmonics import basis
 from tests import reference
 
 

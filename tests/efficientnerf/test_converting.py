@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.nerftree.converting import coordinates, lookup, pruned, with_degree, with_resolution
-from efficientnerf.nerftree.quantising import compacted
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.conversion import coordinates, lookup, pruned, with_degree, with_resolution
+from efficientnerf.asset.quantisation import compacted
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.fields import hash as hash_module
-from efficientnerf.kernels import cpu_mlp, tiles
-from efficientnerf.kernels.lanes import pointer
+from efficientnerf.backends.numba import mlp, tiles
+from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.fields import hash
 
 ROOT = Path(__file__).resolve().parents[2]
 SHAPES = [(24, 64, 2, 28), (24, 32, 1, 1), (6, 8, 1, 13), (2, 40, 3, 4), (10, 20, 4, 49), (34, 100, 2, 16)]  # inputs, width, hidden layers, outputs
@@ -57,10 +57,10 @@ def expected(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, 
 
 
 def passes(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, bfloat16: bool, offset: float = 0.0) -> list[np.ndarray]:
-    prepared = cpu_mlp.prepared(weights, bfloat16)
+    prepared = mlp.prepared(weights, bfloat16)
     out = np.full((features.shape[1], len(weights[-1])), np.nan, np.float32)
-    kept = cpu_mlp.forward(features, prepared, offset, out, keep=True)
-    pull, of_weights = cpu_mlp.backward(grad, features, prepared, kept, [w.shape for w in weights])
+    kept = mlp.forward(features, prepared, offset, out, keep=True)
+    pull, of_weights = mlp.backward(grad, features, prepared, kept, [w.shape for w in weights])
     return [out, pull, *of_weights]
 
 
@@ -70,7 +70,7 @@ def test_passes_are_those_of_autograd(shape: tuple[int, int, int, int], bfloat16
     """With as many samples as fill no block, one block, blocks and a rest, and chunks and a rest."""
     rng = np.random.default_rng(0)
     weights = weights_of(*shape, rng)
-    for samples in (1, 64, 64 + 16, 2 * cpu_mlp.CHUNK + 129):
+    for samples in (1, 64, 64 + 16, 2 * mlp.CHUNK + 129):
         features, grad = rng.normal(size=(shape[0], samples)).astype(np.float32), rng.normal(size=(samples, shape[3])).astype(np.float32)
         for ours, theirs in zip(passes(features, weights, grad, bfloat16), expected(features, weights, grad, bfloat16), strict=True):
             error = np.linalg.norm(ours - theirs.numpy()) / np.linalg.norm(theirs.numpy())
@@ -83,17 +83,17 @@ def test_nothing_beside_the_outputs_is_written_and_none_left_out(bfloat16: bool)
     rng = np.random.default_rng(1)
     for inputs, width, layers, outputs in SHAPES:
         weights = weights_of(inputs, width, layers, outputs, rng)
-        for samples in (0, 1, 63, 64, 65, cpu_mlp.CHUNK + 1):
+        for samples in (0, 1, 63, 64, 65, mlp.CHUNK + 1):
             features = rng.normal(size=(inputs, samples)).astype(np.float32)
             around = np.full((samples + 2 * outputs + 32, outputs), 7, np.float32)
             out = around[outputs : outputs + samples]
             out[:] = np.nan
-            prepared = cpu_mlp.prepared(weights, bfloat16)
-            assert cpu_mlp.forward(features, prepared, 0.5, out, keep=False).size == 0
+            prepared = mlp.prepared(weights, bfloat16)
+            assert mlp.forward(features, prepared, 0.5, out, keep=False).size == 0
             assert (around[:outputs] == 7).all()
             assert (around[outputs + samples :] == 7).all()
             kept = np.full((samples, outputs), np.nan, np.float32)
-            cpu_mlp.forward(features, prepared, 0.5, kept, keep=True)
+            mlp.forward(features, prepared, 0.5, kept, keep=True)
             assert np.isfinite(out).all()
             assert np.array_equal(out, kept)
 
@@ -202,7 +202,7 @@ def test_a_processor_without_wide_registers_says_the_same(tmp_path: Path) -> Non
 def test_the_field_is_that_of_plain_torch(precision: str, near: float, layers: int) -> None:
     """The same field in float64 goes through autograd alone."""
     generator = torch.Generator().manual_seed(0)
-    field = hash_module.HashField(
+    field = hash.HashField(
         levels=3, log2_table=10, coarsest=4, finest=16, hidden=16, layers=layers, degree=1, initial_density=0.5, generator=generator, precision=precision
     )
     field.table.data.normal_(generator=generator)

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from efficientnerf.backends.numba import adam
 from efficientnerf.fields.hash import HashField, encode_reference
-from efficientnerf.kernels import cpu_adam
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.test_kernels import RATES, gradients
 
-cuda = pytest.importorskip("efficientnerf.kernels.cuda")
+cuda = pytest.importorskip("efficientnerf.backends.triton.hash_grid")
 
 
 def field(log2_table: int = 9) -> HashField:
@@ -80,7 +80,7 @@ def test_adam_is_the_cpu_kernel(skip_zeros: bool) -> None:
         corrections = (1 - 0.9**number, 1 - 0.99**number)
         cuda.adam(ours[0], grad.to(DEVICE), *ours[1:], rate, 0.9, 0.99, *corrections, 1e-15, skip_zeros=skip_zeros)
         flat = [t.view(-1).numpy() for t in (theirs[0], grad.clone(), *theirs[1:])]
-        cpu_adam.adam(*flat, *(np.float32(x) for x in (rate, 0.9, 0.99, *corrections, 1e-15)), skip_zeros)
+        adam.adam(*flat, *(np.float32(x) for x in (rate, 0.9, 0.99, *corrections, 1e-15)), skip_zeros)
     for a, b in zip(ours, theirs, strict=True):
         torch.testing.assert_close(a.cpu(), b, rtol=2e-5, atol=1e-7)
     once, never = ours[0][302].cpu(), start[302]

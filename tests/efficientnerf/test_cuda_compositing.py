@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf import compositing
+from efficientnerf.rendering import compositing
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.test_compositing import Bundle, bundle, in_float32
 
-cuda = pytest.importorskip("efficientnerf.kernels.cuda_compositing")
+cuda = pytest.importorskip("efficientnerf.backends.triton.compositing")
 
 COUNTS = {"short": (5, 1, 0, 9, 7, 3), "long": (0, 33, 100, 32, 64, 1), "one": (1,), "empty": (0, 0)}
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf import sampling
-from efficientnerf.grid import Space
-from efficientnerf.sampling import Samples
+from efficientnerf.geometry.spaces import Space
+from efficientnerf.sampling import samples as sampling
+from efficientnerf.sampling.samples import Samples
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.test_sampling import BOUNDS, STEP, Rays, coarse_samples_of, make_rays, voxels_of
 
-cuda = pytest.importorskip("efficientnerf.kernels.cuda_sampling")
+cuda = pytest.importorskip("efficientnerf.backends.triton.sampling")
 
 
 def there(rays: Rays) -> Rays:

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera, rays
-from efficientnerf.nerftree.tree import NerfTree, Rendering, tree_from_voxels
-from efficientnerf.render import render_tree_reference
+from efficientnerf.asset.tree import NerfTree, Rendering, tree_from_voxels
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.rendering.render import render_tree_reference
 from tests import reference
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.test_render import TREES, looking, tensors
 from tests.efficientnerf.trees import LOW, random_tree, rays_at, uniform_tree
 
-cuda = pytest.importorskip("efficientnerf.kernels.cuda_tree")
+cuda = pytest.importorskip("efficientnerf.backends.triton.tree")
 
 
 def drawn_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> Rendering:
@@ -132,7 +132,7 @@ def test_an_empty_tree_and_no_rays() -> None:
 
 
 def test_palettes_are_decoded() -> None:
-    from efficientnerf.nerftree.palettes import PaletteHarmonics
+    from efficientnerf.asset.palettes import PaletteHarmonics
 
     tree = random_tree(3, degree=1)
     rng = np.random.default_rng(0)
@@ -173,7 +173,7 @@ def test_rays_of_another_frame_are_looked_at_along_those_of_the_world() -> None:
     origins, directions = rays_at(tree, 60)
     looking = np.roll(directions, 1, axis=0)
     found = cuda.draw_rays(cuda.device_tree(tree, DEVICE), *(t.to(DEVICE) for t in tensors(origins, directions, looking)))
-    from efficientnerf.kernels.cpu_tree import render_rays
+    from efficientnerf.backends.numba.tree.rendering import render_rays
 
     agree(Rendering(*(t.cpu().numpy() for t in found)), Rendering(*render_rays(tree, origins, directions, looking)), faces=0.02)
 

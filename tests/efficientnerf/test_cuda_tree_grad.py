@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera
-from efficientnerf.device_pixels import DevicePixels
-from efficientnerf.kernels.cpu_tree_grad import Seen
-from efficientnerf.nerftree import optimising
-from efficientnerf.nerftree.optimising import Targets, error, greatest_weights, optimise, optimiser
-from efficientnerf.nerftree.tree import NerfTree
-from efficientnerf.pixels import Pixels
+from efficientnerf.asset import refinement
+from efficientnerf.asset.refinement import Targets, error, greatest_weights, optimise, optimiser
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree.gradients import Seen
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.test_ndc_tree import camera_at, wall
 from tests.efficientnerf.test_optimising import ball_tree, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
-kernels = pytest.importorskip("efficientnerf.kernels.cuda_tree_grad")
-device = pytest.importorskip("efficientnerf.nerftree.optimising_device")
+kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
+device = pytest.importorskip("efficientnerf.asset.refinement_device")
 
 
 def there(seen: Seen) -> Seen:
@@ -105,7 +105,7 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
     assert (gradients(bare, origins, directions, seen_at_random(40, 0.0))[0] > 0).any()
 
 
-def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 6) -> tuple[optimising.Optimiser, list[float]]:
+def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 6) -> tuple[refinement.Optimiser, list[float]]:
     """Steps in one go, or in several with the state fetched in between, as a checkpoint does."""
     o = optimiser(tree)
     errors: list[float] = []
@@ -137,12 +137,12 @@ def test_steps_are_those_of_the_cpu() -> None:
 def test_interrupted_or_not_the_bytes_are_the_same() -> None:
     targets = device.sent_targets(Targets(pixels(6, 16), (1.0, 1.0, 1.0)), DEVICE)
     whole, apart = (fitted(targets, ball_tree(8), until)[0] for until in ([6], [2, 5, 6]))
-    for name in optimising.STATE:
+    for name in refinement.STATE:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 
 
 def test_the_room_that_a_fit_takes_is_known_before() -> None:
-    from stages.memory import needed_on_device
+    from stages.baking.memory import needed_on_device
 
     tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
     fit = device.DeviceFit(optimiser(tree), torch.device(DEVICE))
@@ -185,7 +185,7 @@ def test_targets_on_the_device_say_the_same(kind: str) -> None:
 
 @pytest.mark.parametrize("stride", [1, 8])
 def test_rays_of_pixels_are_those_of_the_host(stride: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf import pixels as module
+    from efficientnerf.training.loop import pixels as module
 
     monkeypatch.setattr(module, "EXACT", 2**23 if stride == 1 else 0)
     lens = ("OPENCV", (30.0, 33.0, 9.0, 12.0, 0.05, -0.02, 0.003, 0.002))

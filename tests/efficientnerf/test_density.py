@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.compositing import activate
-from efficientnerf.density import DEEPEST, cell_of, close, density_voxels, fade, refresh_cells, reopen, sweep_cells, update, voxel_weights
-from efficientnerf.kernels import dispatch
+from efficientnerf.backends import dispatch
+from efficientnerf.rendering.compositing import activate
+from efficientnerf.sampling.occupancy import DEEPEST, cell_of, close, density_voxels, fade, refresh_cells, reopen, sweep_cells, update, voxel_weights
 from tests import reference
 
 SIDE = 3

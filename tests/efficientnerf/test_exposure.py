@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf import training
-from efficientnerf.exposure import SCALE, exposed, exposure_loss, log_gains
-from efficientnerf.pixels import Pixels
-from efficientnerf.training import restore, state_of, train, trainer
+from efficientnerf.training import loop
+from efficientnerf.training.exposure import SCALE, exposed, exposure_loss, log_gains
+from efficientnerf.training.loop import restore, state_of, train, trainer
+from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import cameras, photograph, untrained
 
 
@@ -39,7 +39,7 @@ def photographs(gains: np.ndarray) -> Pixels:
 
 
 def test_differences_between_photographs_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "RATE_WARM_UP", 10)
+    monkeypatch.setattr(loop, "RATE_WARM_UP", 10)
     gains = np.exp(0.1 * np.array([1.0, -1, 1, -1, 1, -1, 1, -1]))[:, None] * np.array([1.0, 1.0, 0.95])
     losses = {}
     for kind in ("gain", "off"):

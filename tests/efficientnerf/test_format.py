@@ -17,11 +17,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from efficientnerf.nerftree import format
-from efficientnerf.nerftree.container import HEADER_LIMIT
-from efficientnerf.nerftree.format import LAYOUTS, FormatError, describe, load, save, serialize
-from efficientnerf.nerftree.metadata import MAJOR, STRUCTURE
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset import format
+from efficientnerf.asset.container import HEADER_LIMIT
+from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, save, serialize
+from efficientnerf.asset.metadata import MAJOR, STRUCTURE
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests.efficientnerf import nerftree_reader
 from tests.efficientnerf.hostile import HOSTILE, METADATA, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
 from tests.efficientnerf.nerftree_reader import Tree

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.mesh import topology
-from efficientnerf.nerftree.tree import NerfTree
-from efficientnerf.surface import NoSurface, points, surface
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.isosurface import NoSurface, points, surface
+from efficientnerf.surface.mesh import topology
 from tests.efficientnerf.test_ndc_tree import DEPTH, NEAR, wall
 
 SLANT = 0.3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.grid import Space, contract, uncontract, voxel_centres
+from efficientnerf.geometry.spaces import Space, contract, uncontract, voxel_centres
 from tests import reference
 
 BOUNDS = np.array([[-1.0, -0.4, 0.2], [0.5, 0.9, 0.8]])
@@ -59,7 +59,7 @@ def test_the_box_lies_where_it_should(contracted: bool, low: float, high: float)
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_voxel_centres_are_those_of_a_baked_grid(contracted: bool) -> None:
-    from efficientnerf.nerftree.baking import grid_of
+    from efficientnerf.asset.bake import grid_of
 
     space = Space(BOUNDS, contracted)
     shape, side = grid_of(BOUNDS, 10, 1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.harmonics import basis, basis_numpy, harmonics_count
+from efficientnerf.rendering.harmonics import basis, basis_numpy, harmonics_count
 from tests import reference
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf import sampling
-from efficientnerf.compositing import composite
-from efficientnerf.grid import Space
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import look
-from efficientnerf.render import valid_count
-from efficientnerf.sampling import IMPORTANCE_FLOOR, Samples, importance_samples, stratified_samples, valid_samples
+from efficientnerf.rendering.compositing import composite
+from efficientnerf.rendering.render import valid_count
+from efficientnerf.sampling import samples as sampling
+from efficientnerf.sampling.samples import IMPORTANCE_FLOOR, Samples, importance_samples, stratified_samples, valid_samples
 from tests.efficientnerf.balls import pixels, untrained
 
 BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import nn
 
-from efficientnerf.cameras import Camera, rays
-from efficientnerf.kernels import cpu_adam
-from efficientnerf.pixels import Pixels
-from efficientnerf.training import BETA1, Adam
+from efficientnerf.backends.numba import adam as cpu_adam
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.training.loop import BETA1, Adam
+from efficientnerf.training.pixels import Pixels
 from tests import reference
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -165,7 +165,7 @@ def test_masks_that_leave_nothing_are_refused() -> None:
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_directions_between_knots_are_off_by_less_than_a_hundredth_of_a_pixel(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    monkeypatch.setattr("efficientnerf.pixels.EXACT", 100)
+    monkeypatch.setattr("efficientnerf.training.pixels.EXACT", 100)
     focal = 900.0
     more = (-0.12, 0.03, 0.001, -0.002) if model == "OPENCV" else (0.02, -0.01, 0.003, 0.0)
     cameras = [camera(n, model, (focal, focal + 5, 420.0 + n, 300.0, *more), 853, 601) for n in range(2)]
@@ -190,8 +190,8 @@ def test_large_photographs_are_held_once_and_as_bytes() -> None:
     program = """
 import resource
 import numpy as np
-from efficientnerf.cameras import Camera
-from efficientnerf.pixels import Pixels
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.training.pixels import Pixels
 cameras = [Camera(f"v{n}", 4000, 3000, "SIMPLE_RADIAL", (3000.0 + n, 2000.0, 1500.0, -0.05), np.eye(4)) for n in range(3)]
 photographs = (np.random.default_rng(n).integers(0, 256, (3000, 4000, 3), np.uint8) for n in range(3))
 masks = (np.ones((3000, 4000), bool) for n in range(3))

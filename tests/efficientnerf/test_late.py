@@ -12,14 +12,16 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from efficientnerf import compositing, late, training, transfer
-from efficientnerf.density import density_voxels
-from efficientnerf.device_pixels import DevicePixels
-from efficientnerf.grid import Space
-from efficientnerf.kernels import dispatch
-from efficientnerf.late import Late, LateShare, Room, mean_over, whole_rays
+from efficientnerf.backends import dispatch, transfer
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, model
-from efficientnerf.sampling import Samples
+from efficientnerf.rendering import compositing
+from efficientnerf.sampling.occupancy import density_voxels
+from efficientnerf.sampling.samples import Samples
+from efficientnerf.training import loop
+from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.loop import readback as late
+from efficientnerf.training.readback import Late, LateShare, Room, mean_over, whole_rays
 from tests.efficientnerf.balls import BOUNDS, pixels, settings
 from tests.efficientnerf.device import DEVICE
 
@@ -160,7 +162,7 @@ def test_padded_steps_learn_what_counted_ones_do(strategy: str, interpreted: Non
         with monkeypatch.context() as patch:
             patch.setattr(late, "SETTLED", settled)
             m = model_of(strategy, iterations=6)
-            steps[settled], voxels[settled] = list(training.train(training.trainer(m), pixels(3, 8))), m.voxels.values
+            steps[settled], voxels[settled] = list(loop.train(loop.trainer(m), pixels(3, 8))), m.voxels.values
     # From the third step on what arrives is the step before.
     for ours, theirs in zip(steps[2], [*steps[1000][:2], *steps[1000][1:-1]], strict=True):
         assert ours.loss == pytest.approx(theirs.loss, rel=1e-3)
@@ -195,7 +197,7 @@ class Waits(TorchDispatchMode):
         return func(*args, **kwargs)
 
 
-def lines_that_wait(running: Iterator[training.Progress]) -> list[str]:
+def lines_that_wait(running: Iterator[loop.Progress]) -> list[str]:
     """Of two steps, after the first four."""
     for _ in range(4):
         next(running)
@@ -206,7 +208,7 @@ def lines_that_wait(running: Iterator[training.Progress]) -> list[str]:
 
 
 def test_lines_that_wait_are_found() -> None:
-    from efficientnerf.sampling import pivotal_samples
+    from efficientnerf.sampling.samples import pivotal_samples
 
     space, found = Space(BOUNDS, False), samples([2, 1])
     with Waits() as waits:
@@ -218,7 +220,7 @@ def test_lines_that_wait_are_found() -> None:
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_no_line_of_a_step_waits(strategy: str, interpreted: None) -> None:
-    running = training.train(training.trainer(model_of(strategy, iterations=9)), pixels(3, 8))
+    running = loop.train(loop.trainer(model_of(strategy, iterations=9)), pixels(3, 8))
     assert lines_that_wait(running) == []
 
 
@@ -235,8 +237,8 @@ def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: No
     monkeypatch.setattr(dispatch, "composite", compositing.composite)
     m = model_of("contracted", iterations=9, exposure="gain", explored=0.1, discretise=discretise)
     origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
-    anchors = training.Anchors(origins, directions, np.full(8, 3.0, np.float32))
-    running = training.train(training.trainer(m, 3), pixels(3, 8), anchors)
+    anchors = loop.Anchors(origins, directions, np.full(8, 3.0, np.float32))
+    running = loop.train(loop.trainer(m, 3), pixels(3, 8), anchors)
     assert lines_that_wait(running) == []
 
 
@@ -245,7 +247,7 @@ def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: No
 def test_no_step_waits_for_the_device(strategy: str) -> None:
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    running = training.train(training.trainer(model_of(strategy, iterations=late.SETTLED + 20, rays=64, explored=0.1)), pixels(3, 8))
+    running = loop.train(loop.trainer(model_of(strategy, iterations=late.SETTLED + 20, rays=64, explored=0.1)), pixels(3, 8))
     for _ in range(late.SETTLED + 4):
         next(running)
     with warnings.catch_warnings(record=True) as caught:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from efficientnerf.metrics import mean_squared_error, psnr, ssim, ssim_map
+from efficientnerf.evaluation.metrics import mean_squared_error, psnr, ssim, ssim_map
 
 
 def pair(seed: int = 0, height: int = 40, width: int = 53) -> tuple[np.ndarray, np.ndarray]:

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.grid import Space
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, look, model, restore, state_of
-from efficientnerf.settings import TrainSettings
+from efficientnerf.training.settings import TrainSettings
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.grid import Space
-from efficientnerf.ndc import BEYOND, Ndc, warped_distance, world_distance
+from efficientnerf.geometry.ndc import BEYOND, Ndc, warped_distance, world_distance
+from efficientnerf.geometry.spaces import Space
 
 
 def some_pose(rng: np.random.Generator) -> np.ndarray:
@@ -150,7 +150,7 @@ def test_a_space_warps_rays_and_is_not_contracted(ndc: Ndc) -> None:
 
 def test_the_kernels_are_the_functions(ndc: Ndc) -> None:
     """Rays that begin before and beyond the near plane, that never come to it, that look back, or along it; hits near, at infinity, and none."""
-    from efficientnerf.kernels import cpu_ndc
+    from efficientnerf.backends.numba import ndc as cpu_ndc
 
     rng = np.random.default_rng(5)
     origins = ndc.world_from_camera[:3, 3] + rng.normal(size=(10_000, 3)) * 3

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera, rays
-from efficientnerf.harmonics import harmonics_count
-from efficientnerf.kernels import cpu_tree
-from efficientnerf.ndc import Ndc
-from efficientnerf.nerftree import format
-from efficientnerf.nerftree.baking import voxel_coordinates
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
-from efficientnerf.render import render_tree_reference
+from efficientnerf.asset import format
+from efficientnerf.asset.bake import voxel_coordinates
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.backends.numba.tree import rendering
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.rendering.harmonics import harmonics_count
+from efficientnerf.rendering.render import render_tree_reference
 
 NEAR = 2.0
 DEPTH = 6.0  # of the wall before the reference camera, world units
@@ -122,9 +122,9 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
     # Voxels that have nothing in common with their neighbours.
     tree = tree.with_values(tree.density_values, np.random.default_rng(3).normal(0, 0.1, tree.sh.shape).astype(np.float32))
     camera = camera_at(*PLACES[place])
-    toward = cpu_tree._sights_of_voxels(tree, camera.centre)
+    toward = rendering._sights_of_voxels(tree, camera.centre)
     away = np.linalg.norm(voxel_coordinates(tree) @ toward[:, :3].T + toward[:, 3], axis=1) / np.linalg.norm(toward[:, :3], 2)
-    assert (away > cpu_tree._nearest_painted(tree)).mean() == pytest.approx(0 if place == "close" else 1, abs=0.1)
+    assert (away > rendering._nearest_painted(tree)).mean() == pytest.approx(0 if place == "close" else 1, abs=0.1)
     y, x = np.mgrid[: camera.height, : camera.width]
     origins, directions = rays(camera, np.stack([x.ravel(), y.ravel()], -1) + 0.5)
     colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))

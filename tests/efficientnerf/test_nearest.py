@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.harmonics import basis_numpy
-from efficientnerf.nerftree.converting import lookup, pruned, with_degree, with_resolution
-from efficientnerf.nerftree.format import describe, load, save
-from efficientnerf.nerftree.optimising import optimiser
-from efficientnerf.nerftree.tree import NerfTree
-from efficientnerf.render import render_tree_reference
-from efficientnerf.surface import surface
+from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
+from efficientnerf.asset.format import describe, load, save
+from efficientnerf.asset.refinement import optimiser
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.harmonics import basis_numpy
+from efficientnerf.rendering.render import render_tree_reference
+from efficientnerf.surface.isosurface import surface
 from tests import reference
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.test_ndc_tree import camera_at, wall
@@ -91,7 +91,7 @@ def test_a_uniform_box_has_its_closed_form_to_its_very_face() -> None:
 
 
 def test_pictures_are_their_rays() -> None:
-    from efficientnerf.cameras import rays
+    from efficientnerf.geometry.cameras import rays
 
     tree = nearest(3, share=0.7)
     camera = looking(tree)
@@ -109,7 +109,7 @@ def test_in_normalised_device_coordinates_too() -> None:
     seen, other = tree.render(camera), wall().render(camera)
     np.testing.assert_allclose(seen.opacity, other.opacity, atol=0.01)
     assert not np.array_equal(seen.colour, other.colour)
-    from efficientnerf.cameras import rays
+    from efficientnerf.geometry.cameras import rays
 
     colour, opacity = render_tree_reference(tree, *tensors(*rays(camera)))
     np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour, atol=1e-3)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from efficientnerf.backends.torch import linear_chain
+from efficientnerf.backends.torch.linear_chain import chain, chain_reference, has_bfloat16, precision_of
 from efficientnerf.fields.mlp import MlpField, positional_encoding
 from efficientnerf.fields.nerf import NerfField
-from efficientnerf.kernels import mlp
-from efficientnerf.kernels.mlp import chain, chain_reference, has_bfloat16, precision_of
 
 TOLERANCE = {torch.float32: 2e-5, torch.bfloat16: 4e-2}
 
@@ -32,7 +32,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_passes_by_hand_are_those_of_autograd(case: str, precision: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over several chunks, the last of them short; gradients of weights, biases and, where nothing skips, of the input."""
-    monkeypatch.setattr(mlp, "ROWS", 48)
+    monkeypatch.setattr(linear_chain, "ROWS", 48)
     sizes, skip, relu_last = CASES[case]
     weights, biases = layers(sizes)
     generator = torch.Generator().manual_seed(2)

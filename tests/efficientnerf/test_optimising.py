@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.kernels import cpu_tree_grad as kernels
-from efficientnerf.kernels.cpu_tree_grad import Records, Seen
-from efficientnerf.nerftree import optimising
-from efficientnerf.nerftree.baking import voxel_coordinates, with_voxels
-from efficientnerf.nerftree.optimising import Targets, error, greatest_weights, grid_of, in_voxels, optimise, optimiser
-from efficientnerf.nerftree.tree import NerfTree
-from efficientnerf.render import render_tree_reference
+from efficientnerf.asset import refinement
+from efficientnerf.asset.bake import voxel_coordinates, with_voxels
+from efficientnerf.asset.refinement import Targets, error, greatest_weights, grid_of, in_voxels, optimise, optimiser
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree import gradients as kernels
+from efficientnerf.backends.numba.tree.gradients import Records, Seen
+from efficientnerf.rendering.render import render_tree_reference
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
@@ -326,15 +326,15 @@ def test_what_hides_behind_an_opaque_wall_is_reached() -> None:
     """A wall of the wrong colour before a ball: from a capped start it gives way in steps in which it otherwise stays."""
     targets = Targets(pixels(10, 24), (1.0, 1.0, 1.0))
     wall = replace(ball_tree(), density_values=np.full(8000, 3000.0, np.float32))
-    assert optimiser(wall, optimising.OPAQUE).density.max() == pytest.approx(optimising.OPAQUE / wall.voxel)
+    assert optimiser(wall, refinement.OPAQUE).density.max() == pytest.approx(refinement.OPAQUE / wall.voxel)
     errors = {}
-    for thickest in (optimising.OPAQUE, np.inf):
+    for thickest in (refinement.OPAQUE, np.inf):
         o = optimiser(wall, thickest)
         *_, errors[thickest] = optimise(o, targets, until=30, steps=30, rays=512, density_rate=0.3, colour_rate=0.05, final=0.1, seed=1)
-    assert errors[optimising.OPAQUE] < 0.75 * errors[np.inf]
+    assert errors[refinement.OPAQUE] < 0.75 * errors[np.inf]
 
 
 def test_state_names_every_array_of_an_optimiser() -> None:
     o = optimiser(random_tree(2))
-    assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(optimising.SQUARES)
-    assert all(isinstance(getattr(o, name), np.ndarray) for name in optimising.STATE)
+    assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(refinement.SQUARES)
+    assert all(isinstance(getattr(o, name), np.ndarray) for name in refinement.STATE)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.nerftree.palettes import PaletteHarmonics
+from efficientnerf.asset.palettes import PaletteHarmonics
 from tests.efficientnerf.trees import random_tree, rays_at
 
 

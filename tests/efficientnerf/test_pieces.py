@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.ndc import Ndc
-from efficientnerf.nerftree.baking import voxel_coordinates
-from efficientnerf.nerftree.pieces import scraps
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.bake import voxel_coordinates
+from efficientnerf.asset.components import scraps
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.ndc import Ndc
 from tests.efficientnerf.test_ndc_tree import looking_along_y
 
 SHAPE = (12, 12, 12)

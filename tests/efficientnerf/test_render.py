@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera
-from efficientnerf.nerftree.tree import LOOKUPS, NerfTree, Rendering
-from efficientnerf.render import FieldRenderer, render_tree_reference
+from efficientnerf.asset.tree import LOOKUPS, NerfTree, Rendering
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.rendering.render import FieldRenderer, render_tree_reference
 from tests import reference
 from tests.efficientnerf.balls import pose, untrained
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
@@ -111,7 +111,7 @@ def test_normals_face_the_ray() -> None:
 
 
 def test_pictures_are_their_rays() -> None:
-    from efficientnerf.cameras import rays
+    from efficientnerf.geometry.cameras import rays
 
     tree = random_tree(0, share=0.7)
     camera = looking(tree)
@@ -135,7 +135,7 @@ def test_a_background_lies_behind() -> None:
 
 
 def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
-    from efficientnerf.cameras import resized
+    from efficientnerf.geometry.cameras import resized
 
     tree = random_tree(0, share=0.7)
     camera = looking(tree)
@@ -161,7 +161,7 @@ def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: i
 
 
 def test_pictures_do_not_depend_on_how_they_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf import render
+    from efficientnerf.rendering import render
 
     tree = random_tree(0, share=0.7)
     whole = tree.render(looking(tree), supersample=2)
@@ -209,7 +209,7 @@ def test_a_fields_picture_is_what_lies_before_in_and_behind_the_box(contracted: 
 
 
 def test_a_fields_picture_does_not_depend_on_how_it_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf import render
+    from efficientnerf.rendering import render
 
     m = untrained()
     camera = Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera, rays, resized
-from efficientnerf.harmonics import basis_numpy
-from efficientnerf.kernels import cpu_blocks, cpu_march
-from efficientnerf.kernels.cpu_blocks import Pool, View, fill, grid_of, paint
-from efficientnerf.kernels.lanes import apart, exp2_minus, interpolated, logistic, pointer, quarters, together
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
-from efficientnerf.render import render_tree_reference
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.backends.numba.simd import apart, exp2_minus, interpolated, logistic, pointer, quarters, together
+from efficientnerf.backends.numba.tree import blocks as cpu_blocks
+from efficientnerf.backends.numba.tree import march
+from efficientnerf.backends.numba.tree.blocks import Pool, View, fill, grid_of, paint
+from efficientnerf.geometry.cameras import Camera, rays, resized
+from efficientnerf.rendering.harmonics import basis_numpy
+from efficientnerf.rendering.render import render_tree_reference
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
@@ -60,8 +61,8 @@ def powers(a, b, c, d):  # type: ignore[no-untyped-def]
 
 def test_the_kernels_exponential_and_logistic() -> None:
     x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 402), [0.0, np.inf]]).astype(np.float32)
-    np.testing.assert_allclose([cpu_march._exp2_minus(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
-    assert cpu_march._exp2_minus(np.float32(0)) == 1
+    np.testing.assert_allclose([march._exp2_minus(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
+    assert march._exp2_minus(np.float32(0)) == 1
     np.testing.assert_allclose([powers(*v) for v in x.reshape(-1, 4)], np.exp2(-x.astype(np.float64)).reshape(-1, 4), atol=2e-7)
     assert powers(*np.zeros(4, np.float32)) == (1, 1, 1, 1)
     y = np.concatenate([-x, x, np.linspace(-20, 20, 2000).astype(np.float32)])
@@ -197,7 +198,7 @@ def test_bricks_near_which_nothing_absorbs_light_are_empty_to_the_kernel() -> No
 
 def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTree:
     """The tree with random codes in place of its harmonics."""
-    from efficientnerf.nerftree.palettes import PaletteHarmonics
+    from efficientnerf.asset.palettes import PaletteHarmonics
 
     rng, count = np.random.default_rng(0), len(tree.density_values)
     codes = rng.integers(entries, size=(count, len(groups))).astype(np.uint8 if entries <= 256 else np.uint16)
@@ -251,7 +252,7 @@ def test_pictures_are_the_torch_functions_from_near_and_far(degree: int, distanc
 
 
 def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.kernels import cpu_tree
+    from efficientnerf.backends.numba.tree import rendering
 
     tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=0.6, sigma=100.0)
     tree.packed  # noqa: B018  # made once, for both
@@ -259,7 +260,7 @@ def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytes
         camera = far_camera(tree, distance)
         usual = tree.render(camera, supersample=2)
         with monkeypatch.context() as patch:
-            patch.setattr(cpu_tree, "POOL_BYTES", 1)
+            patch.setattr(rendering, "POOL_BYTES", 1)
             patch.setattr("numba.get_num_threads", lambda: 3)
             other = tree.render(camera, supersample=2)
         for name in FIELDS:
@@ -267,7 +268,7 @@ def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytes
 
 
 def test_the_work_of_a_picture_is_counted() -> None:
-    from efficientnerf.kernels.cpu_tree import picture_work
+    from efficientnerf.backends.numba.tree.rendering import picture_work
 
     tree = uniform_tree(sigma=0.5)
     camera = camera_of(tree)
@@ -377,7 +378,7 @@ def test_normals_are_those_of_the_tree_where_half_of_the_light_is_gone() -> None
 
 
 def test_harmonics_may_be_asked_for_other_directions_than_the_rays() -> None:
-    from efficientnerf.kernels.cpu_tree import render_rays
+    from efficientnerf.backends.numba.tree.rendering import render_rays
 
     tree = uniform_tree(sigma=80.0)
     sh = np.zeros((len(tree.sh), 4, 3), np.float32)

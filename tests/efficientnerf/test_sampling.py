@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf import sampling
-from efficientnerf.compositing import ray_of_sample
-from efficientnerf.grid import Space
-from efficientnerf.kernels import dispatch
-from efficientnerf.sampling import Samples
+from efficientnerf.backends import dispatch
+from efficientnerf.geometry.spaces import Space
+from efficientnerf.rendering.compositing import ray_of_sample
+from efficientnerf.sampling import samples
+from efficientnerf.sampling.samples import Samples
 from tests import reference
 
 BOUNDS = np.array([[-1.0, -0.5, -0.25], [1.0, 0.5, 0.75]])
 STEP, SIDE = 0.11, 6
-FINDERS = {"torch": sampling.valid_samples, "kernel": dispatch.valid_samples}
-DIVIDERS = {"torch": sampling.pivotal_samples, "kernel": dispatch.pivotal_samples}
+FINDERS = {"torch": samples.valid_samples, "kernel": dispatch.valid_samples}
+DIVIDERS = {"torch": samples.pivotal_samples, "kernel": dispatch.pivotal_samples}
 
 
 class Rays(NamedTuple):
@@ -87,7 +87,7 @@ def test_valid_samples_are_those_of_the_loop(kind: str, contracted: bool, thresh
 @pytest.mark.parametrize("contracted", [False, True])
 def test_both_try_the_same_number(contracted: bool) -> None:
     rays, space = make_rays("outside"), Space(BOUNDS, contracted)
-    fast, slow = (find(space, *rays, STEP, 60, voxels_of(), 0.4) for find in (dispatch.valid_samples, sampling.valid_samples))
+    fast, slow = (find(space, *rays, STEP, 60, voxels_of(), 0.4) for find in (dispatch.valid_samples, samples.valid_samples))
     assert fast.tried == pytest.approx(slow.tried, abs=2)
     assert len(fast.start) < fast.tried
 
@@ -156,7 +156,7 @@ def test_intervals_lie_end_to_end_and_samples_in_them(finder: str, contracted: b
 @pytest.mark.parametrize("half", [(1, 1, 1), (1, 0.3, 0.1), (0.1, 1, 1)])
 def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: int, half: tuple[float, float, float]) -> None:
     from efficientnerf.model import model
-    from efficientnerf.settings import TrainSettings
+    from efficientnerf.training.settings import TrainSettings
 
     space = Space(np.array([np.negative(half), half]), True)
     m = model(space, TrainSettings(coarse_samples=coarse_samples, voxels=8, levels=2, log2_table=8), None)
@@ -172,7 +172,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     assert reach.min() > reference.FARTHEST
 
 
-@pytest.mark.parametrize("choose", [sampling.pivots, dispatch.pivots], ids=["torch", "kernel"])
+@pytest.mark.parametrize("choose", [samples.pivots, dispatch.pivots], ids=["torch", "kernel"])
 @pytest.mark.parametrize("most", [1, 3, 5, 100])
 def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[..., torch.Tensor], most: int) -> None:
     rng = np.random.default_rng(3)
@@ -190,7 +190,7 @@ def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[.
 
 def coarse_samples_of(rays: Rays, contracted: bool) -> tuple[Space, Samples, torch.Tensor]:
     space = Space(BOUNDS, contracted)
-    coarse = sampling.valid_samples(space, *rays, STEP, 60, voxels_of().to(rays.origins.dtype), 0.4)
+    coarse = samples.valid_samples(space, *rays, STEP, 60, voxels_of().to(rays.origins.dtype), 0.4)
     return space, coarse, torch.rand(len(coarse.start), generator=torch.Generator().manual_seed(0)) < 0.5
 
 
@@ -218,14 +218,14 @@ def test_the_pivotal_kernel_is_the_torch_function(contracted: bool) -> None:
     rays = make_rays("inside")
     space, coarse, pivotal = coarse_samples_of(rays, contracted)
     args = (space, rays.origins, rays.directions, rays.offset, coarse, pivotal, 4)
-    for fast, slow in zip(dispatch.pivotal_samples(*args)[:6], sampling.pivotal_samples(*args)[:6], strict=True):
+    for fast, slow in zip(dispatch.pivotal_samples(*args)[:6], samples.pivotal_samples(*args)[:6], strict=True):
         torch.testing.assert_close(torch.as_tensor(fast), torch.as_tensor(slow), rtol=1e-4, atol=1e-5)
 
 
 def test_no_point_is_evaluated_twice() -> None:
     rays = double(make_rays("outside"))
     space, coarse, _ = coarse_samples_of(rays, False)
-    fine = sampling.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, torch.ones(len(coarse.start), dtype=torch.bool), 4)
+    fine = samples.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, torch.ones(len(coarse.start), dtype=torch.bool), 4)
     assert len(torch.unique(coarse.point, dim=0)) == len(coarse.point)
     assert len(torch.unique(fine.point, dim=0)) == len(fine.point)
 

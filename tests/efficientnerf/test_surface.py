@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from efficientnerf import surface as surfaces
-from efficientnerf.mesh import decimate, face_areas, face_volumes, moved, sample, separate, smooth, tidy, topology
-from efficientnerf.surface import NoSurface, automatic_threshold, enclosed_cells, isosurface, points, surface
+from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface, points, surface
+from efficientnerf.surface.isosurface import isosurface as surfaces
+from efficientnerf.surface.mesh import decimate, face_areas, face_volumes, moved, sample, separate, smooth, tidy, topology
 
 LEVEL = 40.0
 NOBODY = np.zeros((0, 3))

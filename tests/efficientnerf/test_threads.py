@@ -14,7 +14,7 @@ import hashlib
 import numba
 import numpy as np
 
-from efficientnerf.training import state_of, train, trainer
+from efficientnerf.training.loop import state_of, train, trainer
 from tests.efficientnerf.balls import pixels, untrained
 from tests.efficientnerf.test_cpu_mlp import passes, weights_of
 from tests.efficientnerf.trees import random_tree, rays_at

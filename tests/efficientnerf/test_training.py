@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf import training
 from efficientnerf.model import Model, look
-from efficientnerf.pixels import Pixels
-from efficientnerf.settings import TrainSettings
-from efficientnerf.training import Adam, Anchors, Progress, anchor_loss, fine_samples_at, learning_rate, restore, share_of_fall, state_of, train, trainer
+from efficientnerf.training import loop
+from efficientnerf.training.loop import Adam, Anchors, Progress, anchor_loss, fine_samples_at, learning_rate, restore, share_of_fall, state_of, train, trainer
+from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.settings import TrainSettings
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
 
 MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_rate": 1e-2}
@@ -23,7 +23,7 @@ MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """The rate rises in a few steps."""
-    monkeypatch.setattr(training, "RATE_WARM_UP", 10)
+    monkeypatch.setattr(loop, "RATE_WARM_UP", 10)
 
 
 def run(m: Model, which: Pixels | None = None) -> list[Progress]:
@@ -236,10 +236,10 @@ def test_voxels_alone_can_choose_the_pivots(contracted: bool) -> None:
 
 def test_a_schedule_that_was_settled_anew_goes_on_from_where_it_stood() -> None:
     aims = (1000, 400, 3000, 700)
-    shares = [training.share_of_fall(step, 2000, 100, aims) for step in range(2001)]
+    shares = [loop.share_of_fall(step, 2000, 100, aims) for step in range(2001)]
     assert all(a <= b for a, b in itertools.pairwise(shares))
     assert max(b - a for a, b in itertools.pairwise(shares)) < 2 / 900  # no leap
-    assert shares[:401] == [training.share_of_fall(step, 1000, 100) for step in range(401)]
-    assert shares[:701] == [training.share_of_fall(step, 3000, 100, aims[:2]) for step in range(701)]
+    assert shares[:401] == [loop.share_of_fall(step, 1000, 100) for step in range(401)]
+    assert shares[:701] == [loop.share_of_fall(step, 3000, 100, aims[:2]) for step in range(701)]
     assert shares[2000] == pytest.approx(1)
     assert learning_rate(2000, 1e-2, 0.05, 2000, 0, 100, aims) == pytest.approx(5e-4)

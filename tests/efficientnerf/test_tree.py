@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests import reference
 from tests.efficientnerf.trees import LOW, random_tree
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.nerftree.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 
 LOW = np.array([-0.7, 0.2, -1.1])
 

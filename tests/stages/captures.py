@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from efficientnerf.cameras import MODELS, Camera, opengl_from_pose, project
+from efficientnerf.geometry.cameras import MODELS, Camera, opengl_from_pose, project
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 40.0
 SHARED = Path(__file__).parents[3] / "shared" / "data"

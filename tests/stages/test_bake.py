@@ -12,16 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.compositing import activate
-from efficientnerf.nerftree import baking, format, writing
-from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.asset import bake as baking
+from efficientnerf.asset import format, serialisation
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.compositing import activate
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
-from stages import bake, memory, optimisation, resolution, train
+from stages import bake, train
 from stages.bake import ASSET, BakeSettings
+from stages.baking import memory, refinement, resolution
 from stages.evaluate import truth_of
-from stages.field import FILE, load_renderer, save_model
-from stages.scene import load
+from stages.io.field_file import FILE, load_renderer, save_model
+from stages.io.scene import load
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
 
@@ -153,7 +155,7 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
 
 
 def test_a_device_without_room_leaves_the_fit_to_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.nerftree.optimising import Targets
+    from efficientnerf.asset.refinement import Targets
     from tests.efficientnerf.balls import pixels
     from tests.efficientnerf.trees import random_tree
 
@@ -165,10 +167,10 @@ def test_a_device_without_room_leaves_the_fit_to_the_host(tmp_path: Path, monkey
     needed = 604 * len(tree.density_values) + 4 * 5**3 * len(tree.voxel_index) + 12 * 60 + 2 * 64 * 4
     for free, where in ((needed, there), (needed - 1, targets)):
         monkeypatch.setattr(memory, "free_on_device", lambda device, free=free: free)
-        assert optimisation._where_there_is_room(made, tree, targets) is where
+        assert refinement._where_there_is_room(made, tree, targets) is where
     assert ["fitted on the CPU" in event["text"] for event in events if event["event"] == "warning"] == [True]
     made.device = "cpu"
-    assert optimisation._where_there_is_room(made, tree, targets) is targets
+    assert refinement._where_there_is_room(made, tree, targets) is targets
 
 
 def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
@@ -186,7 +188,7 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
     monkeypatch.setattr(resolution, "PIXELS", 0.2)
     sizes = {}
     for room in (10**7, 20_000):
-        monkeypatch.setattr(writing, "most_voxels", lambda *asked, room=room: room)
+        monkeypatch.setattr(serialisation, "most_voxels", lambda *asked, room=room: room)
         told: list[dict[str, Any]] = []
         made = job(tmp_path / str(room), fitted, **inputs)
         made._report = told.append
@@ -203,10 +205,10 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
 
 def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
     chosen = BakeSettings(optimise_rays=1000)
-    assert [optimisation.steps_of(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
-    assert {optimisation.steps_of(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
+    assert [refinement.steps_of(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
+    assert {refinement.steps_of(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
     asked = dataclasses.replace(chosen, optimise=7)
-    assert {optimisation.steps_of(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
+    assert {refinement.steps_of(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
     made = job(tmp_path, dataclasses.replace(QUICK, optimise=None, optimise_rays=64), **inputs)
     run(made)
     report = json.loads((made.out / "report.json").read_text())["optimisation"]

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import rays
-from efficientnerf.nerftree.baking import flattened
-from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.asset.bake import flattened
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import rays
 from stages import bake, train
 from stages.bake import ASSET, NDC_DEPTH, BakeSettings
-from stages.exporters.frames import write_png
-from stages.field import load_renderer
-from stages.forward import forward_of
-from stages.optimisation import WEIGHED_NDC
-from stages.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
-from stages.scene import Scene, View, load, save
+from stages.baking.refinement import WEIGHED_NDC
+from stages.baking.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
+from stages.framing.forward_facing import forward_of
+from stages.io.exporters.frames import write_png
+from stages.io.field_file import load_renderer
+from stages.io.scene import Scene, View, load, save
 from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import ORBIT, SIMILARITY, job, poses
 from tests.stages.test_forward import depths, row

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from efficientnerf import training
-from efficientnerf.settings import TrainSettings
-from efficientnerf.training import Progress, Trainer
+from efficientnerf.training import loop
+from efficientnerf.training.loop import Progress, Trainer
+from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages import train
-from stages.budget import MOST, TIMED, Budget
-from stages.field import FILE, load_renderer
+from stages.io.field_file import FILE, load_renderer
+from stages.training.budget import MOST, TIMED, Budget
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -33,7 +33,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """A step takes half a second, or two in the warm-up; nothing else takes any time."""
-    now, steps = [0.0], training.train
+    now, steps = [0.0], loop.train
 
     def timed(t: Trainer, *rest: Any) -> Iterator[Progress]:
         for done in steps(t, *rest):
@@ -41,8 +41,8 @@ def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
             yield done
 
     monkeypatch.setattr(train, "clock", lambda: now[0])
-    monkeypatch.setattr(training, "train", timed)
-    monkeypatch.setattr("stages.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr(loop, "train", timed)
+    monkeypatch.setattr("stages.pictures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def digest(made: Job) -> str:
@@ -149,4 +149,4 @@ def test_steps_that_change_their_pace_end_on_time(tmp_path: Path, pace: Callable
 
 
 def rate(step: int, s: TrainSettings) -> float:
-    return training.share_of_fall(step, s.iterations, s.rate_hold, s.rate_aims)
+    return loop.share_of_fall(step, s.iterations, s.rate_hold, s.rate_aims)

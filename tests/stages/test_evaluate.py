@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from efficientnerf.cameras import Camera, Similarity, rays
-from efficientnerf.metrics import psnr, ssim
+from efficientnerf.evaluation.metrics import psnr, ssim
+from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages.evaluate import EvaluateSettings, background_stride, evaluate, spread, thickened, thinned, thinned_camera
-from stages.exporters.frames import frame_from_rendering, write_png
-from stages.paths import pose_on_sphere
-from stages.plots import eight_bits
-from stages.scene import Orbit, Scene, View, save
+from stages.framing.camera_paths import pose_on_sphere
+from stages.io.exporters.frames import frame_from_rendering, write_png
+from stages.io.scene import Orbit, Scene, View, save
+from stages.pictures.plots import eight_bits
 from tests.fakes import WHITE, BallField, BallTree
 
 TREE = BallTree()

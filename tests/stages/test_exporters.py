@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.cameras import Similarity
-from efficientnerf.mesh import Mesh, PointCloud, vertex_normals
+from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
 from pipeline.errors import BadInput
-from stages.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SourceFrame
-from stages.exporters.glb import gltf_from_capture
-from stages.exporters.writing import source_frame
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SourceFrame
+from stages.io.exporters.glb import gltf_from_capture
+from stages.io.exporters.writing import source_frame
 
 Z_UP = SourceFrame(Similarity.identity())
 Y_DOWN = SourceFrame(Similarity(0.5, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([1.0, 2, 3])), metric=True)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import state_of
 from pipeline.errors import CorruptArtifact
-from stages.field import FILE, GAINS, load_gains, load_renderer, read_tensors, save_model, write_tensors
+from stages.io.field_file import FILE, GAINS, load_gains, load_renderer, read_tensors, save_model, write_tensors
 from tests.efficientnerf.balls import pose, untrained
 
 CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3))
@@ -20,7 +20,7 @@ CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3)
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("field", ["hash", "mlp"])
 def test_a_saved_field_draws_the_same_picture(tmp_path: Path, field: str, contracted: bool) -> None:
-    from efficientnerf.render import FieldRenderer
+    from efficientnerf.rendering.render import FieldRenderer
 
     m = untrained(field=field, contracted=contracted)
     with torch.no_grad():

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.cameras import Camera, Similarity
+from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
-from stages import importers
-from stages.capture import Capture, Photo
-from stages.forward import content_depths, forward_of, mean_pose
-from stages.framing import frame
-from stages.paths import spiral_poses, turntable_cameras
+from stages.framing.camera_paths import spiral_poses, turntable_cameras
+from stages.framing.forward_facing import content_depths, forward_of, mean_pose
+from stages.framing.framing import frame
+from stages.io import importers
+from stages.io.capture import Capture, Photo
 from tests.efficientnerf.test_ndc_tree import wall
 from tests.stages import captures
 from tests.stages.test_framing import looking, some_rotation
@@ -39,7 +39,7 @@ def depths(cameras: list[Camera], near: float = NEAR, far: float = FAR) -> np.nd
 
 def in_pictures(cameras: list[Camera], near: float, far: float) -> np.ndarray:
     """Points at depths from near to far of random pixels of the cameras."""
-    from efficientnerf.cameras import rays
+    from efficientnerf.geometry.cameras import rays
 
     rng = np.random.default_rng(1)
     points = []

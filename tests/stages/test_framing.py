@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from efficientnerf.cameras import Camera, Similarity, project
+from efficientnerf.geometry.cameras import Camera, Similarity, project
 from pipeline.errors import BadInput
-from stages import extent
-from stages.capture import Capture, Photo, SparsePoints
-from stages.framing import Framing, estimated_up, frame, heading_of, rotation_to_z
+from stages.framing import scene_bounds
+from stages.framing.framing import Framing, estimated_up, frame, heading_of, rotation_to_z
+from stages.io.capture import Capture, Photo, SparsePoints
 
 PLAIN = Path("a.png")
 
@@ -46,7 +46,7 @@ def capture_of(cameras: list[Camera], xyz: np.ndarray | None = None, *, moved: S
     moved = moved or Similarity.identity()
     points = None
     if xyz is not None:
-        seen = extent.in_view(xyz, cameras)
+        seen = scene_bounds.in_view(xyz, cameras)
         count = len(xyz)
         observers = tuple(tuple(int(i) for i in np.flatnonzero(seen[:, k])) for k in range(count))
         points = SparsePoints(moved.points(xyz), np.zeros((count, 3), np.uint8), np.ones(count), observers)
@@ -262,7 +262,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def real(name: str, form: str) -> Capture:
-    from stages.importers import IMPORTERS
+    from stages.io.importers import IMPORTERS
     from stages.poses import PosesSettings
 
     if not (DATA / name).is_dir():
@@ -278,7 +278,7 @@ def entry(origins: np.ndarray, directions: np.ndarray, bounds: np.ndarray) -> np
 
 
 def test_chair_lies_in_its_box() -> None:
-    from efficientnerf.cameras import rays
+    from efficientnerf.geometry.cameras import rays
 
     capture = replace(real("chair_200", "blender"), background=(1.0, 1.0, 1.0))
     framing = frame(capture)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.cameras import Camera, opengl_from_pose, project, quarter_turned, rays
-from stages import importers
-from stages.capture import Capture
-from stages.importers import colmap_model
+from efficientnerf.geometry.cameras import Camera, opengl_from_pose, project, quarter_turned, rays
+from stages.io import importers
+from stages.io.capture import Capture
+from stages.io.importers import colmap_model
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS, Settings
 
@@ -171,8 +171,8 @@ def test_llff_takes_the_largest_images_and_scales_the_focal_length(tmp_path: Pat
 
 
 def test_masks_beside_photographs(tmp_path: Path) -> None:
-    from stages.importers.photographs import masks_of, photographs
-    from stages.importers.source import Source
+    from stages.io.importers.photographs import masks_of, photographs
+    from stages.io.importers.source import Source
 
     black = np.zeros((HEIGHT, WIDTH), np.uint8)
     for layout, mask in {"a": "masks/1.png", "b": "masks/1.jpg.png", "images/c": "images/masks/1.png", "images": "masks/1.PNG"}.items():

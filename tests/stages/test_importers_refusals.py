@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from pipeline.errors import BadInput
-from stages import importers
-from stages.capture import Capture
-from stages.importers import llff, transforms
+from stages.io import importers
+from stages.io.capture import Capture
+from stages.io.importers import llff, transforms
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH, Settings
 
@@ -100,7 +100,7 @@ def test_json_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     folder = captures.nerfstudio(tmp_path / "a")
     monkeypatch.setattr(transforms, "MOST_FRAMES", 5)
     refusal(folder, "6 frames; at most 5")
-    from stages.importers.source import read_json
+    from stages.io.importers.source import read_json
 
     with pytest.raises(BadInput, match="at most"):
         read_json(folder / "transforms.json", most=100)

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.cameras import rays
-from efficientnerf.grid import Space
+from efficientnerf.geometry.cameras import rays
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import model
-from efficientnerf.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
+from efficientnerf.training.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import settings_from
 from stages import train
-from stages.field import load_renderer, space_of
-from stages.forward import forward_of
-from stages.lattice import LARGEST, MOST, sized
-from stages.resolution import ndc_pixel
-from stages.scene import Scene, View
-from stages.scene import load as load_scene
+from stages.baking.resolution import ndc_pixel
+from stages.framing.forward_facing import forward_of
+from stages.io.field_file import load_renderer, space_of
+from stages.io.scene import Scene, View
+from stages.io.scene import load as load_scene
+from stages.training.hash_resolution import LARGEST, MOST, sized
 from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import ORBIT, SIMILARITY, job, poses
 from tests.stages.test_forward import depths, row

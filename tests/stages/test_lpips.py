@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.perceptual import CHANNELS, SHIFT, TAPS, Lpips, _layers
+from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
 from stages import lpips_weights
 from stages.evaluate import Truth, perceived, summary

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.cameras import Similarity
-from efficientnerf.nerftree.tree import tree_from_voxels
+from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.geometry.cameras import Similarity
 from pipeline.errors import Interrupted, StageFailed
 from pipeline.stage import Job
 from stages import mesh as stage

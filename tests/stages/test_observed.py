@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.cameras import Camera, project
-from efficientnerf.grid import Space
+from efficientnerf.asset.bake import voxel_coordinates
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import look
-from efficientnerf.nerftree.baking import voxel_coordinates
-from efficientnerf.nerftree.tree import NerfTree
-from efficientnerf.pixels import Pixels
+from efficientnerf.training.pixels import Pixels
 from stages import bake, train
-from stages.field import load_renderer, space_of
-from stages.observed import often_seen, seldom_seen, spread_order
-from stages.scene import Scene, views_of
-from stages.scene import load as load_scene
-from stages.scene import save as save_scene
+from stages.framing.view_coverage import often_seen, seldom_seen, spread_order
+from stages.io.field_file import load_renderer, space_of
+from stages.io.scene import Scene, views_of
+from stages.io.scene import load as load_scene
+from stages.io.scene import save as save_scene
 from tests.efficientnerf import balls
 from tests.stages.balls import job, poses
 

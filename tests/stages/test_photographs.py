@@ -16,9 +16,10 @@ from PIL import Image
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages import matches, upright
-from stages.capture import Capture
-from stages.photographs import find_cameras
+from stages.io import photo as upright
+from stages.io.capture import Capture
+from stages.sfm import matches
+from stages.sfm.reconstruction import find_cameras
 
 ROOT = Path(__file__).resolve().parents[2]
 STILL_LIFE = ROOT / "examples" / "still_life"
@@ -157,7 +158,7 @@ def test_still_life_lies_in_the_box(ten: tuple[list[str], Path, Capture]) -> Non
     """The things on the table, by the true mesh brought into the frame of the cameras found."""
     import trimesh
 
-    from stages.framing import frame
+    from stages.framing.framing import frame
 
     names, _, capture = ten
     truth = true_centres(TRUTH)
@@ -186,7 +187,7 @@ def test_again_in_another_order_gives_the_same_bits(ten: tuple[list[str], Path, 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from stages.photographs import find_cameras
+from stages.sfm.reconstruction import find_cameras
 folder, work, phase, moment, side = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
 def progress(done, total, text="", **facts):
     if text == phase and done >= moment:
@@ -295,7 +296,7 @@ def test_lens_with_more_than_one_term_of_distortion(tmp_path: Path) -> None:
     """Fourteen photographs drawn again as a lens with two radial and two tangential terms would have taken them."""
     import cv2
 
-    from efficientnerf.cameras import Camera, project, rays
+    from efficientnerf.geometry.cameras import Camera, project, rays
 
     chosen()
     names = sorted(path.name for path in STILL_LIFE.glob("*.jpg"))[:14]
@@ -383,7 +384,7 @@ from dataclasses import replace
 from pathlib import Path
 from pipeline.errors import PipelineError
 from pipeline.runner import run_stages
-from stages.matches import quiet_pycolmap
+from stages.sfm.matches import quiet_pycolmap
 from tests.pipeline.toy import STAGES, make_run
 
 def work(job):
@@ -412,7 +413,7 @@ def test_colmap_leaves_sigterm_as_it_was(tmp_path: Path, engine: bool, code: int
 
 WHILE_IMPORTING = """
 import os, signal, sys
-from stages.matches import quiet_pycolmap
+from stages.sfm.matches import quiet_pycolmap
 
 sent = 0
 def answer(number, frame):

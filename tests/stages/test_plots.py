@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, eight_bits, error_picture, grid_sheet
+from stages.pictures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, eight_bits, error_picture, grid_sheet
 
 
 def test_sheet_holds_each_image_at_its_place(tmp_path: Path) -> None:

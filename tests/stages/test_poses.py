@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from efficientnerf.cameras import project
+from efficientnerf.geometry.cameras import project
 from pipeline.errors import BadInput, Interrupted
 from pipeline.stage import Job
-from stages import poses, scene
-from stages.capture import Capture, Photo
+from stages import poses
+from stages.io import scene
+from stages.io.capture import Capture, Photo
+from stages.io.scene import Scene
 from stages.poses import PosesSettings, assign_splits
-from stages.scene import Scene
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS
 
@@ -248,7 +249,7 @@ def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest
         options["warn"]("one found no place")
         return Capture(kind="photographs", photos=found, background=None, rejected=(("img_5.png", "overlaps no other"),), warnings=("one found no place",))
 
-    monkeypatch.setattr("stages.photographs.find_cameras", find_cameras)
+    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find_cameras)
     whole, warnings = run(source, tmp_path / "a", features=1000, matching="sequential", feature_side=800, seed=3)
     assert (asked["features"], asked["matching"], asked["max_side"], asked["seed"]) == (1000, "sequential", 800, 3)
     assert asked["names"] == [camera.name for camera in made]
@@ -283,7 +284,7 @@ def test_it_stops_at_a_safe_point(tmp_path: Path) -> None:
 
 
 def test_names_that_differ_only_in_their_extension() -> None:
-    from stages.working_images import relative_paths
+    from stages.io.working_images import relative_paths
 
     names = ["images/a.png", "images/a.jpg", "images_4/A.png", "b/../../a.png", "/c.png"]
     cameras = [replace(camera, name=name) for name, camera in zip(names, captures.cameras(5), strict=True)]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from stages.resolution import CLOSE, LEAST, Choice, affordable_resolution, finest_resolution
-from stages.scene import load
+from stages.baking.resolution import CLOSE, LEAST, Choice, affordable_resolution, finest_resolution
+from stages.io.scene import load
 from tests.stages.balls import poses
 
 

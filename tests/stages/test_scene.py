@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from efficientnerf.cameras import Similarity, rays, resized
+from efficientnerf.geometry.cameras import Similarity, rays, resized
 from pipeline.errors import BadInput
-from stages import importers, scene
-from stages.capture import SparsePoints
-from stages.exporters import cameras as camera_exporter
-from stages.scene import Orbit, Scene, View
+from stages.io import importers, scene
+from stages.io.capture import SparsePoints
+from stages.io.exporters import cameras
+from stages.io.scene import Orbit, Scene, View
 from tests.stages import captures
 from tests.stages.test_importers import LENSES, assert_same_rays
 
@@ -174,7 +174,7 @@ def test_exported_cameras_are_those_of_the_source(model: str, tmp_path: Path) ->
     named = replace(whole, views=tuple(replace(view, source_camera=replace(view.source_camera, name=view.image)) for view in whole.views))
     named = replace(named, views=tuple(replace(view, camera=replace(view.camera, name=view.image)) for view in named.views))
     captures.write_pictures(tmp_path, [view.image for view in named.views])
-    camera_exporter.write(named, tmp_path / "transforms.json")
+    cameras.write(named, tmp_path / "transforms.json")
     capture = importers.IMPORTERS["nerfstudio"].read(tmp_path, captures.Settings())
     truth = captures.cameras() if model == "SIMPLE_PINHOLE" else captures.cameras(model=model, params=LENSES[model])
     assert_same_rays(capture, truth)
@@ -187,6 +187,6 @@ def test_exported_cameras_are_those_of_the_source(model: str, tmp_path: Path) ->
 def test_exported_cameras_that_differ_state_their_own_lens() -> None:
     whole = scene_of()
     other = replace(whole.views[0], source_camera=resized(whole.views[0].source_camera, 64, 48))
-    document = camera_exporter.transforms_from_scene(replace(whole, views=(other, *whole.views[1:])))
+    document = cameras.transforms_from_scene(replace(whole, views=(other, *whole.views[1:])))
     assert "fl_x" not in document
     assert [frame["w"] for frame in document["frames"]] == [64, 32, 32, 32, 32, 32]

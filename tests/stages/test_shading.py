@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from efficientnerf.mesh import Mesh
-from stages.shading import IN_FRONT, draw_sides
+from efficientnerf.surface.mesh import Mesh
+from stages.pictures.shading import IN_FRONT, draw_sides
 
 PAPER = 237  # the background, of 255
 

@@ -12,10 +12,10 @@ import pytest
 
 from pipeline.errors import Interrupted, UsageError
 from pipeline.stage import Job
-from stages import scene as scenes
 from stages import train
-from stages.capture import SparsePoints
-from stages.field import FILE, load_gains, load_renderer
+from stages.io import scene as scenes
+from stages.io.capture import SparsePoints
+from stages.io.field_file import FILE, load_gains, load_renderer
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -31,7 +31,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_curve(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Drawing the curve takes longer than this little training; one test wants it."""
     if "curve" not in request.node.name:
-        monkeypatch.setattr("stages.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+        monkeypatch.setattr("stages.pictures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:
@@ -88,7 +88,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, un
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "other", "flipped"])
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(scene: Path, tmp_path: Path, undisturbed: str, damage: str) -> None:
-    from stages.field import write_tensors
+    from stages.io.field_file import write_tensors
 
     with pytest.raises(Interrupted):
         run(job(tmp_path, settings(**QUICK), poses=scene, stop=StopAt(9)))
@@ -135,7 +135,7 @@ def test_photographs_with_masks(tmp_path: Path) -> None:
 
     from PIL import Image
 
-    from stages import scene as scenes
+    from stages.io import scene as scenes
 
     folder = poses(tmp_path / "poses", photographs=True)
     s = scenes.load(folder)

@@ -11,11 +11,11 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from efficientnerf.metrics import psnr
+from efficientnerf.evaluation.metrics import psnr
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
-from stages.exporters.frames import read_png
-from stages.paths import turntable_cameras
+from stages.framing.camera_paths import turntable_cameras
+from stages.io.exporters.frames import read_png
 from stages.turntable import STAGE, TurntableSettings, draw_turntable
 from tests.fakes import BallTree
 
@@ -92,7 +92,7 @@ def test_progress_ends_at_the_last_frame(tmp_path: Path) -> None:
 
 
 def test_the_stage_reads_an_asset_file(tmp_path: Path) -> None:
-    from efficientnerf.nerftree.tree import tree_from_voxels
+    from efficientnerf.asset.tree import tree_from_voxels
 
     indices = np.stack(np.meshgrid(*[np.arange(2, 6)] * 3, indexing="ij"), -1).reshape(-1, 3)
     tree = tree_from_voxels((2, 2, 2), 0.25, np.full(3, -1.0), indices, np.full(64, 40.0), np.zeros((64, 1, 3)), background=(1.0, 1.0, 1.0))

@@ -14,7 +14,7 @@ from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
 from stages.settings import setting
 from workflows import asset
-from workflows.cli import main
+from workflows.cli.main import main
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,8 @@ def toys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     presets.mkdir()
     (presets / "preview.toml").write_text('description = "Toy."\n[train]\niterations = 3\n', encoding="utf-8")
     (presets / "tiny.toml").write_text('description = "Smaller toy."\n[train]\niterations = 1\nrate = 2\n', encoding="utf-8")
-    monkeypatch.setattr("workflows.resolve.PRESETS_FOLDER", presets)
-    monkeypatch.setattr("workflows.device.cuda_device_count", lambda: 0)
+    monkeypatch.setattr("workflows.cli.resolve.PRESETS_FOLDER", presets)
+    monkeypatch.setattr("workflows.cli.device.cuda_device_count", lambda: 0)
     monkeypatch.setattr(asset, "STAGES", TOYS)
     source = tmp_path / "source"
     source.mkdir()

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from efficientnerf.nerftree.format import WRITERS, describe, load, save
+from efficientnerf.asset.format import WRITERS, describe, load, save
 from tests.efficientnerf.trees import random_tree
 from tests.workflows.conftest import Result
-from workflows.cli_assets import LAYOUTS
+from workflows.cli.assets import LAYOUTS
 
 Enerf = Callable[..., Result]
 

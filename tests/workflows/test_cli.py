@@ -250,7 +250,7 @@ HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib", "skimage", "scipy", 
 def test_what_has_nothing_to_do_imports_nothing_heavy(tmp_path: Path, arguments: list[str]) -> None:
     """In a process of its own, with the real stages and a run of which nothing has been made (`--until` keeps it from beginning)."""
     program = (
-        "import sys; from pathlib import Path; from pipeline.run import Run; from workflows.cli import main\n"
+        "import sys; from pathlib import Path; from pipeline.run import Run; from workflows.cli.main import main\n"
         f"Run.create(Path({str(tmp_path / 'run')!r}), Path({str(tmp_path)!r}))\n"
         f"code = main({[str(tmp_path / 'run') if each == 'RUN' else each for each in arguments]!r} + (['--dry-run'] if {'--out' in arguments} else []))\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr); sys.exit(code)"
@@ -269,7 +269,7 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path) -> None:
             "import sys, time; from workflows import asset; from tests.workflows.conftest import TOYS; asset.STAGES = TOYS\n"
             "import pipeline.stage; known = pipeline.stage.Job.safe_point\n"
             "pipeline.stage.Job.safe_point = lambda job: (time.sleep(0.05), known(job))\n"
-            "from workflows.cli import main; sys.exit(main(sys.argv[1:]))"
+            "from workflows.cli.main import main; sys.exit(main(sys.argv[1:]))"
         )
         command = [sys.executable, "-c", program, "run", str(toys), "--out", str(run), "--preset", "preview", "--set", "train.iterations=2000", "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from pipeline.errors import UsageError
-from workflows import device
+from workflows.cli import device
 
 
 @pytest.mark.parametrize(
@@ -51,5 +51,5 @@ def test_it_agrees_with_torch() -> None:
 
 
 def test_asking_does_not_import_torch() -> None:
-    program = "import sys; from workflows.device import has_cuda; has_cuda(); sys.exit('torch' in sys.modules)"
+    program = "import sys; from workflows.cli.device import has_cuda; has_cuda(); sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True)

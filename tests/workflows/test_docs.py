@@ -24,7 +24,7 @@ def test_links_of_the_readme_lead_somewhere() -> None:
 
 
 def test_commands_of_the_readme_exist() -> None:
-    from workflows.cli import enerf
+    from workflows.cli.main import enerf
 
     text = (ROOT / "README.md").read_text(encoding="utf-8") + (ROOT / "examples/README.md").read_text(encoding="utf-8")
     calls = re.findall(r"^    enerf (\w+)(.*)$", text, flags=re.MULTILINE)

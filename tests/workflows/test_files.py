@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from efficientnerf.nerftree import format as nerftree
-from efficientnerf.nerftree.tree import NerfTree
+from efficientnerf.asset import format
+from efficientnerf.asset.tree import NerfTree
 from tests.workflows.conftest import Result
 
 Enerf = Callable[..., Result]
@@ -39,7 +39,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
         metadata={"world_from_capture": {"scale": SCALE, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}},
     )
     path = tmp_path_factory.mktemp("asset") / "ball.nerftree"
-    nerftree.save(tree, path)
+    format.save(tree, path)
     return path
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import BadInput, UsageError
-from workflows import paper
-from workflows.cli import main
-from workflows.paper import PAPER, Request, Result, Table
+from workflows.cli.main import main
+from workflows.paper import document as paper
+from workflows.paper.document import PAPER, Request, Result, Table
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from workflows.cli import main
-from workflows.paper_structures import COLUMNS, NAMES, Case
+from workflows.cli.main import main
+from workflows.paper.structures import COLUMNS, NAMES, Case
 
 
 def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workflows.paper_structures.CACHINGS", 1)
-    monkeypatch.setattr("workflows.paper_structures.QUERIES", 1)
+    monkeypatch.setattr("workflows.paper.structures.CACHINGS", 1)
+    monkeypatch.setattr("workflows.paper.structures.QUERIES", 1)
     assert main(["paper", "7", "--out", str(tmp_path), "--scale", "0.12", "--device", "cpu", "--quiet"]) == 0
     table = json.loads((tmp_path / "table_7.json").read_text())
     assert table["columns"] == list(COLUMNS)
@@ -35,13 +35,13 @@ def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_the_torch_versions_fill_the_same_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    from workflows import paper_structures
+    from workflows.paper import structures
 
-    monkeypatch.setattr(paper_structures, "CACHINGS", 1)
-    monkeypatch.setattr(paper_structures, "QUERIES", 1)
-    rows, note = paper_structures._measure(Case(32, 0.2), 1000, paper_structures._in_torch("cpu"))
+    monkeypatch.setattr(structures, "CACHINGS", 1)
+    monkeypatch.setattr(structures, "QUERIES", 1)
+    rows, note = structures._measure(Case(32, 0.2), 1000, structures._in_torch("cpu"))
     assert [row["structure"] for row in rows] == list(NAMES.values())
-    kernels, _ = paper_structures._measure(Case(32, 0.2), 1000, paper_structures._in_numba())
+    kernels, _ = structures._measure(Case(32, 0.2), 1000, structures._in_numba())
     for row, kernel in zip(rows, kernels, strict=True):
         assert row["memory of dense"] == pytest.approx(kernel["memory of dense"], rel=0.05, abs=0.01), row["structure"]
     assert "6,554 voxels" in note

@@ -11,13 +11,14 @@ from typing import Any
 import pytest
 
 from pipeline.errors import BadInput
-from stages.scene import load, save
+from stages.io.scene import load, save
 from tests.efficientnerf.balls import cameras, picture
 from tests.stages.captures import write_picture
-from workflows import paper, paper_tables
-from workflows.cli import main
-from workflows.paper import PAPER, Request
-from workflows.paper_runs import Figures, Row, _pace, scenes, settings_of
+from workflows.cli.main import main
+from workflows.paper import document as paper
+from workflows.paper import tables
+from workflows.paper.document import PAPER, Request
+from workflows.paper.runs import Figures, Row, _pace, scenes, settings_of
 
 
 def ball(folder: Path) -> Path:
@@ -47,7 +48,7 @@ def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
     assert small["bake"]["resolution"] < whole["bake"]["resolution"]
     for name in ("coarse_samples", "fine_samples", "near", "far", "degree", "pivotal_weight", "voxel_beta", "voxel_initial", "sampling", "max_pivots"):
         assert small["train"][name] == whole["train"][name], name
-    light, standard = settings_of(Row("n4"), 0.001)["train"], settings_of(Row("nerf", paper_tables.NERF), 0.001)["train"]
+    light, standard = settings_of(Row("n4"), 0.001)["train"], settings_of(Row("nerf", tables.NERF), 0.001)["train"]
     assert light["coarse_hidden"] < standard["coarse_hidden"] == standard["hidden"]
     differ = {name for name in light if light[name] != standard[name]}
     assert differ == {"field", "sampling", "coarse_samples", "coarse_hidden", "coarse_layers"}  # so the rest is shared
@@ -80,7 +81,7 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         asked.append(row.name)
         return made_up(0.184 if row.name == "nerf" else 0.021, 21.0 if row.name == "valid" else 30.0)
 
-    monkeypatch.setattr(paper_tables, "measured", measured)
+    monkeypatch.setattr(tables, "measured", measured)
     request = Request(ball(tmp_path / "chair"), tmp_path / "out", 0.001)
     paper.make(number, request)
     document = json.loads((tmp_path / "out" / f"table_{number}.json").read_text())
@@ -126,10 +127,10 @@ def test_a_tree_is_measured_on_as_many_views_as_the_network(tmp_path: Path, monk
     """On the device that was asked for, its pictures' way back to the host not counted."""
     import numpy as np
 
-    from efficientnerf.nerftree.tree import NerfTree
+    from efficientnerf.asset.tree import NerfTree
     from tests.efficientnerf.trees import random_tree
     from tests.stages.balls import poses
-    from workflows import paper_runs
+    from workflows.paper import runs
 
     folder = poses(tmp_path / "poses")
     s = load(folder)
@@ -140,11 +141,11 @@ def test_a_tree_is_measured_on_as_many_views_as_the_network(tmp_path: Path, monk
     sent: list[str] = []
     monkeypatch.setattr(NerfTree, "to", lambda self, device: sent.append(device) or self)
     drawn: list[str] = []
-    seconds = paper_runs._frame_seconds
-    monkeypatch.setattr(paper_runs, "_frame_seconds", lambda tree, camera, background: drawn.append(camera.name) or seconds(tree, camera, background))
+    seconds = runs._frame_seconds
+    monkeypatch.setattr(runs, "_frame_seconds", lambda tree, camera, background: drawn.append(camera.name) or seconds(tree, camera, background))
     for wanted, count in ((2, 2), (0, 3)):
         drawn.clear()
-        figures = paper_runs._tree_figures(run, wanted, "cuda")
+        figures = runs._tree_figures(run, wanted, "cuda")
         assert len(drawn) == 1 + count  # the first, which compiles, is not counted
         assert 3 < figures["psnr"] < 40
         assert figures["fps"] > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from workflows import asset
-from workflows.resolve import Settings, preset_names, read_preset, table_of
+from workflows.cli.resolve import Settings, preset_names, read_preset, table_of
 
 TYPES = {stage.name: stage.settings for stage in asset.STAGES}
 

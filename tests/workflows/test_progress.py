@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workflows import progress
-from workflows.progress import Bars, JsonLines, Lines, Quiet, duration, plain, sentence, size
+from workflows.cli import progress
+from workflows.cli.progress import Bars, JsonLines, Lines, Quiet, duration, plain, sentence, size
 
 
 def event(kind: str, **facts: object) -> dict[str, object]:

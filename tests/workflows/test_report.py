@@ -12,7 +12,7 @@ from urllib.parse import unquote
 from pipeline.run import Run
 from tests.workflows.conftest import Result
 from tests.workflows.test_cli import Enerf
-from workflows.report import page
+from workflows.report.page import page
 
 
 class Links(HTMLParser):

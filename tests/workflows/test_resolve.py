@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
 from stages.settings import describe_settings, name_of_type, setting
-from workflows.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
+from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,235 @@
+"""From a trained model to a NerfTree (EfficientNeRF, section 3.5; the choice and averaging of voxels after PlenOctree).
+
+1. `visible_voxels`: every voxel's greatest fine weight over the training pixels, both stages run as in training; and, for photographs, what these
+   pixels show before and behind the box.
+2. `chosen_voxels`: those above a threshold, dilated by one voxel so that linear interpolation has all its corners.
+3. `voxel_values`: density and harmonics averaged over several jittered points of each voxel, in blocks.
+4. `efficientnerf.asset.refinement` makes the tree of these look like the photographs, and drops what does not show.
+
+B coarse cells, P pixels, N voxels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.spaces import Space
+from efficientnerf.model import Model, look
+from efficientnerf.rendering.compositing import activate
+from efficientnerf.rendering.render import split_by_box
+from efficientnerf.sampling.occupancy import cell_of
+from efficientnerf.training.pixels import Pixels
+
+RAYS_PER_BLOCK = 8192
+POINTS_PER_BLOCK = 2**17
+
+
+def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int, int, int], float]:
+    """Coarse cells along x, y, z and the side of a voxel, so that `resolution` voxels span the longest side of the box and cells cover it."""
+    extent = np.asarray(bounds[1], np.float64) - np.asarray(bounds[0], np.float64)
+    voxel = float(extent.max()) / resolution
+    x, y, z = (max(1, math.ceil(round(side / (voxel * brick), 6))) for side in extent)
+    return (x, y, z), voxel
+
+
+def flattened(space: Space, depth: float) -> Space:
+    """A space in normalised device coordinates whose x and y are stretched, so that a cube there is `depth` times as deep as it was wide, per depth.
+
+    Grid coordinates are the same in both. So are lengths along z', which rays nearly run along, and with them densities; what a slanted ray meets more of
+    is left to the fit.
+    """
+    if space.ndc is None:
+        raise ValueError("only normalised device coordinates can be flattened: elsewhere rays come from all sides")
+    return replace(space, bounds=np.asarray(space.bounds, np.float64) * (depth, depth, 1.0), ndc=space.ndc.stretched(depth))
+
+
+@dataclass(frozen=True, eq=False)
+class Visible:
+    """What the network showed of the voxels, and of what lies outside of the box.
+
+    cells     (B,) int64 flat coarse cells (x slowest) in which any sample fell, ascending
+    greatest  (B, brick^3) float32, each voxel's greatest weight
+    chosen    (P,) int64 pixels that were looked at
+    before    (P, 4) float16 premultiplied colour and opacity between camera and box; None on a constant background, as the next
+    behind    (P, 3) float16 colour beyond the box
+    """
+
+    cells: np.ndarray
+    greatest: np.ndarray
+    chosen: np.ndarray
+    before: np.ndarray | None
+    behind: np.ndarray | None
+
+
+@torch.no_grad()
+def visible_voxels(
+    m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, bounds_min: np.ndarray, brick: int, count: int, done: Callable[[int, int], None],
+    space: Space | None = None,
+) -> Visible:  # fmt: skip
+    """Greatest weight of each voxel over about `count` training pixels, evenly spread. Memory grows with the cells that are met, not with the grid.
+
+    done   called with pixels looked at and their number
+    space  the network's, in the frame that the voxels are cubes of: see `flattened`; None: the network's own
+    """
+    space = space or m.space
+    size = torch.tensor(shape) * brick
+    row_of = torch.full((math.prod(shape),), -1, dtype=torch.int32)
+    greatest = torch.zeros(1024, brick**3)
+    rows = 0
+    low = torch.as_tensor(bounds_min, dtype=torch.float32)
+    chosen = spread_pixels(pixels, count)
+    surroundings = []
+    for begin in range(0, len(chosen), RAYS_PER_BLOCK):
+        bundle = pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])
+        origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
+        behind = m.behind(directions)
+        seen = look(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
+        if m.background is None:
+            parts = split_by_box(m, origins, directions, torch.ones_like(near), seen, behind)
+            surroundings.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
+        at = torch.floor((space.world(seen.fine.point).cpu() - low) / voxel).long()
+        inside = ((at >= 0) & (at < size)).all(dim=1)
+        at, weight = at[inside], seen.fine_weight.cpu()[inside]
+        cell = at // brick
+        local, flat = at - cell * brick, (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
+        new = torch.unique(flat[row_of[flat] < 0])
+        row_of[new] = torch.arange(rows, rows + len(new), dtype=torch.int32)
+        rows += len(new)
+        if rows > len(greatest):
+            greatest = torch.cat([greatest, greatest.new_zeros(2 * rows - len(greatest), brick**3)])
+        slot = row_of[flat].long() * brick**3 + (local[:, 0] * brick + local[:, 1]) * brick + local[:, 2]
+        greatest.view(-1).scatter_reduce_(0, slot, weight, reduce="amax")
+        done(min(len(chosen), begin + RAYS_PER_BLOCK), len(chosen))
+    cells = torch.nonzero(row_of >= 0).squeeze(1)
+    before, beyond = (np.concatenate(part) for part in zip(*surroundings, strict=True)) if surroundings else (None, None)
+    return Visible(cells.numpy(), greatest[row_of[cells].long()].numpy(), chosen, before, beyond)
+
+
+def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
+    """About `count` usable pixels, one of each stretch of so many, at random: always the same one would visit a few columns alone where the stretch
+    divides the width."""
+    total = len(pixels)
+    stride = max(1, total // max(count, 1))
+    stretches = np.arange(0, total, stride)
+    chosen = np.minimum(stretches + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(stretches)), total - 1)
+    return chosen[pixels.usable_at(chosen)]
+
+
+def coarsened(
+    seen: Visible, shape: tuple[int, int, int], voxel: float, to_shape: tuple[int, int, int], to_voxel: float, brick: int, threshold: float
+) -> Visible:
+    """What was seen of a grid, for one of larger voxels of the same corner: each of these has the greatest weight of the voxels whose centres lie in it.
+    Weights that don't exceed `threshold` are left out."""
+    from efficientnerf.backends.numba.voxels import carry
+
+    row_of = np.full(math.prod(to_shape), -1, np.int32)
+    given = seen.cells, seen.greatest, float(np.float32(threshold)), shape, to_shape, voxel / to_voxel, brick, row_of
+    rows = carry(*given, np.zeros((0, brick**3), np.float32), 0)
+    greatest = np.zeros((rows, brick**3), np.float32)
+    carry(*given, greatest, rows)
+    cells = np.flatnonzero(row_of >= 0)
+    return replace(seen, cells=cells, greatest=greatest[row_of[cells]])
+
+
+def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
+    """Coordinates (N, 3) int32 of the voxels whose greatest weight exceeds `threshold`, and of those around them, in the order of the grid.
+
+    They are marked in the cells that they reach, so that memory grows with what is found, and neither with the grid nor with the neighbours looked at.
+    """
+    from efficientnerf.backends.numba.voxels import listed, mark
+
+    threshold = float(np.float32(threshold))
+    reached = np.zeros(shape, bool)
+    reached.reshape(-1)[seen.cells[(seen.greatest > threshold).any(axis=1)]] = True
+    for axis in range(3):
+        for _ in range(math.ceil(dilate / brick)):
+            low, high = reached.copy().swapaxes(0, axis), reached.swapaxes(0, axis)
+            high[1:] |= low[:-1]
+            high[:-1] |= low[1:]
+    cells = np.flatnonzero(reached)
+    row_of = np.full(reached.size, -1, np.int32)
+    row_of[cells] = np.arange(len(cells))
+    into = np.zeros((len(cells), brick**3), bool)
+    mark(seen.cells, seen.greatest, threshold, shape, brick, dilate, row_of, into)
+    flat = np.empty(np.count_nonzero(into), np.int64)
+    listed(into, cells, shape, brick, flat)
+    flat.sort()
+    index = np.empty((len(flat), 3), np.int32)
+    for axis in (2, 1, 0):
+        flat, index[:, axis] = np.divmod(flat, shape[axis] * brick)
+    return index
+
+
+@torch.no_grad()
+def voxel_values(
+    m: Model, indices: np.ndarray, voxel: float, bounds_min: np.ndarray, points: int, seed: int, first: int = 0, space: Space | None = None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Density (n,) and harmonics (n, K, 3) of the voxels, block by block from the `first`-th block on.
+
+    points  jittered points to a voxel: one in each of so many slices along a diagonal permutation, averaged; densities as they are,
+            harmonics weighted by density; 0: the centre of the voxel alone, for fields that were trained on these (`train.discretise`)
+    space   as in `visible_voxels`
+
+    Where the density voxels or the coarse field say that space is empty the density is zero: the fine field is hardly asked there and may say anything.
+    """
+    space = space or m.space
+    low = torch.as_tensor(bounds_min, dtype=torch.float32)
+    jittered, points = points > 0, max(1, points)
+    per_block = POINTS_PER_BLOCK // points or 1
+    for number in range(first, math.ceil(len(indices) / per_block)):
+        block = torch.from_numpy(indices[number * per_block : (number + 1) * per_block])
+        rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 1, number]))
+        jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32)) if jittered else torch.full((len(block), 1, 3), 0.5)
+        world = (block[:, None] + jitter) * voxel + low
+        point = space.grid(world.reshape(-1, 3)).to(m.device)
+        raw = m.fine(m.asked(point))
+        valid = m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold
+        density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
+        density = density * _looked_into(m, space.grid((block + 0.5) * voxel + low))[:, None]
+        share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
+        sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
+        yield density.mean(dim=1).cpu().numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().cpu().numpy()
+
+
+def _looked_into(m: Model, grid: torch.Tensor) -> torch.Tensor:
+    """(n,) bool on the model's device: whether the coarse field at grid coordinates (n, 3) absorbs as much over an interval as a valid density voxel has to.
+
+    Where it says less a pivot is among the lightest of its ray and dropped before the subject, but not before the sky: the network hides what
+    the fine field has there just where it would be seen, and nothing in the asset could.
+    """
+    if m.coarse is None or m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
+        return torch.ones(len(grid), dtype=torch.bool, device=m.device)
+    raw = m.coarse(m.asked(grid.float().to(m.device)))[:, 0]
+    return activate(raw, m.coarse.activation) > m.voxels.threshold
+
+
+def blocks_of(count: int, points: int) -> int:
+    """How many blocks `voxel_values` yields for so many voxels."""
+    return math.ceil(count / max(1, POINTS_PER_BLOCK // max(1, points)))
+
+
+def voxel_coordinates(tree: NerfTree) -> np.ndarray:
+    """Coordinates (N, 3) int32 of the stored voxels, in their order."""
+    owner = np.full(len(tree.voxel_index), 0, np.int64)
+    cells = np.flatnonzero(tree.brick_index.reshape(-1) >= 0)
+    owner[tree.brick_index.reshape(-1)[cells]] = cells
+    brick, local = np.nonzero(tree.voxel_index >= 0)
+    cell = np.stack(np.unravel_index(owner[brick], tree.shape), axis=-1)
+    index = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
+    out = np.empty((len(tree.density_values), 3), np.int32)
+    out[tree.voxel_index[brick, local]] = index
+    return out
+
+
+def with_voxels(tree: NerfTree, keep: np.ndarray) -> NerfTree:
+    """The tree with some of its voxels, (N,) bool, alone; they keep their order."""
+    return tree_from_voxels(
+        tree.shape, tree.voxel, tree.bounds_min, voxel_coordinates(tree)[keep], tree.density_values[keep], tree.sh[keep],
+        brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup,
+    )  # fmt: skip

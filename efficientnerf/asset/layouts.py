@@ -1,0 +1,167 @@
+"""How the voxels of a tree lie in a file: one entry of LAYOUTS for each layout of FORMAT.md, section 3.
+
+    sparse   the stored voxels, halves                                            2 + 6 K bytes a voxel
+    compact  the stored voxels, codes into tables and palettes                    4 + G (or 2 G) bytes a voxel
+    full     the paper's plain layout: all voxels of each brick, halves or floats
+
+B bricks, N stored voxels, K harmonics, G groups of them, T entries of a table, P of a palette.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.asset.container import FormatError
+from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.rendering.harmonics import harmonics_count
+
+LIMIT = 65000.0  # fits a half
+Shape = tuple[int, ...]
+Tensors = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What one layout is made of.
+
+    minor    the format 1.x that brought it
+    tensors  names beside `coarse.occupancy`, and the types that each may have
+    expected shapes that the tensors must have, from the metadata and the shapes they do have
+    stored   which voxels of each brick are stored, (B, b^3) bool
+    values   density (N,) float32 and harmonics of the stored voxels; anything wrong in them is a FormatError
+    """
+
+    minor: int
+    tensors: dict[str, tuple[str, ...]]
+    expected: Callable[[str, dict[str, Any], dict[str, Shape]], dict[str, Shape]]
+    stored: Callable[[str, dict[str, Any], Tensors], np.ndarray]
+    values: Callable[[str, dict[str, Any], Tensors, int], tuple[np.ndarray, np.ndarray | PaletteHarmonics]]
+
+
+def _voxels_of(meta: dict[str, Any]) -> int:
+    return int(meta["brick"]) ** 3
+
+
+def _harmonics_of(meta: dict[str, Any]) -> int:
+    return harmonics_count(int(meta["sh_degree"]))
+
+
+def _first(shape: Shape) -> int:
+    return shape[0] if shape else -1
+
+
+def _masked(name: str, meta: dict[str, Any], raw: Tensors) -> np.ndarray:
+    """Rows of `brick.mask` as booleans."""
+    masks, voxels = raw["brick.mask"], _voxels_of(meta)
+    if not len(masks):
+        return np.zeros((0, voxels), bool)
+    bits = np.unpackbits(masks.view(np.uint8), axis=1, bitorder="little").astype(bool)
+    if bits[:, voxels:].any():
+        raise FormatError(f"{name}: 'brick.mask' has bits set beyond the {voxels} voxels of a brick")
+    return bits[:, :voxels]
+
+
+def _mask_shape(meta: dict[str, Any], found: dict[str, Shape]) -> Shape:
+    return (_first(found["brick.mask"]), math.ceil(_voxels_of(meta) / 64))
+
+
+def _counted(name: str, count: int, stored: int) -> None:
+    if count != stored:
+        raise FormatError(f"{name}: masks name {count} voxels but {stored} are stored")
+
+
+def _sound(name: str, density: np.ndarray, *coefficients: np.ndarray) -> None:
+    if not (np.isfinite(density).all() and (density >= 0).all() and all(np.isfinite(values).all() for values in coefficients)):
+        raise FormatError(f"{name}: densities must be finite and not negative, harmonics finite")
+
+
+# sparse
+
+
+def _sparse_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
+    count = found["voxel.density"][0] if len(found["voxel.density"]) == 1 else -1
+    return {"brick.mask": _mask_shape(meta, found), "voxel.density": (count,), "voxel.sh": (count, _harmonics_of(meta), 3)}
+
+
+def _sparse_values(name: str, meta: dict[str, Any], raw: Tensors, count: int) -> tuple[np.ndarray, np.ndarray]:
+    _counted(name, count, len(raw["voxel.density"]))
+    density, sh = raw["voxel.density"].astype(np.float32), raw["voxel.sh"].astype(np.float32)
+    _sound(name, density, sh)
+    return density, sh
+
+
+# compact
+
+
+def _groups_of(name: str, meta: dict[str, Any]) -> tuple[int, ...]:
+    groups, above = meta.get("sh_groups"), _harmonics_of(meta) - 1
+    if not (isinstance(groups, list) and all(type(n) is int and n > 0 for n in groups) and sum(groups) == above):
+        raise FormatError(f"{name}: metadata 'sh_groups' is {str(groups)[:60]}; expected whole numbers above 0 whose sum is {above}")
+    return tuple(groups)
+
+
+def _compact_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
+    count = found["voxel.density"][0] if len(found["voxel.density"]) == 1 else -1
+    groups = _groups_of(name, meta)
+    most = {"density.table": 256, "base.table": 256, "sh.palette": 65536}
+    length = {table: _first(found[table]) for table in most}
+    for table, limit in most.items():
+        if length[table] > limit:
+            raise FormatError(f"{name}: tensor '{table}' has {length[table]} entries; expected at most {limit}")
+    return {
+        "brick.mask": _mask_shape(meta, found),
+        "voxel.density": (count,),
+        "density.table": (length["density.table"],),
+        "voxel.base": (count, 3),
+        "base.table": (length["base.table"], 3),
+        "voxel.sh": (count, len(groups)),
+        "sh.palette": (length["sh.palette"], _harmonics_of(meta) - 1, 3),
+    }
+
+
+def _compact_values(name: str, meta: dict[str, Any], raw: Tensors, count: int) -> tuple[np.ndarray, PaletteHarmonics]:
+    _counted(name, count, len(raw["voxel.density"]))
+    for codes, entries in (("voxel.density", "density.table"), ("voxel.base", "base.table"), ("voxel.sh", "sh.palette")):
+        if raw[codes].size and int(raw[codes].max()) >= len(raw[entries]):
+            raise FormatError(f"{name}: '{codes}' holds the code {int(raw[codes].max())}; expected codes below the {len(raw[entries])} entries of '{entries}'")
+    table, base, palette = (raw[key].astype(np.float32) for key in ("density.table", "base.table", "sh.palette"))
+    _sound(name, table, base, palette)
+    return table[raw["voxel.density"]], PaletteHarmonics(raw["voxel.base"], base, raw["voxel.sh"], palette, _groups_of(name, meta))
+
+
+# full
+
+
+def _full_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
+    bricks, voxels = _first(found["brick.density"]), _voxels_of(meta)
+    return {"brick.density": (bricks, voxels), "brick.sh": (bricks, voxels, _harmonics_of(meta), 3)}
+
+
+def _full_stored(name: str, meta: dict[str, Any], raw: Tensors) -> np.ndarray:
+    return np.ones(raw["brick.density"].shape, bool)
+
+
+def _full_values(name: str, meta: dict[str, Any], raw: Tensors, count: int) -> tuple[np.ndarray, np.ndarray]:
+    density = raw["brick.density"].reshape(-1).astype(np.float32)
+    sh = raw["brick.sh"].reshape(count, _harmonics_of(meta), 3).astype(np.float32)
+    _sound(name, density, sh)
+    return density, sh
+
+
+LAYOUTS = {
+    "sparse": Layout(0, {"brick.mask": ("U64",), "voxel.density": ("F16",), "voxel.sh": ("F16",)}, _sparse_shapes, _masked, _sparse_values),
+    "compact": Layout(
+        1,
+        {
+            "brick.mask": ("U64",), "voxel.density": ("U8",), "voxel.base": ("U8",), "voxel.sh": ("U8", "U16"),
+            "density.table": ("F32",), "base.table": ("F32",), "sh.palette": ("F16",),
+        },
+        _compact_shapes, _masked, _compact_values,
+    ),
+    "full": Layout(1, {"brick.density": ("F16", "F32"), "brick.sh": ("F16", "F32")}, _full_shapes, _full_stored, _full_values),
+}  # fmt: skip

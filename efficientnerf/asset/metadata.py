@@ -1,0 +1,137 @@
+"""What an asset says of itself beside its tensors, checked: the rules of FORMAT.md, section 2."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.asset.container import FormatError
+from efficientnerf.geometry.ndc import NUMBERS, Ndc
+from efficientnerf.rendering.harmonics import MAX_DEGREE
+
+MAJOR = 1
+MAX_CELLS = 2**30
+NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not draw it
+NDC_MINOR = 2  # the version that brought them
+NEAREST_PREFIX = "nearest-"  # of layouts whose voxels are not interpolated; before the other prefix where both hold
+NEAREST_MINOR = 3
+STRUCTURE = {
+    "format", "format_version", "layout", "shape", "brick", "voxel", "bounds_min", "sh_degree", "sh_convention", "sh_groups", "colour_space",
+    "background", "sha256", "ndc", "lookup",
+}  # fmt: skip
+
+
+def _number(name: str, meta: dict[str, Any], key: str, low: float, high: float, *, whole: bool) -> float:
+    value = meta.get(key)
+    if type(value) not in ((int,) if whole else (int, float)) or not low <= value <= high:  # type: ignore[operator]
+        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected a {'whole ' if whole else ''}number from {low} to {high}")
+    return value  # type: ignore[return-value]
+
+
+def _numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, high: float) -> list[float]:
+    value = meta.get(key)
+    if not (isinstance(value, list) and len(value) == count and all(type(x) in (int, float) and low <= x <= high for x in value)):
+        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected {count} numbers from {low} to {high}")
+    return value
+
+
+def _check_frame(name: str, meta: dict[str, Any]) -> None:
+    """What may be said of the capture's frame and of the cameras' orbit must be sound where it is said."""
+    for key in ("world_from_capture", "orbit"):
+        if not isinstance(meta.get(key, {}), dict):
+            raise FormatError(f"{name}: metadata '{key}' is {str(meta[key])[:60]}; expected an object")
+    if type(meta.get("metric", False)) is not bool:
+        raise FormatError(f"{name}: metadata 'metric' is {str(meta['metric'])[:60]}; expected true or false")
+    if "world_from_capture" in meta:
+        similarity = meta["world_from_capture"]
+        _number(name, similarity, "scale", 1e-30, 1e30, whole=False)
+        _numbers(name, similarity, "translation", 3, -1e30, 1e30)
+        rows = similarity.get("rotation")
+        if not (isinstance(rows, list) and len(rows) == 3):
+            raise FormatError(f"{name}: metadata 'rotation' is {str(rows)[:60]}; expected three rows")
+        rotation = np.array([_numbers(name, {"rotation": row}, "rotation", 3, -2, 2) for row in rows], np.float64)
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+            raise FormatError(f"{name}: metadata 'rotation' is not a rotation")
+    if "orbit" in meta:
+        orbit = meta["orbit"]
+        _numbers(name, orbit, "centre", 3, -1e30, 1e30)
+        _number(name, orbit, "radius", 1e-30, 1e30, whole=False)
+        _number(name, orbit, "elevation", -90, 90, whole=False)
+        _number(name, orbit, "heading", -360, 360, whole=False)
+        if type(orbit.get("forward_facing")) is not bool:
+            raise FormatError(f"{name}: metadata 'forward_facing' is {str(orbit.get('forward_facing'))[:60]}; expected true or false")
+
+
+def layout_of(meta: dict[str, Any]) -> str:
+    """Which tables of tensors hold, whatever frame the grid lies in and however it is looked up."""
+    return str(meta.get("layout")).removeprefix(NEAREST_PREFIX).removeprefix(NDC_PREFIX)
+
+
+def layout_name(layout: str, *, ndc: bool, lookup: str) -> tuple[str, int]:
+    """What a file of these tables calls its layout, and the minor version that knows the name; 0 where no prefix is needed."""
+    name, minor = (NDC_PREFIX + layout, NDC_MINOR) if ndc else (layout, 0)
+    return (NEAREST_PREFIX + name, NEAREST_MINOR) if lookup == "nearest" else (name, minor)
+
+
+def lookup_of(name: str, meta: dict[str, Any]) -> str:
+    """How the voxels are looked up; the layout's name and the key `lookup` must say the same."""
+    nearest = str(meta.get("layout")).startswith(NEAREST_PREFIX)
+    found, expected = meta.get("lookup", None if nearest else "trilinear"), "nearest" if nearest else "trilinear"
+    if found != expected:
+        raise FormatError(f"{name}: metadata 'lookup' is {str(found)[:60]}; expected {expected} in layout {str(meta.get('layout'))[:60]}")
+    return expected
+
+
+def ndc_of(name: str, meta: dict[str, Any]) -> Ndc | None:
+    """The reference camera of a file in normalised device coordinates, which must name one; None for a file in the world."""
+    if not str(meta.get("layout")).removeprefix(NEAREST_PREFIX).startswith(NDC_PREFIX):
+        return None
+    found = meta.get("ndc")
+    if not isinstance(found, dict):
+        raise FormatError(f"{name}: metadata 'ndc' is {str(found)[:60]}; expected an object")
+    for key in NUMBERS:
+        _number(name, found, key, 1e-30, 1e30, whole=False)
+    rows = found.get("world_from_camera")
+    if not (isinstance(rows, list) and len(rows) == 4):
+        raise FormatError(f"{name}: metadata 'world_from_camera' is {str(rows)[:60]}; expected four rows")
+    for row in rows:
+        _numbers(name, {"world_from_camera": row}, "world_from_camera", 4, -1e30, 1e30)
+    try:
+        return Ndc.from_json(found)
+    except ValueError as error:
+        raise FormatError(f"{name}: metadata 'ndc': {error}") from None
+
+
+def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) -> None:
+    """Raises FormatError, naming the file `name`, at the first rule that is broken.
+
+    layouts  those that this build reads
+    """
+    if meta.get("format") != "nerftree":
+        raise FormatError(f"{name}: metadata 'format' is {str(meta.get('format'))[:60]}; expected nerftree")
+    version = str(meta.get("format_version")).split(".")
+    if len(version) != 2 or not all(part.isascii() and part.isdecimal() and len(part) < 6 for part in version):
+        raise FormatError(f"{name}: format version {str(meta.get('format_version'))[:60]}; expected MAJOR.MINOR")
+    if int(version[0]) != MAJOR:
+        raise FormatError(f"{name}: format version {'.'.join(version)}; this build reads {MAJOR}.x. Upgrade efficientnerf.")
+    if layout_of(meta) not in layouts:
+        raise FormatError(f"{name}: layout {str(meta.get('layout'))[:60]}; this build reads {', '.join(layouts)}. Upgrade efficientnerf.")
+    if meta.get("sh_convention") != "real-orthonormal-plenoctree" or meta.get("colour_space") != "srgb-sigmoid":
+        found = f"harmonics {str(meta.get('sh_convention'))[:60]} in {str(meta.get('colour_space'))[:60]}"
+        raise FormatError(f"{name}: {found}; expected real-orthonormal-plenoctree in srgb-sigmoid")
+    shape = _numbers(name, meta, "shape", 3, 1, 2**16)
+    if not all(type(n) is int for n in shape) or math.prod(shape) > MAX_CELLS:
+        raise FormatError(f"{name}: shape {shape}; expected whole numbers with a product of at most {MAX_CELLS}")
+    _number(name, meta, "brick", 1, 16, whole=True)
+    _number(name, meta, "sh_degree", 0, MAX_DEGREE, whole=True)
+    _number(name, meta, "voxel", 1e-30, 1e30, whole=False)
+    _numbers(name, meta, "bounds_min", 3, -1e30, 1e30)
+    if "background" not in meta:
+        raise FormatError(f"{name}: metadata 'background' is missing; expected three numbers or null")
+    if meta["background"] is not None:
+        _numbers(name, meta, "background", 3, 0, 1)
+    _check_frame(name, meta)
+    lookup_of(name, meta)
+    ndc_of(name, meta)

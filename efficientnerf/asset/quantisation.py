@@ -1,0 +1,161 @@
+"""From floats to codes: palettes for harmonics, a table for densities.
+
+Palettes are found by k-means over a sample of the voxels, drawn in proportion to how much each shows (its opacity), starting from k-means++
+(Arthur & Vassilvitskii 2007). Every draw is from a seeded generator and every sum has one order: the same tree gives the same codes.
+Vectors that are few enough to have an entry each keep their values, but for the rounding of the palette to halves.
+
+N voxels, K harmonics, G groups, P entries.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.harmonics import C0
+
+ENTRIES = 256  # of a table whose codes are bytes
+SAMPLES = 2**16
+ITERATIONS = 12
+FAINT = 1e-3  # optical depth of a voxel below which its density is nothing
+OPAQUE = 50.0  # optical depth above which a voxel shows no difference
+LIMIT = 65000.0  # fits a half
+
+
+def compacted(tree: NerfTree, entries: int = ENTRIES, groups: tuple[int, ...] | None = None) -> NerfTree:
+    """The same tree with its harmonics as codes and at most 256 different densities: what the layout `compact` can hold.
+
+    entries  of the palette, at most 65536
+    groups   harmonics above the base that share a code, in order; one each by default
+    """
+    groups = (1,) * (tree.harmonics_count - 1) if groups is None else groups
+    share = -np.expm1(-tree.density_values * np.float32(tree.voxel))
+    density = quantised_density(tree.density_values, tree.voxel)
+    return replace(tree, density_values=density, harmonics=quantised_harmonics(tree.sh, share, entries, groups))
+
+
+def quantised_density(density: np.ndarray, voxel: float) -> np.ndarray:
+    """Densities (N,) rounded to at most 256 values: 0, and 255 whose logarithms are evenly spaced.
+
+    Up to 2.2 % away from what they were at an optical depth (density times side of the voxel) from 0.001 to 50, 0 below, 50 above.
+    """
+    known = np.unique(density)
+    if len(known) <= ENTRIES:
+        return density
+    depth = density.astype(np.float64) * voxel
+    low, high = FAINT, min(OPAQUE, float(depth.max()))
+    if high <= low:
+        return np.zeros_like(density)
+    level = np.rint(np.log(np.maximum(depth, low) / low) / math.log(high / low) * (ENTRIES - 2)).clip(0, ENTRIES - 2)
+    table = (low * (high / low) ** (np.arange(ENTRIES - 1) / (ENTRIES - 2)) / voxel).astype(np.float32)
+    return np.where(depth < low / 2, np.float32(0), table[level.astype(np.int64)])
+
+
+def quantised_harmonics(sh: np.ndarray, share: np.ndarray, entries: int, groups: tuple[int, ...]) -> PaletteHarmonics:
+    """Coefficients (N, K, 3) as codes.
+
+    share  (N,) how much each voxel shows, >= 0
+    """
+    if sum(groups) != sh.shape[1] - 1:
+        raise ValueError(f"groups {groups} hold {sum(groups)} harmonics; expected {sh.shape[1] - 1}")
+    sh = np.clip(sh, -LIMIT, LIMIT)
+    base, table = _base_codes(sh[:, 0])
+    palette = np.zeros((0, sh.shape[1] - 1, 3), np.float32)
+    codes = np.zeros((len(sh), len(groups)), np.uint16 if entries > ENTRIES else np.uint8)
+    first = 0
+    for group, size in enumerate(groups):
+        vectors = np.ascontiguousarray(sh[:, 1 + first : 1 + first + size].reshape(len(sh), 3 * size))
+        centroids, codes[:, group] = clustered(vectors, share, entries, seed=group)
+        if len(centroids) > len(palette):
+            palette = np.concatenate([palette, np.zeros((len(centroids) - len(palette), *palette.shape[1:]), np.float32)])
+        palette[: len(centroids), first : first + size] = centroids.reshape(-1, size, 3)
+        first += size
+    return PaletteHarmonics(base, table, codes, palette, groups)
+
+
+def _base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Codes (N, 3) uint8 and table (T, 3) float32 of the base colour's coefficients (N, 3).
+
+    The levels are evenly spaced on a curve that is four parts the colour that a coefficient makes by itself and one part the coefficient:
+    fine where colour changes, yet not blind where the other harmonics bring a saturated base back.
+    """
+    codes, table = np.zeros(base.shape, np.uint8), np.zeros((ENTRIES, 3), np.float32)
+    for channel in range(3) if len(base) else ():
+        values = base[:, channel]
+        known = np.unique(values)
+        if len(known) <= ENTRIES:
+            levels = known.astype(np.float64)
+        else:
+            fine = np.linspace(known[0], known[-1], 2**14)
+            colour = 1 / (1 + np.exp(-C0 * fine))
+            curve = 0.8 * (colour - colour[0]) / (colour[-1] - colour[0]) + 0.2 * (fine - fine[0]) / (fine[-1] - fine[0])
+            levels = np.interp(np.linspace(0, 1, ENTRIES), curve, fine)
+        rounded = levels.astype(np.float32)
+        codes[:, channel] = np.searchsorted((rounded[1:] + rounded[:-1]) / 2, values)
+        table[: len(rounded), channel] = rounded
+    return codes, table[: int(codes.max(initial=0)) + 1]
+
+
+def clustered(vectors: np.ndarray, share: np.ndarray, entries: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids (P, D) float32, halves in value, P <= entries, and the code (n,) of each vector (n, D) float32."""
+    from efficientnerf.backends.numba import clusters
+
+    rng = np.random.Generator(np.random.Philox(key=seed))
+    sample = _sample(vectors, share, max(SAMPLES, 16 * entries), rng)
+    centroids = _seeded(sample, entries, rng)
+    for _ in range(ITERATIONS):
+        found, distance = _nearest(sample, centroids)
+        total, count = np.zeros(centroids.shape), np.zeros(len(centroids), np.int64)
+        clusters.sums(sample, found, total, count)
+        moved = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], centroids).astype(np.float32)
+        idle = np.flatnonzero(count == 0)
+        if len(idle):  # an entry that nothing chose takes the place of what is worst served
+            moved[idle] = sample[np.argsort(-distance, kind="stable")[: len(idle)]]
+        if np.array_equal(moved, centroids):
+            break
+        centroids = moved
+    centroids = centroids.astype(np.float16).astype(np.float32)
+    return centroids, _nearest(vectors, centroids)[0]
+
+
+def _sample(vectors: np.ndarray, share: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """All vectors if they are few, else `count` of them, in proportion to their share (and a hundredth of its mean, so that none is out)."""
+    if len(vectors) <= count:
+        return vectors
+    weight = share.astype(np.float64)
+    weight += 0.01 * weight.mean() + 1e-12
+    reached = np.cumsum(weight)
+    return vectors[np.searchsorted(reached, (np.arange(count) + rng.random(count)) / count * reached[-1]).clip(0, len(vectors) - 1)]
+
+
+def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.ndarray:
+    """k-means++: each next centroid a vector drawn in proportion to its squared distance from those before; fewer where none is away."""
+    from efficientnerf.backends.numba import clusters
+
+    if not len(sample):
+        return np.zeros((0, sample.shape[1]), np.float32)
+    most = max(SAMPLES // 4, 4 * entries)
+    few = sample if len(sample) <= most else sample[rng.permutation(len(sample))[:most]]
+    turned = np.ascontiguousarray(few.T)
+    chosen = [few[int(rng.integers(len(few)))]]
+    distance = np.full(len(few), np.inf, np.float32)
+    for _ in range(entries - 1):
+        clusters.approach(turned, chosen[-1], distance)
+        reached = np.cumsum(distance, dtype=np.float64)
+        if reached[-1] <= 0:
+            break
+        chosen.append(few[min(int(np.searchsorted(reached, rng.random() * reached[-1], side="right")), len(few) - 1)])
+    return np.array(chosen)
+
+
+def _nearest(vectors: np.ndarray, centroids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Index of the nearest centroid of each vector, and the squared distance to it."""
+    from efficientnerf.backends.numba import clusters
+
+    found, distance = np.zeros(len(vectors), np.int32), np.zeros(len(vectors), np.float32)
+    clusters.nearest(np.ascontiguousarray(vectors.T), centroids, found, distance)
+    return found, distance

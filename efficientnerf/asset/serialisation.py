@@ -1,0 +1,177 @@
+"""A tree as the tensors of a layout. WRITERS names what can be asked for:
+
+    compact  the file layout `compact`, a code of eight bits per harmonic       12 bytes a voxel of degree 2
+    small    the same layout, one code of 16 bits for all harmonics              6
+    sparse   halves                                                             56
+    full     all voxels of each brick, halves; full32: floats
+
+B bricks, N stored voxels, K harmonics.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.asset.container import FormatError
+from efficientnerf.asset.layouts import LIMIT
+from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.rendering.harmonics import harmonics_count
+
+SMALL_ENTRIES = 4096
+FILL_BLOCK = 2**21  # voxels times harmonics that are filled at once
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """Tensors of a file layout in their little-endian types, and metadata that the layout needs."""
+
+    layout: str
+    tensors: dict[str, np.ndarray]
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+def written_as(tree: NerfTree, writer: str | None) -> Written:
+    """The tree's tensors as `writer` makes them; by default what loses nothing: `compact` for codes, else `sparse`."""
+    if writer is None:
+        return _coded(tree) if isinstance(tree.harmonics, PaletteHarmonics) else _sparse(tree)
+    if writer not in WRITERS:
+        raise ValueError(f"layout {writer!r}; expected one of {', '.join(WRITERS)}")
+    return WRITERS[writer](tree)
+
+
+def bytes_per_voxel(writer: str, degree: int) -> int:
+    """Of a stored voxel in `compact`, `small` or `sparse`, without the masks of the bricks."""
+    harmonics = harmonics_count(degree)
+    return {"compact": 4 + (harmonics - 1), "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
+
+
+def most_voxels(size: int, writer: str, degree: int, shape: tuple[int, int, int], brick: int) -> int:
+    """How many voxels a file of `size` bytes has room for, if a quarter of the voxels of its bricks are stored (usually more are)."""
+    palette = {"compact": 256, "small": SMALL_ENTRIES, "sparse": 0}[writer] * (harmonics_count(degree) - 1) * 6
+    fixed = 2**14 + math.prod(shape) // 8 + palette
+    mask = 8 * math.ceil(brick**3 / 64) / max(1.0, brick**3 / 4)
+    return max(0, int((size - fixed) / (bytes_per_voxel(writer, degree) + mask)))
+
+
+def order_of(tree: NerfTree) -> np.ndarray:
+    """Stored voxels in the order of the file: brick by brick in the order of the cells, in a brick by number."""
+    order = _bricks(tree)
+    return order[order >= 0]
+
+
+def _bricks(tree: NerfTree) -> np.ndarray:
+    """(B, b^3) voxel numbers or -1, bricks in the order of their cells."""
+    owner = tree.brick_index.reshape(-1)
+    return tree.voxel_index[owner[owner >= 0]]
+
+
+def _mask(tree: NerfTree) -> np.ndarray:
+    """64-bit words (B, ceil(b^3 / 64)): which voxels of each brick are stored."""
+    stored = _bricks(tree) >= 0
+    words = math.ceil(tree.brick**3 / 64)
+    padded = np.zeros((len(stored), words * 64), bool)
+    padded[:, : tree.brick**3] = stored
+    return np.ascontiguousarray(np.packbits(padded, axis=1, bitorder="little").view("<u8").reshape(len(stored), words))
+
+
+def _densities(tree: NerfTree, order: np.ndarray) -> np.ndarray:
+    density = _finite("density", tree.density_values[order])
+    if (density < 0).any():
+        raise FormatError("voxel.density: holds values below zero; such a tree can't be saved")
+    return density
+
+
+def _finite(what: str, values: np.ndarray) -> np.ndarray:
+    if not np.isfinite(values).all():
+        raise FormatError(f"voxel.{what}: holds values that are not finite; such a tree can't be saved")
+    return values
+
+
+def _sparse(tree: NerfTree) -> Written:
+    order = order_of(tree)
+    density = np.minimum(_densities(tree, order), LIMIT).astype("<f2")
+    sh = np.clip(_finite("sh", tree.sh[order]), -LIMIT, LIMIT).astype("<f2")
+    return Written("sparse", {"brick.mask": _mask(tree), "voxel.density": density, "voxel.sh": sh})
+
+
+def _coded(tree: NerfTree) -> Written:
+    """Codes as they are; only densities of more than 256 values are rounded."""
+    from efficientnerf.asset.quantisation import quantised_density
+
+    assert isinstance(tree.harmonics, PaletteHarmonics)
+    order = order_of(tree)
+    codes = tree.harmonics.chosen(order)
+    table, density = np.unique(quantised_density(_densities(tree, order), tree.voxel), return_inverse=True)
+    tensors = {
+        "brick.mask": _mask(tree),
+        "voxel.density": density.reshape(-1).astype("<u1"),
+        "density.table": table.astype("<f4"),
+        "voxel.base": codes.base,
+        "base.table": _finite("sh", codes.base_table).astype("<f4"),
+        "voxel.sh": codes.codes.astype("<u2" if len(codes.palette) > 256 else "<u1"),
+        "sh.palette": np.clip(_finite("sh", codes.palette), -LIMIT, LIMIT).astype("<f2"),
+    }
+    return Written("compact", tensors, {"sh_groups": list(codes.groups)})
+
+
+def _compact(tree: NerfTree) -> Written:
+    from efficientnerf.asset.quantisation import compacted
+
+    kept = isinstance(tree.harmonics, PaletteHarmonics) and set(tree.harmonics.groups) <= {1} and len(tree.harmonics.palette) <= 256
+    return _coded(tree if kept else compacted(_checked(tree)))
+
+
+def _small(tree: NerfTree) -> Written:
+    from efficientnerf.asset.quantisation import compacted
+
+    above = tree.harmonics_count - 1
+    groups = (above,) if above else ()
+    kept = isinstance(tree.harmonics, PaletteHarmonics) and tree.harmonics.groups == groups
+    # A palette larger than a thirty-second of the voxels would be most of the file.
+    entries = min(SMALL_ENTRIES, max(256, len(tree.density_values) // 32))
+    return _coded(tree if kept else compacted(_checked(tree), entries, groups))
+
+
+def _checked(tree: NerfTree) -> NerfTree:
+    _densities(tree, order_of(tree))
+    _finite("sh", tree.sh)
+    return tree
+
+
+def _full(tree: NerfTree, dtype: str = "<f2") -> Written:
+    """All voxels of each brick. What was not stored gets density 0, and harmonics that fade over from the stored ones of its brick, the nearer
+    the more: colours are interpolated over stored voxels alone, so that grey ones would show at the rim."""
+    index, voxels, harmonics = _bricks(tree), tree.brick**3, tree.harmonics_count
+    _checked(tree)
+    stored = index >= 0
+    limit = LIMIT if dtype == "<f2" else np.inf
+    density = np.minimum(np.where(stored, tree.density_values[index] if len(tree.density_values) else 0, 0), limit).astype(dtype)
+    sh = np.zeros((len(index), voxels, harmonics, 3), dtype)
+    at = np.argwhere(np.ones((tree.brick,) * 3, bool))
+    away = ((at[:, None] - at) ** 2).sum(axis=2)
+    near = (1 / np.maximum(away, 1).astype(np.float32) ** 3) * (away > 0)  # (b^3, b^3)
+    each = max(1, FILL_BLOCK // (voxels * harmonics))
+    for begin in range(0, len(index), each):
+        block, here = index[begin : begin + each], stored[begin : begin + each]
+        known = np.zeros((len(block), voxels, harmonics * 3), np.float32)
+        known[here] = tree.sh[block[here]].reshape(-1, harmonics * 3)
+        weight = here.astype(np.float32) @ near.T  # (bricks, b^3)
+        filled = np.matmul(near, known) / np.maximum(weight, 1e-12)[..., None]
+        values = np.where(here[..., None], known, filled)
+        sh[begin : begin + each] = np.clip(values, -limit, limit).reshape(len(block), voxels, harmonics, 3).astype(dtype)
+    return Written("full", {"brick.density": density, "brick.sh": sh})
+
+
+WRITERS: dict[str, Callable[[NerfTree], Written]] = {
+    "compact": _compact,
+    "small": _small,
+    "sparse": _sparse,
+    "full": _full,
+    "full32": lambda tree: _full(tree, "<f4"),
+}

@@ -1,0 +1,323 @@
+"""NerfTree: coarse dense voxels over sparse bricks (EfficientNeRF, section 3.5), as it lies in memory.
+
+The grid has shape * brick voxels a side, cubic, of `voxel` world units. A coarse cell is either empty, and then space in it has no
+density whatever its neighbours hold, or it owns a brick of brick^3 voxels, of which those that matter are stored.
+Values sit at voxel centres and are interpolated linearly between the stored ones, or hold all over their voxels: `lookup` says which.
+
+The grid lies in the tree's *frame*: the world, or the normalised device coordinates of a reference camera (`efficientnerf.geometry.ndc`) where the scene is
+forward-facing. What users ask and are answered is always of the world, densities apart, which are per unit of the frame.
+
+B bricks, N stored voxels, K harmonics, R rays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.rendering.harmonics import harmonics_count
+
+if TYPE_CHECKING:
+    from efficientnerf.backends.numba.tree.packed import Packed
+    from efficientnerf.backends.triton.tree import DeviceTree
+    from efficientnerf.geometry.cameras import Camera
+    from efficientnerf.geometry.ndc import Ndc, WarpedRays
+
+
+LOOKUPS = ("trilinear", "nearest")
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera (or a bundle of rays) sees of a scene.
+
+    colour   (..., 3) float32, sRGB, premultiplied by the opacity, or over the background that was asked for
+    opacity  (...)    float32, 0 to 1
+    depth    (...)    float32, world units, along the view axis for cameras and along the ray for rays; where half of the light is
+                      absorbed, infinity where less than half ever is
+    normal   (..., 3) float32, unit, world frame, out of the surface; zero where nothing is hit
+    """
+
+    colour: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class NerfTree:
+    """The baked asset.
+
+    shape        coarse cells along x, y, z
+    brick        voxels along a side of a coarse cell (the paper's D_f)
+    voxel        side of a voxel, units of the frame
+    bounds_min   (3,) float64, corner of the grid, in the frame
+    brick_index  shape int32: which brick a coarse cell owns, -1 where it is empty
+    voxel_index  (B, brick^3) int32: which stored voxel, -1 where none (x slowest, z fastest)
+    density_values  (N,) float32, per unit of the frame, >= 0
+    harmonics    what the voxels' colours are made of, one of two:
+                 (N, K, 3) float32, or PaletteHarmonics: codes into palettes, as files of the layout `compact` load
+    background   sRGB colour that the training images lay on, or None for photographs with surroundings
+    device       where pictures are drawn, see `to`; not part of the asset
+    ndc          the reference camera whose normalised device coordinates are the frame, or None: the frame is the world
+    lookup       what a point gets: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
+                 where that one is not stored (EfficientNeRF, section 4.1, has the field trained on such coordinates)
+
+    For renderers: `sh` is always there as plain floats, but decoding a palette costs 12 K bytes a voxel and is remembered; a kernel
+    that matters reads `harmonics` itself where it is a PaletteHarmonics, whose docstring states what its arrays mean. A kernel for codes
+    needs no second form for plain floats if it reads `sh` there.
+    """
+
+    shape: tuple[int, int, int]
+    brick: int
+    voxel: float
+    bounds_min: np.ndarray
+    brick_index: np.ndarray
+    voxel_index: np.ndarray
+    density_values: np.ndarray
+    harmonics: np.ndarray | PaletteHarmonics
+    background: tuple[float, float, float] | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
+    ndc: Ndc | None = None
+    lookup: str = "trilinear"
+
+    def __post_init__(self) -> None:
+        if self.lookup not in LOOKUPS:
+            raise ValueError(f"lookup {self.lookup!r}; expected one of {', '.join(LOOKUPS)}")
+
+    @cached_property
+    def sh(self) -> np.ndarray:
+        """Coefficients (N, K, 3) float32; decoded, once, where `harmonics` are codes."""
+        return self.harmonics.decoded() if isinstance(self.harmonics, PaletteHarmonics) else self.harmonics
+
+    def coefficients(self, voxels: np.ndarray | slice) -> np.ndarray:
+        """Coefficients (n, K, 3) float32 of some voxels; unlike `sh`, nothing is kept."""
+        return self.harmonics.decoded(voxels) if isinstance(self.harmonics, PaletteHarmonics) else self.harmonics[voxels]
+
+    @property
+    def harmonics_count(self) -> int:
+        """K."""
+        return self.harmonics.count if isinstance(self.harmonics, PaletteHarmonics) else self.harmonics.shape[1]
+
+    @property
+    def degree(self) -> int:
+        """Degree of the spherical harmonics."""
+        return round(self.harmonics_count**0.5) - 1
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Voxels along x, y, z."""
+        x, y, z = self.shape
+        return x * self.brick, y * self.brick, z * self.brick
+
+    @property
+    def bounds_max(self) -> np.ndarray:
+        return self.bounds_min + np.asarray(self.resolution) * self.voxel
+
+    @cached_property
+    def leap(self) -> np.ndarray:
+        """How many coarse cells a ray in an empty cell may leap: shape uint8, 0 in occupied cells.
+
+        The chessboard distance to the nearest occupied cell: a cube of that radius minus one around the cell is empty.
+        """
+        return leaps(self.brick_index >= 0)
+
+    @cached_property
+    def packed(self) -> Packed:
+        """The densities and harmonics as the renderer on the CPU reads them; made at the first picture. Values changed in place later are not seen."""
+        from efficientnerf.backends.numba.tree.packed import pack
+
+        return pack(self)
+
+    @cached_property
+    def on_device(self) -> DeviceTree:
+        """The tree as the kernel on `device` reads it; sent at the first picture."""
+        from efficientnerf.backends.triton.tree import device_tree
+
+        return device_tree(self, self.device)
+
+    def to(self, device: str) -> NerfTree:
+        """The same tree, drawn on "cpu" or "cuda", the latter where its kernels can be built; points are answered on the CPU."""
+        return replace(self, device=device)
+
+    @staticmethod
+    def load(path: str | Path) -> NerfTree:
+        """Read and verify an asset file; `efficientnerf.asset.format.FormatError` where it is not one."""
+        from efficientnerf.asset.format import load
+
+        return load(path)
+
+    def save(self, path: str | Path, layout: str | None = None) -> None:
+        """Write the asset file, whole or not at all: `compact`, `small`, `sparse`, `full` or `full32`; by default the one that loses nothing more."""
+        from efficientnerf.asset.format import save
+
+        save(self, path, layout)
+
+    def render(self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
+        """The picture that a camera in the training frame takes.
+
+        background   sRGB colour to composite over; None leaves the colour premultiplied
+        supersample  rays along each side of a pixel
+        """
+        from efficientnerf.rendering.render import render_tree
+
+        return render_tree(self, camera, background=background, supersample=supersample)
+
+    def render_rays(self, origins: np.ndarray, directions: np.ndarray, *, eye: np.ndarray | None = None, columns: int | None = None) -> Rendering:
+        """What rays see: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray.
+
+        What is known of all rays makes them faster on the CPU, and changes colours by less than 1e-3 (2e-3 in normalised device coordinates):
+
+        eye      (3,) the point that all come from
+        columns  how many make a row, where they are the rows of a picture
+        """
+        from efficientnerf.backends.dispatch import tree_rays
+
+        if self.ndc is None:
+            return Rendering(*tree_rays(self, origins, directions, None, eye, columns))
+        from efficientnerf.backends.numba import ndc as cpu_ndc
+
+        rays = cpu_ndc.rays(self.ndc, origins, directions)
+        colour, opacity, along, normal = tree_rays(self, rays.origins, rays.directions, np.asarray(directions), eye, columns)
+        return Rendering(colour, opacity, *cpu_ndc.hits(self.ndc, rays, along, normal))
+
+    def frame_rays(self, origins: Any, directions: Any) -> WarpedRays:
+        """World rays (R, 3), unit directions, as rays of the tree's frame: what anything that walks the grid itself has to do first.
+
+        `(result.origins - bounds_min) / voxel` are voxel coordinates and `result.directions` the unit directions there; a step of one voxel is
+        `voxel` units of the frame, which densities are per. Harmonics are looked up along the directions of the world, as they went in.
+        `efficientnerf.geometry.ndc.world_distance` turns distances along the result into those of the world. Numpy arrays and torch tensors alike.
+        """
+        from efficientnerf.geometry.ndc import WarpedRays
+
+        if self.ndc is not None:
+            return self.ndc.rays(origins, directions)
+        none = origins[..., 0] * 0
+        return WarpedRays(origins, directions, none, none + 1, none)
+
+    def _in_frame(self, points: np.ndarray) -> np.ndarray:
+        return points if self.ndc is None else self.ndc.points(np.asarray(points, np.float64))
+
+    def density(self, points: np.ndarray) -> np.ndarray:
+        """Density at points (N, 3) of the world: (N,) float32, per unit of the frame."""
+        from efficientnerf.backends.numba.tree.rendering import density_at
+
+        return density_at(self, self._in_frame(points))
+
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        """Unit vectors down the density's gradient at points (N, 3); zero where it is flat."""
+        from efficientnerf.backends.numba.tree.rendering import normal_at
+
+        at = self._in_frame(points)
+        normal = normal_at(self, at)
+        return normal if self.ndc is None else self.ndc.world_normals(at, normal.astype(np.float64)).astype(np.float32)
+
+    def colour(self, points: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
+        """sRGB colour at points (N, 3), seen along unit directions (N, 3), or its view-independent part: (N, 3) float32, 0 to 1.
+
+        Grey where no voxel is stored.
+        """
+        from efficientnerf.backends.numba.tree.rendering import colour_at
+
+        return colour_at(self, self._in_frame(points), directions)
+
+    def density_block(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
+        """Density at the voxel centres low <= (i, j, k) < high: float32, zero outside of the grid and where nothing is stored."""
+        low_a, high_a = np.asarray(low), np.asarray(high)
+        if (high_a < low_a).any():
+            raise ValueError(f"density_block from {tuple(low)} to {tuple(high)}: the upper corner lies below the lower one")
+        axes = [np.arange(a, b) for a, b in zip(low_a, high_a, strict=True)]
+        inside = [(a >= 0) & (a < n) for a, n in zip(axes, self.resolution, strict=True)]
+        out = np.zeros(tuple(high_a - low_a), np.float32)
+        i, j, k = (a[m] for a, m in zip(axes, inside, strict=True))
+        if not (len(i) and len(j) and len(k) and len(self.voxel_index)):
+            return out
+        d = self.brick
+        brick = self.brick_index[np.ix_(i // d, j // d, k // d)]
+        local = ((i % d)[:, None, None] * d + (j % d)[:, None]) * d + (k % d)
+        index = np.where(brick >= 0, self.voxel_index[np.maximum(brick, 0), local], -1)
+        out[np.ix_(*inside)] = np.where(index >= 0, self.density_values[np.maximum(index, 0)], 0)
+        return out
+
+    def with_values(self, density: np.ndarray, sh: np.ndarray) -> NerfTree:
+        """The same voxels with other densities (N,) and coefficients (N, K, 3)."""
+        count = len(self.density_values)
+        if density.shape != (count,) or sh.ndim != 3 or sh.shape[::2] != (count, 3):
+            raise ValueError(f"values of shapes {density.shape} and {sh.shape} for {count} voxels; expected ({count},) and ({count}, K, 3)")
+        harmonics_count(round(sh.shape[1] ** 0.5) - 1)
+        return replace(self, density_values=np.ascontiguousarray(density, np.float32), harmonics=np.ascontiguousarray(sh, np.float32))
+
+    def with_metadata(self, **entries: Any) -> NerfTree:
+        return replace(self, metadata={**self.metadata, **entries})
+
+
+def leaps(occupied: np.ndarray) -> np.ndarray:
+    """`NerfTree.leap` of coarse cells (X, Y, Z) bool."""
+    from scipy.ndimage import distance_transform_cdt
+
+    if not occupied.any():
+        return np.full(occupied.shape, 255, np.uint8)
+    return np.ascontiguousarray(np.minimum(distance_transform_cdt(~occupied, metric="chessboard"), 255).astype(np.uint8))
+
+
+def tree_from_voxels(
+    shape: tuple[int, int, int],
+    voxel: float,
+    bounds_min: np.ndarray,
+    indices: np.ndarray,
+    density: np.ndarray,
+    sh: np.ndarray,
+    *,
+    brick: int = 4,
+    background: tuple[float, float, float] | None = None,
+    metadata: dict[str, Any] | None = None,
+    ndc: Ndc | None = None,
+    lookup: str = "trilinear",
+) -> NerfTree:
+    """Build a tree from a list of voxels.
+
+    indices  (N, 3) integer voxel coordinates, each once, inside shape * brick
+    density  (N,)   per world unit
+    sh       (N, K, 3)
+
+    Voxels are stored brick by brick in the order of the coarse cells (x slowest), inside a brick likewise: the order is part of the format.
+    """
+    indices = np.asarray(indices, np.int64)
+    cells = np.asarray(shape, np.int64)
+    if len(indices) and ((indices < 0).any() or (indices >= cells * brick).any()):
+        raise ValueError(f"voxel coordinates outside of the grid of {tuple(cells * brick)} voxels")
+    harmonics_count(round(sh.shape[1] ** 0.5) - 1)
+    cell = indices // brick
+    local = indices - cell * brick
+    cell_flat = (cell[:, 0] * cells[1] + cell[:, 1]) * cells[2] + cell[:, 2]
+    local_flat = (local[:, 0] * brick + local[:, 1]) * brick + local[:, 2]
+    key = cell_flat * brick**3 + local_flat
+    order = np.argsort(key, kind="stable")
+    if len(key) > 1 and (np.diff(key[order]) == 0).any():
+        raise ValueError("a voxel is listed twice")
+    occupied, brick_of = np.unique(cell_flat[order], return_inverse=True)
+    brick_index = np.full(int(cells.prod()), -1, np.int32)
+    brick_index[occupied] = np.arange(len(occupied), dtype=np.int32)
+    voxel_index = np.full((len(occupied), brick**3), -1, np.int32)
+    voxel_index[brick_of, local_flat[order]] = np.arange(len(order), dtype=np.int32)
+    x, y, z = (int(c) for c in cells)
+    return NerfTree(
+        shape=(x, y, z),
+        brick=brick,
+        voxel=float(voxel),
+        bounds_min=np.asarray(bounds_min, np.float64),
+        brick_index=brick_index.reshape(x, y, z),
+        voxel_index=voxel_index,
+        density_values=np.ascontiguousarray(density[order], np.float32),
+        harmonics=np.ascontiguousarray(sh[order], np.float32),
+        background=background,
+        metadata=dict(metadata or {}),
+        ndc=ndc,
+        lookup=lookup,
+    )

@@ -1,0 +1,86 @@
+"""Rays into normalised device coordinates and hits back into the world (numba, all cores): what `efficientnerf.geometry.ndc` states, in one pass over the rays.
+
+The letters are those of that module, whose functions are the reference. R rays.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from efficientnerf.geometry.ndc import BEYOND, Ndc, WarpedRays
+
+BLOCK = 4096  # rays of a task
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _rays(origins, directions, turn, place, a, b, near, beyond, start, along, begin, pace, bend):  # type: ignore[no-untyped-def]
+    for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
+        for n in range(block * BLOCK, min(len(origins), block * BLOCK + BLOCK)):
+            px, py, pz = origins[n, 0] - place[0], origins[n, 1] - place[1], origins[n, 2] - place[2]
+            vx, vy, vz = directions[n, 0], directions[n, 1], directions[n, 2]
+            x, y = px * turn[0, 0] + py * turn[1, 0] + pz * turn[2, 0], px * turn[0, 1] + py * turn[1, 1] + pz * turn[2, 1]
+            z = px * turn[0, 2] + py * turn[1, 2] + pz * turn[2, 2]
+            dx, dy = vx * turn[0, 0] + vy * turn[1, 0] + vz * turn[2, 0], vx * turn[0, 1] + vy * turn[1, 1] + vz * turn[2, 1]
+            dz = vx * turn[0, 2] + vy * turn[1, 2] + vz * turn[2, 2]
+            meets, t = True, 0.0
+            if z < near:
+                meets = dz > 1e-9
+                t = (near - z) / dz if meets else 0.0
+            x, y, z = x + t * dx, y + t * dy, max(z + t * dz, near) if meets else near
+            jx, jy, jz = a * (dx * z - x * dz) / (z * z), b * (dy * z - y * dz) / (z * z), 2 * near * dz / (z * z)
+            g = np.sqrt(jx * jx + jy * jy + jz * jz)
+            begin[n], bend[n] = t, dz / z
+            if not meets or g < 1e-12:
+                start[n, 0], start[n, 1], start[n, 2] = 0.0, 0.0, beyond
+                along[n, 0], along[n, 1], along[n, 2] = 0.0, 0.0, 1.0
+                pace[n] = 1.0
+                continue
+            start[n, 0], start[n, 1], start[n, 2] = a * x / z, b * y / z, 1 - 2 * near / z
+            along[n, 0], along[n, 1], along[n, 2] = jx / g, jy / g, jz / g
+            pace[n] = g
+
+
+def rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> WarpedRays:
+    """`Ndc.rays` of float64 arrays."""
+    count = len(origins)
+    start, along = np.empty((count, 3)), np.empty((count, 3))
+    begin, pace, bend = np.empty(count), np.empty(count), np.empty(count)
+    pose = np.ascontiguousarray(ndc.world_from_camera, np.float64)
+    given = (np.ascontiguousarray(part, np.float64) for part in (origins, directions, pose[:3, :3], pose[:3, 3]))
+    _rays(*given, *ndc.slopes, ndc.near, BEYOND, start, along, begin, pace, bend)
+    return WarpedRays(start, along, begin, pace, bend)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _hits(start, along, begin, pace, bend, distance, normal, turn, a, b, near, out_distance, out_normal):  # type: ignore[no-untyped-def]
+    for block in numba.prange((len(start) + BLOCK - 1) // BLOCK):
+        for n in range(block * BLOCK, min(len(start), block * BLOCK + BLOCK)):
+            s = np.float64(distance[n])
+            out_distance[n] = np.inf
+            out_normal[n, 0] = out_normal[n, 1] = out_normal[n, 2] = 0
+            if not np.isfinite(s):
+                continue
+            rest = pace[n] - bend[n] * s
+            if rest > 1e-6 * pace[n]:
+                out_distance[n] = begin[n] + s / rest
+            z = 2 * near / max(1 - (start[n, 2] + s * along[n, 2]), 1e-9)
+            x, y = (start[n, 0] + s * along[n, 0]) * z / a, (start[n, 1] + s * along[n, 1]) * z / b
+            nx, ny, nz = a * normal[n, 0], b * normal[n, 1], 2 * near * np.float64(normal[n, 2])
+            nz = (nz - x * nx - y * ny) / z
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if length > 0:
+                for k in range(3):
+                    out_normal[n, k] = (turn[k, 0] * nx + turn[k, 1] * ny + turn[k, 2] * nz) / length
+
+
+def hits(ndc: Ndc, warped: WarpedRays, distance: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Hits on rays of `rays` in the world: distances (R,) float32, `world_distance`, and normals (R, 3) float32, `Ndc.world_normals`.
+
+    distance  (R,)   float32 along the warped rays; infinity where nothing is hit
+    normal    (R, 3) float32 in normalised device coordinates
+    """
+    out = np.empty(len(distance), np.float32), np.empty((len(distance), 3), np.float32)
+    turn = np.ascontiguousarray(ndc.world_from_camera[:3, :3], np.float64)
+    _hits(*warped, np.ascontiguousarray(distance), np.ascontiguousarray(normal), turn, *ndc.slopes, ndc.near, *out)
+    return out

@@ -1,0 +1,213 @@
+"""Compositing on CUDA (Triton), forward and backward: one program a ray, 32 of its samples at a time.
+
+The sums along a ray are scans over the samples of a chunk, with what came before carried from chunk to chunk. The harmonics become colours here, so
+that coefficients are read once and no array of N x 3 x K is made. Samples beyond the last offset (the padding of a bundle with a fixed capacity)
+get no weight and no gradient.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from efficientnerf.backends.triton.tree_walk import sigmoid
+from efficientnerf.rendering.compositing import LARGEST_LOGIT, Composite
+
+CHUNK = 32
+# Optical depth beyond which a sample is as good as opaque (e^-25 = 1e-11). Capped so that a sum over the chunk minus a sample's own part still holds
+# what lies before it: a density may be as large as e^15.
+OPAQUE = tl.constexpr(25.0)
+LARGEST = tl.constexpr(LARGEST_LOGIT)
+
+
+@triton.jit
+def _activate(x, EXPONENTIAL: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Density and its derivative; see `efficientnerf.rendering.compositing.activate`."""
+    if EXPONENTIAL:
+        density = tl.exp(tl.minimum(x, LARGEST))
+        slope = tl.where(x > LARGEST, 0.0, density)
+    else:
+        z = x - 1
+        e = tl.exp(-tl.abs(z))
+        density = tl.maximum(z, 0.0) + tl.log(1 + e)
+        slope = tl.where(z >= 0, 1.0, e) / (1 + e)
+    return density, slope
+
+
+@triton.jit
+def _forward(  # type: ignore[no-untyped-def]
+    raw, length, first, harmonics, background, colour, opacity, distortion, weight, rgb,
+    K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
+):  # fmt: skip
+    WIDTH: tl.constexpr = 1 + 3 * K
+    r = tl.program_id(0).to(tl.int64)
+    base = tl.load(first + r)
+    end = tl.load(first + r + 1)
+    k = tl.arange(0, KP)
+    basis = tl.load(harmonics + r * K + k, k < K, other=0.0)
+    passed = 0.0  # optical depth of the chunks before
+    at = 0.0  # length of the chunks before
+    near_weight = 0.0
+    near_moment = 0.0
+    spread = 0.0
+    red = 0.0
+    green = 0.0
+    blue = 0.0
+    while base < end:
+        n = base + tl.arange(0, CHUNK)
+        live = n < end
+        size = tl.load(length + n, live, other=0.0)
+        density, _ = _activate(tl.load(raw + n * WIDTH, live, other=0.0), EXPONENTIAL)
+        depth = tl.where(live, tl.minimum(density * size, OPAQUE), 0.0)
+        w = tl.exp(-(passed + tl.cumsum(depth, 0) - depth)) * (1 - tl.exp(-depth))
+        tile = raw + n[:, None] * WIDTH + 1 + k[None, :]
+        seen = live[:, None] & (k < K)[None, :]
+        cr = sigmoid(tl.sum(tl.load(tile, seen, other=0.0) * basis[None, :], 1))
+        cg = sigmoid(tl.sum(tl.load(tile + K, seen, other=0.0) * basis[None, :], 1))
+        cb = sigmoid(tl.sum(tl.load(tile + 2 * K, seen, other=0.0) * basis[None, :], 1))
+        tl.store(weight + n, w, live)
+        tl.store(rgb + n * 3, cr, live)
+        tl.store(rgb + n * 3 + 1, cg, live)
+        tl.store(rgb + n * 3 + 2, cb, live)
+        red += tl.sum(w * cr, 0)
+        green += tl.sum(w * cg, 0)
+        blue += tl.sum(w * cb, 0)
+        middle = at + tl.cumsum(size, 0) - 0.5 * size
+        moment = w * middle
+        before_weight = near_weight + tl.cumsum(w, 0) - w
+        before_moment = near_moment + tl.cumsum(moment, 0) - moment
+        spread += tl.sum(2 * w * (middle * before_weight - before_moment) + w * w * size / 3, 0)
+        near_weight += tl.sum(w, 0)
+        near_moment += tl.sum(moment, 0)
+        passed += tl.sum(depth, 0)
+        at += tl.sum(size, 0)
+        base += CHUNK
+    light = tl.exp(-passed)
+    tl.store(colour + r * 3, red + light * tl.load(background + r * 3))
+    tl.store(colour + r * 3 + 1, green + light * tl.load(background + r * 3 + 1))
+    tl.store(colour + r * 3 + 2, blue + light * tl.load(background + r * 3 + 2))
+    tl.store(opacity + r, 1 - light)
+    tl.store(distortion + r, spread)
+
+
+@triton.jit
+def _backward(  # type: ignore[no-untyped-def]
+    raw, length, first, harmonics, background, weight, rgb, grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background,
+    K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
+):  # fmt: skip
+    """Totals first, then the chunks from the last to the first: what lies behind a sample is summed up, never a small difference of large numbers."""
+    WIDTH: tl.constexpr = 1 + 3 * K
+    r = tl.program_id(0).to(tl.int64)
+    begin = tl.load(first + r)
+    end = tl.load(first + r + 1)
+    passed = 0.0
+    at = 0.0
+    all_weight = 0.0
+    all_moment = 0.0
+    base = begin
+    while base < end:
+        n = base + tl.arange(0, CHUNK)
+        live = n < end
+        size = tl.load(length + n, live, other=0.0)
+        w = tl.load(weight + n, live, other=0.0)
+        density, _ = _activate(tl.load(raw + n * WIDTH, live, other=0.0), EXPONENTIAL)
+        passed += tl.sum(tl.where(live, tl.minimum(density * size, OPAQUE), 0.0), 0)
+        all_weight += tl.sum(w, 0)
+        all_moment += tl.sum(w * (at + tl.cumsum(size, 0) - 0.5 * size), 0)
+        at += tl.sum(size, 0)
+        base += CHUNK
+    g0 = tl.load(grad_colour + r * 3)
+    g1 = tl.load(grad_colour + r * 3 + 1)
+    g2 = tl.load(grad_colour + r * 3 + 2)
+    gs = tl.load(grad_distortion + r)
+    light = tl.exp(-passed)
+    tl.store(grad_background + r * 3, light * g0)
+    tl.store(grad_background + r * 3 + 1, light * g1)
+    tl.store(grad_background + r * 3 + 2, light * g2)
+    # What lies behind a sample contributes `rest`: the background, and the samples after it.
+    b0 = tl.load(background + r * 3)
+    b1 = tl.load(background + r * 3 + 1)
+    b2 = tl.load(background + r * 3 + 2)
+    rest = light * (g0 * b0 + g1 * b1 + g2 * b2 - tl.load(grad_opacity + r))
+    far_weight = 0.0
+    far_moment = 0.0
+    k = tl.arange(0, KP)
+    basis = tl.load(harmonics + r * K + k, k < K, other=0.0)
+    while base > begin:
+        base -= CHUNK
+        n = base + tl.arange(0, CHUNK)
+        live = n < end
+        size = tl.load(length + n, live, other=0.0)
+        w = tl.load(weight + n, live, other=0.0)
+        density, slope = _activate(tl.load(raw + n * WIDTH, live, other=0.0), EXPONENTIAL)
+        depth = tl.where(live, tl.minimum(density * size, OPAQUE), 0.0)
+        passed -= tl.sum(depth, 0)
+        at -= tl.sum(size, 0)
+        middle = at + tl.cumsum(size, 0) - 0.5 * size
+        moment = w * middle
+        after_weight = far_weight + tl.sum(w, 0) - tl.cumsum(w, 0)
+        after_moment = far_moment + tl.sum(moment, 0) - tl.cumsum(moment, 0)
+        before_weight = all_weight - after_weight - w
+        before_moment = all_moment - after_moment - moment
+        spread = 2 * (middle * (before_weight - after_weight) - before_moment + after_moment) + 2.0 / 3.0 * w * size
+        cr = tl.load(rgb + n * 3, live, other=0.0)
+        cg = tl.load(rgb + n * 3 + 1, live, other=0.0)
+        cb = tl.load(rgb + n * 3 + 2, live, other=0.0)
+        own = tl.load(grad_weight + n, live, other=0.0) + g0 * cr + g1 * cg + g2 * cb + gs * spread
+        pulled = w * own
+        behind = rest + tl.sum(pulled, 0) - tl.cumsum(pulled, 0)
+        after = tl.exp(-(tl.maximum(passed, 0.0) + tl.cumsum(depth, 0)))
+        tl.store(grad_raw + n * WIDTH, (after * own - behind) * size * slope, live)
+        tile = grad_raw + n[:, None] * WIDTH + 1 + k[None, :]
+        seen = live[:, None] & (k < K)[None, :]
+        tl.store(tile, (w * g0 * cr * (1 - cr))[:, None] * basis[None, :], seen)
+        tl.store(tile + K, (w * g1 * cg * (1 - cg))[:, None] * basis[None, :], seen)
+        tl.store(tile + 2 * K, (w * g2 * cb * (1 - cb))[:, None] * basis[None, :], seen)
+        rest += tl.sum(pulled, 0)
+        far_weight += tl.sum(w, 0)
+        far_moment += tl.sum(moment, 0)
+
+
+def _padded(terms: int) -> int:
+    return max(4, triton.next_power_of_2(terms))
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, exponential: bool) -> tuple[Tensor, ...]:
+        raw, length, first, harmonics, background = (t.detach().contiguous() for t in (raw, length, first, harmonics, background))
+        rays, samples, terms = len(first) - 1, len(raw), harmonics.shape[1]
+        colour, opacity, distortion = raw.new_empty(rays, 3), raw.new_empty(rays), raw.new_empty(rays)
+        weight, rgb = raw.new_zeros(samples), raw.new_zeros(samples, 3)  # zeros: the padding belongs to no ray
+        if rays:
+            _forward[(rays,)](
+                raw, length, first, harmonics, background, colour, opacity, distortion, weight, rgb,
+                K=terms, KP=_padded(terms), EXPONENTIAL=exponential, CHUNK=CHUNK, num_warps=1,
+            )  # fmt: skip
+        ctx.save_for_backward(raw, length, first, harmonics, background, weight, rgb)
+        ctx.exponential = exponential
+        ctx.mark_non_differentiable(rgb)
+        return colour, opacity, distortion, weight, rgb
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        raw, length, first, harmonics, background, weight, rgb = ctx.saved_tensors
+        rays, terms = len(first) - 1, harmonics.shape[1]
+        grad_raw, grad_background = torch.zeros_like(raw), torch.empty_like(background)
+        if rays:
+            _backward[(rays,)](
+                raw, length, first, harmonics, background, weight, rgb, *(g.contiguous() for g in grads[:4]), grad_raw, grad_background,
+                K=terms, KP=_padded(terms), EXPONENTIAL=ctx.exponential, CHUNK=CHUNK, num_warps=1,
+            )  # fmt: skip
+        return grad_raw, None, None, None, grad_background, None
+
+
+def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
+    """See `efficientnerf.rendering.compositing.composite`; differentiable in `raw` and `background`, and the samples' colours carry no gradient."""
+    if activation not in ("exp", "softplus"):
+        raise ValueError(f"activation {activation!r}: expected 'exp' or 'softplus'")
+    return Composite(*_Composite.apply(raw, length, first, harmonics, background, activation == "exp"))

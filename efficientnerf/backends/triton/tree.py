@@ -1,0 +1,196 @@
+"""A NerfTree on a CUDA device, and its pictures: the kernel is `efficientnerf.backends.triton.tree_march`.
+
+The tree is laid out anew for a device, whose memory is large and whose caches are small. A brick gets a border one voxel wide, copied from its
+neighbours, so that the eight corners of any point in its cell lie together, at places that the point alone decides; coefficients of a voxel are a row of
+halves (the type in files) whose length is a power of two.
+
+B bricks, N voxels, K harmonics, E = brick + 2.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+import triton
+from torch import Tensor
+
+from efficientnerf.backends.transfer import constant, sent
+from efficientnerf.backends.triton.hash_grid import INTERPRETED
+from efficientnerf.backends.triton.tree_march import march
+from efficientnerf.geometry.cameras import Camera, rays
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+TILE = (32, 16) if INTERPRETED else (8, 4)  # pixels of a program
+BRICKS_AT_ONCE = 2**14
+# A program's warps by the length of a voxel's row of coefficients: as few as keep the row and the basis in registers.
+WARPS = {4: 1, 16: 1, 32: 1, 64: 4, 128: 4}
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceTree:
+    """What the kernel reads.
+
+    grid     (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may leap
+    density  (B, E^3) float16, voxels of a brick with its border, z fastest; 0 where nothing is stored
+    index    (B, E^3) int32: which voxel's coefficients, -1 where nothing is stored
+    sh       (N, row) float16: K coefficients for red, green and blue each, then zeros
+    low      (3,) corner of the grid in the tree's frame; `voxel` its unit there
+    nearest  whether voxels are not interpolated
+    """
+
+    grid: Tensor
+    density: Tensor
+    index: Tensor
+    sh: Tensor
+    brick: int
+    terms: int
+    voxel: float
+    low: np.ndarray
+    nearest: bool = False
+
+    @property
+    def bytes(self) -> int:
+        return sum(t.numel() * t.element_size() for t in (self.grid, self.density, self.index, self.sh))
+
+
+class Drawing(NamedTuple):
+    """`efficientnerf.asset.tree.Rendering` on the device: colour (..., 3), opacity (...), depth (...), normal (..., 3), float32."""
+
+    colour: Tensor
+    opacity: Tensor
+    depth: Tensor
+    normal: Tensor
+
+
+def laid_out(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Tensor]:
+    """`grid` and `index` of a DeviceTree, on the device; bricks are taken in blocks, so that little more than the result is needed."""
+    brick_index = torch.from_numpy(tree.brick_index).to(device)
+    leap = torch.from_numpy(tree.leap.astype(np.int32)).to(device)
+    voxel_index = torch.from_numpy(np.ascontiguousarray(tree.voxel_index, np.int32)).to(device)
+    d, edge, bricks = tree.brick, tree.brick + 2, len(tree.voxel_index)
+    reach = torch.arange(-1, d + 1, device=device)
+    border = torch.stack(torch.meshgrid(reach, reach, reach, indexing="ij"), dim=-1).reshape(-1, 3)  # (E^3, 3)
+    cells = torch.nonzero(brick_index >= 0)  # (B, 3), in the order of the cells
+    cells = cells[torch.argsort(brick_index[tuple(cells.unbind(1))])]
+    size = torch.tensor(tree.resolution, device=device)
+    index = torch.empty(bricks, edge**3, dtype=torch.int32, device=device)
+    for begin in range(0, bricks, BRICKS_AT_ONCE):
+        at = cells[begin : begin + BRICKS_AT_ONCE, None] * d + border  # (b, E^3, 3)
+        there = ((at >= 0) & (at < size)).all(dim=-1)
+        at = at.clamp(min=0).minimum(size - 1)
+        cell = at // d
+        owner = brick_index[cell[..., 0], cell[..., 1], cell[..., 2]].long()
+        local = at - cell * d
+        slot = (local[..., 0] * d + local[..., 1]) * d + local[..., 2]
+        index[begin : begin + BRICKS_AT_ONCE] = torch.where(there & (owner >= 0), voxel_index[owner.clamp(min=0), slot], -1)
+    return torch.where(brick_index >= 0, brick_index, -leap).contiguous(), index
+
+
+def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTree:
+    """Send a tree to the device; in blocks, so that little more than the result is needed."""
+    grid, index = laid_out(tree, device)
+    values = torch.from_numpy(np.ascontiguousarray(tree.density_values, np.float32)).to(device)
+    density = torch.empty(index.shape, dtype=torch.float16, device=device)
+    for begin in range(0, len(index), BRICKS_AT_ONCE):
+        found = index[begin : begin + BRICKS_AT_ONCE].long()
+        density[begin : begin + BRICKS_AT_ONCE] = torch.where(found >= 0, values[found.clamp(min=0)], 0).clamp(max=65504).half()
+    terms, row = tree.harmonics_count, triton.next_power_of_2(3 * tree.harmonics_count)
+    sh = torch.zeros(len(values), row, dtype=torch.float16, device=device)
+    step = 2**18
+    for begin in range(0, len(values), step):
+        part = torch.from_numpy(np.ascontiguousarray(tree.coefficients(slice(begin, begin + step)))).to(device)
+        sh[begin : begin + step, : 3 * terms] = part.transpose(1, 2).reshape(len(part), 3 * terms).clamp(-65504, 65504).half()
+    return DeviceTree(grid, density, index, sh, tree.brick, terms, tree.voxel, tree.bounds_min, tree.lookup == "nearest")
+
+
+def _launch(
+    t: DeviceTree, count: int, buffers: tuple[Tensor, Tensor, Tensor] | None, camera: tuple[float, ...], size: tuple[int, int],
+    background: tuple[float, float, float] | None,
+) -> Drawing:  # fmt: skip
+    device = t.grid.device
+    out = Drawing(*(torch.empty(count, *tail, device=device) for tail in ((3,), (), (), (3,))))
+    if count == 0:
+        return out
+    wide, high = TILE
+    programs = triton.cdiv(count, wide * high) if buffers else triton.cdiv(size[0], wide) * triton.cdiv(size[1], high)
+    # Without voxels there is nothing that the kernel would read, but it must have something to point at.
+    density, index, sh = (x if len(x) else x.new_zeros(1, x.shape[1]) for x in (t.density, t.index, t.sh))
+    march[(programs,)](
+        *(buffers or (out.colour, out.colour, out.colour)), t.grid, density, index, sh, *out,
+        count, *size, *t.grid.shape, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
+        PINHOLE=buffers is None, OVER=background is not None, NEAREST=t.nearest, BRICK=t.brick, K=t.terms, ROW=t.sh.shape[1], WIDE=wide, HIGH=high,
+        num_warps=WARPS[t.sh.shape[1]],
+    )  # fmt: skip
+    return out
+
+
+def draw_rays(t: DeviceTree, origins: Tensor, directions: Tensor, looking: Tensor | None = None) -> Drawing:
+    """Rays of the tree's frame on the device: origins (R, 3), unit directions (R, 3), and those in the world where the frame is another.
+
+    Depth is the distance along the ray, normals are of the frame; nothing waits for the device.
+    """
+    start = ((origins.double() - constant(t.low, origins.double())) / t.voxel).float().contiguous()
+    along = directions.float().contiguous()
+    seen_from = along if looking is None else looking.float().contiguous()
+    return _launch(t, len(start), (start, along, seen_from), (0.0,) * 16, (0, 0), None)
+
+
+@functools.lru_cache(maxsize=4)
+def _lens(width: int, height: int, model: str, params: tuple[float, ...], supersample: int, device: torch.device) -> Tensor:
+    """Unit directions (rays, 3) in the camera, of all samples row by row; kept, because distortion is inverted on the host."""
+    still = Camera("lens", width, height, model, params, np.eye(4))
+    y, x = np.mgrid[0 : height * supersample, 0 : width * supersample]
+    pixels = (np.stack([x.ravel(), y.ravel()], -1) + 0.5) / supersample
+    return torch.from_numpy(rays(still, pixels)[1].astype(np.float32)).to(device)
+
+
+def draw(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Drawing:
+    """The picture that a camera of the tree's frame takes, (H, W, ...), on the device; nothing waits for it.
+
+    One launch where the camera is a pinhole and `supersample` is 1; else rays are made, or samples averaged, by some more. See `NerfTree.render`.
+    """
+    if supersample < 1:
+        raise ValueError(f"supersample {supersample}: expected at least 1")
+    height, width = camera.height * supersample, camera.width * supersample
+    over = background if supersample == 1 else None
+    if camera.model in PINHOLES:
+        k = camera.intrinsics
+        place = (*((camera.centre - t.low) / t.voxel), *camera.world_from_camera[:3, :3].ravel())
+        lens = (k["fx"] * supersample, k["fy"] * supersample, k["cx"] * supersample, k["cy"] * supersample)
+        flat = _launch(t, height * width, None, tuple(float(x) for x in (*place, *lens)), (width, height), over)
+    else:
+        local = _lens(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
+        rotation = sent(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), local.device)
+        place = tuple(float(x) for x in (camera.centre - t.low) / t.voxel)
+        start = torch.stack([torch.full_like(local[:, 0], x) for x in place], dim=1)
+        along = local @ rotation
+        flat = _launch(t, len(start), (start, along, along), (0.0,) * 16, (0, 0), over)
+        flat = flat._replace(depth=flat.depth * local[:, 2])
+    shape = (camera.height, supersample, camera.width, supersample)
+    if supersample == 1:
+        return Drawing(*(x.reshape(camera.height, camera.width, *x.shape[1:]) for x in flat))
+    return _averaged(Drawing(*(x.reshape(*shape, *x.shape[1:]) for x in flat)), background)
+
+
+def _averaged(samples: Drawing, background: tuple[float, float, float] | None) -> Drawing:
+    """Pixels from samples (H, s, W, s, ...), as `efficientnerf.rendering.render.render_tree` makes them."""
+    height, s, width, _ = samples.opacity.shape
+    colour, opacity = samples.colour.mean(dim=(1, 3)), samples.opacity.mean(dim=(1, 3))
+    along = samples.depth.permute(0, 2, 1, 3).reshape(height, width, s * s).sort(dim=-1).values
+    hits = along.isfinite().sum(dim=-1, keepdim=True)
+    middle = (hits - 1).clamp(0, (s * s - 1) // 2)
+    solid = opacity >= 0.5
+    depth = torch.where(solid, along.gather(-1, middle)[..., 0], torch.inf)
+    facing = samples.normal.sum(dim=(1, 3))
+    normal = facing / facing.norm(dim=-1, keepdim=True).clamp(min=1e-12) * solid[..., None]
+    if background is not None:
+        for channel, value in enumerate(background):
+            colour[..., channel] += (1 - opacity) * value
+    return Drawing(colour, opacity, depth, normal)

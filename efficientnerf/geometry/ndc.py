@@ -1,0 +1,202 @@
+"""Normalised device coordinates of forward-facing captures: all that lies before a reference camera, out to infinity, in a box.
+
+Mildenhall et al. 2020, "NeRF", appendix C. With (x, y, z) in the reference camera (x right, y down, z forward: the project's axes, where the
+appendix has y up and looks along -z), focal length f, width W, height H and near plane n:
+
+    x' = f / (W/2)  x / z        y' = f / (H/2)  y / z        z' = 1 - 2 n / z
+
+z' is -1 on the near plane and 1 at infinity, and even steps of z' are even steps of parallax. Straight lines stay straight. A ray o + t d that
+begins at t0 (on the near plane, or at o where that lies beyond it) becomes a ray of unit direction; with p = o + t0 d, J the map's
+derivative at p, g = |J d| and k = d_z / p_z (z as above) the point at distance t lies, along the warped ray, at
+
+    s(t) = g (t - t0) / (1 + k (t - t0))        t(s) = t0 + s / (g - k s)
+
+Everything works on numpy arrays and on torch tensors alike; results are of the kind, type and device of what goes in. No torch is imported.
+
+R rays, N points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+NUMBERS = ("focal", "width", "height", "near")
+BEYOND = 3.0  # z' from which a ray that never enters the box starts, leaving it
+
+
+class WarpedRays(NamedTuple):
+    """Rays in normalised device coordinates, and the way back to distances of the world.
+
+    origins, directions  (R, 3) where the rays begin, and unit directions
+    begin                (R,) world distance along the ray at which it begins (t0)
+    pace, bend           (R,) g and k of the module
+    """
+
+    origins: Any
+    directions: Any
+    begin: Any
+    pace: Any
+    bend: Any
+
+
+def world_distance(along: Any, begin: Any, pace: Any, bend: Any) -> Any:
+    """World distance from a ray's own origin of points at distance `along` its warped ray; infinity from the far plane on. Arrays of one shape."""
+    rest = pace - bend * along
+    seen = rest > 1e-6 * pace
+    return _where(seen, begin + along / _where(seen, rest, _one(rest)), np.inf)
+
+
+def warped_distance(distance: Any, begin: Any, pace: Any, bend: Any) -> Any:
+    """The inverse of `world_distance`; 0 before the warped ray begins."""
+    past = _at_least(distance - begin, 0.0)
+    return pace * past / _at_least(1 + bend * past, 1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class Ndc:
+    """The reference camera.
+
+    world_from_camera  (4, 4) its pose, the project's axes
+    focal              pixels
+    width, height      pixels; x' and y' are -1 and 1 at the borders of a picture of this size
+    near               distance of the near plane from the camera, world units
+    """
+
+    world_from_camera: np.ndarray
+    focal: float
+    width: float
+    height: float
+    near: float
+
+    @cached_property
+    def slopes(self) -> tuple[float, float]:
+        """x' and y' of a point one unit to the side at a distance of one unit."""
+        return 2 * self.focal / self.width, 2 * self.focal / self.height
+
+    def stretched(self, by: float) -> Ndc:
+        """The reference camera whose x' and y' are `by` times these."""
+        return replace(self, width=self.width / by, height=self.height / by)
+
+    def to_json(self) -> dict[str, Any]:
+        return {"world_from_camera": self.world_from_camera.tolist(), **{name: float(getattr(self, name)) for name in NUMBERS}}
+
+    @staticmethod
+    def from_json(data: Mapping[str, Any]) -> Ndc:
+        """The inverse of `to_json`; KeyError, TypeError or ValueError for what is none."""
+        ndc = Ndc(np.asarray(data["world_from_camera"], np.float64).reshape(4, 4), *(float(data[name]) for name in NUMBERS))
+        rotation, row = ndc.world_from_camera[:3, :3], ndc.world_from_camera[3]
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0 or (row != (0, 0, 0, 1)).any():
+            raise ValueError("the reference camera's pose is no rigid motion")
+        if not all(np.isfinite(x) and x > 0 for x in (ndc.focal, ndc.width, ndc.height, ndc.near)):
+            raise ValueError("the reference camera's focal length, width, height and near plane must be positive")
+        return ndc
+
+    def _camera(self, vectors: Any, *, directions: bool) -> tuple[Any, Any, Any]:
+        rotation = _like(self.world_from_camera[:3, :3], vectors)
+        local = (vectors if directions else vectors - _like(self.world_from_camera[:3, 3], vectors)) @ rotation
+        return local[..., 0], local[..., 1], local[..., 2]
+
+    def points(self, world: Any) -> Any:
+        """World points (..., 3) to normalised device coordinates. What does not lie before the camera comes out beyond z' = BEYOND: outside of any box."""
+        x, y, z = self._camera(world, directions=False)
+        a, b = self.slopes
+        seen = z > 1e-6 * self.near
+        z = _where(seen, z, _one(z))
+        return _stack([_where(seen, a * x / z, _one(z) * 0), _where(seen, b * y / z, _one(z) * 0), _where(seen, 1 - 2 * self.near / z, BEYOND)])
+
+    def world(self, ndc: Any) -> Any:
+        """The inverse of `points`, for z' < 1."""
+        a, b = self.slopes
+        z = 2 * self.near / _at_least(1 - ndc[..., 2], 1e-9)
+        local = _stack([ndc[..., 0] * z / a, ndc[..., 1] * z / b, z])
+        return local @ _like(self.world_from_camera[:3, :3].T.copy(), ndc) + _like(self.world_from_camera[:3, 3], ndc)
+
+    def sights(self, eye: np.ndarray) -> np.ndarray:
+        """(3, 4): takes (x', y', z', 1) to the world direction, of any length, along which that place is seen from `eye` (3,), world.
+
+        With W = (1 - z') / (2 n) a place is R (x'/a, y'/b, 1) / W + t, for the camera's rotation R and position t; times W, less the eye, it is linear.
+        """
+        rotation, beside = self.world_from_camera[:3, :3], (self.world_from_camera[:3, 3] - eye) / (2 * self.near)
+        a, b = self.slopes
+        return np.stack([rotation[:, 0] / a, rotation[:, 1] / b, -beside, rotation[:, 2] + beside], axis=1)
+
+    def rays(self, origins: Any, directions: Any) -> WarpedRays:
+        """World rays (R, 3), unit directions, to rays in normalised device coordinates.
+
+        One that never comes before the near plane gets an origin beyond z' = BEYOND and looks away.
+        """
+        a, b = self.slopes
+        x, y, z = self._camera(origins, directions=False)
+        dx, dy, dz = self._camera(directions, directions=True)
+        ahead = dz > 1e-9
+        steep = _where(ahead, dz, _one(dz))
+        begin = _where(z < self.near, _where(ahead, (self.near - z) / steep, _one(z) * np.inf), _one(z) * 0)
+        meets = begin < np.inf
+        begin = _where(meets, begin, _one(z) * 0)
+        x, y = x + begin * dx, y + begin * dy
+        z = _where(meets, _at_least(z + begin * dz, self.near), _one(z) * self.near)
+        jx, jy, jz = a * (dx * z - x * dz) / z**2, b * (dy * z - y * dz) / z**2, 2 * self.near * dz / z**2
+        pace = (jx * jx + jy * jy + jz * jz) ** 0.5
+        nowhere = ~meets | (pace < 1e-12)
+        divisor = _where(nowhere, _one(z), pace)
+        zero, one = _one(z) * 0, _one(z)
+        start = _stack([_where(nowhere, zero, a * x / z), _where(nowhere, zero, b * y / z), _where(nowhere, one * BEYOND, 1 - 2 * self.near / z)])
+        along = _stack([_where(nowhere, zero, jx / divisor), _where(nowhere, zero, jy / divisor), _where(nowhere, one, jz / divisor)])
+        return WarpedRays(start, along, begin, divisor, dz / z)
+
+    def world_normals(self, ndc: Any, normals: Any) -> Any:
+        """Normals (N, 3) of surfaces in normalised device coordinates, at points there (N, 3), to unit normals in the world; zero stays zero.
+
+        A gradient is pulled back by the transposed derivative of the map, J^T.
+        """
+        a, b = self.slopes
+        z = 2 * self.near / _at_least(1 - ndc[..., 2], 1e-9)
+        x, y = ndc[..., 0] * z / a, ndc[..., 1] * z / b
+        nx, ny, nz = a * normals[..., 0], b * normals[..., 1], 2 * self.near * normals[..., 2]
+        # J = [[a/z, 0, -a x/z^2], [0, b/z, -b y/z^2], [0, 0, 2n/z^2]]; the common factor 1/z goes with the length.
+        local = _stack([nx, ny, (nz - x * nx - y * ny) / z])
+        world = local @ _like(self.world_from_camera[:3, :3].T.copy(), ndc)
+        length = (world * world).sum(-1) ** 0.5
+        return world / _where(length > 0, length, _one(length))[..., None]
+
+
+def _is_numpy(value: Any) -> bool:
+    return isinstance(value, np.ndarray | np.generic)
+
+
+def _like(constant: np.ndarray, value: Any) -> Any:
+    """The constant in the kind, type and device of `value`."""
+    if _is_numpy(value):
+        return np.asarray(constant, value.dtype)
+    from efficientnerf.backends import transfer
+
+    return transfer.constant(constant, value)
+
+
+def _one(value: Any) -> Any:
+    return value * 0 + 1
+
+
+def _where(condition: Any, yes: Any, no: Any) -> Any:
+    if _is_numpy(condition):
+        return np.where(condition, yes, no)
+    import torch
+
+    return torch.where(condition, yes, no)
+
+
+def _at_least(value: Any, least: float) -> Any:
+    return np.maximum(value, np.asarray(least, value.dtype)) if _is_numpy(value) else value.clamp(min=least)
+
+
+def _stack(parts: list[Any]) -> Any:
+    if _is_numpy(parts[0]):
+        return np.stack(parts, axis=-1)
+    import torch
+
+    return torch.stack(parts, dim=-1)

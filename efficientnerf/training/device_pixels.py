@@ -1,0 +1,63 @@
+"""Training pixels on a device: `efficientnerf.training.pixels` without the host's part in looking them up. R rays, C views, P pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from efficientnerf.backends.transfer import sent
+from efficientnerf.training.pixels import Pixels
+
+MOST_OF_MEMORY = 0.5  # of the device's free memory: photographs that would take more stay on the host
+
+
+class DevicePixels:
+    """The pixels, and all that their rays are made of, on a device. Which ones are looked at is chosen on the host, as ever, by the same random numbers."""
+
+    def __init__(self, pixels: Pixels, device: str | torch.device) -> None:
+        self.pixels, self.device = pixels, torch.device(device)
+        self.offsets, self.width, self.lens, self.knots = (self._there(a) for a in (pixels.offsets, pixels.width, pixels.lens, pixels.knots))
+        self.rotation, self.centre, self.near, self.far, self.lookup = (
+            self._there(a) for a in (pixels.rotation, pixels.centre, pixels.near, pixels.far, pixels.lookup)
+        )
+        room = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else np.inf
+        self.images = self._there(pixels.images) if pixels.images.nbytes <= MOST_OF_MEMORY * room else None
+
+    def _there(self, values: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def choose(self, count: int, rng: np.random.Generator, *, middle: bool = False) -> np.ndarray:
+        """See `Pixels.choose`."""
+        return self.pixels.choose(count, rng, middle=middle)
+
+    def sent(self, values: np.ndarray) -> Tensor:
+        """An array on the device; nothing waits for it."""
+        return sent(torch.from_numpy(np.ascontiguousarray(values)), self.device)
+
+    def bundle(self, index: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """`Pixels.bundle` on the device."""
+        at = self.sent(index)
+        colour = self.sent(self.pixels.images[index]) if self.images is None else self.images[at]
+        view = torch.searchsorted(self.offsets, at, right=True) - 1
+        rotation = self.rotation[view]  # (R, 3, 3)
+        directions = (rotation * self._in_camera(at - self.offsets[view], view)[:, None]).sum(dim=2)
+        slant = (directions * rotation[:, :, 2]).sum(dim=1).clamp(min=1e-3)  # near and far are measured along the view axis
+        return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, colour.float() / 255
+
+    def _in_camera(self, pixel: Tensor, view: Tensor) -> Tensor:
+        """Unit directions (R, 3) in the camera of pixels of views, from the knots of their lenses."""
+        width, knots, stride = self.width[view], self.knots[view], self.pixels.stride
+        row, column = pixel // width, pixel % width
+        at = self.lens[view] + row // stride * knots + column // stride
+        if stride == 1:
+            return self.lookup[at]
+        f, g = (column % stride)[:, None] / stride, (row % stride)[:, None] / stride
+        right, below = at + (f[:, 0] > 0), torch.where(g[:, 0] > 0, knots, 0)
+        upper = (1 - f) * self.lookup[at] + f * self.lookup[right]
+        lower = (1 - f) * self.lookup[at + below] + f * self.lookup[right + below]
+        mixed = (1 - g) * upper + g * lower
+        return mixed / mixed.norm(dim=1, keepdim=True)

@@ -1,0 +1,130 @@
+"""The pixels that a field is trained on, in little memory: bytes, and directions by lookup.
+
+R rays, C views, P pixels of all views.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, rays
+
+EXACT = 2**23  # pixels of all lenses together up to which each has a direction of its own (12 bytes each)
+STRIDE = 8  # beyond it: every so many pixels there is a knot
+
+
+class Pixels:
+    """All training pixels, and the rays that they see.
+
+    images    (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha
+    usable    (P / 8,) uint8 or None: a bit for each pixel that masks leave in
+    lookup    (K, 3) float32: unit directions in the camera at knots, `stride` pixels apart; one table for all views that share a lens
+
+    Between knots 8 apart directions are interpolated: with a focal length of f pixels that is off by less than about 8 / f pixels.
+    """
+
+    def __init__(
+        self, cameras: list[Camera], images: Iterable[np.ndarray], masks: Iterable[np.ndarray | None], near: np.ndarray, far: np.ndarray, channels: int = 0
+    ) -> None:
+        """
+        images, masks  of each view, (H, W, 3 or 4) uint8, and (H, W) bool or None; taken one after the other, so that they may come from disk
+        near, far      (C,) along the view axis
+        channels       3, or 4 if any image has alpha; 0 looks for itself, and keeps all images at once
+        """
+        self.near, self.far = near.astype(np.float32), far.astype(np.float32)
+        if not channels:
+            images = list(images)
+            channels = max(image.shape[-1] for image in images)
+        self.width = np.array([camera.width for camera in cameras], np.int64)
+        self.height = np.array([camera.height for camera in cameras], np.int64)
+        self.offsets = np.concatenate([[0], np.cumsum(self.width * self.height)]).astype(np.int64)
+        self.images = np.empty((int(self.offsets[-1]), channels), np.uint8)
+        for at, image in zip(self.offsets[:-1], images, strict=True):
+            part = self.images[at : at + image.shape[0] * image.shape[1]]
+            part[:, : image.shape[-1]] = image.reshape(-1, image.shape[-1])
+            part[:, image.shape[-1] :] = 255
+        self.usable = self._usable(masks)
+        self.rotation = np.stack([camera.world_from_camera[:3, :3] for camera in cameras]).astype(np.float32)
+        self.centre = np.stack([camera.centre for camera in cameras]).astype(np.float32)
+        self._look_up(cameras)
+
+    def _usable(self, masks: Iterable[np.ndarray | None]) -> np.ndarray | None:
+        bits = None
+        for (at, end), mask in zip(itertools.pairwise(self.offsets.tolist()), masks, strict=True):
+            if mask is None:
+                continue
+            if bits is None:
+                bits = np.full(-(-len(self) // 8), 255, np.uint8)
+            # The bytes at both ends may hold pixels of the views beside this one.
+            first, last = at // 8, -(-end // 8)
+            whole = np.unpackbits(bits[first:last])
+            whole[at - 8 * first : end - 8 * first] = mask.reshape(-1)
+            bits[first:last] = np.packbits(whole)
+        if bits is not None and not np.unpackbits(bits, count=len(self)).any():
+            raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
+        return bits
+
+    def _look_up(self, cameras: list[Camera]) -> None:
+        """The tables of directions, and for each view where its own begins and how many knots a row has."""
+        lenses: dict[tuple, list[int]] = {}
+        for n, camera in enumerate(cameras):
+            lenses.setdefault((camera.width, camera.height, camera.model, camera.params), []).append(n)
+        self.stride = 1 if sum(width * height for width, height, *_ in lenses) <= EXACT else STRIDE
+        self.lens, self.knots = np.empty(len(cameras), np.int64), np.empty(len(cameras), np.int64)
+        tables, at = [], 0
+        for (width, height, model, params), views in lenses.items():
+            columns, rows = (-(-(side - 1) // self.stride) + 1 for side in (width, height))  # the last knot lies at the last pixel or beyond it
+            y, x = np.mgrid[0:rows, 0:columns] * self.stride + 0.5
+            still = Camera(cameras[views[0]].name, width, height, model, params, np.eye(4))
+            tables.append(rays(still, np.stack([x.ravel(), y.ravel()], axis=-1))[1].astype(np.float32))
+            self.lens[views], self.knots[views] = at, columns
+            at += rows * columns
+        self.lookup = np.concatenate(tables)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def choose(self, count: int, rng: np.random.Generator, *, middle: bool = False) -> np.ndarray:
+        """Indices of `count` usable pixels, with replacement; with `middle`, of the middle half of the pictures' sides where any is usable there."""
+        if self.usable is None and not middle:
+            return rng.integers(len(self), size=count)
+        found = np.empty(0, np.int64)
+        while len(found) < count:
+            tried = rng.integers(len(self), size=2 * count)
+            if self.usable is not None:
+                tried = tried[self.usable_at(tried)]
+            if middle:
+                tried = tried[self._in_middle(tried)] if self._in_middle(tried).any() else tried
+            found = np.concatenate([found, tried])
+        return found[:count]
+
+    def usable_at(self, index: np.ndarray) -> np.ndarray:
+        """(R,) bool: whether masks leave these pixels in."""
+        if self.usable is None:
+            return np.ones(len(index), bool)
+        return (self.usable[index >> 3] >> (7 - (index & 7)) & 1).astype(bool)
+
+    def view_of(self, index: np.ndarray) -> np.ndarray:
+        """(R,) the view of each pixel."""
+        return np.searchsorted(self.offsets, index, side="right") - 1
+
+    def _in_middle(self, index: np.ndarray) -> np.ndarray:
+        """(N,) bool: whether pixels lie at least a quarter of their picture's width and height from its sides."""
+        view = self.view_of(index)
+        y, x = np.divmod(index - self.offsets[view], self.width[view])
+        return (np.abs(2 * x + 1 - self.width[view]) < self.width[view] / 2) & (np.abs(2 * y + 1 - self.height[view]) < self.height[view] / 2)
+
+    def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""
+        from efficientnerf.backends.numba import rays as cpu
+
+        view = self.view_of(index)
+        directions = np.empty((len(index), 3), np.float32)
+        pixel = index - self.offsets[view]
+        cpu.ray_directions(self.lookup, self.lens, self.knots, self.stride, pixel, self.width, self.rotation, view, directions)
+        slant = np.einsum("ri,ri->r", directions, self.rotation[view, :, 2])
+        slant = np.maximum(slant, 1e-3)  # near and far are measured along the view axis
+        return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, self.images[index].astype(np.float32) / np.float32(255)

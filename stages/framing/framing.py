@@ -1,0 +1,276 @@
+"""Where is up, what is the subject, how far does it reach: from a capture's own frame to the training frame.
+
+Everything is estimated from the cameras, and from the sparse points or alpha channels where there are any. The constants here are
+fractions of what is measured; none has a unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, Similarity, project
+from pipeline.errors import BadInput
+from stages.framing import scene_bounds
+from stages.framing.forward_facing import Forward, content_depths, forward_of
+from stages.io.capture import Capture
+from stages.io.scene import Orbit
+
+UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
+PARALLEL = 0.03  # below this mean squared sine to the common direction (about 10 degrees) view axes do not meet in a point
+FRONT = -90.0  # azimuth, degrees, to which a capture without axes of its own turns its cameras: looking along +y, as front views do
+
+
+@dataclass(frozen=True, eq=False)
+class Framing:
+    """The training frame of a capture.
+
+    world_from_capture  the similarity that leads there
+    bounds              (2, 3) the box of interest in the training frame, centred on the origin, largest half extent 1
+    orbit               how the cameras stand around the subject, training frame
+    near_far            (C, 2) per photo, along the view axis, training frame
+    space               "box", "contracted" or "ndc"
+    forward             the reference camera and its box, with ndc alone
+    facts               how it was found, for the report
+    """
+
+    world_from_capture: Similarity
+    bounds: np.ndarray
+    orbit: Orbit
+    near_far: np.ndarray
+    space: str
+    forward: Forward | None
+    facts: dict[str, object]
+
+
+def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto") -> Framing:
+    """Choose the training frame and the box of interest.
+
+    up      "auto", or an axis of the capture's frame ("z", "-y", ...) that points up
+    box     six numbers in the capture's frame, x y z of one corner and of the opposite one; None: estimated
+    margin  room left on every side of the sparse points, as a fraction of their longest side: what they miss (bare rims) does not depend on
+            the direction. Other boxes get none: silhouettes bound the subject from outside
+    space   "auto", or what the space of the field shall be
+
+    Raises BadInput for an empty box or an unknown axis, and for ndc where the cameras do not all look the same way.
+    """
+    cameras = [photo.camera for photo in capture.photos]
+    if not cameras:
+        raise BadInput("a capture without photographs cannot be framed.")
+    upward, from_axes = up_vector(capture, up)
+    turn = rotation_to_z(upward)
+    stated = _corners(box) if box is not None else None if capture.bounds is None else _corners(np.asarray(capture.bounds).ravel())
+    focus, converging = focus_of(capture)
+    if not from_axes and stated is None:
+        turn = _facing_front(turn, cameras, focus)
+    if stated is not None:
+        corners = stated @ turn.T
+        low, high, how = corners.min(0), corners.max(0), "given" if box is not None else "stated by the source"
+    else:
+        turned = Similarity(1.0, turn, np.zeros(3))
+        low, high, how = scene_bounds.box_of_interest(capture, turned, turned.points(focus), converging)
+        room = margin * (high - low).max() if how == "sparse points" else 0.0
+        low, high = low - room, high + room
+    centre, half = (low + high) / 2, (high - low) / 2
+    half = np.maximum(half, 0.02 * half.max())  # a flat subject gets some thickness
+    scale = 1.0 / half.max()
+    world = Similarity(float(scale), turn, -scale * centre)
+    bounds = np.stack([-half, half]) * scale
+    placed = [world.camera(camera) for camera in cameras]
+    orbit = orbit_of(placed, np.clip(world.points(focus), *bounds))
+    facts: dict[str, object] = {
+        "up": [round(float(c), 6) for c in upward],
+        "up_from": "given" if up != "auto" else "stated by the source" if capture.up is not None else "estimated from the cameras",
+        "bounds_from": how,
+        "converging": converging,
+        "scale": float(scale),
+    }
+    space, forward, facts["space_from"] = space_of(capture, placed, world, space)
+    facts["space"] = space
+    return Framing(world, bounds, orbit, near_far(capture, placed, world, bounds), space, forward, facts)
+
+
+def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choice: str) -> tuple[str, Forward | None, str]:
+    """The space of the field, the forward-facing capture where it is ndc, and how it was chosen."""
+    usual = "contracted" if capture.background is None else "box"
+    if choice in ("box", "contracted") or (choice == "auto" and (capture.kind != "llff" or capture.background is not None)):
+        return (usual, None, "usual for this kind of source") if choice == "auto" else (choice, None, "given")
+    points, observers = (None, ()) if capture.points is None else (world.points(capture.points.xyz), capture.points.observers)
+    found = forward_of(placed, content_depths(capture.photos, placed, world.scale, points, observers))
+    if isinstance(found, Forward):
+        return "ndc", found, "given" if choice == "ndc" else "all cameras look the same way"
+    if choice == "ndc":
+        raise BadInput(f"poses.space ndc: {found}. Choose contracted or box, or leave it out.")
+    return usual, None, found
+
+
+def up_vector(capture: Capture, choice: str) -> tuple[np.ndarray, bool]:
+    """The unit vector that points up in the capture's frame, and whether it is exact (given or stated) instead of estimated."""
+    if choice != "auto":
+        if choice not in UP_CHOICES:
+            raise BadInput(f"up axis {choice!r}: expected one of {', '.join(UP_CHOICES)}.")
+        axis = np.zeros(3)
+        axis["xyz".index(choice[-1])] = -1.0 if choice[0] == "-" else 1.0
+        return axis, True
+    if capture.up is not None:
+        return np.asarray(capture.up, np.float64) / np.linalg.norm(capture.up), True
+    return estimated_up([photo.camera for photo in capture.photos]), False
+
+
+def estimated_up(cameras: Sequence[Camera]) -> np.ndarray:
+    """Cameras are held level more often than they are held at one pitch: up is perpendicular to their x axes, as nearly as can be.
+
+    The smallest eigenvector of sum w x x^T - 0.01 sum w u u^T (x: right, u: up axes); the second term decides where all cameras look the
+    same way and their x axes leave up free to turn about them. Reweighted, so that a few tilted photographs do not count.
+    """
+    right = np.array([camera.world_from_camera[:3, 0] for camera in cameras])
+    above = np.array([camera.up for camera in cameras])
+    weight = np.ones(len(cameras))
+    up = above.mean(0)
+    for _ in range(20):
+        scatter = (right * weight[:, None]).T @ right - 0.01 * (above * weight[:, None]).T @ above
+        up = np.linalg.eigh(scatter)[1][:, 0]
+        weight = 1.0 / (1.0 + ((right @ up) / 0.1) ** 2)
+    return up if (above @ up).sum() >= 0 else -up
+
+
+def rotation_to_z(up: np.ndarray) -> np.ndarray:
+    """(3, 3) the smallest rotation that turns the unit vector `up` to +z; exact for the axes."""
+    if abs(up[2] - 1) < 1e-12:
+        return np.eye(3)
+    if abs(up[2] + 1) < 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = up
+    k = 1.0 / (1.0 + z)
+    return np.array([[1 - x * x * k, -x * y * k, -x], [-x * y * k, 1 - y * y * k, -y], [x, y, z]])
+
+
+def focus_of(capture: Capture) -> tuple[np.ndarray, bool]:
+    """The point that the cameras look at, in the capture's frame, and whether their axes meet there.
+
+    Least squares over the view axes, reweighted so that cameras that look elsewhere do not count. Where the axes are parallel, or meet
+    behind the cameras, it is the point in front of the middle camera at the middle depth of the sparse points (else of near and far,
+    else at the cameras' own spread).
+    """
+    cameras = [photo.camera for photo in capture.photos]
+    centres = np.array([camera.centre for camera in cameras])
+    forward = np.array([camera.forward for camera in cameras])
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (C, 3, 3)
+    weight = np.ones(len(cameras))
+    point = centres.mean(0)
+    scatter = np.linalg.eigvalsh(across.mean(0))[0]
+    if scatter > PARALLEL:
+        for _ in range(20):
+            matrix = (weight[:, None, None] * across).sum(0)
+            point = np.linalg.solve(matrix, (weight[:, None, None] * across @ centres[:, :, None]).sum(0)[:, 0])
+            miss = np.linalg.norm((across @ (point - centres)[:, :, None])[:, :, 0], axis=1)
+            weight = 1.0 / (1.0 + (miss / max(float(np.median(miss)), 1e-12)) ** 2)
+        ahead = ((point - centres) * forward).sum(1)
+        close = np.median(miss) < 0.5 * np.median(np.linalg.norm(point - centres, axis=1))
+        if (ahead > 0).mean() >= 0.8 and close:
+            return point, True
+    mean_forward = forward.mean(0)
+    middle = int(np.argmin(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    if np.linalg.norm(mean_forward) < 0.3:  # looking outwards, all round
+        return centres.mean(0), False
+    return centres[middle] + forward[middle] * _middle_depth(capture, centres), False
+
+
+def _middle_depth(capture: Capture, centres: np.ndarray) -> float:
+    if capture.points is not None and len(capture.points.xyz):
+        depths = np.concatenate([project(photo.camera, capture.points.xyz)[1] for photo in capture.photos[:: max(1, len(capture.photos) // 20)]])
+        if (depths > 0).any():
+            return float(np.median(depths[depths > 0]))
+    stated = [(photo.near, photo.far) for photo in capture.photos if photo.near and photo.far]
+    if stated:
+        near, far = np.median(np.array(stated, np.float64), axis=0)
+        return float(2 / (1 / near + 1 / far))  # the middle of what the pictures show is the middle in 1 / depth
+    return float(4 * np.linalg.norm(centres - centres.mean(0), axis=1).mean()) or 1.0
+
+
+def _facing_front(turn: np.ndarray, cameras: Sequence[Camera], focus: np.ndarray) -> np.ndarray:
+    """`turn`, followed by the rotation about z that brings the middle of the cameras to the front."""
+    heading, _ = heading_of(np.array([camera.centre - focus for camera in cameras]) @ turn.T)
+    angle = np.radians(FRONT - heading)
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]) @ turn
+
+
+def heading_of(offsets: np.ndarray) -> tuple[float, bool]:
+    """Azimuth of the middle of the cameras, degrees, and whether they keep to one side.
+
+    offsets  (C, 3) from the subject to the cameras, z up
+
+    The middle of the arc that is left when the widest gap between neighbouring azimuths is taken away; where there is no clear gap
+    (under 60 degrees), the azimuth of the first camera.
+    """
+    azimuth = np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0]))
+    ordered = np.sort(azimuth)
+    gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < 60.0:
+        return float(azimuth[0]), False
+    middle = ordered[widest] + gaps[widest] / 2 + 180.0
+    return float((middle + 180.0) % 360.0 - 180.0), bool(gaps[widest] >= 180.0)
+
+
+def orbit_of(cameras: Sequence[Camera], centre: np.ndarray) -> Orbit:
+    """How cameras (training frame) stand around a point."""
+    offsets = np.array([camera.centre for camera in cameras]) - centre
+    distance = np.linalg.norm(offsets, axis=1)
+    elevation = np.degrees(np.arcsin(np.clip(offsets[:, 2] / np.maximum(distance, 1e-12), -1, 1)))
+    heading, one_side = heading_of(offsets)
+    return Orbit(
+        centre=(float(centre[0]), float(centre[1]), float(centre[2])),
+        radius=float(np.median(distance)),
+        elevation=float(np.median(elevation)),
+        forward_facing=one_side,
+        heading=heading,
+    )
+
+
+def near_far(capture: Capture, placed: Sequence[Camera], world: Similarity, bounds: np.ndarray) -> np.ndarray:
+    """(C, 2) depth range of each photo in the training frame.
+
+    A constant background: the depths of the box. Surroundings: from half of the nearest sparse point it sees (or the near it states) to
+    beyond everything; without either, from a twentieth of the way to the box.
+    """
+    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    seen: list[list[int]] = [[] for _ in placed]
+    if capture.points is not None:
+        for point, observers in enumerate(capture.points.observers):
+            for observer in observers:
+                seen[observer].append(point)
+    points = None if capture.points is None else world.points(capture.points.xyz)
+    rows = []
+    for photo, camera, mine in zip(capture.photos, placed, seen, strict=True):
+        depths = (corners - camera.centre) @ camera.forward
+        box_far = max(float(depths.max()), 0.1)
+        inside = bool((np.abs(camera.centre) <= bounds[1]).all())
+        box_near = 0.02 * box_far if inside else max(float(depths.min()), 0.02 * box_far)
+        if capture.background is not None:
+            rows.append((box_near, box_far))
+            continue
+        near, far = 0.05 * max(box_near, 0.2 * box_far), box_far
+        if photo.near and photo.far:
+            near, far = 0.9 * photo.near * world.scale, max(far, 1.1 * photo.far * world.scale)
+        elif points is not None and len(mine) >= 10:
+            depths = (points[mine] - camera.centre) @ camera.forward
+            depths = depths[depths > 0]
+            if len(depths):
+                near = 0.5 * float(np.quantile(depths, 0.01))
+                far = max(far, 1.5 * float(np.quantile(depths, 0.99)))
+        rows.append((min(near, 0.5 * far), far))
+    return np.array(rows, np.float64).reshape(-1, 2)
+
+
+def _corners(box: Sequence[float] | np.ndarray) -> np.ndarray:
+    """(8, 3) corners of a box given by six numbers."""
+    numbers = np.asarray(box, np.float64).ravel()
+    if numbers.shape != (6,) or not np.isfinite(numbers).all():
+        raise BadInput(f"crop box: found {len(numbers)} numbers, expected six finite ones: x y z of one corner and of the opposite one.")
+    low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])
+    if (high - low).min() <= 0:
+        raise BadInput(f"crop box: has no volume ({low.tolist()} to {high.tolist()}).")
+    return np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])

@@ -1,0 +1,78 @@
+"""What an importer hands over: cameras, images and points in the frame of the source, before anything is framed or resized."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One image of the source and the camera that took it.
+
+    camera      in the capture's frame, for the image after EXIF rotation, at the source's full size; its name is the image's
+                path relative to the source folder
+    image       the file itself
+    mask        the file of its mask, or None
+    mask_ignore "black" if zero pixels of the mask are left out, "white" if the non-zero ones are
+    split       "train", "val" or "test" where the source says so, else None
+    near, far   along the view axis in the capture's units where the source says so, else None
+    """
+
+    camera: Camera
+    image: Path
+    mask: Path | None = None
+    mask_ignore: str = "black"
+    split: str | None = None
+    near: float | None = None
+    far: float | None = None
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Points that structure from motion (or a depth sensor) left behind.
+
+    xyz        (N, 3) float64, the capture's frame
+    rgb        (N, 3) uint8, sRGB
+    error      (N,)   float64 mean reprojection error, pixels (nan where unknown)
+    observers  N tuples of indices into the capture's photos (empty where unknown)
+    """
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    error: np.ndarray
+    observers: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A source, read.
+
+    kind        "photographs", "blender", "nerfstudio", "instant-ngp", "llff" or "colmap"
+    photos      in sorted order of name within each split; all registered
+    background  the constant sRGB colour (three floats, 0-1) that transparent pixels are composited on, or None where photographs show
+                real surroundings
+    up          unit up vector in the capture's frame where the format defines one (Blender: +z), else None
+    points      or None
+    bounds      (2, 3) box in the capture's frame where the source states one (instant-ngp's aabb), else None
+    rejected    (name, reason) of each image that could not be used
+    warnings    sentences for the user
+    reprojection_error  mean, pixels, where known
+    metric      whether a unit of the capture's frame is known to be a metre
+    """
+
+    kind: str
+    photos: tuple[Photo, ...]
+    background: tuple[float, float, float] | None
+    up: np.ndarray | None = None
+    points: SparsePoints | None = None
+    bounds: np.ndarray | None = None
+    rejected: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+    reprojection_error: float | None = None
+    metric: bool = False
+    facts: dict[str, object] = field(default_factory=dict)

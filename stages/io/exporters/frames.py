@@ -1,0 +1,68 @@
+"""Frames as PNG: 8 bits, sRGB, straight alpha. The same pixels are the same bytes, and a file that is there is whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import UsageError
+from stages.io.exporters.aside import written_aside
+
+NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+
+
+def background_from_text(text: str) -> tuple[float, float, float] | None:
+    """The sRGB colour (0-1) of "white", "black" or "#rrggbb"; None for "transparent". UsageError for anything else."""
+    if text == "transparent":
+        return None
+    if text in NAMED:
+        return NAMED[text]
+    digits = text.removeprefix("#")
+    if text.startswith("#") and len(digits) == 6 and all(digit in "0123456789abcdefABCDEF" for digit in digits):
+        red, green, blue = (int(digits[k : k + 2], 16) / 255.0 for k in (0, 2, 4))
+        return red, green, blue
+    raise UsageError(f"background: found {text!r}, expected white, black, transparent or #rrggbb")
+
+
+def frame_from_rendering(colour: np.ndarray, opacity: np.ndarray, background: tuple[float, float, float] | None) -> np.ndarray:
+    """The 8-bit frame of a rendering.
+
+    colour      (H, W, 3) sRGB premultiplied by opacity (H, W)
+    background  sRGB colour below it; None keeps the alpha
+    returns     (H, W, 3) or, without a background, (H, W, 4) uint8
+    """
+    from efficientnerf.rendering.colour import straight_from_premultiplied
+    from stages.pictures.plots import eight_bits
+
+    if background is not None:
+        return eight_bits(colour + (1.0 - opacity[..., None]) * np.asarray(background, np.float32))
+    straight = straight_from_premultiplied(colour, opacity)
+    return eight_bits(np.concatenate([straight, opacity[..., None]], axis=-1))
+
+
+def over_background(frame: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+    """(H, W, 4) uint8 over a colour -> (H, W, 3) uint8; RGB passes through."""
+    if frame.shape[2] == 3:
+        return frame
+    from stages.pictures.plots import eight_bits
+
+    values = frame.astype(np.float32) / 255.0
+    alpha = values[..., 3:]
+    return eight_bits(values[..., :3] * alpha + (1.0 - alpha) * np.asarray(background, np.float32))
+
+
+def write_png(frame: np.ndarray, path: Path) -> None:
+    """Write (H, W, 3) or (H, W, 4) uint8; a kill leaves no half of a file."""
+    from PIL import Image
+
+    with written_aside(path) as aside:
+        Image.fromarray(np.ascontiguousarray(frame)).save(aside, "PNG", compress_level=6)
+
+
+def read_png(path: Path) -> np.ndarray:
+    """(H, W, 3) or (H, W, 4) uint8 of a file that write_png wrote."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image)

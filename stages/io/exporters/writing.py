@@ -1,0 +1,82 @@
+"""What all exporters share: the frame that a file's numbers are in, the checks before, and writing aside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.surface.mesh import Mesh, PointCloud
+from pipeline.errors import BadInput
+from pipeline.files import sync_folder
+from stages.io.exporters.aside import written_aside
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFrame:
+    """The capture's frame, in which meshes and points are handed to exporters.
+
+    world_from_capture  to the training frame, whose z is up
+    metric              whether a unit is known to be a metre
+    """
+
+    world_from_capture: Similarity
+    metric: bool = False
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit, the direction in the capture's frame that is up."""
+        return self.world_from_capture.rotation.T @ np.array([0.0, 0.0, 1.0])
+
+
+CAPTURE_IS_Z_UP = SourceFrame(Similarity.identity())
+
+
+def source_frame(metadata: Mapping[str, Any]) -> SourceFrame:
+    """The capture's frame as an asset's metadata records it."""
+    recorded = metadata.get("world_from_capture")
+    if recorded is None:
+        return SourceFrame(Similarity.identity(), bool(metadata.get("metric", False)))
+    similarity = Similarity(float(recorded["scale"]), np.asarray(recorded["rotation"], np.float64), np.asarray(recorded["translation"], np.float64))
+    return SourceFrame(similarity, bool(metadata.get("metric", False)))
+
+
+def check_mesh(mesh: Mesh, path: Path) -> None:
+    """Raise BadInput for a mesh that would make a broken file: no faces, numbers that are not finite, faces that name no vertex."""
+    if not len(mesh.faces):
+        raise BadInput(f"{path}: the mesh has no faces. Lower the threshold (`--set mesh.threshold=...`) or train longer.")
+    _check_finite({"vertices": mesh.vertices, "normals": mesh.normals, "colours": mesh.colours}, path)
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise BadInput(f"{path}: faces name vertices {mesh.faces.min()} to {mesh.faces.max()}, expected 0 to {len(mesh.vertices) - 1}. Make the mesh again.")
+
+
+def check_points(points: PointCloud, path: Path) -> None:
+    """Raise BadInput for a cloud that would make a broken file: empty, or with numbers that are not finite."""
+    if not len(points.positions):
+        raise BadInput(f"{path}: the point cloud is empty. Lower the threshold (`--set points.threshold=...`) or train longer.")
+    _check_finite({"positions": points.positions, "normals": points.normals, "colours": points.colours}, path)
+
+
+def _check_finite(arrays: dict[str, np.ndarray], path: Path) -> None:
+    for name, values in arrays.items():
+        with np.errstate(over="ignore"):
+            bad = ~np.isfinite(values.astype(np.float32)).all(1)
+        if bad.any():
+            found = f"{int(bad.sum())} of {len(values)} {name} are not finite in single precision, the first is row {int(bad.argmax())}"
+            raise BadInput(f"{path}: {found}. Bake the asset again.")
+
+
+def bytes_from_srgb(colours: np.ndarray) -> np.ndarray:
+    """sRGB 0-1 -> uint8, rounded."""
+    return np.round(np.clip(colours, 0, 1) * 255).astype(np.uint8)
+
+
+def write_aside(path: Path, parts: Iterable[bytes | memoryview]) -> None:
+    """Write a file under a name of its own, sync it, then put it in place: `path` holds all of it, or what it held before."""
+    with written_aside(path) as aside, open(aside, "wb") as file:
+        file.writelines(parts)
+    sync_folder(path.parent)

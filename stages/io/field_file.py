@@ -1,0 +1,130 @@
+"""The trained field on disk: field.safetensors, read strictly and written whole or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.training.settings import TrainSettings
+from pipeline.errors import CorruptArtifact, UsageError
+from pipeline.stage import settings_from
+from stages.io.exporters.aside import written_aside
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.model import Model
+    from efficientnerf.rendering.render import FieldRenderer
+    from stages.io.scene import Scene
+
+FILE = "field.safetensors"
+FORMAT = 1
+
+
+def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path) -> None:
+    """A safetensors file with one metadata entry, "field", a JSON text with a digest of the tensors: the same input gives the same bytes."""
+    from safetensors.torch import save
+
+    plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    text = json.dumps({"format": FORMAT, **about, "sha256": digest_of(plain)}, sort_keys=True)
+    data = save(plain, metadata={"field": text})
+    with written_aside(path) as aside:
+        aside.write_bytes(data)
+
+
+def digest_of(tensors: dict[str, Tensor]) -> str:
+    """SHA-256 over names, types, shapes and bytes, in the order of the names. The format itself has no check: a flipped bit would be trained on."""
+    digest = hashlib.sha256()
+    for name, t in sorted(tensors.items()):
+        digest.update(f"{name} {t.dtype} {tuple(t.shape)}\n".encode())
+        digest.update(t.numpy().tobytes())
+    return digest.hexdigest()
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors and the metadata of a file of `write_tensors`; CorruptArtifact where it is damaged."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt", device="cpu") as file:
+            about = json.loads((file.metadata() or {}).get("field", "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, ValueError, OSError) as error:
+        raise CorruptArtifact(f"{path}: not a readable field file ({str(error)[:80]}). Train again.") from None
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise CorruptArtifact(f"{path}: field file of format {about.get('format') if isinstance(about, dict) else None}; this build reads {FORMAT}.")
+    if digest_of(tensors) != about.get("sha256"):
+        raise CorruptArtifact(f"{path}: damaged field file: its tensors are not those that its SHA-256 was made of. Train again.")
+    return tensors, about
+
+
+def space_of(s: Scene) -> Space:
+    """The space that a scene's field lives in."""
+    from efficientnerf.geometry.spaces import Space
+
+    return Space(s.bounds, s.contracted) if s.forward is None else Space(s.forward.bounds, False, s.forward.ndc)
+
+
+GAINS = "exposure.gains"
+
+
+def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, np.ndarray] | None = None) -> None:
+    """gains: of each training view by the name of its image, (3,) the factors from the scene's colours to the photograph's, where they were learned."""
+    import torch
+
+    from efficientnerf.model import state_of
+
+    about = {
+        "settings": dataclasses.asdict(m.settings),
+        "bounds": m.space.bounds.tolist(),
+        "contracted": m.space.contracted,
+        "ndc": None if m.space.ndc is None else m.space.ndc.to_json(),
+        "background": m.background,
+        "near": near,
+        "far": far,
+    }
+    tensors = state_of(m)
+    if gains:
+        tensors[GAINS] = torch.from_numpy(np.stack([gains[name] for name in sorted(gains)]).astype(np.float32))  # (C, 3)
+        about["exposed"] = sorted(gains)
+    write_tensors(tensors, about, path)
+
+
+def load_gains(folder: Path) -> dict[str, np.ndarray]:
+    """What `save_model` was given: the factors (3,) of each training view; none where exposure was not learned."""
+    path = folder / FILE
+    tensors, about = read_tensors(path)
+    names = about.get("exposed", [])
+    if not names and GAINS not in tensors:
+        return {}
+    if GAINS not in tensors or tuple(tensors[GAINS].shape) != (len(names), 3):
+        found = tuple(tensors[GAINS].shape) if GAINS in tensors else None
+        raise CorruptArtifact(f"{path}: '{GAINS}' is {found}; expected {(len(names), 3)}. Train again.")
+    return dict(zip(names, tensors[GAINS].numpy(), strict=True))
+
+
+def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
+    """The trained model in the folder of the train stage, ready to draw."""
+    from efficientnerf.geometry.ndc import Ndc
+    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.model import model, restore
+    from efficientnerf.rendering.render import FieldRenderer
+
+    path = folder / FILE
+    tensors, about = read_tensors(path)
+    try:
+        background = about["background"]
+        ndc = None if about.get("ndc") is None else Ndc.from_json(about["ndc"])
+        space = Space(np.asarray(about["bounds"], np.float64).reshape(2, 3), bool(about["contracted"]), ndc)
+        span = (float(about["near"]), float(about["far"]))
+        m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device, span)
+        restore(m, tensors)
+        return FieldRenderer(m, *span)
+    except (UsageError, KeyError, TypeError, ValueError) as error:
+        raise CorruptArtifact(f"{path}: {error}. Train again.") from None

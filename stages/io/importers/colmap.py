@@ -1,0 +1,143 @@
+"""A COLMAP model and its images.
+
+Of several models in a folder (sparse/0, sparse/1, ...) the one with most registered images is taken: the first may be a fragment, and
+a small reprojection error is no sign of a good one.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, pose_from_colmap
+from pipeline.errors import BadInput
+from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.importers import lenses
+from stages.io.importers.colmap_model import Model, Points, count_images, model_files, read_model
+from stages.io.importers.photographs import masks_of
+from stages.io.importers.source import FEWEST, ImportSettings, Source, account_for_missing, account_for_places, listed
+
+_MODEL_PLACES = (".", "sparse", "sparse/*", "colmap", "colmap/sparse", "colmap/sparse/*", "dense/sparse", "dense/*/sparse", "model", "models/*")
+_IMAGE_PLACES = ("images", "input", "rgb", "photos", ".", "../images", "../../images")
+_REMEDY = "Put the images into a folder `images` beside the model."
+
+
+def model_folders(folder: Path) -> list[Path]:
+    """Every folder of the source that holds a model, the one with most images first (then in order of name)."""
+    places = dict.fromkeys(place for pattern in _MODEL_PLACES for place in (sorted(folder.glob(pattern)) if pattern != "." else [folder]))
+    found = [place for place in places if place.is_dir() and model_files(place)]
+    return sorted(found, key=count_images, reverse=True) if len(found) > 1 else found
+
+
+def files(folder: Path, settings: ImportSettings) -> list[Path]:
+    """The files of the model that is used, the images that it names and their masks."""
+    source = Source(folder, settings.allow_outside)
+    place = _best(source)
+    model = read_model(place, points=False)
+    images = [path for path in _find_images(source, model)[0].values() if path is not None]
+    return [*(model_files(place) or []), *images, *masks_of(source, images).values()]
+
+
+def read(folder: Path, settings: ImportSettings) -> Capture:
+    """The capture that the folder's best model describes. Raises BadInput."""
+    source = Source(folder, settings.allow_outside)
+    place = _best(source)
+    model = read_model(place)
+    where = source.name_of(place) if place != source.root else source.root.name
+    images, places, extensions = _find_images(source, model)
+    missing = sorted(model.images[number].name for number, path in images.items() if path is None)
+    here = {number: path for number, path in images.items() if path is not None}
+    warnings = account_for_missing(where, len(images), len(here), missing, settings.strict, _REMEDY)
+    warnings += account_for_places(where, places, extensions)
+    others = [f"{source.name_of(other)} ({count_images(other)} images)" for other in model_folders(source.root) if other != place]
+    if others:
+        warnings.append(f"{where} with {len(model.images)} images is used; there is also {listed(others)}.")
+    photos, ids, rejected, remarks = _photos(source, model, here, where)
+    if len(photos) < FEWEST:
+        raise BadInput(f"{place}: {len(photos)} usable images; at least {FEWEST} are needed.")
+    points = _sparse(model.points, ids) if model.points is not None and len(model.points.xyz) else None
+    if points is None:
+        warnings.append(f"{where}: no points3D; the bounds are guessed from the cameras alone.")
+    return Capture(
+        kind="colmap",
+        photos=photos,
+        background=None,
+        points=points,
+        rejected=(*((name, "listed but missing on disk") for name in missing), *rejected),
+        warnings=tuple(warnings + remarks),
+        reprojection_error=_mean_error(points),
+        facts={"model": where, "registered": len(model.images), "cameras": len(model.cameras)},
+    )
+
+
+def _best(source: Source) -> Path:
+    found = model_folders(source.root)
+    if not found:
+        raise BadInput(f"{source.root}: no COLMAP model: expected cameras and images (.bin or .txt) here, in sparse/ or sparse/0. Choose a format with --as.")
+    source.check_inside(found[0])
+    return found[0]
+
+
+def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], list[tuple[str, str]], list[tuple[str, str]]]:
+    """Image id -> file or None; (listed, found) of those elsewhere; (listed, found) of those with another extension.
+
+    The folder of images is the one in which most of the model's names are found.
+    """
+    names = {number: image.name for number, image in sorted(model.images.items(), key=lambda item: item[1].name)}
+    places_to_look = [Path(os.path.normpath(base / place)) for place in _IMAGE_PLACES for base in (source.root, model.folder, model.folder.parent)]
+    candidates = [path for path in dict.fromkeys(places_to_look) if path.is_dir() and path.is_relative_to(source.root)]
+    counts = {folder: sum((folder / name).is_file() for name in names.values()) for folder in candidates}
+    best = max(candidates, key=lambda folder: counts[folder])  # the first of equals
+    found: dict[int, Path | None] = {}
+    places: list[tuple[str, str]] = []
+    extensions: list[tuple[str, str]] = []
+    for number, name in names.items():
+        result = source.find(name, best)
+        found[number] = result.path
+        if result.path is not None and result.how != "listed":
+            (places if result.how == "elsewhere" else extensions).append((name, source.name_of(result.path)))
+    return found, places, extensions
+
+
+def _photos(
+    source: Source, model: Model, here: dict[int, Path], where: str
+) -> tuple[tuple[Photo, ...], dict[int, int], list[tuple[str, str]], list[str]]:
+    """Photos sorted by name; COLMAP's image id -> index of its photo; the rejected; warnings."""
+    masks = masks_of(source, list(here.values()))
+    kept: list[tuple[int, Photo]] = []
+    rejected: list[tuple[str, str]] = []
+    warnings: list[str] = []
+    odd: dict[str, list[str]] = {}
+    for number, path in here.items():
+        posed, name = model.images[number], source.name_of(path)
+        lens = model.cameras[posed.camera]
+        try:
+            header = lenses.read_header(path)
+        except lenses.UnreadableHeader as error:
+            rejected.append((name, str(error)))
+            warnings.append(f"{name}: {error}; left out.")
+            continue
+        pose = pose_from_colmap(np.array(posed.quaternion), np.array(posed.translation))
+        stated = lenses.checked(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {posed.camera}")
+        camera, remark = lenses.fitted(stated, header, f"{where}: {posed.name}")
+        if remark is not None:
+            odd.setdefault(remark, []).append(name)
+        kept.append((number, Photo(camera, path, masks.get(path))))
+    kept.sort(key=lambda item: item[1].camera.name)
+    ids = {number: index for index, (number, _) in enumerate(kept)}
+    return tuple(photo for _, photo in kept), ids, rejected, warnings + lenses.fit_warnings(where, odd)
+
+
+def _sparse(points: Points, ids: dict[int, int]) -> SparsePoints:
+    observers = tuple(tuple(sorted(ids[number] for number in seen if number in ids)) for seen in points.observers)
+    return SparsePoints(points.xyz, points.rgb, points.error, observers)
+
+
+def _mean_error(points: SparsePoints | None) -> float | None:
+    """As COLMAP states it: over the points whose error is known."""
+    if points is None:
+        return None
+    known = points.error[np.isfinite(points.error) & (points.error >= 0)]
+    return float(known.mean()) if len(known) else None

@@ -1,0 +1,319 @@
+"""COLMAP's files cameras, images and points3D, binary and text, read strictly.
+
+Every count is checked against the size of the file before anything is allocated; a file that ends early, or goes on after its end, is
+refused. Newer models also hold `rigs` and `frames`; the pose of every image still stands in `images`, so they are not needed.
+Formats: the COLMAP documentation, "Output format".
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import MODELS
+from pipeline.errors import BadInput
+
+# Number of each camera model in binary files: (name, how many parameters).
+MODEL_NUMBERS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+LARGEST_FILE = 8 << 30  # bytes
+MOST_IMAGES = 100_000
+_AGAIN = "Copy the model again, or export it anew."
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera of cameras.bin|txt."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image of images.bin|txt: world to camera as quaternion w x y z and translation."""
+
+    name: str
+    camera: int
+    quaternion: tuple[float, float, float, float]
+    translation: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Points:
+    """points3D.bin|txt. observers: per point the ids of the images that see it, sorted, each once."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    error: np.ndarray
+    observers: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class Model:
+    folder: Path
+    cameras: dict[int, Lens]
+    images: dict[int, PosedImage]
+    points: Points | None
+
+
+def model_files(folder: Path) -> list[Path] | None:
+    """The files of the model in a folder (binary before text), points3D last where it is there; None where there is no model."""
+    for suffix in (".bin", ".txt"):
+        needed = [folder / f"cameras{suffix}", folder / f"images{suffix}"]
+        if all(path.is_file() for path in needed):
+            points = folder / f"points3D{suffix}"
+            return [*needed, points] if points.is_file() else needed
+    return None
+
+
+def count_images(folder: Path) -> int:
+    """How many images a model says to hold, at the price of a look; 0 where that cannot be told."""
+    found = model_files(folder)
+    if not found:
+        return 0
+    path = found[1]
+    if path.suffix == ".bin":
+        with path.open("rb") as file:
+            head = file.read(8)
+        return struct.unpack("<Q", head)[0] if len(head) == 8 else 0
+    return sum(1 for _ in _image_lines(path))
+
+
+def read_model(folder: Path, *, points: bool = True) -> Model:
+    """The model in a folder, with or without its points. Raises BadInput."""
+    found = model_files(folder)
+    if found is None:
+        raise BadInput(f"{folder}: no COLMAP model: expected cameras and images as .bin or .txt.")
+    for path in found:
+        if path.stat().st_size > LARGEST_FILE:
+            raise BadInput(f"{path}: {path.stat().st_size >> 30} GiB; at most {LARGEST_FILE >> 30} GiB are read.")
+    binary = found[0].suffix == ".bin"
+    cameras = (_cameras_bin if binary else _cameras_txt)(found[0])
+    images = (_images_bin if binary else _images_txt)(found[1])
+    for image in images.values():
+        if image.camera not in cameras:
+            raise BadInput(f"{found[1]}: image {image.name} refers to camera {image.camera}, which {found[0].name} does not hold. {_AGAIN}")
+    cloud = (_points_bin if binary else _points_txt)(found[2]) if points and len(found) == 3 else None
+    return Model(folder, cameras, images, cloud)
+
+
+class _Bytes:
+    """A binary file read from front to back; never beyond its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, path.read_bytes(), 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        size = struct.calcsize(layout)
+        self.need(size)
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += size
+        return values
+
+    def need(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise BadInput(f"{self.path}: truncated: {len(self.data)} bytes, at least {self.at + size} expected. {_AGAIN}")
+
+    def skip(self, size: int) -> None:
+        self.need(size)
+        self.at += size
+
+    def count(self, least_each: int, what: str, most: int | None = None) -> int:
+        (count,) = self.take("<Q")
+        if most is not None and count > most:
+            raise BadInput(f"{self.path}: says to hold {count} {what}; at most {most} are read. Is it a COLMAP model?")
+        self.need(count * least_each)
+        return int(count)
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.at, self.at + 4096)
+        if end < 0:
+            raise BadInput(f"{self.path}: truncated: a name without an end at byte {self.at}. {_AGAIN}")
+        raw, self.at = self.data[self.at : end], end + 1
+        return raw.decode("utf-8", "surrogateescape")
+
+    def finish(self) -> None:
+        if self.at != len(self.data):
+            raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes after its end. Is it a COLMAP model? {_AGAIN}")
+
+
+def _lens(path: Path, number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
+    if model not in MODELS:
+        raise BadInput(f"{path}: camera {number} is a {model}; supported are {', '.join(MODELS)}. Undistort with `colmap image_undistorter` first.")
+    if len(params) != len(MODELS[model]):
+        raise BadInput(f"{path}: camera {number}: {model} has {len(MODELS[model])} parameters, found {len(params)}. {_AGAIN}")
+    if not (0 < width <= 65535 and 0 < height <= 65535):
+        raise BadInput(f"{path}: camera {number}: size {width}x{height}. {_AGAIN}")
+    return Lens(model, width, height, params)
+
+
+def _posed(path: Path, name: str, camera: int, numbers: tuple[float, ...]) -> PosedImage:
+    quaternion, translation = numbers[:4], numbers[4:]
+    if not all(map(math.isfinite, numbers)) or abs(math.hypot(*quaternion) - 1) > 1e-2:
+        found = f"quaternion {list(quaternion)}, translation {list(translation)}"
+        raise BadInput(f"{path}: image {name}: {found}; expected a unit quaternion and finite numbers. {_AGAIN}")
+    if not name:
+        raise BadInput(f"{path}: an image without a name. {_AGAIN}")
+    return PosedImage(name, camera, quaternion, translation)  # type: ignore[arg-type]
+
+
+def _cameras_bin(path: Path) -> dict[int, Lens]:
+    file, cameras = _Bytes(path), {}
+    for _ in range(file.count(24, "cameras", MOST_IMAGES)):
+        number, model_number, width, height = file.take("<IiQQ")
+        if model_number not in MODEL_NUMBERS:
+            raise BadInput(f"{path}: camera {number} has model number {model_number}, which is not known. Undistort with `colmap image_undistorter` first.")
+        model, parameters = MODEL_NUMBERS[model_number]
+        cameras[number] = _lens(path, number, model, width, height, file.take(f"<{parameters}d"))
+    file.finish()
+    return cameras
+
+
+def _images_bin(path: Path) -> dict[int, PosedImage]:
+    file, images = _Bytes(path), {}
+    for _ in range(file.count(73, "images", MOST_IMAGES)):
+        number, *pose, camera = file.take("<I7dI")
+        images[number] = _posed(path, file.text(), camera, tuple(pose))
+        file.skip(24 * file.count(24, "points of an image"))  # x, y, id of the point: not needed
+    file.finish()
+    return images
+
+
+def _points_bin(path: Path) -> Points:
+    file = _Bytes(path)
+    count = file.count(51, "points")
+    xyz, rgb, error = np.empty((count, 3)), np.empty((count, 3), np.uint8), np.empty(count)
+    observers = []
+    for i in range(count):
+        _, x, y, z, r, g, b, off = file.take("<Q3d3Bd")
+        xyz[i], rgb[i], error[i] = (x, y, z), (r, g, b), off
+        length = file.count(8, "observations of a point")
+        track = struct.unpack_from(f"<{2 * length}I", file.data, file.at)
+        file.skip(8 * length)
+        observers.append(tuple(sorted(set(track[::2]))))
+    file.finish()
+    return _finite(path, Points(xyz, rgb, error, tuple(observers)))
+
+
+def _finite(path: Path, points: Points) -> Points:
+    if not np.isfinite(points.xyz).all():
+        raise BadInput(f"{path}: {int((~np.isfinite(points.xyz).all(1)).sum())} points are not finite. {_AGAIN}")
+    return points
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    with path.open(encoding="utf-8", errors="surrogateescape", newline="\n") as file:
+        for number, line in enumerate(file, 1):
+            yield number, line.rstrip("\r\n")
+
+
+def _stated(path: Path, what: str) -> int | None:
+    """The count that COLMAP writes into a comment at the top."""
+    for number, line in _lines(path):
+        if number > 10 or not line.startswith("#"):
+            break
+        if line.startswith(f"# Number of {what}:"):
+            digits = line.split(":")[1].split(",")[0].strip()
+            return int(digits) if digits.isdigit() else None
+    return None
+
+
+def _check_count(path: Path, what: str, found: int) -> None:
+    stated = _stated(path, what)
+    if stated is not None and stated > found:
+        raise BadInput(f"{path}: truncated: its first lines say {stated} {what}, it holds {found}. {_AGAIN} (Or correct that comment.)")
+
+
+def _numbers(path: Path, line: int, words: list[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise BadInput(f"{path}: line {line}: {error}. {_AGAIN}") from error
+
+
+def _integer(path: Path, line: int, word: str) -> int:
+    if not word.lstrip("-").isdigit() or len(word) > 20:
+        raise BadInput(f"{path}: line {line}: {word[:40]!r} is not a whole number. {_AGAIN}")
+    return int(word)
+
+
+def _cameras_txt(path: Path) -> dict[int, Lens]:
+    cameras = {}
+    for line, text in _lines(path):
+        words = text.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 5:
+            raise BadInput(f"{path}: line {line}: {len(words)} words, expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS. {_AGAIN}")
+        number = _integer(path, line, words[0])
+        params = tuple(_numbers(path, line, words[4:]))
+        cameras[number] = _lens(path, number, words[1], _integer(path, line, words[2]), _integer(path, line, words[3]), params)
+    _check_count(path, "cameras", len(cameras))
+    return cameras
+
+
+def _image_lines(path: Path) -> Iterator[tuple[int, str, str | None]]:
+    """(line number, first line, second line or None at the end of the file) of each image; the second may be empty."""
+    lines = _lines(path)
+    for number, text in lines:
+        if text.strip() and not text.lstrip().startswith("#"):
+            yield number, text, next(lines, (0, None))[1]
+
+
+def _images_txt(path: Path) -> dict[int, PosedImage]:
+    images: dict[int, PosedImage] = {}
+    for line, text, points in _image_lines(path):
+        words = text.split(maxsplit=9)
+        if len(words) < 10:
+            expected = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME (then a line of points, or an empty one)"
+            raise BadInput(f"{path}: line {line}: {len(words)} words, expected {expected}. {_AGAIN}")
+        if points is not None and len(points.split()) % 3:
+            raise BadInput(f"{path}: line {line + 1}: truncated: points come as X Y POINT3D_ID, found {len(points.split())} words. {_AGAIN}")
+        if len(images) >= MOST_IMAGES:
+            raise BadInput(f"{path}: more than {MOST_IMAGES} images; not read.")
+        numbers = tuple(_numbers(path, line, words[1:8]))
+        images[_integer(path, line, words[0])] = _posed(path, words[9].strip(), _integer(path, line, words[8]), numbers)
+    _check_count(path, "images", len(images))
+    return images
+
+
+def _points_txt(path: Path) -> Points:
+    xyz, rgb, error, observers = [], [], [], []
+    for line, text in _lines(path):
+        words = text.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 8 or len(words) % 2:
+            expected = "POINT3D_ID X Y Z R G B ERROR and pairs IMAGE_ID POINT2D_IDX"
+            raise BadInput(f"{path}: line {line}: truncated: {len(words)} words, expected {expected}. {_AGAIN}")
+        numbers = _numbers(path, line, words[1:8])
+        colour = numbers[3:6]
+        if not all(0 <= channel <= 255 for channel in colour):
+            raise BadInput(f"{path}: line {line}: colour {colour}, expected 0 to 255. {_AGAIN}")
+        xyz.append(numbers[:3])
+        rgb.append(colour)
+        error.append(numbers[6])
+        observers.append(tuple(sorted({_integer(path, line, word) for word in words[8::2]})))
+    _check_count(path, "points", len(xyz))
+    points = Points(np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3), np.array(error, np.float64), tuple(observers))
+    return _finite(path, points)

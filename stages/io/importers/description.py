@@ -1,0 +1,94 @@
+"""What a source holds, without changing or decoding it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.io.capture import Capture
+from stages.io.importers import IMPORTERS, ReadingDefaults, candidates, lenses
+from stages.io.importers.photographs import masks_of, photographs
+from stages.io.importers.source import Source
+
+
+def describe_source(folder: Path, format: str = "auto") -> dict[str, Any]:
+    """Count, resolutions, camera models, bounds and oddities of a source, as plain JSON values."""
+    possible = candidates(folder)
+    name = possible[0] if format == "auto" else format
+    described = _posed(IMPORTERS[name].read(folder, ReadingDefaults())) if IMPORTERS[name].posed else _photographs(folder)
+    others = [other for other in possible if other not in (name, "photographs")]
+    if others:
+        described["odd"].append(f"can also be read --as {' or '.join(others)}.")
+    return {"what": "source", "format": name} | described
+
+
+def _sizes(sizes: list[tuple[int, int]]) -> list[dict[str, int]]:
+    return [{"width": width, "height": height, "count": count} for (width, height), count in sorted(Counter(sizes).items())]
+
+
+def _posed(capture: Capture) -> dict[str, Any]:
+    centres = np.array([photo.camera.centre for photo in capture.photos])
+    bounds: dict[str, Any] = {"cameras": [centres.min(0).tolist(), centres.max(0).tolist()]}
+    if capture.points is not None:
+        bounds["points"] = np.percentile(capture.points.xyz, [1, 99], axis=0).tolist()
+    if capture.bounds is not None:
+        bounds["stated"] = capture.bounds.tolist()
+    cameras = [
+        {
+            "name": photo.camera.name,
+            "width": photo.camera.width,
+            "height": photo.camera.height,
+            "model": photo.camera.model,
+            "params": list(photo.camera.params),
+            "split": photo.split,
+            "capture_from_camera": photo.camera.world_from_camera.tolist(),
+        }
+        for photo in capture.photos
+    ]
+    return {
+        "count": len(capture.photos),
+        "splits": dict(Counter(photo.split or "not stated" for photo in capture.photos)),
+        "resolution": _sizes([(photo.camera.width, photo.camera.height) for photo in capture.photos]),
+        "models": sorted({photo.camera.model for photo in capture.photos}),
+        "bounds": bounds,
+        "masks": sum(photo.mask is not None for photo in capture.photos),
+        "points": 0 if capture.points is None else len(capture.points.xyz),
+        "reprojection_error": capture.reprojection_error,
+        "metric": capture.metric,
+        "facts": capture.facts,
+        "rejected": [{"name": name, "reason": reason} for name, reason in capture.rejected],
+        "odd": list(capture.warnings),
+        "cameras": cameras,
+    }
+
+
+def _photographs(folder: Path) -> dict[str, Any]:
+    source = Source(folder)
+    images = [source.check_inside(path) for path in photographs(folder)]
+    sizes, rejected, turned = [], [], 0
+    for image in images:
+        try:
+            header = lenses.read_header(image)
+        except lenses.UnreadableHeader as error:
+            rejected.append({"name": source.name_of(image), "reason": str(error)})
+            continue
+        sizes.append(header.size)
+        turned += header.orientation != 1
+    odd = [f"{entry['name']}: {entry['reason']}" for entry in rejected]
+    if turned:
+        odd.append(f"{turned} images are turned by their EXIF orientation.")
+    if len(set(sizes)) > 1:
+        odd.append("images are of mixed sizes.")
+    return {
+        "count": len(sizes),
+        "resolution": _sizes(sizes),
+        "models": [],
+        "bounds": None,
+        "masks": len(masks_of(source, images)),
+        "rejected": rejected,
+        "odd": odd,
+        "cameras": [],
+    }

@@ -1,0 +1,164 @@
+"""Checks that every importer makes of a camera: its matrix is a rigid motion, its lens is possible, its size is the image's."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, quarter_turned, resized
+from pipeline.errors import BadInput
+from stages.io.importers.source import listed
+
+_EXIF_ORIENTATION = 0x0112
+_QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}  # clockwise, from the stored pixels to the upright image; the others are mirrored
+
+
+class UnreadableHeader(Exception):
+    """A file that is not an image; the text says why."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an image file says before its pixels are decoded.
+
+    stored_width, stored_height  of the pixels as stored
+    orientation                  EXIF's number, 1-8
+    alpha                        whether the format holds an alpha channel
+    """
+
+    stored_width: int
+    stored_height: int
+    orientation: int
+    alpha: bool
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) after EXIF rotation."""
+        width, height = self.stored_width, self.stored_height
+        return (height, width) if self.orientation >= 5 else (width, height)
+
+
+def read_header(path: Path) -> Header:
+    """Size, orientation and alpha of an image file; raises UnreadableHeader."""
+    import warnings
+
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
+            with Image.open(path) as image:
+                exif = Image.Exif()
+                if "exif" in image.info:  # getexif() would decode the whole of a PNG to look for a late block
+                    exif.load(image.info["exif"])
+                else:
+                    exif = image.getexif() if image.format != "PNG" else exif
+                orientation = exif.get(_EXIF_ORIENTATION, 1)
+                alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+                width, height = image.size
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else f"{type(error).__name__}: not an image that can be read"
+        raise UnreadableHeader(reason) from error
+    if not (0 < width <= 65535 and 0 < height <= 65535):
+        raise UnreadableHeader(f"size {width}x{height}")
+    return Header(width, height, orientation if orientation in range(1, 9) else 1, alpha)
+
+
+def rigid(matrix: Any, where: str) -> np.ndarray:
+    """A camera-to-world matrix from a file as (4, 4) float64 with an orthonormal rotation; BadInput says what is wrong with it.
+
+    Columns may deviate from a rotation by 1e-3, as rounded numbers do.
+    """
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape != (4, 4):
+        shape = "x".join(map(str, pose.shape)) if pose.size else "no matrix"
+        raise BadInput(f"{where}: expected a 4x4 matrix, camera to world; found {shape}. Write the data set again.")
+    if not np.isfinite(pose).all():
+        raise BadInput(f"{where}: the matrix holds numbers that are not finite. Leave that frame out, or write the data set again.")
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise BadInput(f"{where}: the last row of the matrix is {pose[3].tolist()}, expected 0 0 0 1 (is it transposed?).")
+    pose[:3, :3] = rotation(pose[:3, :3], where)
+    pose[3] = (0, 0, 0, 1)
+    return pose
+
+
+def rotation(columns: np.ndarray, where: str) -> np.ndarray:
+    """(3, 3) that is a rotation up to rounding -> the nearest exact one; BadInput otherwise."""
+    lengths = np.linalg.norm(columns, axis=0)
+    scale = float(lengths.mean())
+    if not np.isfinite(columns).all() or lengths.min() < 1e-9:
+        raise BadInput(f"{where}: the matrix is no rotation (axes of length {', '.join(f'{n:.4g}' for n in lengths)}). Write the data set again.")
+    if abs(scale - 1) > 1e-3 and np.ptp(lengths) < 1e-3 * scale:
+        raise BadInput(f"{where}: the rotation is scaled by {scale:.6g}. Divide the upper left 3x3 of every matrix by it, and leave the positions as they are.")
+    if np.abs(columns.T @ columns - np.eye(3)).max() > 2e-3:
+        raise BadInput(
+            f"{where}: the matrix is no rotation: its axes have lengths {', '.join(f'{n:.4g}' for n in lengths)} or are not at right angles. "
+            "Write the data set again, with rotation and scale kept apart."
+        )
+    if np.linalg.det(columns) < 0:
+        raise BadInput(f"{where}: the matrix is left-handed (a mirror image). Negate one axis where the data set was written.")
+    left, _, right = np.linalg.svd(columns)
+    return np.asarray(left @ right)
+
+
+def checked(camera: Camera, where: str) -> Camera:
+    """The camera itself; BadInput for a lens that cannot be: a focal length that is not positive, numbers that are not finite."""
+    named = camera.intrinsics
+    if not all(math.isfinite(value) for value in camera.params):
+        raise BadInput(f"{where}: camera parameters {list(camera.params)} are not all finite. Write the data set again.")
+    if named["fx"] <= 0 or named["fy"] <= 0:
+        raise BadInput(f"{where}: focal length {min(named['fx'], named['fy']):g}; expected more than zero pixels. Write the data set again.")
+    if camera.width <= 0 or camera.height <= 0:
+        raise BadInput(f"{where}: image size {camera.width}x{camera.height}; expected more than zero pixels. Write the data set again.")
+    return camera
+
+
+def fitted(camera: Camera, header: Header, where: str) -> tuple[Camera, str | None]:
+    """The camera of a file's upright image, from a camera that may have been stated at another size or for the pixels as stored.
+
+    returns  the camera and what was odd: "resized", "turned", "upright?" (turned by 180 degrees or mirrored, where the stated size
+             does not say for which the camera was stated: taken to be the upright image) or None
+    Raises BadInput where the aspect does not agree (1 %, or a pixel of rounding).
+    """
+    width, height = header.size
+    stated = camera.width, camera.height
+    if header.orientation >= 5 and not same_aspect(stated, (width, height)) and same_aspect(stated, (height, width)):
+        if header.orientation not in _QUARTER_TURNS:
+            raise BadInput(f"{where}: the image is mirrored by its EXIF orientation ({header.orientation}) and the camera is not. Write the image upright.")
+        camera = resized(camera, height, width)
+        for _ in range(_QUARTER_TURNS[header.orientation]):
+            camera = quarter_turned(camera)
+        return camera, "turned"
+    if stated == (width, height):
+        return camera, "upright?" if header.orientation != 1 and (header.orientation < 5 or width == height) else None
+    if not same_aspect(stated, (width, height)):
+        raise BadInput(
+            f"{where}: the camera is stated for {camera.width}x{camera.height}, the image is {width}x{height}, of another aspect. "
+            "Use the images that the cameras were made for (not cropped ones), or correct w and h."
+        )
+    return resized(camera, width, height), "resized"
+
+
+def same_aspect(stated: tuple[int, int], actual: tuple[int, int]) -> bool:
+    """Whether two sizes show the same picture: equal aspect within 1 %, or within the rounding of a side by one pixel."""
+    (w, h), (width, height) = stated, actual
+    if min(w, h, width, height) <= 0:
+        return False
+    return abs(width * h / (w * height) - 1) <= 0.01 or abs(height - h * width / w) <= 1 or abs(width - w * height / h) <= 1
+
+
+def fit_warnings(where: str, odd: dict[str, list[str]]) -> list[str]:
+    """Sentences about what `fitted` found odd: kind -> names of the images."""
+    said = {
+        "resized": "are not of the stated size; the intrinsics were scaled to them",
+        "turned": "are turned by EXIF and their cameras stated for the pixels as stored; the cameras were turned too",
+        "upright?": "are turned by EXIF; their cameras are taken to be those of the upright images",
+    }
+    return [f"{where}: {len(names)} images ({listed(names)}) {said[kind]}." for kind, names in odd.items()]

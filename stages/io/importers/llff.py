@@ -1,0 +1,132 @@
+"""LLFF: poses_bounds.npy beside images/, images_4/, images_8/ ...
+
+A row is 3x5 [R | t | (h, w, f)] with camera columns down, right, back, then near and far; rows are in the order of the sorted names.
+h, w, f are those of the full images; the images at hand may be smaller, and f is scaled to them.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, pose_from_llff
+from pipeline.errors import BadInput
+from stages.io.capture import Capture, Photo
+from stages.io.importers import lenses
+from stages.io.importers.photographs import masks_of
+from stages.io.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, images_in
+
+POSES = "poses_bounds.npy"
+
+
+def image_folders(folder: Path) -> dict[int, Path]:
+    """Reduction factor -> folder of images: images/ is 1, images_4/ is 4."""
+    folders = {1: folder / "images"} if images_in(folder / "images") else {}
+    for entry in sorted(folder.iterdir()):
+        match = re.fullmatch(r"images_(\d{1,4})", entry.name)
+        if match and int(match[1]) > 0 and images_in(entry):
+            folders.setdefault(int(match[1]), entry)
+    return dict(sorted(folders.items()))
+
+
+def files(folder: Path, settings: ImportSettings) -> list[Path]:
+    """The matrix of poses, the images of the folder that is used, and their masks."""
+    source = Source(folder, settings.allow_outside)
+    images = _images(source, settings, _row_count(folder / POSES))[0]
+    return [folder / POSES, *images, *masks_of(source, images).values()]
+
+
+def read(folder: Path, settings: ImportSettings) -> Capture:
+    """The capture that poses_bounds.npy describes. Raises BadInput."""
+    rows = _rows(folder / POSES)
+    source = Source(folder, settings.allow_outside)
+    images, factor, warnings = _images(source, settings, len(rows))
+    masks = masks_of(source, images)
+    photos: list[Photo] = []
+    rejected: list[tuple[str, str]] = []
+    odd: dict[str, list[str]] = {}
+    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
+        name, where = source.name_of(image), f"{POSES}: row {index} ({source.name_of(image)})"
+        try:
+            header = lenses.read_header(image)
+        except lenses.UnreadableHeader as error:
+            rejected.append((name, str(error)))
+            warnings.append(f"{name}: {error}; left out.")
+            continue
+        camera, remark = lenses.fitted(_camera(row, name, where), header, where)
+        if remark in ("turned", "upright?"):  # another size than stated is what the folders are for
+            odd.setdefault(str(remark), []).append(name)
+        near, far = float(row[15]), float(row[16])
+        if not 0 < near < far:
+            raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
+        photos.append(Photo(camera, image, masks.get(image), near=near, far=far))
+    if len(photos) < FEWEST:
+        raise BadInput(f"{folder}: {len(photos)} usable images; at least {FEWEST} are needed.")
+    return Capture(
+        kind="llff",
+        photos=tuple(photos),
+        background=None,
+        rejected=tuple(rejected),
+        warnings=tuple(warnings + lenses.fit_warnings(POSES, odd)),
+        facts={"image_folder": images[0].parent.name, "factor": factor},
+    )
+
+
+def _camera(row: np.ndarray, name: str, where: str) -> Camera:
+    matrix = row[:15].reshape(3, 5)
+    pose = pose_from_llff(matrix[:, :4])
+    pose[:3, :3] = lenses.rotation(pose[:3, :3], where)
+    height, width, focal = matrix[:, 4]
+    if width != round(width) or height != round(height) or not (0 < width <= 65535 and 0 < height <= 65535):
+        raise BadInput(f"{where}: h, w are {height:g}, {width:g}; expected the image size in whole pixels.")
+    width, height = int(width), int(height)
+    return lenses.checked(Camera(name, width, height, "SIMPLE_PINHOLE", (float(focal), width / 2, height / 2), pose), where)
+
+
+def _row_count(path: Path) -> int:
+    return len(_rows(path))
+
+
+def _rows(path: Path) -> np.ndarray:
+    """(N, 17) float64, finite; nothing but plain numbers is read from the file."""
+    try:
+        size = path.stat().st_size
+        if size > 17 * 8 * MOST_FRAMES + 4096:
+            raise BadInput(f"{path}: {size} bytes; more than {MOST_FRAMES} poses are not read.")
+        array = np.load(path, allow_pickle=False, mmap_mode=None)
+    except OSError as error:
+        raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error
+    except (ValueError, EOFError, MemoryError) as error:
+        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({str(error).splitlines()[0] if str(error) else type(error).__name__}).") from error
+    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 17 or array.dtype.kind not in "fiu":
+        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
+        raise BadInput(f"{path}: {found}; expected numbers of shape (N, 17): 3x5 poses, near and far. Write it again with LLFF's imgs2poses.")
+    rows = array.astype(np.float64)
+    if not np.isfinite(rows).all():
+        raise BadInput(f"{path}: row {int(np.flatnonzero(~np.isfinite(rows).all(1))[0])} holds numbers that are not finite. Write it again.")
+    return rows
+
+
+def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[Path], int, list[str]]:
+    """The images in the order of the rows, the reduction factor of their folder, and warnings."""
+    folders = image_folders(source.root)
+    if not folders:
+        raise BadInput(f"{source.root}: {POSES} without images: expected a folder images, images_4, images_8 ... beside it.")
+    counts = {factor: len(images_in(folder)) for factor, folder in folders.items()}
+    if settings.llff_factor is not None:
+        if settings.llff_factor not in folders:
+            there = ", ".join(folder.name for folder in folders.values())
+            raise BadInput(f"{source.root}: no images reduced by {settings.llff_factor} (poses.llff_factor); there are {there}.")
+        usable = [settings.llff_factor]
+    else:
+        usable = list(folders)
+    fitting = [factor for factor in usable if counts[factor] == count]
+    if not fitting:
+        found = ", ".join(f"{folders[factor].name} holds {counts[factor]}" for factor in usable)
+        raise BadInput(f"{source.root / POSES}: {count} poses, but {found} images; rows belong to the sorted names. Restore the images it was made from.")
+    warnings = []
+    if fitting[0] != usable[0]:
+        warnings.append(f"{folders[usable[0]].name} holds {counts[usable[0]]} images for {count} poses; {folders[fitting[0]].name} is used instead.")
+    return [source.check_inside(image) for image in images_in(folders[fitting[0]])], fitting[0], warnings

@@ -1,0 +1,76 @@
+"""Folders of photographs: which files are photographs, and the masks beside them.
+
+A mask lies in a folder `masks` beside or inside that of the images, or at the top of the source, at the image's own relative path, as
+IMG_1.png or (COLMAP's way) IMG_1.jpg.png for IMG_1.jpg; where it is black, the image is left out.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.errors import BadInput
+from stages.io.importers.source import FEWEST, IMAGE_SUFFIXES, MOST_FRAMES, ImportSettings, Source, images_in, walk
+
+MASKS = "masks"
+# What conversions leave beside the photographs: reductions, depth maps, masks.
+_NOT_PHOTOGRAPHS = {MASKS, "mask", "depth", "depths", "sparse", "dense", "stereo"}
+
+
+def photographs(folder: Path) -> list[Path]:
+    """The photographs of a folder: directly in it, else in its folder images/, else anywhere below it; sorted by path."""
+    found = images_in(folder) or images_in(folder / "images")
+    if not found:
+        everything = walk(folder)
+        found = sorted(
+            path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not _NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1])
+        )
+        if not found:
+            raise BadInput(_nothing(folder, everything))
+    if len(found) > MOST_FRAMES:
+        raise BadInput(f"{folder}: {len(found)} images; at most {MOST_FRAMES} are read.")
+    return found
+
+
+def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
+    """Image -> mask, of those that have one."""
+    listings: dict[Path, dict[str, Path]] = {}
+    found = {}
+    for image in images:
+        inside = image.parent.relative_to(source.root) if image.parent.is_relative_to(source.root) else Path()
+        # images/a/1.jpg: images/a/masks, images/masks/a, masks/images/a, masks/a
+        places = [image.parent / MASKS, source.root / MASKS / inside]
+        for depth in range(len(inside.parts)):
+            above, below = Path(*inside.parts[:depth]), inside.parts[depth:]
+            places += [source.root / above / MASKS / Path(*below), source.root / above / MASKS / Path(*below[1:])]
+            places.append(source.root / above / below[0] / MASKS / Path(*below[1:]))
+        for place in dict.fromkeys(places):
+            if place not in listings:
+                by_stem: dict[str, Path] = {}
+                for path in images_in(place):
+                    by_stem.setdefault(path.stem.lower(), path)
+                listings[place] = by_stem
+            mask = listings[place].get(image.name.lower()) or listings[place].get(image.stem.lower())
+            if mask is not None:
+                found[image] = source.check_inside(mask)
+                break
+    return found
+
+
+def files(folder: Path, settings: ImportSettings) -> list[Path]:
+    """The photographs and their masks."""
+    source = Source(folder, settings.allow_outside)
+    images = [source.check_inside(path) for path in photographs(folder)]
+    return [*images, *masks_of(source, images).values()]
+
+
+def _nothing(folder: Path, everything: Sequence[Path]) -> str:
+    known = "png, jpg, webp, tif or bmp"
+    if not everything:
+        return f"{folder}: the folder is empty. Expected at least {FEWEST} photographs ({known}) or a posed data set."
+    common = Counter(path.suffix.lower() or "(no extension)" for path in everything).most_common(3)
+    return (
+        f"{folder}: no images of a known type ({known}); found {', '.join(f'{count} {suffix}' for suffix, count in common)}. "
+        "Convert the photographs to JPEG or PNG, or name another folder."
+    )

@@ -1,0 +1,348 @@
+"""transforms.json in its three dialects: Blender (NeRF's Realistic Synthetic), nerfstudio and instant-ngp.
+
+All state camera-to-world matrices with x right, y up, looking along -z, and are read by the same rules; they differ in
+
+    blender      one file per split, `camera_angle_x`, names without extension; the world's z is up
+    nerfstudio   intrinsics at the top or per frame, `mask_path` (black is left out), `train_filenames` etc., points in a PLY file
+    instant-ngp  `aabb_scale`, `scale`, `offset`; masks `dynamic_mask_<image>.png` (white is left out); rolling-shutter pairs of matrices
+
+The capture's frame is that of the matrices as they stand: `applied_transform` says how nerfstudio got there, and is only recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import MODELS, Camera, pose_from_opengl
+from pipeline.errors import BadInput
+from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.importers import lenses
+from stages.io.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, account_for_missing, account_for_places, read_json
+
+SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
+LARGEST_PLY = 1 << 30  # bytes
+_REMEDY = "Copy them into the source folder, or take their frames out of the JSON."
+_NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path")
+_NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
+_NGP_FACTS = ("aabb_scale", "scale", "offset")
+_NGP_KEYS = (*_NGP_FACTS, "is_fisheye", "from_na", "n_extra_learnable_dims", "enable_depth_loading", "integer_depth_scale", "render_aabb")
+_UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")
+_NGP_SCALE = 0.33  # of instant-ngp, where the file states none
+
+
+@dataclass
+class _Frame:
+    """A frame of a file and the image that it led to."""
+
+    document: dict[str, Any]
+    file: Path
+    index: int
+    entry: dict[str, Any]
+    split: str | None
+    listed: str
+    image: Path
+
+    @property
+    def where(self) -> str:
+        return f"{self.file.name}: frame {self.index} ({self.listed})"
+
+
+@dataclass
+class _Listing:
+    frames: list[_Frame] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    repeated: list[tuple[str, str]] = field(default_factory=list)
+    places: list[tuple[str, str]] = field(default_factory=list)
+    extensions: list[tuple[str, str]] = field(default_factory=list)
+    total: int = 0
+
+
+def json_files(folder: Path) -> list[Path]:
+    """The JSON files that make up the data set: those of the splits, or transforms.json."""
+    splits = [folder / name for name in SPLIT_FILES if (folder / name).is_file()]
+    whole = folder / "transforms.json"
+    return splits or ([whole] if whole.is_file() else [])
+
+
+def dialect(folder: Path) -> str:
+    """"blender", "nerfstudio" or "instant-ngp", by the keys that only one of them has."""
+    document = _document(json_files(folder)[0])
+    frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
+    if any(key in document for key in _NERFSTUDIO_KEYS) or any("mask_path" in frame or "depth_file_path" in frame for frame in frames):
+        return "nerfstudio"
+    if any(key in document for key in _NGP_KEYS) or any("transform_matrix_start" in frame for frame in frames):
+        return "instant-ngp"
+    return "blender" if "camera_angle_x" in document and "fl_x" not in document else "nerfstudio"
+
+
+def files(folder: Path, settings: ImportSettings) -> list[Path]:
+    """The JSON files, the images and masks that they name, and the points."""
+    source = Source(folder, settings.allow_outside)
+    paths: dict[Path, None] = dict.fromkeys(json_files(folder))
+    for file in json_files(folder):
+        document = _document(file)
+        ply = _ply(source, document)
+        if ply is not None:
+            paths[ply] = None
+    for frame in _list_frames(source).frames:
+        paths[frame.image] = None
+        mask, _ = _mask(source, frame)
+        if mask is not None:
+            paths[mask] = None
+    return list(paths)
+
+
+def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Capture:
+    """The capture that a folder's transforms*.json describes; `kind` overrides the dialect. Raises BadInput."""
+    if not json_files(folder):
+        raise BadInput(f"{folder}: no transforms.json or transforms_train.json. Name the folder that holds it, or choose another format with --as.")
+    kind = kind or dialect(folder)
+    source = Source(folder, settings.allow_outside)
+    where = ", ".join(file.name for file in json_files(folder))
+    listing = _list_frames(source)
+    photos, rejected, odd, lens_warnings = _photos(source, listing, kind)
+    rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *rejected]
+    warnings = account_for_missing(where, listing.total, len(photos), listing.missing, settings.strict, _REMEDY)
+    if len(photos) < FEWEST:
+        raise BadInput(f"{folder / where}: {len(photos)} usable images of {listing.total} frames; at least {FEWEST} are needed.")
+    warnings += account_for_places(where, listing.places, listing.extensions) + lenses.fit_warnings(where, odd) + lens_warnings
+    if listing.repeated:
+        warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
+    document = _document(json_files(folder)[0])
+    if len({file.name for file in json_files(folder)} & set(SPLIT_FILES)) and (folder / "transforms.json").is_file():
+        warnings.append(f"transforms.json is not read: {where} state the same with their splits.")
+    points, point_warnings = _points(source, document)
+    order = {"train": 0, "val": 1, "test": 2, None: 3}
+    return Capture(
+        kind=kind,
+        photos=tuple(sorted(photos, key=lambda photo: (order[photo.split], photo.camera.name))),
+        background=None,
+        up=np.array([0.0, 0.0, 1.0]) if kind == "blender" else None,
+        points=points,
+        bounds=_bounds(document, json_files(folder)[0]) if kind == "instant-ngp" else None,
+        rejected=tuple(rejected),
+        warnings=tuple(warnings + point_warnings),
+        metric=any("depth_file_path" in frame.entry for frame in listing.frames) and "applied_scale" not in document,
+        facts={key: document[key] for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
+    )
+
+
+def _document(file: Path) -> dict[str, Any]:
+    document = read_json(file)
+    if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
+        raise BadInput(f"{file}: no data set: expected an object with a list `frames`. Name the folder of a data set, or choose a format with --as.")
+    if not document["frames"]:
+        raise BadInput(f"{file}: its list of frames is empty. At least {FEWEST} are needed.")
+    if len(document["frames"]) > MOST_FRAMES:
+        raise BadInput(f"{file}: {len(document['frames'])} frames; at most {MOST_FRAMES} are read.")
+    return document
+
+
+def _list_frames(source: Source) -> _Listing:
+    listing = _Listing()
+    seen: set[Path] = set()
+    split_files = json_files(source.root)
+    for file in split_files:
+        document = _document(file)
+        split_of_file = SPLIT_FILES.get(file.name) if len(split_files) > 1 else None
+        split_of_name = dict(_listed_splits(document, file))
+        for index, entry in enumerate(document["frames"]):
+            if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+                raise BadInput(f"{file}: frame {index} has no `file_path`. Write the data set again, or take it out.")
+            listing.total += 1
+            name = entry["file_path"]
+            found = source.find(name, file.parent)
+            if found.path is None:
+                listing.missing.append(name)
+            elif found.path in seen:
+                listing.repeated.append((name, f"the same image as an earlier frame ({source.name_of(found.path)})"))
+            else:
+                seen.add(found.path)
+                place = {"elsewhere": listing.places, "extension": listing.extensions}.get(found.how)
+                if place is not None:
+                    place.append((name, source.name_of(found.path)))
+                split = split_of_file or split_of_name.get(_plain(name))
+                listing.frames.append(_Frame(document, file, index, entry, split, name, found.path))
+    return listing
+
+
+def _listed_splits(document: dict[str, Any], file: Path) -> Iterator[tuple[str, str]]:
+    for split in ("train", "val", "test"):
+        names = document.get(f"{split}_filenames", [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise BadInput(f"{file}: {split}_filenames is not a list of names.")
+        yield from ((_plain(name), split) for name in names)
+
+
+def _plain(name: str) -> str:
+    return name.removeprefix("./").replace("\\", "/")
+
+
+def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str]], dict[str, list[str]], list[str]]:
+    """Photos, the rejected as (name, reason), what `lenses.fitted` found odd, and warnings."""
+    photos: list[Photo] = []
+    rejected: list[tuple[str, str]] = []
+    odd: dict[str, list[str]] = {}
+    warnings: list[str] = []
+    rolling = lost_masks = 0
+    for frame in listing.frames:
+        name = source.name_of(frame.image)
+        try:
+            header = lenses.read_header(frame.image)
+        except lenses.UnreadableHeader as error:
+            rejected.append((name, str(error)))
+            warnings.append(f"{name}: {error}; left out.")
+            continue
+        pose = _pose(frame)
+        rolling += "transform_matrix" not in frame.entry
+        camera, remark = lenses.fitted(_lens(frame, name, header.size, pose), header, frame.where)
+        if remark is not None:
+            odd.setdefault(remark, []).append(name)
+        mask, ignore = _mask(source, frame)
+        lost_masks += mask is None and "mask_path" in frame.entry
+        photos.append(Photo(camera, frame.image, mask, ignore, frame.split))
+    if rolling:
+        warnings.append(f"{rolling} frames state a rolling shutter (transform_matrix_start, _end); the pose in the middle is used.")
+    if lost_masks:
+        warnings.append(f"{lost_masks} masks that are listed (mask_path) are missing; those images are used whole.")
+    centred = [photo for photo in photos if 0 < photo.camera.intrinsics["cx"] < photo.camera.width and 0 < photo.camera.intrinsics["cy"] < photo.camera.height]
+    if len(centred) < len(photos):
+        warnings.append(f"{len(photos) - len(centred)} cameras have their principal point outside the image: cx, cy may belong to another size.")
+    return photos, rejected, odd, warnings
+
+
+def _pose(frame: _Frame) -> np.ndarray:
+    entry = frame.entry
+    if "transform_matrix" in entry:
+        return pose_from_opengl(lenses.rigid(entry["transform_matrix"], f"{frame.where}: transform_matrix"))
+    if "transform_matrix_start" in entry and "transform_matrix_end" in entry:
+        start, end = (lenses.rigid(entry[key], f"{frame.where}: {key}") for key in ("transform_matrix_start", "transform_matrix_end"))
+        middle = 0.5 * (start + end)
+        left, _, right = np.linalg.svd(middle[:3, :3])  # the rotation half way
+        middle[:3, :3] = left @ right
+        return pose_from_opengl(middle)
+    raise BadInput(f"{frame.where}: no `transform_matrix`. Write the data set again, or take that frame out.")
+
+
+def _lens(frame: _Frame, name: str, actual: tuple[int, int], pose: np.ndarray) -> Camera:
+    """The camera at the size that the file states, or at the image's own where it states none."""
+    given = {key: value for key, value in (frame.document | frame.entry).items() if key != "frames"}
+
+    def number(key: str, default: float = 0.0) -> float:
+        value = given.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise BadInput(f"{frame.where}: {key} is {value!r}, expected a finite number. Write the data set again.")
+        return float(value)
+
+    for key in _UNSUPPORTED:
+        if given.get(key):
+            raise BadInput(f"{frame.where}: lens model {key} is not supported. Undistort the images first, e.g. to a pinhole or OPENCV_FISHEYE camera.")
+    width, height = (number("w", actual[0]), number("h", actual[1])) if "w" in given and "h" in given else actual
+    if width != int(width) or height != int(height) or not (0 < width <= 65535 and 0 < height <= 65535):
+        raise BadInput(f"{frame.where}: w, h are {width:g}x{height:g}; expected the image size in whole pixels.")
+    fx, fy = _focal(frame, given, number, width, height)
+    named = {"f": fx, "fx": fx, "fy": fy, "cx": number("cx", width / 2), "cy": number("cy", height / 2)}
+    named |= {key: number(key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
+    model = _model(frame, given, named)
+    camera = Camera(name, int(width), int(height), model, tuple(named[parameter] for parameter in MODELS[model]), pose)
+    return lenses.checked(camera, frame.where)
+
+
+def _focal(frame: _Frame, given: dict[str, Any], number: Any, width: float, height: float) -> tuple[float, float]:
+    focal = {}
+    for axis, side in (("x", width), ("y", height)):
+        if f"fl_{axis}" in given:
+            focal[axis] = number(f"fl_{axis}")
+        elif f"camera_angle_{axis}" in given:
+            angle = number(f"camera_angle_{axis}")
+            if not 0 < angle < math.pi:
+                raise BadInput(f"{frame.where}: camera_angle_{axis} is {angle:g}; expected an angle between 0 and pi, in radians.")
+            focal[axis] = 0.5 * side / math.tan(0.5 * angle)
+    if not focal:
+        raise BadInput(f"{frame.where}: no focal length: expected fl_x or camera_angle_x, at the top or in the frame.")
+    fx = focal.get("x", focal.get("y", 0.0))
+    return fx, focal.get("y", fx)
+
+
+def _model(frame: _Frame, given: dict[str, Any], named: dict[str, float]) -> str:
+    """COLMAP's name of the lens that a frame states."""
+    stated = given.get("camera_model")
+    if given.get("is_fisheye") is True:
+        stated = "OPENCV_FISHEYE"
+    if stated is None or stated == "OPENCV":
+        if named["k4"] or named["k5"] or named["k6"]:
+            raise BadInput(f"{frame.where}: k4 to k6 without `camera_model`; their meaning differs between models. State FULL_OPENCV or OPENCV_FISHEYE.")
+        if named["k3"]:
+            return "FULL_OPENCV"
+        if stated == "OPENCV" or any(named[key] for key in ("k1", "k2", "p1", "p2")):
+            return "OPENCV"
+        return "SIMPLE_PINHOLE" if named["fx"] == named["fy"] else "PINHOLE"
+    if stated not in MODELS:
+        raise BadInput(f"{frame.where}: camera_model {stated!r}; supported are {', '.join(MODELS)}. Undistort the images first.")
+    unused = [key for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2") if named[key] and key not in MODELS[stated]]
+    if unused:
+        raise BadInput(f"{frame.where}: camera_model {stated} with {', '.join(unused)}, which that model does not have. State the model that fits.")
+    if "f" in MODELS[stated] and named["fx"] != named["fy"]:  # SIMPLE_... and RADIAL have one focal length
+        return "PINHOLE" if stated == "SIMPLE_PINHOLE" else "OPENCV"
+    return str(stated)
+
+
+def _mask(source: Source, frame: _Frame) -> tuple[Path | None, str]:
+    """The mask of a frame and which of its pixels are left out."""
+    listed = frame.entry.get("mask_path")
+    if isinstance(listed, str) and listed:
+        return source.find(listed, frame.file.parent).path, "black"
+    for name in (f"dynamic_mask_{frame.image.stem}.png", f"dynamic_mask_{frame.image.name}.png"):
+        beside = frame.image.with_name(name)
+        if beside.is_file():
+            return source.check_inside(beside), "white"
+    return None, "black"
+
+
+def _bounds(document: dict[str, Any], file: Path) -> np.ndarray | None:
+    """instant-ngp's unit cube in the frame of the matrices: it maps x to scale * x + offset, and expects the subject within [0, 1].
+
+    `aabb_scale` widens that cube for the surroundings; what is wanted is the subject.
+    """
+    if "aabb_scale" not in document and "scale" not in document:
+        return None
+    scale, offset = document.get("scale", _NGP_SCALE), document.get("offset", [0.5, 0.5, 0.5])
+    numbers = [scale, *(offset if isinstance(offset, list) else [None])]
+    if len(numbers) != 4 or any(isinstance(n, bool) or not isinstance(n, (int, float)) or not math.isfinite(n) for n in numbers) or scale <= 0:
+        raise BadInput(f"{file}: scale {scale!r} and offset {offset!r}; expected a positive number and three numbers.")
+    centre = (0.5 - np.array(offset, np.float64)) / scale
+    return np.stack([centre - 0.5 / scale, centre + 0.5 / scale])
+
+
+def _ply(source: Source, document: dict[str, Any]) -> Path | None:
+    listed = document.get("ply_file_path")
+    return source.find(listed, suffixes=(".ply",)).path if isinstance(listed, str) and listed else None
+
+
+def _points(source: Source, document: dict[str, Any]) -> tuple[SparsePoints | None, list[str]]:
+    if "ply_file_path" not in document:
+        return None, []
+    path = _ply(source, document)
+    if path is None or path.stat().st_size > LARGEST_PLY:
+        return None, [f"ply_file_path {document['ply_file_path']}: {'missing' if path is None else 'larger than 1 GiB'}; the points are not used."]
+    import trimesh
+
+    try:
+        cloud = trimesh.load(path, file_type="ply", process=False)
+        xyz = np.asarray(cloud.vertices, np.float64).reshape(-1, 3)
+        colours = getattr(cloud, "colors", None)
+        colours = cloud.visual.vertex_colors if colours is None else colours
+        rgb = np.asarray(colours, np.uint8)[:, :3] if len(np.asarray(colours)) == len(xyz) else np.full((len(xyz), 3), 128, np.uint8)
+    except Exception as error:  # trimesh raises whatever its parser stumbles over
+        return None, [f"{path.name}: not readable as a PLY of points ({type(error).__name__}: {str(error)[:80]}); the points are not used."]
+    finite = np.isfinite(xyz).all(-1)
+    if not finite.any():
+        return None, [f"{path.name}: holds no points; not used."]
+    xyz, rgb = xyz[finite], rgb[finite]
+    return SparsePoints(xyz, rgb, np.full(len(xyz), np.nan), ((),) * len(xyz)), []

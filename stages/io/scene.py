@@ -1,0 +1,438 @@
+"""The scene: what the poses stage leaves and every later stage reads.
+
+    scene.json           cameras, splits, bounds, the similarity to the capture's frame, the orbit (this module)
+    images/, masks/      at working size, 8 bits, sRGB; masks are 0 or 255, 255 = use
+    points.safetensors   sparse points in the training frame, where there are any
+
+Format 2 says what space the field lives in, and holds the reference camera of a forward-facing capture; format 1, without, is read as well.
+
+Training frame: right-handed, z up, origin at the centre of the box, the largest half extent of the box 1.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, Similarity
+from efficientnerf.geometry.ndc import Ndc
+from pipeline.errors import BadInput
+from pipeline.files import Unreadable, read_json
+from stages.framing.forward_facing import SPACES, Forward
+from stages.io.capture import SparsePoints
+
+FORMAT = 2
+SPLITS = ("train", "val", "test")
+LARGEST_FILE = 256 << 20  # bytes of scene.json; a hundred thousand views fit
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """How the capture goes round its subject, for turntables; in the training frame.
+
+    centre          what the cameras look at
+    radius          their usual distance from it, world units
+    elevation       their usual angle above the horizon, degrees
+    forward_facing  whether they all look about the same way instead of standing around it
+    heading         azimuth of the middle of the cameras seen from the centre, degrees, anticlockwise from +x
+    """
+
+    centre: tuple[float, float, float]
+    radius: float
+    elevation: float
+    forward_facing: bool
+    heading: float
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One image of the scene.
+
+    image, mask    paths relative to the folder of the scene; mask: 0/255 PNG of the image's size, 255 = use, or None
+    camera         in the training frame, at the size of `image`
+    source_camera  in the capture's frame, at the size of the source image after EXIF rotation
+    near, far      world units, along the view axis
+    """
+
+    image: str
+    mask: str | None
+    split: str
+    camera: Camera
+    source_camera: Camera
+    near: float
+    far: float
+
+    @property
+    def name(self) -> str:
+        return self.camera.name
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All views of a capture in the training frame.
+
+    kind        the kind of the capture ("photographs", "blender", ...)
+    bounds      (2, 3) the box of interest
+    background  constant sRGB colour (0-1) that the RGBA images are composited on; None: photographs with real surroundings
+    points      whether points.safetensors stands beside scene.json
+    metric      whether a unit of the capture's frame is a metre
+    space       where the field lives: "box", "contracted" (the box and a shell for all beyond) or "ndc" (normalised device coordinates); "auto"
+                is contracted for photographs with surroundings, else the box
+    forward     the forward-facing capture; there for ndc, and only there
+    """
+
+    kind: str
+    views: tuple[View, ...]
+    bounds: np.ndarray
+    background: tuple[float, float, float] | None
+    world_from_capture: Similarity
+    orbit: Orbit
+    points: bool = False
+    metric: bool = False
+    space: str = "auto"
+    forward: Forward | None = None
+
+    def __post_init__(self) -> None:
+        if self.space not in SPACES or (self.space == "ndc") != (self.forward is not None):
+            raise ValueError(f"space {self.space!r} with {'no' if self.forward is None else 'a'} reference camera; expected one of {', '.join(SPACES)}")
+
+    @property
+    def contracted(self) -> bool:
+        """Whether space beyond the box belongs to the field."""
+        return self.space == "contracted" or (self.space == "auto" and self.background is None)
+
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Always +z: the poses stage turns the capture upright."""
+        return (0.0, 0.0, 1.0)
+
+
+def views_of(scene: Scene, split: str) -> tuple[View, ...]:
+    """The views of one split, in order; "report" gives test, or val where there is no test."""
+    if split == "report":
+        return views_of(scene, "test") or views_of(scene, "val")
+    return tuple(view for view in scene.views if view.split == split)
+
+
+def save(scene: Scene, folder: Path) -> None:
+    """Write folder/scene.json; images, masks and points are the caller's."""
+    views = [
+        {
+            "image": view.image,
+            "mask": view.mask,
+            "split": view.split,
+            "near": view.near,
+            "far": view.far,
+            "camera": _camera_to_json(view.camera),
+            "source_camera": _camera_to_json(view.source_camera),
+        }
+        for view in scene.views
+    ]
+    document = {
+        "format": FORMAT,
+        "kind": scene.kind,
+        "up": list(scene.up),
+        "bounds": scene.bounds.tolist(),
+        "background": scene.background,
+        "world_from_capture": {
+            "scale": scene.world_from_capture.scale,
+            "rotation": scene.world_from_capture.rotation.tolist(),
+            "translation": scene.world_from_capture.translation.tolist(),
+        },
+        "orbit": {
+            "centre": list(scene.orbit.centre),
+            "radius": scene.orbit.radius,
+            "elevation": scene.orbit.elevation,
+            "forward_facing": scene.orbit.forward_facing,
+            "heading": scene.orbit.heading,
+        },
+        "points": scene.points,
+        "metric": scene.metric,
+        "space": scene.space,
+        "forward": None if scene.forward is None else _forward_to_json(scene.forward),
+        "views": views,
+    }
+    (folder / "scene.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def load(folder: Path) -> Scene:
+    """Read folder/scene.json, checked; BadInput names what is wrong with it."""
+    path = folder / "scene.json"
+    document = _Reader(_read_json(path), str(path))
+    version = document.integer("format")  # also refuses what is not an object
+    if not 1 <= version <= FORMAT:
+        raise BadInput(f"{path}: format version {version}; this build reads 1 to {FORMAT}. Upgrade efficientnerf, or run the poses stage again.")
+    background = document.value.get("background")
+    transform, orbit = document.reader("world_from_capture"), document.reader("orbit")
+    views = tuple(_view_from_json(_Reader(view, f"{path}: views[{i}]"), folder) for i, view in enumerate(document.items("views")))
+    scene = Scene(
+        kind=document.text("kind"),
+        views=views,
+        bounds=document.numbers("bounds", (2, 3)),
+        background=None if background is None else _triple(document.numbers("background", (3,))),
+        world_from_capture=Similarity(transform.number("scale"), transform.numbers("rotation", (3, 3)), transform.numbers("translation", (3,))),
+        orbit=Orbit(
+            centre=_triple(orbit.numbers("centre", (3,))),
+            radius=orbit.number("radius"),
+            elevation=orbit.number("elevation"),
+            forward_facing=orbit.flag("forward_facing"),
+            heading=orbit.number("heading"),
+        ),
+        points=document.flag("points"),
+        metric=document.flag("metric"),
+        **({} if version == 1 else _space_from_json(document, path)),
+    )
+    if not (scene.bounds[0] < scene.bounds[1]).all():
+        raise BadInput(f"{path}: bounds are empty ({scene.bounds.tolist()}). Run the poses stage again.")
+    if scene.world_from_capture.scale <= 0 or not _is_rotation(scene.world_from_capture.rotation):
+        raise BadInput(f"{path}: world_from_capture is not a similarity. Run the poses stage again.")
+    return scene
+
+
+def read_image(folder: Path, view: View) -> np.ndarray:
+    """The working image, uint8 sRGB (H, W, 3), or (H, W, 4) with straight alpha."""
+    import cv2
+
+    path = folder / view.image
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION) if path.is_file() else None
+    if pixels is None or pixels.dtype != np.uint8 or pixels.shape[:2] != (view.camera.height, view.camera.width):
+        found = "missing or unreadable" if pixels is None else f"{pixels.dtype} {pixels.shape[1]}x{pixels.shape[0]}"
+        raise BadInput(f"{path}: {found}; expected an 8-bit image of {view.camera.width}x{view.camera.height}. Run the poses stage again.")
+    if pixels.ndim == 2:
+        return np.repeat(pixels[..., None], 3, -1)
+    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
+
+
+def has_alpha(folder: Path, view: View) -> bool:
+    """Whether the working image has an alpha channel; only its header is read."""
+    from PIL import Image
+
+    try:
+        with Image.open(folder / view.image) as image:
+            return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+    except OSError:
+        return False  # reading it will say what is wrong
+
+
+def read_mask(folder: Path, view: View) -> np.ndarray | None:
+    """bool (H, W), True = use; None where every pixel counts."""
+    import cv2
+
+    if view.mask is None:
+        return None
+    path = folder / view.mask
+    pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if pixels is None or pixels.shape != (view.camera.height, view.camera.width):
+        raise BadInput(f"{path}: missing, unreadable or not {view.camera.width}x{view.camera.height}. Run the poses stage again.")
+    return pixels >= 128
+
+
+def save_points(points: SparsePoints, folder: Path) -> None:
+    """Write folder/points.safetensors; `points` in the training frame, observers as indices into the scene's views."""
+    from safetensors.numpy import save_file
+
+    counts = np.array([len(seen) for seen in points.observers], np.int64)
+    tensors = {
+        "xyz": np.ascontiguousarray(points.xyz, np.float64),
+        "rgb": np.ascontiguousarray(points.rgb, np.uint8),
+        "error": np.ascontiguousarray(points.error, np.float64),
+        "observer_counts": counts,
+        "observers": np.array([view for seen in points.observers for view in seen], np.int64),
+    }
+    save_file(tensors, str(folder / "points.safetensors"))
+
+
+def read_points(folder: Path) -> SparsePoints:
+    """The sparse points in the training frame; observers are indices into the scene's views."""
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    path = folder / "points.safetensors"
+    try:
+        tensors = load_file(str(path))
+        ends = np.cumsum(tensors["observer_counts"])
+        observers = tuple(tuple(seen.tolist()) for seen in np.split(tensors["observers"], ends[:-1])) if len(ends) else ()
+        return SparsePoints(tensors["xyz"], tensors["rgb"], tensors["error"], observers)
+    except (OSError, SafetensorError, KeyError, ValueError) as error:
+        raise BadInput(f"{path}: not readable as sparse points ({error}). Run the poses stage again.") from error
+
+
+def describe(folder: Path) -> dict[str, Any]:
+    """What `enerf inspect RUN/poses` prints: the source's cameras in the capture's frame, and what the scene knows of itself."""
+    scene = load(folder)
+    cameras = [
+        {
+            "name": view.name,
+            "width": view.source_camera.width,
+            "height": view.source_camera.height,
+            "model": view.source_camera.model,
+            "params": list(view.source_camera.params),
+            "split": view.split,
+            "capture_from_camera": view.source_camera.world_from_camera.tolist(),
+            "working_size": [view.camera.width, view.camera.height],
+        }
+        for view in scene.views
+    ]
+    corners = np.stack(np.meshgrid(*scene.bounds.T, indexing="ij"), -1).reshape(-1, 3)
+    in_capture = scene.world_from_capture.inverse().points(corners)
+    return {
+        "what": "scene",
+        "kind": scene.kind,
+        "count": len(scene.views),
+        "splits": {split: len(views_of(scene, split)) for split in SPLITS},
+        "resolution": sorted({(view.source_camera.width, view.source_camera.height) for view in scene.views}),
+        "models": sorted({view.source_camera.model for view in scene.views}),
+        "bounds": scene.bounds.tolist(),
+        "bounds_in_capture": [in_capture.min(0).tolist(), in_capture.max(0).tolist()],
+        "background": scene.background,
+        "space": scene.space,
+        "masks": sum(view.mask is not None for view in scene.views),
+        "points": len(read_points(folder).xyz) if scene.points else 0,
+        "metric": scene.metric,
+        "world_from_capture": {
+            "scale": scene.world_from_capture.scale,
+            "rotation": scene.world_from_capture.rotation.tolist(),
+            "translation": scene.world_from_capture.translation.tolist(),
+        },
+        "odd": _report_warnings(folder),
+        "cameras": cameras,
+    }
+
+
+def _report_warnings(folder: Path) -> list[str]:
+    path = folder / "report.json"
+    report = _read_json(path) if path.is_file() else {}
+    found = report.get("warnings", []) if isinstance(report, dict) else []
+    return [str(sentence) for sentence in found]
+
+
+def _forward_to_json(forward: Forward) -> dict[str, Any]:
+    return {
+        **forward.ndc.to_json(),
+        "bounds": forward.bounds.tolist(),
+        "far": forward.far,
+        "radii": list(forward.radii),
+        "focus": forward.focus,
+        "tangents": list(forward.tangents),
+    }
+
+
+def _space_from_json(document: _Reader, path: Path) -> dict[str, Any]:
+    space = document.text("space")
+    if space not in SPACES or (space == "ndc") != (document.value.get("forward") is not None):
+        raise BadInput(f"{path}: space {space[:40]!r}; expected one of {', '.join(SPACES)}, and ndc with what is said of it. Run the poses stage again.")
+    if space != "ndc":
+        return {"space": space}
+    reader = document.reader("forward")
+    try:
+        ndc = Ndc.from_json(reader.value)
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(f"{path}: forward: {error}. Run the poses stage again.") from error
+    bounds, tangents = reader.numbers("bounds", (2, 3)), reader.numbers("tangents", (2,))
+    radii = _triple(reader.numbers("radii", (3,)))
+    forward = Forward(ndc, bounds, reader.number("far"), radii, reader.number("focus"), (float(tangents[0]), float(tangents[1])))
+    if min([forward.far - ndc.near, forward.focus, *tangents, *(bounds[1] - bounds[0])]) <= 0:
+        raise BadInput(f"{path}: forward: no box before the reference camera. Run the poses stage again.")
+    return {"space": space, "forward": forward}
+
+
+def _camera_to_json(camera: Camera) -> dict[str, Any]:
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "model": camera.model,
+        "params": list(camera.params),
+        "world_from_camera": camera.world_from_camera.tolist(),
+    }
+
+
+def _camera_from_json(data: _Reader) -> Camera:
+    pose = data.numbers("world_from_camera", (4, 4))
+    if not _is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any():
+        raise BadInput(f"{data.where}.world_from_camera is not a rigid motion. Run the poses stage again.")
+    width, height = data.integer("width"), data.integer("height")
+    if not (0 < width <= 65536 and 0 < height <= 65536):
+        raise BadInput(f"{data.where}: size {width}x{height}. Run the poses stage again.")
+    try:
+        return Camera(data.text("name"), width, height, data.text("model"), tuple(data.numbers("params", (-1,)).tolist()), pose)
+    except ValueError as error:
+        raise BadInput(f"{data.where}: {error}. Run the poses stage again.") from error
+
+
+def _view_from_json(data: _Reader, folder: Path) -> View:
+    split = data.text("split")
+    near, far = data.number("near"), data.number("far")
+    if split not in SPLITS or not 0 <= near < far:
+        expected = f"one of {', '.join(SPLITS)} and 0 <= near < far"
+        raise BadInput(f"{data.where}: split {split!r}, near {near}, far {far}; expected {expected}. Run the poses stage again.")
+    mask = data.text("mask") if data.value.get("mask") is not None else None
+    for relative in (data.text("image"), mask):
+        if relative is not None and (Path(relative).is_absolute() or ".." in Path(relative).parts):
+            raise BadInput(f"{data.where}: {relative} lies outside {folder}. Run the poses stage again.")
+    return View(data.text("image"), mask, split, _camera_from_json(data.reader("camera")), _camera_from_json(data.reader("source_camera")), near, far)
+
+
+def _is_rotation(matrix: np.ndarray) -> bool:
+    return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5) and np.linalg.det(matrix) > 0)
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return read_json(path, LARGEST_FILE)
+    except FileNotFoundError as error:
+        raise BadInput(f"{path}: {error.strerror}. Run the poses stage first.") from error
+    except Unreadable as error:
+        raise BadInput(f"{path}: {error}. Run the poses stage again.") from error
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """A JSON object whose fields are taken out by type; errors say where."""
+
+    value: Any
+    where: str
+
+    def _take(self, name: str, kinds: type | tuple[type, ...], expected: str) -> Any:
+        found = self.value.get(name) if isinstance(self.value, dict) else None
+        if not isinstance(found, kinds) or (isinstance(found, bool) and kinds is not bool):
+            raise BadInput(f"{self.where}.{name}: expected {expected}, found {str(found)[:40]!r}. Run the poses stage again.")
+        return found
+
+    def text(self, name: str) -> str:
+        return str(self._take(name, str, "text"))
+
+    def flag(self, name: str) -> bool:
+        return bool(self._take(name, bool, "true or false"))
+
+    def integer(self, name: str) -> int:
+        return int(self._take(name, int, "a whole number"))
+
+    def number(self, name: str) -> float:
+        return float(self.numbers(name, ()))
+
+    def items(self, name: str) -> list[Any]:
+        return list(self._take(name, list, "a list"))
+
+    def reader(self, name: str) -> _Reader:
+        return _Reader(self._take(name, dict, "an object"), f"{self.where}.{name}")
+
+    def numbers(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Finite float64 of this shape; (-1,) any length."""
+        found = self._take(name, (list, int, float), "numbers")
+        try:
+            array = np.array(found)
+        except ValueError:
+            array = np.array(None)
+        if array.dtype.kind not in "if" or not (array.shape == shape or (shape == (-1,) and array.ndim == 1)) or not all(map(math.isfinite, array.ravel())):
+            raise BadInput(f"{self.where}.{name}: expected finite numbers of shape {shape}, found {str(found)[:40]}. Run the poses stage again.")
+        return array.astype(np.float64)

@@ -1,0 +1,216 @@
+"""The images that later stages read: upright, 8 bits sRGB, at working size, with a mask where pixels are to be left out."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import BadInput
+from stages.io.capture import Photo
+from stages.io.importers.lenses import read_header, same_aspect
+from stages.io.photo import UnreadableImage, working_size, write_png
+
+OPAQUE = 128  # alpha from which a pixel counts where alpha is used as a mask
+_LOSSY = (".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """A source image after EXIF rotation.
+
+    pixels    (H, W, 3 or 4) uint8 sRGB, straight alpha
+    verbatim  whether the file itself holds exactly these pixels in a form that later stages read
+    turned    EXIF orientation, 1-8
+    """
+
+    pixels: np.ndarray
+    verbatim: bool
+    turned: int
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written for one photo: paths relative to the folder of the scene, size in pixels, what is odd."""
+
+    image: str
+    mask: str | None
+    width: int
+    height: int
+    warnings: tuple[str, ...] = ()
+
+
+def decode(path: Path) -> Decoded:
+    """Every pixel of an image file; raises UnreadableImage, also where the file ends early."""
+    import warnings
+
+    from PIL import Image
+
+    from stages.io.photo import pixels_and_alpha, upright
+
+    orientation = _orientation(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
+            with Image.open(path) as image:
+                verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image, path)
+                rgb, alpha = pixels_and_alpha(image)
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UnreadableImage(f"cannot be decoded ({reason[:100]})") from error
+    pixels = rgb if alpha is None else np.dstack([rgb, alpha])
+    return Decoded(np.ascontiguousarray(upright(pixels, orientation)), verbatim, orientation)
+
+
+def has_transparency(path: Path) -> bool:
+    """Whether any pixel of an image is not opaque; raises UnreadableImage."""
+    pixels = decode(path).pixels
+    return pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any())
+
+
+def composites(photos: tuple[Photo, ...], choice: str, posed_by_json: bool) -> bool:
+    """Whether alpha is coverage (the images are composited on a constant background) instead of a mask.
+
+    choice         the setting: "auto", "composite" or "mask"
+    posed_by_json  whether the capture is a transforms.json data set
+
+    "auto" composites where every image of a transforms.json data set holds an alpha channel and most have transparent pixels: renders of
+    an object. Opaque images, also in Blender's dialect, show real or rendered surroundings, and a few images with alpha among opaque ones
+    are masked photographs. Images that cannot be read have no say.
+    """
+    if choice != "auto":
+        return choice == "composite"
+    if not posed_by_json or not all(read_header(photo.image).alpha for photo in photos):
+        return False
+    transparent = opaque = 0
+    for photo in photos:
+        try:
+            transparent, opaque = (transparent + 1, opaque) if has_transparency(photo.image) else (transparent, opaque + 1)
+        except UnreadableImage:
+            continue
+        if 2 * max(transparent, opaque) > len(photos):
+            break
+    return transparent > opaque
+
+
+def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alpha: bool) -> Written:
+    """Write the working image of a photo, and its mask if it has one.
+
+    relative    path of the image below folder/images, with its source's extension
+    max_side    longest side of the working image, pixels
+    keep_alpha  write RGBA as it is; else pixels with alpha below one half go into the mask
+
+    A file that need not change is copied byte for byte, anything else becomes a PNG. Raises UnreadableImage; BadInput for a mask of another
+    aspect than its image.
+    """
+    found = decode(photo.image)
+    height, width = found.pixels.shape[:2]
+    if (width, height) != (photo.camera.width, photo.camera.height):
+        before = f"{photo.camera.width}x{photo.camera.height}"
+        raise BadInput(f"{photo.image}: {width}x{height} pixels, but {before} a moment ago. Leave the source alone while it is read.")
+    size = working_size(width, height, max_side)
+    usable, warnings = (None, []) if photo.mask is None else _usable(photo, size, found.turned)
+    pixels = _resized(found.pixels, size)
+    has_alpha = pixels.shape[2] == 4
+    if has_alpha and not keep_alpha:
+        opaque = pixels[..., 3] >= OPAQUE
+        usable = opaque if usable is None else usable & opaque
+        pixels = pixels[..., :3]
+    verbatim = found.verbatim and size == (width, height) and (keep_alpha or not has_alpha)
+    path = folder / "images" / relative
+    path = path if verbatim else path.with_name(path.stem + ".png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if verbatim:
+        shutil.copyfile(photo.image, path)
+    else:
+        write_png(path, pixels)
+    mask = None
+    if usable is not None and not usable.all():
+        mask = folder / "masks" / PurePosixPath(relative).with_suffix(".png")
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        write_png(mask, np.where(usable, np.uint8(255), np.uint8(0)))
+        if not usable.any():
+            warnings.append(f"{photo.camera.name}: its mask leaves out every pixel.")
+    return Written(path.relative_to(folder).as_posix(), None if mask is None else mask.relative_to(folder).as_posix(), *size, tuple(warnings))
+
+
+def relative_paths(cameras: list[Camera]) -> list[str]:
+    """A path below images/ for each camera by its name; no two alike, even without their extensions."""
+    taken: set[str] = set()
+    paths = []
+    for camera in cameras:
+        parts = [part for part in PurePosixPath(camera.name).parts if part not in ("/", "..")]
+        parts = parts[1:] if len(parts) > 1 and re.fullmatch(r"images(_\d+)?", parts[0]) else parts
+        path, again = PurePosixPath(*parts), 2
+        while path.with_suffix("").as_posix().lower() in taken:
+            path, again = PurePosixPath(*parts).with_stem(f"{PurePosixPath(*parts).stem}_{again}"), again + 1
+        taken.add(path.with_suffix("").as_posix().lower())
+        paths.append(path.as_posix())
+    return paths
+
+
+def _orientation(path: Path) -> int:
+    from stages.io.importers.lenses import UnreadableHeader
+
+    try:
+        return read_header(path).orientation
+    except UnreadableHeader as error:
+        raise UnreadableImage(f"cannot be decoded ({error})") from error
+
+
+def _is_plain(image: Any, path: Path) -> bool:
+    """Whether OpenCV reads the file's pixels as Pillow does: JPEG in colour, PNG with 8 bits a channel."""
+    if image.format == "JPEG":
+        return bool(image.mode == "RGB")
+    if image.format == "PNG" and image.mode in ("RGB", "RGBA"):
+        with path.open("rb") as file:
+            return file.read(25)[24:] == b"\x08"  # IHDR's bit depth: Pillow cuts 16 bits to 8
+    return False
+
+
+def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """At another size by averaging areas in sRGB; colours weigh by their alpha, so that those of transparent pixels do not show."""
+    import cv2
+
+    if pixels.shape[1::-1] == size:
+        return pixels
+    if pixels.shape[2] == 3:
+        return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+    whole = pixels.astype(np.float32)
+    whole[..., :3] *= whole[..., 3:] / 255
+    whole = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+    whole[..., :3] *= 255 / np.maximum(whole[..., 3:], 1e-3)
+    return np.clip(np.rint(whole), 0, 255).astype(np.uint8)
+
+
+def _usable(photo: Photo, size: tuple[int, int], turned: int) -> tuple[np.ndarray, list[str]]:
+    """(h, w) bool at working size from the photo's mask file, and warnings."""
+    from stages.io.photo import upright
+
+    assert photo.mask is not None
+    try:
+        mask = _grey(photo.mask)
+    except UnreadableImage as error:
+        raise UnreadableImage(f"its mask {photo.mask.name} {error}") from error
+    expected = photo.camera.width, photo.camera.height
+    if turned >= 5 and not same_aspect(mask.shape[::-1], expected):
+        mask = upright(mask, turned)  # drawn over the pixels as stored
+    found = mask.shape[1], mask.shape[0]
+    sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
+    if not same_aspect(found, expected):
+        raise BadInput(f"{photo.mask}: {sizes}, of another aspect. Make the mask for this image.")
+    warnings = [] if found == expected else [f"{photo.mask.name}: {sizes}; it was resized."]
+    rows = ((np.arange(size[1]) + 0.5) * found[1] / size[1]).astype(int)
+    columns = ((np.arange(size[0]) + 0.5) * found[0] / size[0]).astype(int)
+    # Lossy files have no clean zero.
+    marked = mask[rows][:, columns] > (127 if photo.mask.suffix.lower() in _LOSSY else 0)
+    return marked if photo.mask_ignore == "black" else ~marked, warnings
+
+
+def _grey(path: Path) -> np.ndarray:
+    return decode(path).pixels[..., :3].max(-1)  # any colour counts as not black

@@ -1,0 +1,67 @@
+"""One picture of all images of a scene: what is used for what, and what could not be used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.io.scene import SPLITS, Scene
+
+THUMBNAIL = 144  # px, longest side
+FRAME = 3  # px
+COLUMNS = 8
+MOST = 240  # thumbnails; larger captures are thinned evenly
+COLOURS = {"train": (70, 130, 180), "val": (218, 165, 32), "test": (60, 160, 75), "rejected": (200, 40, 40)}
+
+
+def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str, str]], source: Path) -> None:
+    """Write folder/contact_sheet.png: thumbnails framed in the colour of their split, names below, the rejected ones crossed out last."""
+    from stages.pictures.plots import contact_sheet
+
+    entries: list[tuple[Path | None, str, str]] = [(folder / view.image, view.name, view.split) for view in scene.views]
+    every = -(-len(entries) // MOST)
+    counts = {split: sum(entry[2] == split for entry in entries) for split in SPLITS} | {"rejected": len(rejected)}
+    title = f"{len(entries)} images: " + ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    shown = entries[::every] + [(_readable(source / name), name, "rejected") for name, _ in rejected[: MOST // 4]]
+    rows = [shown[first : first + COLUMNS] for first in range(0, len(shown), COLUMNS)]
+    contact_sheet(
+        [[_framed(path, split) for path, _, split in row] for row in rows],
+        [[f"{name} {split}" for _, name, split in row] for row in rows],
+        folder / "contact_sheet.png",
+        thumbnail=THUMBNAIL + 2 * FRAME,
+        title=title + (f" (every {every}th shown)" if every > 1 else ""),
+    )
+
+
+def _framed(path: Path | None, split: str) -> np.ndarray:
+    from PIL import ImageDraw, ImageOps
+
+    framed = ImageOps.expand(_thumbnail(path), FRAME, COLOURS[split])
+    if split == "rejected":
+        draw, right, bottom = ImageDraw.Draw(framed), framed.width - 1, framed.height - 1
+        draw.line((0, 0, right, bottom), fill=COLOURS[split], width=FRAME)
+        draw.line((0, bottom, right, 0), fill=COLOURS[split], width=FRAME)
+    return np.asarray(framed)
+
+
+def _readable(path: Path) -> Path | None:
+    return path if path.is_file() else None
+
+
+def _thumbnail(path: Path | None) -> Any:
+    """At most THUMBNAIL to a side; grey where there is nothing to show."""
+    from PIL import Image, ImageOps
+
+    if path is not None:
+        try:
+            with Image.open(path) as image:
+                image.draft("RGB", (2 * THUMBNAIL, 2 * THUMBNAIL))
+                upright = ImageOps.exif_transpose(image)
+                upright.thumbnail((THUMBNAIL, THUMBNAIL))
+                return upright.convert("RGBA" if upright.mode in ("RGBA", "LA", "P", "PA") else "RGB")
+        except Exception:
+            pass  # rejected because it cannot be read, most likely
+    return Image.new("RGB", (THUMBNAIL, THUMBNAIL * 3 // 4), (200, 200, 200))

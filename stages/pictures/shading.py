@@ -1,0 +1,74 @@
+"""A mesh as a picture, for people to look at: four sides, above in its colours, below as grey clay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from efficientnerf.surface.mesh import Mesh, sample
+
+_PAPER = np.array([0.93, 0.93, 0.93])
+_SAMPLES = 600_000
+ROUND = (0.0, 90.0, 180.0, 270.0)
+IN_FRONT = (-36.0, -12.0, 12.0, 36.0)  # what was photographed from one side has no other
+
+
+def draw_sides(
+    mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, size: int = 420, turns: Sequence[float] = ROUND, shown: float = 1.0
+) -> np.ndarray:
+    """Orthographic views of a mesh in a frame with z up, from several sides.
+
+    heading    degrees around z that the turns are counted from, from +x
+    elevation  degrees above the horizon
+    turns      degrees around z of each view
+    shown      share of the surface that the pictures reach, from its middle outwards: surfaces far behind a subject would leave it a few pixels
+    returns    (2 size, size times the number of views, 3) uint8 sRGB
+
+    The surface is drawn as a dense cloud of samples with a depth buffer: no rasteriser is needed for a picture this small.
+    """
+    face, weight = sample(mesh.vertices, mesh.faces, _SAMPLES, seed=0)
+    corners = mesh.faces[face]  # (N, 3)
+    positions = np.einsum("nci,nc->ni", mesh.vertices[corners], weight)
+    normals = np.einsum("nci,nc->ni", mesh.normals[corners], weight)
+    colours = np.einsum("nci,nc->ni", mesh.colours[corners], weight)
+    if shown < 1:
+        centre = np.median(mesh.vertices, axis=0)  # vertices are dense where photographs show much
+        reach = float(np.quantile(np.linalg.norm(mesh.vertices - centre, axis=1), shown))
+    else:
+        centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+        reach = float(np.linalg.norm(mesh.vertices - centre, axis=1).max())
+    local = (positions - centre) / max(reach, 1e-12)
+    near = (local**2).sum(axis=1) <= 1 + 1e-9
+    columns = []
+    for turn in turns:
+        right, up, back = _axes(heading + turn, elevation)
+        facing = np.flatnonzero((normals @ back > -0.2) & near)
+        seen = local[facing]
+        picked = _front_samples(seen @ right, seen @ up, seen @ back, size)  # (size, size), -1 where nothing is
+        picked = np.where(picked >= 0, facing[picked], -1) if len(facing) else picked
+        light = back + 0.5 * up - 0.4 * right
+        shade = np.clip(normals @ (light / np.linalg.norm(light)), 0, 1) * 0.7 + 0.2
+        hit = picked[..., None] >= 0
+        columns.append(np.concatenate([np.where(hit, colours[picked], _PAPER), np.where(hit, shade[picked][..., None], _PAPER)]))
+    return np.round(np.clip(np.concatenate(columns, 1), 0, 1) * 255).astype(np.uint8)
+
+
+def _axes(heading: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right, up and back (towards the viewer) of a view from this direction."""
+    a, e = np.radians(heading), np.radians(elevation)
+    right = np.array([-np.sin(a), np.cos(a), 0.0])
+    back = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    return right, np.cross(back, right), back
+
+
+def _front_samples(x: np.ndarray, y: np.ndarray, height: np.ndarray, size: int) -> np.ndarray:
+    """(size, size) which sample, of those with x and y in -1..1, is nearest to the viewer in each pixel; -1 where there is none."""
+    order = np.argsort(height, kind="stable")
+    column = ((x * 0.97 + 1) / 2 * (size - 1)).astype(np.int64)[order]
+    row = ((1 - y * 0.97) / 2 * (size - 1)).astype(np.int64)[order]
+    front = np.full((size, size), -1)
+    # Each sample covers two by two pixels: what lies behind must not shine through where samples happen to be sparse.
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        np.maximum.at(front, (row + i, column + j), np.arange(len(order)))
+    return np.where(front >= 0, order[front], -1) if len(order) else front

@@ -1,0 +1,364 @@
+"""Photographs to features and verified matches: the part of structure from motion that takes long and is resumed.
+
+Everything lies in one work folder: upright copies of the photographs at working size (`images/`), their masks (`masks/`) and
+COLMAP's database. A feature depends on its image alone and a verified match on its two images alone, so that what a killed run
+left in the database is what an undisturbed run would have put there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import hashlib
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stages.io.photo import UnreadableImage, UprightPhoto, mask_of, upright_photo, write_png
+
+LAYOUT = 1  # of the work folder; raise it when what is written there changes meaning
+BLOCK = 8  # images to a side of a block of pairs: a block takes a second or three, nothing answers inside one, and each builds its images' indices anew
+FINE_BELOW = 1000  # px, longest side: smaller images are searched at twice their size (four times slower, four times as exact)
+NEIGHBOURS = 10  # images matched after each one in a sequence
+KEYFRAMES = 40  # images of a sequence that are matched with each other, to close its loops
+
+Progress = Callable[..., None]
+SafePoint = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class WorkImage:
+    """The upright copy of one photograph.
+
+    name            of the photograph
+    file            of the copy: numbers in sorted order of name
+    width, height   of the photograph, upright, pixels
+    work_width, work_height  of the copy
+    focal           pixels of the photograph, from its EXIF data, or None
+    camera_key      photographs with equal keys were taken by one camera at one setting
+    """
+
+    name: str
+    file: str
+    width: int
+    height: int
+    work_width: int
+    work_height: int
+    focal: float | None
+    camera_key: str
+
+
+# What glog catches. It does so from the moment pycolmap is imported, prints a stack trace and aborts: at SIGTERM too, instead of what the
+# process has arranged to do.
+_CAUGHT = (signal.SIGSEGV, signal.SIGILL, signal.SIGFPE, signal.SIGABRT, signal.SIGBUS, signal.SIGTERM)
+_ROOM = 1024  # bytes; a struct sigaction takes 152 on Linux
+
+
+def import_pycolmap() -> Any:
+    """pycolmap; the only place that imports it. Every signal is handled afterwards as it was before.
+
+    The handlers are kept as C has them: Python's own record knows nothing of those that faulthandler or another library has set, and
+    sets handlers in the main thread only.
+    """
+    if "pycolmap" not in sys.modules:
+        libc = ctypes.CDLL(None)
+        handlers = [(number, ctypes.create_string_buffer(_ROOM)) for number in _CAUGHT]
+        for number, handler in handlers:
+            libc.sigaction(int(number), None, handler)
+        # A SIGTERM that comes while glog holds its handler waits until ours is back.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        try:
+            import pycolmap
+        finally:
+            for number, handler in handlers:
+                libc.sigaction(int(number), handler, None)
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    import pycolmap
+
+    return pycolmap
+
+
+@contextlib.contextmanager
+def quiet_pycolmap() -> Iterator[Any]:
+    """pycolmap with its log silenced, except for fatal errors."""
+    pycolmap = import_pycolmap()
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
+    try:
+        yield pycolmap
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def threads() -> int:
+    """CPUs this process may use."""
+    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _atomic_text(path: Path, text: str) -> None:
+    aside = path.with_name(path.name + ".part")
+    aside.write_text(text)
+    os.replace(aside, path)
+
+
+def prepare(
+    folder: Path,
+    names: Sequence[str],
+    *,
+    max_side: int,
+    features: int,
+    seed: int,
+    masks: Mapping[str, Path],
+    work: Path,
+    progress: Progress,
+    safe_point: SafePoint,
+    warn: Callable[..., None],
+) -> tuple[list[WorkImage], list[tuple[str, str]]]:
+    """Upright copies of the photographs in `work/images`, longest side at most `max_side`; what cannot be read is left out.
+
+    returns  the copies in sorted order of name, and (name, reason) of each photograph left out
+
+    What an earlier, killed call with the same photographs and settings left in `work` is kept, anything else there is removed.
+    """
+    request = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "photographs": _digests(folder, names, masks, safe_point)}
+    text = json.dumps(request, indent=1, sort_keys=True)
+    record = work / "request.json"
+    if not record.is_file() or record.read_text() != text:
+        for part in ("images", "masks", "copies"):
+            shutil.rmtree(work / part, ignore_errors=True)
+        remove_database(work)
+        for part in ("images", "masks", "copies"):
+            (work / part).mkdir(parents=True)
+        _atomic_text(record, text)
+    images: list[WorkImage] = []
+    rejected: list[tuple[str, str]] = []
+    for index, name in enumerate(sorted(names)):
+        safe_point()
+        note = work / "copies" / f"{index:05d}.json"
+        if not note.is_file():
+            _atomic_text(note, json.dumps(_copy(folder, name, index, max_side, masks.get(name), work)))
+        copied = json.loads(note.read_text())
+        if "reason" in copied:
+            rejected.append((name, copied["reason"]))
+            warn(f"{name}: {copied['reason']}; left out.")
+        else:
+            if copied["remark"]:
+                warn(f"{name}: {copied['remark']}")
+            images.append(WorkImage(**copied["image"]))
+        progress(index + 1, len(names), "reading photographs")
+    return images, rejected
+
+
+def _digests(folder: Path, names: Sequence[str], masks: Mapping[str, Path], safe_point: SafePoint) -> list[list[str | None]]:
+    rows: list[list[str | None]] = []
+    for name in sorted(names):
+        safe_point()
+        try:
+            digest = _sha256(folder / name)
+        except OSError as error:
+            digest = str(error.strerror)
+        rows.append([name, digest, _sha256(masks[name]) if name in masks else None])
+    return rows
+
+
+def _copy(folder: Path, name: str, index: int, max_side: int, mask_path: Path | None, work: Path) -> dict[str, Any]:
+    try:
+        photo: UprightPhoto = upright_photo(folder / name, max_side)
+    except UnreadableImage as error:
+        return {"reason": str(error)}
+    file = f"{index:05d}.png"
+    write_png(work / "images" / file, photo.rgb)
+    mask, remark = photo.opaque, ""
+    if mask_path is not None:
+        try:
+            given = mask_of(mask_path, photo)
+            mask = given if mask is None else mask & given
+        except UnreadableImage as error:
+            remark = f"its mask is not used: {error}"
+    if mask is not None:
+        write_png(work / "masks" / f"{file}.png", np.where(mask, np.uint8(255), np.uint8(0)))
+    height, width = photo.rgb.shape[:2]
+    focal = None if photo.focal is None else float(photo.focal)
+    key = f"{photo.width}x{photo.height} {photo.maker} {focal if focal is None else round(focal, 1)}"
+    return {"image": WorkImage(name, file, photo.width, photo.height, width, height, focal, key).__dict__, "remark": remark}
+
+
+def database_path(work: Path) -> Path:
+    return work / "database.db"
+
+
+def remove_database(work: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        Path(str(database_path(work)) + suffix).unlink(missing_ok=True)
+
+
+def open_database(work: Path, images: Sequence[WorkImage]) -> bool:
+    """A database that lists exactly `images`, each with its camera; made anew unless the one that is there is whole.
+
+    returns  whether features or matches of an earlier call are kept
+    """
+    if database_path(work).exists():
+        if _is_sound(database_path(work), images):
+            return True
+        remove_database(work)
+    # The database appears by rename: a kill while the images are being listed leaves none.
+    aside = work / "database.part"
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        Path(str(aside) + suffix).unlink(missing_ok=True)
+    with quiet_pycolmap() as pycolmap:
+        cameras: dict[str, int] = {}
+        for image in images:
+            if image.camera_key not in cameras:
+                with pycolmap.Database.open(aside) as database:
+                    cameras[image.camera_key] = database.write_camera(_first_guess(image))
+            options = pycolmap.ImageReaderOptions()
+            options.existing_camera_id = cameras[image.camera_key]
+            pycolmap.import_images(aside, work / "images", pycolmap.CameraMode.SINGLE, [image.file], options)
+    with contextlib.closing(sqlite3.connect(aside)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    os.replace(aside, database_path(work))
+    return False
+
+
+def _first_guess(image: WorkImage) -> Any:
+    """SIMPLE_RADIAL: one focal length and one distortion term, which every number of photographs can support.
+
+    Richer lenses are tried once the scene is known. Without EXIF data the focal length starts at 1.2 times the longest side, a
+    moderate wide angle as phones and small cameras have it.
+    """
+    pycolmap = import_pycolmap()
+    scale = np.sqrt(image.work_width * image.work_height / (image.width * image.height))
+    focal = image.focal * scale if image.focal else 1.2 * max(image.work_width, image.work_height)
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=image.work_width, height=image.work_height, params=[focal, image.work_width / 2, image.work_height / 2, 0.0]
+    )
+    camera.has_prior_focal_length = image.focal is not None
+    return camera
+
+
+def _is_sound(path: Path, images: Sequence[WorkImage]) -> bool:
+    """Whether SQLite finds no damage, the images are those expected, and no image or pair is half written."""
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            ask = connection.execute
+            if ask("PRAGMA integrity_check").fetchall() != [("ok",)]:
+                return False
+            if [row[0] for row in ask("SELECT name FROM images ORDER BY image_id")] != [image.file for image in images]:
+                return False
+            if ask("SELECT COUNT(DISTINCT camera_id) FROM images").fetchone()[0] != len({image.camera_key for image in images}):
+                return False
+            keypoints = dict(ask("SELECT image_id, rows FROM keypoints").fetchall())
+            descriptors = dict(ask("SELECT image_id, rows FROM descriptors").fetchall())
+            if keypoints != descriptors:
+                return False
+            matched = {row[0] for row in ask("SELECT pair_id FROM matches")}
+            return {row[0] for row in ask("SELECT pair_id FROM two_view_geometries")} <= matched
+    except sqlite3.Error:
+        return False
+
+
+def extract(work: Path, images: Sequence[WorkImage], *, features: int, progress: Progress, safe_point: SafePoint) -> None:
+    """SIFT features of the images that have none yet, a few images at a time."""
+    with quiet_pycolmap() as pycolmap:
+        with pycolmap.Database.open(database_path(work)) as database:
+            known = {image.name for image in database.read_all_images() if database.exists_descriptors(image.image_id)}
+        reader = pycolmap.ImageReaderOptions()
+        if any((work / "masks").glob("*.png")):
+            for image in images:  # COLMAP skips an image whose mask is missing
+                if not (work / "masks" / f"{image.file}.png").exists():
+                    write_png(work / "masks" / f"{image.file}.png", np.full((image.work_height, image.work_width), 255, np.uint8))
+            reader.mask_path = work / "masks"
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu = False
+        options.num_threads = threads()
+        options.sift.max_num_features = features
+        done = len(known)
+        progress(done, len(images), "finding features")
+        for octave in (-1, 0):
+            options.sift.first_octave = octave
+            todo = [i for i in images if i.file not in known and (max(i.work_width, i.work_height) < FINE_BELOW) == (octave < 0)]
+            for start in range(0, len(todo), 2 * threads()):
+                safe_point()
+                some = [image.file for image in todo[start : start + 2 * threads()]]
+                pycolmap.extract_features(
+                    database_path(work), work / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+                )
+                done += len(some)
+                progress(done, len(images), "finding features")
+
+
+def pairs_to_match(count: int, how: str) -> list[list[tuple[int, int]]]:
+    """Blocks of pairs (i < j) of positions in the sorted list of images.
+
+    exhaustive  every pair
+    sequential  each image with the NEIGHBOURS after it and those 2, 4, 8 ... times as far; besides, up to KEYFRAMES images spread
+                evenly over the sequence with each other, so that a walk round an object is closed
+    """
+    if how == "exhaustive":
+        wanted = {(i, j) for i in range(count) for j in range(i + 1, count)}
+    elif how == "sequential":
+        offsets = [*range(1, NEIGHBOURS + 1), *(NEIGHBOURS * 2**k for k in range(1, 4))]
+        wanted = {(i, i + offset) for i in range(count) for offset in offsets if i + offset < count}
+        key = range(0, count, max(1, -(-count // KEYFRAMES)))
+        wanted |= {(i, j) for i in key for j in key if i < j}
+    else:
+        raise ValueError(f"matching {how!r}: expected 'exhaustive' or 'sequential'")
+    blocks: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j in sorted(wanted):
+        blocks.setdefault((i // BLOCK, j // BLOCK), []).append((i, j))
+    return [blocks[place] for place in sorted(blocks)]
+
+
+def match(work: Path, images: Sequence[WorkImage], *, how: str, seed: int, progress: Progress, safe_point: SafePoint) -> None:
+    """Matches and two-view geometries of the pairs that have none yet, a block at a time.
+
+    COLMAP compares descriptors by FAISS, which multiplies matrices with an OpenBLAS built for a single thread: two threads that ask for its
+    scratch memory at once may be given the same piece, and then some matches are wrong, about once in sixty runs on a busy machine. One
+    thread compares (COLMAP verifies in another one meanwhile, without BLAS).
+    """
+    with quiet_pycolmap() as pycolmap:
+        with pycolmap.Database.open(database_path(work)) as database:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            verified = {tuple(sorted(pair)) for pair in verified_pairs(database_path(work))}
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.use_gpu = False
+        matching.num_threads = 1
+        geometry = pycolmap.TwoViewGeometryOptions()
+        geometry.ransac.random_seed = seed
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = work / "pairs.txt"
+        blocks = pairs_to_match(len(images), how)
+        total, done = sum(map(len, blocks)), 0
+        for block in blocks:
+            safe_point()
+            todo = [(i, j) for i, j in block if tuple(sorted((ids[images[i].file], ids[images[j].file]))) not in verified]
+            if todo:
+                (work / "pairs.txt").write_text("".join(f"{images[i].file} {images[j].file}\n" for i, j in todo))
+                pycolmap.match_image_pairs(database_path(work), matching, pairing, geometry, pycolmap.Device.cpu)
+            done += len(block)
+            progress(done, total, "matching pairs")
+
+
+def verified_pairs(path: Path) -> list[tuple[int, int]]:
+    """Image ids of each pair in the table of two-view geometries, in order."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        return [unpacked(row[0]) for row in connection.execute("SELECT pair_id FROM two_view_geometries ORDER BY pair_id")]
+
+
+def unpacked(pair: int) -> tuple[int, int]:
+    """COLMAP packs the ids of two images into one number."""
+    return (pair - pair % 2147483647) // 2147483647, pair % 2147483647

@@ -1,0 +1,216 @@
+"""Cameras from photographs: structure from motion with COLMAP's incremental mapper, on the CPU, repeatable to the last bit.
+
+The frame is COLMAP's own: neither its scale nor its up axis means anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import resized
+from pipeline.errors import BadInput
+from stages.io.capture import Capture, Photo, SparsePoints
+from stages.sfm import mapping, matches
+from stages.sfm.matches import WorkImage
+
+EXHAUSTIVE_UP_TO = 100  # photographs; beyond it, every pair would take longer than everything else together
+NAMED = 8  # photographs that an error lists by name
+
+def find_cameras(
+    folder: Path,
+    names: Sequence[str],
+    *,
+    max_side: int = 1600,
+    features: int = 4096,
+    matching: str = "auto",
+    seed: int = 0,
+    masks: Mapping[str, Path] | None = None,
+    work: Path,
+    progress: Callable[..., None],
+    safe_point: Callable[[], None],
+    warn: Callable[..., None],
+) -> Capture:
+    """Find where each photograph was taken from, and what took it.
+
+    folder, names   the photographs, paths relative to the folder; any order
+    max_side        longest side at which features are searched, pixels
+    features        most features of a photograph
+    matching        "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
+    masks           of some or all names: no features where the mask is black
+    work            scratch folder; what a killed call left in it is used again, and the result is the same to the bit
+    returns         a Capture of kind "photographs"; photographs that failed are in `rejected`, with the reason
+
+    Raises BadInput where fewer than 3 or less than half of the photographs find their place.
+    """
+    masks = masks or {}
+    work.mkdir(parents=True, exist_ok=True)
+    images, unreadable = matches.prepare(
+        folder, names, max_side=max_side, features=features, seed=seed, masks=masks, work=work, progress=progress, safe_point=safe_point, warn=warn
+    )
+    if len(images) < mapping.FEWEST:
+        raise BadInput(
+            f"{folder}: {len(images)} readable photographs; at least {mapping.FEWEST} are needed, and 20 or more all round a subject are better."
+            + (f" Unreadable: {_listed([name for name, _ in unreadable])}." if unreadable else "")
+        )
+    if matching == "auto":
+        matching = "exhaustive" if len(images) <= EXHAUSTIVE_UP_TO else "sequential"
+    with _full_disk_named(work):
+        matches.open_database(work, images)
+        matches.extract(work, images, features=features, progress=progress, safe_point=safe_point)
+        matches.match(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
+        models = mapping.models_of(work, images, seed, progress, safe_point)
+    rejected = [*unreadable, *_left_out(work, images, models)]
+    if mapping.registered(models) < max(mapping.FEWEST, len(images) / 2):
+        raise BadInput(_failure(folder, images, models, rejected, matching))
+    capture = _capture(folder, work, images, mapping.refined(work, images, models[0], safe_point), masks, rejected)
+    for sentence in capture.warnings:
+        warn(sentence)
+    return capture
+
+
+@contextlib.contextmanager
+def _full_disk_named(work: Path) -> Iterator[None]:
+    """COLMAP reports a full disk as one of many RuntimeErrors."""
+    try:
+        yield
+    except (RuntimeError, sqlite3.OperationalError) as error:
+        if shutil.disk_usage(work).free < 1 << 20:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(work)) from error
+        raise
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+
+
+def _left_out(work: Path, images: Sequence[WorkImage], models: Sequence[Any]) -> list[tuple[str, str]]:
+    """(name, reason) of each photograph that the best model does not hold."""
+    held = [{image.name for image in model.images.values() if image.has_pose} for model in models]
+    missing = [image for image in images if not held or image.file not in held[0]]
+    if not missing:
+        return []
+    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+        features = {image.file: database.num_keypoints_for_image(ids[image.file]) for image in missing}
+        best: dict[int, int] = {}
+        for pair in matches.verified_pairs(matches.database_path(work)):
+            inliers = len(database.read_two_view_geometry(*pair).inlier_matches)
+            for image_id in pair:
+                best[image_id] = max(best.get(image_id, 0), inliers)
+    rejected = []
+    for image in missing:
+        other = next((model for model in held[1:] if image.file in model), None)
+        inliers = best.get(ids[image.file], 0)
+        if other is not None:
+            reason = f"belongs to a separate group of {len(other)} photographs that shares too little with the rest"
+        elif features[image.file] < 50:
+            reason = f"only {features[image.file]} features found: blurred, dark or without texture"
+        elif inliers < 15:
+            reason = "overlaps no other photograph well enough"
+        else:
+            reason = f"too few points shared with the cameras found (at most {inliers} with one photograph)"
+        rejected.append((image.name, reason))
+    return rejected
+
+
+def _failure(folder: Path, images: Sequence[WorkImage], models: Sequence[Any], rejected: Sequence[tuple[str, str]], how: str) -> str:
+    hints = ["more photographs with at least 60 % overlap between neighbours, sharp, of a subject with texture"]
+    if how == "sequential":
+        hints.append("--set poses.matching=exhaustive if the names do not follow the path of the camera")
+    hints.append("--set poses.features=8192")
+    worst = dict(rejected)
+    fewest = max(mapping.FEWEST, -(-len(images) // 2))
+    return (
+        f"{folder}: cameras found for {mapping.registered(models)} of {len(images)} photographs; at least {fewest} are needed. "
+        f"Not placed: {_listed(list(worst))} ({next(iter(worst.values()), 'no model')}).\nTry {'; '.join(hints)}."
+    )
+
+
+def _capture(
+    folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Mapping[str, Path], rejected: list[tuple[str, str]]
+) -> Capture:
+    by_file = {image.file: image for image in images}
+    registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    at_work = [mapping.camera_of(model, image, by_file[image.name]) for image in registered]  # at working size
+    photos = tuple(
+        Photo(camera=resized(camera, by_file[image.name].width, by_file[image.name].height), image=folder / camera.name, mask=masks.get(camera.name))
+        for camera, image in zip(at_work, registered, strict=True)
+    )
+    index = {image.image_id: i for i, image in enumerate(registered)}
+    points = _points(model, index)
+    agreement = mapping.agreement_of(work, images, model)
+    facts: dict[str, object] = {
+        "photographs": len(images),
+        "registered": len(photos),
+        "points": len(points.xyz),
+        "triangulation_angle": round(triangulation_angle(points, photos), 3),
+        "pairs_agreeing": round(agreement, 4),
+    }
+    warnings = _doubts(photos, points, agreement, [by_file[image.name].focal for image in registered])
+    if rejected:
+        warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} found no place: {_listed([name for name, _ in rejected])}.")
+    return Capture(
+        kind="photographs",
+        photos=photos,
+        background=None,
+        points=points,
+        rejected=tuple(rejected),
+        warnings=tuple(warnings),
+        reprojection_error=float(model.compute_mean_reprojection_error()),
+        facts=facts,
+    )
+
+
+def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
+    ordered = [point for _, point in sorted(model.points3D.items())]
+    return SparsePoints(
+        xyz=np.array([point.xyz for point in ordered], np.float64).reshape(-1, 3),
+        rgb=np.array([point.color for point in ordered], np.uint8).reshape(-1, 3),
+        error=np.array([point.error for point in ordered], np.float64),
+        observers=tuple(tuple(sorted({index[element.image_id] for element in point.track.elements})) for point in ordered),
+    )
+
+
+def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
+    """Median over the points of the largest angle between two of their rays, degrees; the depth of a scene seen under less than about
+    two is a guess."""
+    if not len(points.xyz):
+        return 0.0
+    centres = np.array([photo.camera.centre for photo in photos])
+    step = max(1, len(points.xyz) // 2000)
+    widest = []
+    for xyz, observers in zip(points.xyz[::step], points.observers[::step], strict=True):
+        towards = centres[list(observers)] - xyz
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        widest.append(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1, 1))))
+    return float(np.median(widest))
+
+
+def _doubts(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:
+    """What is odd about a model whose counts and reprojection error are fine."""
+    doubts = []
+    angle = triangulation_angle(points, photos)
+    if angle < 2.0:
+        doubts.append(f"The photographs were taken almost from one place (points are seen under {angle:.1f} degrees): depth will be poor.")
+    if agreement < 0.8:
+        doubts.append(
+            f"Only {agreement:.0%} of the matches between pairs of photographs agree with the cameras found: repeated structure may have folded the scene. "
+            "Look at the cameras before training."
+        )
+    lenses = {photo.camera.params: (photo.camera, prior) for photo, prior in zip(photos, priors, strict=True)}
+    for camera, prior in lenses.values():
+        focal, longest = camera.intrinsics["fx"], max(camera.width, camera.height)
+        if prior and mapping.far_off(focal, prior):
+            doubts.append(f"{camera.name}: focal length {focal:.0f} px, but {prior:.0f} px by its EXIF data; cropped or edited photographs may explain it.")
+        elif not 0.35 < focal / longest < 6.0:
+            doubts.append(f"{camera.name}: an unlikely focal length, {focal:.0f} px at {longest} px wide.")
+    return doubts

@@ -1,0 +1,70 @@
+"""`enerf diff` and `enerf convert`: what can be done with asset files and nothing else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from workflows.cli.options import common_options, folder_type, json_option, quiet_option
+
+DIFFERENT = 6  # exit code of `enerf diff`; 1 would be that of a defect
+LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asset.serialisation.WRITERS, which a test compares; that import is heavy
+
+
+@click.command(short_help="Compare two assets: what they say, their tensors, their pictures.")
+@click.argument("first", metavar="A", type=folder_type)
+@click.argument("second", metavar="B", type=folder_type)
+@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Pictures to compare, from around A; 0: none.")
+@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels along a side of the pictures.")
+@json_option
+@quiet_option
+@common_options
+def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet: bool) -> int:
+    """Say which metadata and tensors of the assets (or the runs' assets) A and B differ, and by how many decibels their pictures do.
+
+    Exit code 0 if they are equal, 6 if they differ, 4 if one is damaged.
+    """
+    from workflows.cli.progress import write_json
+    from workflows.inspection.compare import compare, in_words
+
+    found = compare(first, second, views, size)
+    code = 0 if found["equal"] else DIFFERENT
+    if as_json:
+        write_json({"event": "summary", "ok": True, "first": str(first), "second": str(second), **found, "exit_code": code})
+    elif not quiet:
+        click.echo(in_words(found))
+    return code
+
+
+@click.command(short_help="Write an asset in another layout, resolution or degree.")
+@click.argument("what", metavar="RUN|ASSET", type=folder_type)
+@click.argument("out", metavar="OUT", type=folder_type)
+@click.option("--layout", type=click.Choice(LAYOUTS), help="How the voxels lie in OUT; as in ASSET if it is left out.")
+@click.option("--sh-degree", "degree", type=click.IntRange(0, 4), help="Keep the spherical harmonics up to this degree.")
+@click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side; fewer than there are.")
+@json_option
+@quiet_option
+@common_options
+def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None, as_json: bool, quiet: bool) -> None:
+    """Write the asset of RUN, or ASSET, to the file OUT.
+
+    compact: 4 bytes a voxel and one for each harmonic above the first; small: 6; sparse: 16-bit floats; full: all voxels of each brick, 16-bit
+    floats, or 32-bit ones as full32. A file that exists is replaced, and only once the new one is whole.
+    """
+    from efficientnerf.asset.format import describe
+    from pipeline.errors import UsageError
+    from workflows.cli.progress import size, write_json
+    from workflows.inspection.convert import convert as convert_asset
+
+    if out.suffix.lower() != ".nerftree":
+        raise UsageError(f"{out}: the extension {out.suffix!r} is not that of an asset; expected .nerftree. For meshes and points: enerf export")
+    if out.is_dir() or not out.absolute().parent.is_dir():
+        raise UsageError(f"{out}: is a folder. Give a file." if out.is_dir() else f"{out}: the folder {out.parent} does not exist. Make it first.")
+    convert_asset(what, out, layout, degree, resolution)
+    about = describe(out)
+    facts = {key: about[key] for key in ("layout", "resolution", "voxels", "sh_degree", "bytes", "bytes_per_voxel")}
+    if as_json:
+        write_json({"event": "summary", "ok": True, "written": [{"path": str(out.absolute()), **facts}], "exit_code": 0})
+    elif not quiet:
+        click.echo(f"{out}: {about['layout']}, {about['voxels']} voxels, degree {about['sh_degree']}, {size(about['bytes'])}")

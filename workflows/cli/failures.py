@@ -1,0 +1,83 @@
+"""How an error reaches the user: one or two lines, an exit code, and with --json an object as the last line."""
+
+from __future__ import annotations
+
+import errno
+import sys
+from typing import Any
+
+import click
+
+INTERNAL = 1  # a defect of this program; the documented codes are those of the errors in pipeline/errors.py
+
+
+class Reported(Exception):
+    """An error together with facts for the JSON object that ends the output."""
+
+    def __init__(self, error: BaseException, facts: dict[str, Any]) -> None:
+        super().__init__(str(error))
+        self.error = error
+        self.facts = facts
+
+
+def exit_code(error: BaseException) -> int:
+    from pipeline.errors import PipelineError
+
+    if isinstance(error, PipelineError):
+        return int(error.exit_code)
+    if isinstance(error, click.exceptions.Exit):
+        return error.exit_code
+    if isinstance(error, (KeyboardInterrupt, click.Abort)):
+        return 130
+    if isinstance(error, click.ClickException):
+        return 2
+    if isinstance(error, OSError):
+        return 3 if error.errno in (errno.ENOSPC, errno.EDQUOT) else 2
+    return INTERNAL
+
+
+def sentence(error: BaseException) -> str:
+    """The error in one or two lines."""
+    from pipeline.errors import PipelineError
+
+    if isinstance(error, PipelineError):
+        return str(error)
+    if isinstance(error, (KeyboardInterrupt, click.Abort)):
+        return "interrupted"
+    if isinstance(error, click.ClickException):
+        text = error.format_message()
+        # click says where help is to be found in lines of its own; one will do.
+        context = getattr(error, "ctx", None)
+        return f"{text} Try '{context.command_path} --help'." if context is not None else text
+    if isinstance(error, OSError):
+        what = error.strerror or type(error).__name__
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return f"{error.filename or 'the disk'}: {what}. Free some space and run the same command again; nothing is lost."
+        return f"{error.filename}: {what}." if error.filename else f"{what}."
+    text = " ".join(str(error).split())
+    return f"internal error: {type(error).__name__}: {text[:300]}. Run it again with --debug for the traceback."
+
+
+def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
+    """Print the error and return the exit code."""
+    facts: dict[str, Any] = {}
+    if isinstance(error, Reported):
+        facts, error = error.facts, error.error
+    if isinstance(error, SystemExit):
+        raise error
+    code = exit_code(error)
+    if code == 0:
+        return 0
+    if isinstance(error, BrokenPipeError):
+        return 0  # the reader of our output has had enough
+    if debug:
+        import traceback
+
+        traceback.print_exception(error, file=sys.stderr)
+    text = sentence(error)
+    print(f"enerf: {text}", file=sys.stderr, flush=True)
+    if as_json:
+        from workflows.cli.progress import write_json
+
+        write_json({"event": "summary", "ok": False, "error": text, "kind": type(error).__name__, **facts, "exit_code": code})
+    return code

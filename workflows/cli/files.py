@@ -1,0 +1,206 @@
+"""`enerf export`, `enerf render` and `enerf inspect`: what can be done with a run, and mostly with an asset file alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from workflows.cli.options import common_options, folder_type, json_option, quiet_option, set_option
+
+if TYPE_CHECKING:
+    from workflows.cli.resolve import Settings
+
+CAMERAS = ".json"
+
+
+@click.command(short_help="Write meshes, points or cameras in other formats.")
+@click.argument("what", metavar="RUN|ASSET", type=folder_type)
+@click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
+@click.option("--to", "first", required=True, metavar="FILE", type=folder_type, help="The file to write; more may follow. Its extension says the format.")
+@click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
+@set_option
+@json_option
+@quiet_option
+@common_options
+def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, sets: tuple[str, ...], as_json: bool, quiet: bool) -> None:
+    """Write the surface of RUN or ASSET as .ply, .glb or .obj, with --points as .ply or .xyz; or the cameras of RUN as .json (nerfstudio).
+
+    Files that exist are replaced, and only once the new ones are whole. '--set mesh.faces=...' and the other settings of mesh and points hold here too.
+    """
+    from pipeline.errors import UsageError
+    from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+    from workflows.cli.progress import write_json
+
+    files = [first, *more]
+    known = [*(POINT_EXPORTERS if as_points else MESH_EXPORTERS), CAMERAS]
+    for path in files:
+        if path.suffix.lower() not in known:
+            kind = "points" if as_points else "a mesh"
+            raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
+        if not path.parent.is_dir():
+            raise UsageError(f"{path}: the folder {path.parent} does not exist. Make it first.")
+        if path.is_dir():
+            raise UsageError(f"{path}: is a folder. Give a file.")
+    cameras = [path for path in files if path.suffix.lower() == CAMERAS]
+    surfaces = [path for path in files if path not in cameras]
+    written: list[dict[str, Any]] = []
+    with _shown(as_json, quiet) as show:
+        for path in cameras:
+            written.append({"path": str(path.absolute()), "cameras": _export_cameras(what, path)})
+        if surfaces:
+            written += _export_surface(what, surfaces, as_points, sets, show)
+    if as_json:
+        write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
+    elif not quiet:
+        for entry in written:
+            facts = ", ".join(f"{value} {name}" for name, value in entry.items() if name != "path")
+            click.echo(f"{entry['path']}  ({facts})")
+
+
+def _export_cameras(what: Path, path: Path) -> int:
+    from pipeline.errors import BadInput
+    from stages.io import scene
+    from stages.io.exporters import cameras
+    from workflows.cli.target import is_run
+
+    folder = what / "poses" if is_run(what) else what
+    if not (folder / "scene.json").is_file():
+        raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
+    found = scene.load(folder)
+    cameras.write(found, path)
+    return len(found.views)
+
+
+def _export_surface(what: Path, files: list[Path], as_points: bool, sets: tuple[str, ...], show: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:
+    from stages import mesh, points
+    from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+    from stages.io.exporters.writing import source_frame
+    from workflows.cli.target import load_asset
+
+    settings = _settings_for(what, sets, {"mesh": mesh.MeshSettings, "points": points.PointsSettings}).resolved()
+    progress = _progress("export", show)
+    tree = load_asset(what)
+    frame = source_frame(tree.metadata)
+    if as_points:
+        cloud = points.points_of(tree, settings["points"], frame, progress)
+        for path in files:
+            POINT_EXPORTERS[path.suffix.lower()](cloud, path, frame)
+        facts: dict[str, Any] = {"points": len(cloud.positions)}
+    else:
+        found = mesh.in_capture(mesh.mesh_of(tree, settings["mesh"], progress), frame)
+        for path in files:
+            MESH_EXPORTERS[path.suffix.lower()](found, path, frame)
+        facts = {"vertices": len(found.vertices), "faces": len(found.faces)}
+    return [{"path": str(path.absolute()), **facts} for path in files]
+
+
+def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> Settings:
+    """Settings of the stages named: as the run recorded them, or the defaults for a bare asset; then `--set`."""
+    from pipeline.run import Run
+    from workflows.cli.resolve import Settings
+    from workflows.cli.target import is_run
+
+    settings = Settings(types)
+    if is_run(what):
+        recorded = Run.open(what).settings
+        settings.put_recorded({name: recorded[name] for name in types if name in recorded})
+    for text in sets:
+        settings.put_option(text)
+    return settings
+
+
+@click.command(short_help="Draw a turntable, or the cameras of a JSON path.")
+@click.argument("what", metavar="RUN|ASSET", type=folder_type)
+@click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder for frame_0000.png and so on; made if need be.")
+@click.option("--path", "camera_path", type=folder_type, metavar="JSON", help="A camera path as nerfstudio exports it, in the frame of the capture.")
+@click.option("--frames", type=click.IntRange(1, 9999), help="Pictures of the turntable.")
+@click.option("--width", type=click.IntRange(16, 8192), help="Pixels; with --path in place of what the file says.")
+@click.option("--height", type=click.IntRange(16, 8192), help="Pixels.")
+@click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb.")
+@click.option("--video", metavar="FILE", type=folder_type, help="Also write the frames as an MP4 (H.264).")
+@set_option
+@json_option
+@quiet_option
+@common_options
+def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any) -> None:
+    """Draw RUN's asset or ASSET from all around, or along a camera path, into DIR.
+
+    The settings of the stage turntable hold here too: '--set turntable.elevation=30'. Frames that exist are replaced.
+    """
+    from dataclasses import replace
+
+    from pipeline.errors import UsageError
+    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames, read_camera_path, similarity_of, turntable_cameras
+    from stages.io.exporters.frames import background_from_text
+    from stages.turntable import TurntableSettings
+    from workflows.cli.progress import write_json
+    from workflows.cli.target import load_asset
+
+    if video is not None and video.suffix.lower() != ".mp4":
+        raise UsageError(f"--video {video}: the extension {video.suffix!r} is not known; expected .mp4.")
+    if video is not None and not video.absolute().parent.is_dir():
+        raise UsageError(f"--video {video}: the folder {video.parent} does not exist. Make it first.")
+    if camera_path is not None and given["frames"] is not None:
+        raise UsageError("--frames: the path says how many there are; give either --path or --frames.")
+    settings = _settings_for(what, sets, {"turntable": TurntableSettings}).resolved()["turntable"]
+    settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
+    background_from_text(settings.background)
+    tree = load_asset(what)
+    fps = settings.fps
+    if camera_path is not None:
+        path = read_camera_path(camera_path, similarity_of(tree), width=given["width"], height=given["height"])
+        cameras, fps = list(path.cameras), path.fps or fps
+    else:
+        shape = {name: getattr(settings, name) for name in ("frames", "width", "height", "elevation", "radius", "fov", "sway")}
+        cameras = turntable_cameras(tree, **shape)
+    options = RenderOptions(background=settings.background, supersample=settings.supersample, exr=settings.exr, video=None, fps=fps, crf=settings.crf)
+    with _shown(as_json, quiet) as show:
+        progress = _progress("render", show)
+        written = draw_frames(tree, cameras, out, options, lambda done, total: progress(done, total, "frames"))
+        if video is not None:
+            encode_frames([each for each in written if each.suffix == ".png"], video, options)
+            written.append(video)
+    if as_json:
+        write_json({"event": "summary", "ok": True, "written": [str(each.absolute()) for each in written], "exit_code": 0})
+    elif not quiet:
+        click.echo(f"{len(cameras)} frames in {out}" + (f", {video}" if video is not None else ""))
+
+
+@click.command(short_help="Describe an asset, a run, a data set, a mesh or points.")
+@click.argument("what", metavar="FILE|FOLDER", type=folder_type)
+@json_option
+@common_options
+def inspect(what: Path, as_json: bool) -> None:
+    """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, what is odd."""
+    from workflows.cli.progress import write_json
+    from workflows.inspection.describe import describe, in_words
+
+    found = describe(what)
+    if as_json:
+        write_json(found, indent=1)
+    else:
+        click.echo(in_words(found))
+
+
+def _shown(as_json: bool, quiet: bool) -> Any:
+    from workflows.cli.progress import display
+
+    return display(as_json=as_json, quiet=quiet)
+
+
+def _progress(stage: str, show: Callable[[dict[str, Any]], None]) -> Callable[[int, int, str], None]:
+    """A callable that turns (done, total, text) into events, at most ten a second."""
+    import time
+
+    last = [0.0]
+
+    def progress(done: int, total: int, text: str) -> None:
+        now = time.monotonic()
+        if done >= total or now - last[0] >= 0.1:
+            last[0] = now
+            show({"event": "progress", "stage": stage, "time": time.time(), "done": done, "total": total, "text": text})
+
+    return progress

@@ -1,0 +1,59 @@
+"""The command `enerf`.
+
+Only click is imported here and by the modules of the commands; what a command needs is imported when it runs, so that `--help` answers
+at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import click
+
+from workflows.cli import assets, files, paper, presets, run, state
+from workflows.cli.failures import report_failure
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog="Exit codes: 0 done; 2 usage or bad input; "
+    "3 a stage failed; 4 corrupt artifact; 5 run locked; 6 assets differ; 130, 143 interrupted.")
+@click.version_option(package_name="efficientnerf", prog_name="enerf")
+def enerf() -> None:
+    """Photographs or posed data sets in, a baked 3D asset out.
+
+    \b
+    enerf run photos/ --out runs/mine      everything, from photographs to asset, turntable, mesh and points
+    enerf run --out runs/mine              go on where it was left
+    """
+
+
+for command in (
+    run.run,
+    run.stage,
+    state.status,
+    state.verify,
+    state.report,
+    files.export,
+    files.render,
+    files.inspect,
+    assets.diff,
+    assets.convert,
+    presets.presets,
+    paper.paper,
+):
+    enerf.add_command(command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code. Errors are one or two lines on standard error, and a JSON object with --json."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    as_json, debug = "--json" in given, "--debug" in given
+    try:
+        result = enerf.main(args=given, prog_name="enerf", standalone_mode=False)
+    except BaseException as error:
+        return report_failure(error, as_json=as_json, debug=debug)
+    return result if isinstance(result, int) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

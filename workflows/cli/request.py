@@ -1,0 +1,129 @@
+"""From the options of `enerf run` to a Run: its source, its settings, its device."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.errors import BadInput, UsageError
+from pipeline.run import NAME, Run
+from pipeline.stage import Stage
+from workflows.cli.device import has_cuda
+from workflows.cli.resolve import Config, Settings, read_config, read_preset, seconds_of, table_of
+
+
+@dataclass(frozen=True)
+class Options:
+    """What was asked for on the command line; None or empty where nothing was said."""
+
+    source: Path | None = None
+    format: str | None = None
+    preset: str | None = None
+    config: Path | None = None
+    sets: tuple[str, ...] = ()
+    seed: int | None = None
+    budget: str | None = None
+    device: str | None = None
+    strict: bool = False
+    allow_outside: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run as it will be, nothing of it written yet.
+
+    run       a Run with the new settings
+    new       whether its folder has yet to be made
+    device    "auto", "cpu" or "cuda" as wanted
+    warnings  for the user
+    """
+
+    run: Run
+    new: bool
+    device: str
+    warnings: list[str] = field(default_factory=list)
+
+    def write(self) -> Run:
+        """Make the run, or change what the standing one records."""
+        if self.new:
+            return Run.create(self.run.path, self.run.source, self.run.settings, preset=self.run.preset, seed=self.run.seed, device=self.run.device)
+        run = Run.open(self.run.path)
+        run.update(source=self.run.source, settings=self.run.settings, preset=self.run.preset, seed=self.run.seed, device=self.run.device)
+        return run
+
+
+def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
+    """What `enerf run` with these options means for the folder `path`. Writes nothing. Raises BadInput and UsageError."""
+    config = read_config(options.config) if options.config is not None else Config({})
+    seed = options.seed if options.seed is not None else config.options.get("seed")
+    device = options.device or config.options.get("device")
+    if device is not None and device not in ("auto", "cpu", "cuda"):
+        raise UsageError(f"--config {options.config}: device: found {device!r}, expected auto, cpu or cuda.")
+    preset = options.preset or config.options.get("preset")
+    standing = _standing(path)
+    if standing is None:
+        # Before anything else: a wrong folder must not be answered with a remark about settings.
+        Run(path).check_free()
+        if options.source is None:
+            raise UsageError(f"{path}: no run is there. To begin one: enerf run SOURCE --out {path}")
+        if preset is None:
+            preset = "standard" if device != "cpu" and has_cuda() else "preview"
+    warnings: list[str] = []
+    settings = Settings({stage.name: stage.settings for stage in stages})
+    if preset is not None:
+        settings.put_table(read_preset(preset).table, f"preset {preset}")
+    elif standing is not None:
+        dropped = settings.put_recorded(standing.settings)
+        if dropped:
+            warnings.append(f"settings that this version does not have are left out: {', '.join(dropped)}")
+    settings.put_table(config.table, f"--config {options.config}")
+    for text in options.sets:
+        settings.put_option(text)
+    if seed is None and standing is not None and options.preset is not None:
+        seed = standing.seed
+    if seed is not None:
+        settings.put_seed(seed)
+    for name, value, origin in (
+        ("format", options.format, f"--as {options.format}"),
+        ("strict", options.strict or None, "--strict"),
+        ("allow_outside", options.allow_outside or None, "--allow-outside"),
+    ):
+        if value is not None:
+            settings.put("poses", name, [value], origin)
+    if options.budget is not None:
+        settings.put("train", "budget", [seconds_of(options.budget)], f"--budget {options.budget}")
+    run = Run(
+        path,
+        _source(options.source, standing),
+        table_of(settings.resolved()),
+        preset=preset or (standing.preset if standing else None),
+        seed=seed if seed is not None else (standing.seed if standing else None),
+        device=device or (standing.device if standing else None) or "auto",
+    )
+    return Plan(run, standing is None, run.device or "auto", warnings)
+
+
+def _standing(path: Path) -> Run | None:
+    return Run.open(path) if (path / NAME).exists() else None
+
+
+def _source(given: Path | None, standing: Run | None) -> Path | None:
+    """The source to record. A run stays with its source unless that is gone or nothing has been made of it yet."""
+    recorded = standing.source if standing is not None else None
+    if given is None:
+        return recorded
+    if not given.exists():
+        raise BadInput(f"{given}: no such file or folder. Give the folder of the photographs or of the data set.")
+    if not given.is_dir():
+        raise BadInput(f"{given}: is a file; expected the folder of the photographs or of the data set. Give {given.absolute().parent}")
+    if not os.listdir(given):
+        raise BadInput(f"{given}: the folder is empty; expected photographs or a data set.")
+    source = Path(os.path.abspath(given))
+    unchanged = recorded is None or os.path.realpath(source) == os.path.realpath(recorded)
+    if standing is not None and not unchanged and standing.folder("poses").exists() and recorded is not None and recorded.exists():
+        raise UsageError(
+            f"{standing.path}: was made from {recorded}, not from {source}. Give a new folder for another source, or go on: {standing.command()}"
+        )
+    return source

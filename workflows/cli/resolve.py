@@ -1,0 +1,196 @@
+"""From presets, files and options to the settings of every stage: names checked, values typed, the last word wins.
+
+The order is: the defaults of the dataclasses, the preset, the configuration file, `--set`, the dedicated options. A table here is
+what TOML gives: `{stage: {setting: value}}`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import BadInput, UnknownSetting, UsageError
+from pipeline.stage import settings_dict, settings_from
+from stages.settings import SettingInfo, describe_settings
+
+Table = Mapping[str, Mapping[str, Any]]
+PRESETS_FOLDER = Path(__file__).parents[1] / "presets"
+# Beside the tables of the stages, a configuration file may hold what the dedicated options say.
+CONFIG_OPTIONS = ("preset", "device", "seed")
+
+
+@dataclass(frozen=True)
+class Preset:
+    name: str
+    description: str
+    table: Table
+
+
+@dataclass(frozen=True)
+class Config:
+    """A configuration file, read: the tables of the stages and the options named in CONFIG_OPTIONS."""
+
+    table: Table
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """` Nearest: x.` or nothing, for the end of an error message."""
+    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f" Nearest: {found[0]}." if found else ""
+
+
+def preset_names() -> list[str]:
+    return sorted(path.stem for path in PRESETS_FOLDER.glob("*.toml"))
+
+
+def read_preset(name: str) -> Preset:
+    if name not in preset_names():
+        raise UsageError(f"--preset {name}: no such preset.{nearest(name, preset_names())} There are: {', '.join(preset_names())}.")
+    table = tomllib.loads((PRESETS_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
+    return Preset(name, table.pop("description"), table)
+
+
+def read_config(path: Path) -> Config:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"--config {path}: cannot be read ({error.strerror}).") from None
+    except UnicodeDecodeError:
+        raise BadInput(f"--config {path}: not a text file; expected TOML in UTF-8.") from None
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BadInput(f"--config {path}: not valid TOML: {error}.") from None
+    options = {name: content.pop(name) for name in CONFIG_OPTIONS if name in content}
+    for name, kind in (("preset", str), ("device", str), ("seed", int)):
+        if name in options and type(options[name]) is not kind:
+            raise UsageError(f"--config {path}: {name}: found {options[name]!r}, expected {'a whole number' if kind is int else 'text'}.")
+    for name, value in content.items():
+        if not isinstance(value, dict):
+            raise UnknownSetting(f"--config {path}: {name} stands outside a table; expected [stage] tables and {', '.join(CONFIG_OPTIONS)}.")
+    return Config(content, options)
+
+
+def parse_value(text: str) -> list[Any]:
+    """What the text of a `--set` may mean, the likeliest first: a TOML value, a list without its brackets, none, the text itself."""
+    readings: list[Any] = []
+    for candidate in (text, f"[{text}]") if "," in text else (text,):
+        try:
+            parsed = tomllib.loads(f"value = {candidate}")
+        except tomllib.TOMLDecodeError:
+            continue
+        if parsed.keys() == {"value"}:
+            readings.append(parsed["value"])
+    return [None, text] if text == "none" else [*readings, text]
+
+
+def seconds_of(text: str) -> float:
+    """Seconds in `90`, `90s`, `10m` or `1h30m`."""
+    found = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
+    if found is None or not any(found.groups()):
+        raise UsageError(f"--budget {text}: expected a time, as in 90s, 10m or 1h30m.")
+    hours, minutes, seconds = (float(part or 0) for part in found.groups())
+    return 3600 * hours + 60 * minutes + seconds
+
+
+class Settings:
+    """The settings of all stages while they are put together; every value is checked as it comes.
+
+    types   {stage: its settings dataclass}
+    """
+
+    def __init__(self, types: Mapping[str, type]) -> None:
+        self.types = dict(types)
+        self.about: dict[str, dict[str, SettingInfo]] = {
+            stage: {info.name: info for info in describe_settings(settings_type)} for stage, settings_type in types.items()
+        }
+        self.values: dict[str, dict[str, Any]] = {stage: {} for stage in types}
+
+    def _info(self, stage: str, name: str, origin: str) -> SettingInfo:
+        if stage not in self.about:
+            raise UnknownSetting(f"{origin}: no stage {stage!r}.{nearest(stage, self.about)} Stages: {', '.join(self.about)}.")
+        if name not in self.about[stage]:
+            known = [f"{stage}.{entry}" for entry in self.about[stage]]
+            close = nearest(f"{stage}.{name}", known) or nearest(name, [f"{s}.{n}" for s in self.about for n in self.about[s]])
+            raise UnknownSetting(f"{origin}: no setting {stage}.{name}.{close} 'enerf presets {stage}' lists them.")
+        return self.about[stage][name]
+
+    def put(self, stage: str, name: str, readings: Sequence[Any], origin: str) -> None:
+        """Set one value: the first reading that fits. `origin` begins the error message."""
+        self._info(stage, name, origin)
+        refused = None
+        for reading in readings:
+            try:
+                checked: Any = settings_from(self.types[stage], {name: reading}, where=stage)
+                self.values[stage][name] = getattr(checked, name)
+                return
+            except UsageError as error:
+                refused = refused or error
+        text = f"{origin}: {refused}"
+        raise UsageError(f"{text if text.endswith(('.', '?')) else f'{text}.'} 'enerf presets {stage}' says what it means.")
+
+    def put_table(self, table: Table, origin: str) -> None:
+        for stage, entries in table.items():
+            if not entries and stage not in self.about:
+                self._info(stage, "", origin)
+            for name, value in entries.items():
+                # TOML has no null: the word for it is none.
+                self.put(stage, name, [None, value] if value == "none" else [value], origin)
+
+    def put_recorded(self, table: Table) -> list[str]:
+        """Take over what a run recorded; returns the names that this version no longer has, or no longer admits."""
+        dropped = []
+        for stage, entries in table.items():
+            for name, value in entries.items():
+                try:
+                    self.put(stage, name, [value], "run.json")
+                except UsageError:
+                    dropped.append(f"{stage}.{name}")
+        return dropped
+
+    def put_option(self, text: str) -> None:
+        """One `--set stage.name=value`."""
+        path, equals, value = text.partition("=")
+        stage, dot, name = path.strip().partition(".")
+        if not equals or not dot or not name:
+            raise UsageError(f"--set {text}: expected stage.name=value, as in --set train.iterations=2000.")
+        self.put(stage, name, parse_value(value.strip()), f"--set {text}")
+
+    def put_seed(self, seed: int) -> None:
+        """Every stage that draws random numbers has a setting `seed`."""
+        for stage, entries in self.about.items():
+            if "seed" in entries:
+                self.put(stage, "seed", [seed], f"--seed {seed}")
+
+    def resolved(self) -> dict[str, Any]:
+        """{stage: an instance of its settings dataclass}."""
+        return {stage: settings_type(**self.values[stage]) for stage, settings_type in self.types.items()}
+
+
+def table_of(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Resolved settings as plain values that JSON can hold."""
+    return {stage: settings_dict(instance) for stage, instance in settings.items()}
+
+
+def shown(value: Any) -> str:
+    """A value as it is written after `--set stage.name=`."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(shown(item) for item in value) + "]"
+    return f"{value}"
+
+
+def meaning(info: SettingInfo) -> str:
+    """What a setting means, as a sentence with its unit."""
+    text = info.doc if ":" in info.doc.split(" ")[0] else info.doc[:1].upper() + info.doc[1:]
+    unit = f" ({info.unit})" if info.unit else ""
+    return f"{text.rstrip('.')}{unit}."

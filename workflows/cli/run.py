@@ -1,0 +1,131 @@
+"""`enerf run` and `enerf stage`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from workflows.cli.failures import Reported
+from workflows.cli.options import common_options, device_option, folder_type, json_option, quiet_option, set_option
+
+if TYPE_CHECKING:
+    from pipeline.run import Run
+    from workflows.cli.request import Plan
+
+
+@click.command(short_help="From photographs or a data set to everything; again: go on.")
+@click.argument("source", required=False, type=folder_type)
+@click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="The folder of the run.")
+@click.option("--as", "format_name", metavar="FORMAT", help="What SOURCE is, instead of finding out: see poses.format in 'enerf presets poses'.")
+@click.option("--preset", metavar="NAME",
+              help="Where settings start from: tiny, preview (default without CUDA), standard (default with), high; paper-n1 to -n4, nerf.")  # fmt: skip
+@set_option
+@click.option("--config", type=folder_type, metavar="FILE", help="A TOML file with tables of settings, one for each stage.")
+@click.option("--until", metavar="STAGE", help="Stop after this stage.")
+@click.option("--from", "start", metavar="STAGE", help="Do this stage and those after it again, even if they are up to date.")
+@device_option
+@click.option("--seed", type=int, help="The seed of every stage that draws random numbers.")
+@click.option("--budget", metavar="TIME", help="Train for so long, as 90s, 10m or 1h, in place of a number of steps: train.budget.")
+@click.option("--strict", is_flag=True, help="Refuse a source of which anything is missing or unreadable.")
+@click.option("--allow-outside", is_flag=True, help="Let a data set name files outside of its folder.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done and why; do nothing.")
+@json_option
+@quiet_option
+@common_options
+def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or go on with RUN.
+
+    SOURCE is a folder of photographs, or of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Without it, RUN goes on with the
+    settings that it recorded; options given change them. What is up to date is not done again.
+    """
+    from workflows import asset
+    from workflows.cli.request import Options, plan_run
+
+    options["format"] = options.pop("format_name")
+    plan = plan_run(run_folder, asset.STAGES, Options(**options))
+    _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run)
+
+
+@click.command(short_help="Run one stage with what the run has.")
+@click.argument("name", metavar="NAME")
+@click.argument("run_folder", metavar="RUN", type=folder_type)
+@set_option
+@click.option("--force", is_flag=True, help="Even if it is up to date.")
+@device_option
+@click.option("--dry-run", is_flag=True, help="Say whether it would run and why; do nothing.")
+@json_option
+@quiet_option
+@common_options
+def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Run the stage NAME of RUN with what the run already has; the stages before it are never run, and named if they are stale."""
+    from pipeline.errors import UsageError
+    from pipeline.run import Run
+    from workflows import asset
+    from workflows.cli.request import Options, plan_run
+    from workflows.cli.resolve import nearest
+
+    names = [each.name for each in asset.STAGES]
+    if name not in names:
+        raise UsageError(f"{name}: no such stage.{nearest(name, names)} Stages: {', '.join(names)}.")
+    for text in options["sets"]:
+        if text.partition(".")[0].strip() in {*names} - {name}:
+            raise UsageError(f"--set {text}: not a setting of {name}, the only stage that runs here. Use: enerf run --out {run_folder} --set {text}")
+    Run.open(run_folder)  # says so where it is none
+    plan = plan_run(run_folder, asset.STAGES, Options(**options))
+    _work(plan, as_json=as_json, quiet=quiet, only=name, force=force, dry_run=dry_run)
+
+
+def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection: Any) -> None:
+    """Carry a plan out, show it, and sum it up."""
+    import time
+
+    from pipeline.runner import run_stages
+    from workflows import asset
+    from workflows.cli.device import resolve_device
+    from workflows.cli.progress import display, write_json
+    from workflows.report.summary import in_words, summary
+
+    device = resolve_device(plan.device)
+    _check_stages(selection)
+    started = time.monotonic()
+    run: Run = plan.run
+    try:
+        with display(as_json=as_json, quiet=quiet) as show:
+            for text in plan.warnings:
+                show({"event": "warning", "stage": "", "text": text, "time": time.time()})
+            if not dry_run:
+                run = plan.write()
+            outcomes = run_stages(run, asset.STAGES, device=device, report=show, dry_run=dry_run, **selection)
+            if any(outcome.action == "ran" for outcome in outcomes):
+                _describe(run)
+    except (Exception, KeyboardInterrupt) as error:
+        raise Reported(error, summary(run.path, ())) from error
+    facts = summary(run.path, outcomes)
+    if as_json:
+        write_json({"event": "summary", "ok": True, **facts, "elapsed": time.monotonic() - started, "device": device, "exit_code": 0})
+    elif not quiet and not dry_run:
+        click.echo(in_words(run.path, outcomes))
+
+
+def _describe(run: Run) -> None:
+    """The page about the run: made anew whenever a stage was."""
+    from pipeline.decide import survey
+    from workflows import asset
+    from workflows.report.page import write_report
+
+    write_report(run, survey(asset.STAGES, run))
+
+
+def _check_stages(selection: dict[str, Any]) -> None:
+    """Refuse a stage that does not exist before a run is made."""
+    from pipeline.errors import UsageError
+    from workflows import asset
+    from workflows.cli.resolve import nearest
+
+    names = [stage.name for stage in asset.STAGES]
+    for option in ("until", "start"):
+        name = selection.get(option)
+        if name is not None and name not in names:
+            raise UsageError(f"--{'from' if option == 'start' else option} {name}: no such stage.{nearest(name, names)} Stages: {', '.join(names)}.")

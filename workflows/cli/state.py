@@ -1,0 +1,132 @@
+"""`enerf status`, `enerf verify` and `enerf report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from workflows.cli.options import common_options, folder_type, json_option, quiet_option
+
+
+@click.command(short_help="Say of each stage whether it is up to date, and why not.")
+@click.argument("run_folder", metavar="RUN", type=folder_type)
+@json_option
+@common_options
+def status(run_folder: Path, as_json: bool) -> None:
+    """Say of each stage of RUN whether it is fresh, stale, missing, partial or corrupt, with the reason, its seconds and its size.
+
+    Files whose size and time of change are the same are taken to be the same; 'enerf verify' reads them.
+    """
+    from pipeline.decide import survey
+    from pipeline.run import Run
+    from workflows import asset
+    from workflows.cli.progress import duration, size, write_json
+
+    run = Run.open(run_folder)
+    stages: list[dict[str, Any]] = []
+    for decision in survey(asset.STAGES, run):
+        made = decision.manifest
+        stages.append(
+            {
+                "name": decision.stage,
+                "state": decision.state,
+                "reason": decision.reason,
+                "note": decision.note,
+                "seconds": None if made is None else made.seconds,
+                "bytes": None if made is None else made.size,
+                "peak_memory": None if made is None else made.peak_memory,
+                "digest": None if made is None else made.digest,
+                "extra": list(decision.extra),
+            }
+        )
+    holder = run.holder()
+    if as_json:
+        facts: dict[str, Any] = {"run": str(run.path), "source": run.source, "preset": run.preset, "seed": run.seed, "device": run.device}
+        write_json({**facts, "written_by": None if holder is None else holder.text(), "stages": stages}, indent=1)
+        return
+    click.echo(f"{run.path}  from {run.source}  preset {run.preset}" if run.preset else f"{run.path}  from {run.source}")
+    for entry in stages:
+        seconds = "" if entry["seconds"] is None else duration(entry["seconds"])
+        count = "" if entry["bytes"] is None else size(entry["bytes"])
+        line = f"{entry['name']:<10} {entry['state']:<8} {seconds:>13} {count:>8}  {entry['reason'] or entry['note'] or ''}"
+        click.echo(line.rstrip())
+        if entry["extra"]:
+            click.echo(f"{'':<10} not written by it: {', '.join(entry['extra'][:5])}{' ...' if len(entry['extra']) > 5 else ''}")
+    if holder is not None:
+        click.echo(f"It is being written by {holder.text()}.")
+
+
+@click.command(short_help="Read everything again and compare it with what was written.")
+@click.argument("what", metavar="RUN|ASSET", type=folder_type)
+@json_option
+@quiet_option
+@common_options
+def verify(what: Path, as_json: bool, quiet: bool) -> None:
+    """Hash every file of RUN and compare it with what was written; or read all of ASSET, which carries its own hashes, and check every rule of its
+    format. Exit code 4 if anything was altered.
+    """
+    if what.is_file():
+        _verify_asset(what, as_json, quiet)
+    else:
+        _verify_run(what, as_json, quiet)
+
+
+def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
+    from pipeline.errors import CorruptArtifact
+    from workflows.cli.failures import Reported
+    from workflows.cli.progress import size, write_json
+    from workflows.cli.target import describe_asset, load_asset
+
+    try:
+        load_asset(path)
+    except CorruptArtifact as error:
+        raise Reported(error, {"asset": str(path), "damaged": list(error.files)}) from error
+    about = describe_asset(path)
+    if as_json:
+        facts = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
+        write_json({"event": "summary", "ok": True, "asset": str(path), **facts, "damaged": [], "exit_code": 0})
+    elif not quiet:
+        click.echo(f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(int(str(about['bytes'])))}, all as written")
+
+
+def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
+    from pipeline.errors import CorruptArtifact
+    from pipeline.run import Run
+    from pipeline.runner import verify as verify_run
+    from workflows import asset
+    from workflows.cli.failures import Reported
+    from workflows.cli.progress import display, size, write_json
+
+    run = Run.open(run_folder)
+    try:
+        with display(as_json=as_json, quiet=quiet) as show:
+            outcomes = verify_run(run, asset.STAGES, show)
+    except CorruptArtifact as error:
+        raise Reported(error, {"run": str(run.path), "damaged": list(error.files)}) from error
+    if as_json:
+        write_json({"event": "summary", "ok": True, "run": str(run.path), "stages": [each.stage for each in outcomes], "damaged": [], "exit_code": 0})
+    elif not quiet:
+        total = sum(each.size for each in outcomes)
+        click.echo(f"{run.path}: {len(outcomes)} stages, {size(total)}, all as written")
+
+
+@click.command(short_help="Write a page about a run: pictures, figures, settings.")
+@click.argument("run_folder", metavar="RUN", type=folder_type)
+@json_option
+@common_options
+def report(run_folder: Path, as_json: bool) -> None:
+    """Write RUN/report.html: what was made, how it looks, how good it is, of what settings. 'enerf run' writes it, too, when it is done."""
+    from pipeline.decide import survey
+    from pipeline.run import Run
+    from workflows import asset
+    from workflows.cli.progress import write_json
+    from workflows.report.page import write_report
+
+    run = Run.open(run_folder)
+    path = write_report(run, survey(asset.STAGES, run))
+    if as_json:
+        write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), "exit_code": 0})
+    else:
+        click.echo(str(path))

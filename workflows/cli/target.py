@@ -1,0 +1,61 @@
+"""What a path on the command line is: a run, an asset, a stage's folder, a file of a known kind, or a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.errors import BadInput, CorruptArtifact
+from pipeline.run import NAME
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+ASSET = "asset.nerftree"
+
+
+def is_run(path: Path) -> bool:
+    return (path / NAME).is_file()
+
+
+def asset_of(path: Path) -> Path:
+    """The asset file that is meant by a run, by its folder `bake`, or by the file itself. Raises BadInput."""
+    if path.is_file():
+        return path
+    if not path.exists():
+        raise BadInput(f"{path}: no such file or folder. Give a run or an asset ({ASSET}).")
+    if is_run(path):
+        found = path / "bake" / ASSET
+        if not found.is_file():
+            raise BadInput(f"{path}: has no asset yet. Make it first: enerf run --out {path} --until bake")
+        return found
+    if (path / ASSET).is_file():
+        return path / ASSET
+    raise BadInput(f"{path}: neither a run (it has no {NAME}) nor an asset. Give a run or an asset ({ASSET}).")
+
+
+def load_asset(path: Path) -> NerfTree:
+    """The asset of a run or of a file, read and checked. Raises BadInput and CorruptArtifact."""
+    from efficientnerf.asset.format import FormatError, load
+
+    found = asset_of(path)
+    try:
+        return load(found)
+    except FormatError as error:
+        raise CorruptArtifact(_with_folder(found, error), (str(found),)) from error
+
+
+def describe_asset(path: Path) -> dict[str, object]:
+    """The header of an asset file. Raises CorruptArtifact."""
+    from efficientnerf.asset.format import FormatError, describe
+
+    try:
+        return describe(path)
+    except FormatError as error:
+        raise CorruptArtifact(_with_folder(path, error), (str(path),)) from error
+
+
+def _with_folder(path: Path, error: Exception) -> str:
+    """The error's text, which names the file, with the folder before it."""
+    text = str(error)
+    return f"{path.parent / text}" if text.startswith(path.name) and str(path.parent) != "." else text

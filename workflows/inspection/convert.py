@@ -1,0 +1,49 @@
+"""An asset file from another."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+
+def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None) -> None:
+    """Write the asset of `what` (a run or an asset) to `out`, whole or not at all; None keeps what it has.
+
+    Raises UsageError for a degree or a resolution that it does not have, BadInput and CorruptArtifact as `load_asset`.
+    """
+    from efficientnerf.asset import conversion, format
+    from efficientnerf.asset.metadata import layout_of
+    from pipeline.errors import UsageError
+    from workflows.cli.target import asset_of, load_asset
+
+    source = asset_of(what)
+    tree = load_asset(what)
+    about = format.describe(source)
+    if layout is None:
+        layout = writer_of(about)
+    if layout_of(about) == "full" and not layout.startswith("full"):
+        tree = conversion.pruned(tree)
+    try:
+        if degree is not None:
+            tree = conversion.with_degree(tree, degree)
+        if resolution is not None:
+            tree = conversion.pruned(conversion.with_resolution(tree, resolution))
+    except ValueError as error:
+        raise UsageError(f"{source}: {error}") from error
+    made_from = {"sha256": hashlib.sha256(source.read_bytes()).hexdigest(), **{key: about[key] for key in ("layout", "resolution", "sh_degree")}}
+    provenance = tree.metadata.get("provenance")
+    tree = tree.with_metadata(provenance={**(provenance if isinstance(provenance, dict) else {}), "converted_from": made_from})
+    format.save(tree, out, layout)
+
+
+def writer_of(about: dict[str, Any]) -> str:
+    """The writer that made a file of this description, or the one that comes nearest."""
+    from efficientnerf.asset.metadata import layout_of
+
+    layout = layout_of(about)
+    if layout == "compact":
+        return "small" if max(about["sh_groups"], default=1) > 1 else "compact"
+    if layout == "full":
+        return "full" if about["values"] == "F16" else "full32"
+    return layout

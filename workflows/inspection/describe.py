@@ -1,0 +1,128 @@
+"""What `enerf inspect` finds out about a path, and how it says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import BadInput
+from workflows.cli.progress import plain, size
+from workflows.cli.target import ASSET, describe_asset, is_run
+
+MESHES = (".ply", ".glb", ".obj", ".xyz")
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Facts about an asset, a run, the cameras of a run, a data set, a mesh or points; `what` says which. Raises BadInput and CorruptArtifact."""
+    if not path.exists():
+        raise BadInput(f"{path}: no such file or folder.")
+    if path.is_file():
+        return _describe_file(path)
+    if is_run(path):
+        return _describe_run(path)
+    if (path / "scene.json").is_file():
+        from stages.io import scene
+
+        return scene.describe(path)
+    if (path / ASSET).is_file():
+        return {"what": "asset", "path": str(path / ASSET), **describe_asset(path / ASSET)}
+    from stages.io.importers.description import describe_source
+
+    return describe_source(path)
+
+
+def _describe_file(path: Path) -> dict[str, Any]:
+    suffix = path.suffix.lower()
+    if suffix == ".nerftree":
+        return {"what": "asset", "path": str(path), **describe_asset(path)}
+    if suffix in MESHES:
+        return {"what": "mesh", "path": str(path), "bytes": path.stat().st_size, **_describe_mesh(path)}
+    if path.name == "scene.json":
+        from stages.io import scene
+
+        return scene.describe(path.parent)
+    if suffix in (".json", ".npy", ".bin", ".txt"):
+        from stages.io.importers.description import describe_source
+
+        return describe_source(path.parent)
+    raise BadInput(f"{path}: of no kind that can be described; expected an asset (.nerftree), a mesh ({', '.join(MESHES)}), a run or the folder of a data set.")
+
+
+def _describe_run(path: Path) -> dict[str, Any]:
+    from pipeline.decide import survey
+    from pipeline.run import Run
+    from workflows import asset
+    from workflows.report.summary import artifacts, metrics
+
+    run = Run.open(path)
+    quality = metrics(run.path) or {}
+    found: dict[str, Any] = {
+        "what": "run",
+        "path": str(run.path),
+        "source": None if run.source is None else str(run.source),
+        "preset": run.preset,
+        "stages": {decision.stage: decision.state for decision in survey(asset.STAGES, run)},
+        "artifacts": artifacts(run.path),
+        "quality": {name: quality[name] for name in ("network", "asset") if name in quality},
+    }
+    if (path / "poses" / "scene.json").is_file():
+        from stages.io import scene
+
+        found["scene"] = scene.describe(path / "poses")
+    if "asset" in found["artifacts"]:
+        found["asset"] = describe_asset(path / "bake" / ASSET)
+    return found
+
+
+def _describe_mesh(path: Path) -> dict[str, Any]:
+    import trimesh
+
+    try:
+        loaded = trimesh.load(path, process=False)
+    except Exception as error:  # trimesh raises whatever the broken file made it stumble over
+        raise BadInput(f"{path}: cannot be read as {path.suffix} ({' '.join(str(error).split())[:200] or type(error).__name__}).") from error
+    if isinstance(loaded, trimesh.Scene):
+        loaded = loaded.to_geometry()
+    vertices = getattr(loaded, "vertices", None)
+    if vertices is None or len(vertices) == 0:
+        raise BadInput(f"{path}: holds no vertices.")
+    faces = getattr(loaded, "faces", None)
+    bounds = [vertices.min(0).tolist(), vertices.max(0).tolist()]
+    found: dict[str, Any] = {"vertices": len(vertices), "faces": 0 if faces is None else len(faces), "bounds": bounds}
+    if found["faces"]:
+        found["watertight"] = bool(loaded.is_watertight)
+    return found
+
+
+def in_words(found: dict[str, Any]) -> str:
+    """The facts as lines of `name  value`; lists of cameras are left to --json."""
+    return "\n".join(_lines(plain(found), ""))
+
+
+def _lines(found: dict[str, Any], indent: str) -> list[str]:
+    lines = []
+    for name, value in found.items():
+        label = f"{indent}{name.replace('_', ' ')}"
+        if name == "cameras" and isinstance(value, list) and all(isinstance(camera, dict) for camera in value):
+            if value:
+                first = value[0]
+                lines.append(f"{label:<24} {len(value)}, listed with --json; the first: {first['name']}, {first['model']} {_shown(first['params'])}")
+        elif name == "odd" and isinstance(value, list):
+            lines += [f"{label:<24} {sentence}" for sentence in value] or [f"{label:<24} nothing"]
+        elif isinstance(value, dict):
+            lines += [label, *_lines(value, indent + "  ")]
+        elif value not in (None, [], ""):
+            lines.append(f"{label:<24} {size(value) if name == 'bytes' else _shown(value)}")
+    return lines
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_shown(item) for item in value) + "]"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_shown(item)}" for name, item in value.items())
+    return str(value)

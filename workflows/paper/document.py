@@ -1,0 +1,130 @@
+"""`enerf paper`: the tables of the paper (EfficientNeRF, Hu et al., CVPR 2022), measured here, the paper's figure beside each of ours.
+
+    OUT/table_N.md     for people
+    OUT/table_N.json   {"table", "title", "scale", "columns", "rows", "notes", "hardware", "versions"}
+    OUT/table_N.png    PSNR over training time, for the tables that train
+
+A row is a mapping from column to value; a column that ends in PAPER holds what the paper printed for the column before it. A table is a function
+from a Request to a Result, and TABLES says which; what trains keeps its runs under OUT/runs, so that a table that was interrupted goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from workflows.paper import structures, tables
+from workflows.paper.result import PAPER, Request, Result, Table
+
+__all__ = ["PAPER", "TABLES", "Request", "Result", "Table", "make"]
+
+TABLES: dict[str, Table] = {
+    "1": Table("Shares of valid and of pivotal samples", True, tables.shares),
+    "2": Table("Quality and speed", True, tables.quality),
+    "3": Table("Versions N1 to N4", True, tables.versions),
+    "4": Table("Sizes of the coarse and of the fine network", True, tables.networks),
+    "5": Table("The modules, one by one", True, tables.modules),
+    "6": Table("Sampling strategies", True, tables.strategies),
+    "7": Table("Structures that cache a scene: dense voxels, sparse tensor, octree, NerfTree", False, structures.structures),
+}
+
+
+def make(number: str, request: Request) -> dict[str, Path]:
+    """Measure one table and write it; returns the files, by kind."""
+    from pipeline.errors import BadInput, UsageError
+
+    if number not in TABLES:
+        raise UsageError(f"paper {number}: no such table. There are: {', '.join(TABLES)}.")
+    table = TABLES[number]
+    if table.needs_data and request.data is None:
+        raise UsageError(f"paper {number}: is measured on scenes. Give --data DIR, a data set or a folder of data sets.")
+    if request.data is not None and not request.data.is_dir():
+        raise BadInput(f"{request.data}: no such folder. Give the folder of a data set, or of several.")
+    request.out.mkdir(parents=True, exist_ok=True)
+    result = table.measure(request)
+    document = {
+        "table": number,
+        "title": table.title,
+        "scale": request.scale,
+        "columns": list(result.columns),
+        "rows": [dict(row) for row in result.rows],
+        "notes": list(result.notes),
+        "hardware": hardware(request.device),
+        "versions": versions(),
+    }
+    written = {"markdown": request.out / f"table_{number}.md", "json": request.out / f"table_{number}.json"}
+    _write(written["json"], json.dumps(document, indent=1, allow_nan=False) + "\n")
+    _write(written["markdown"], in_markdown(document))
+    if result.curves:
+        from stages.pictures.plots import curve
+
+        written["plot"] = request.out / f"table_{number}.png"
+        curve(written["plot"], result.curves, x_label="seconds of training", y_label="PSNR of held-back views / dB", title=f"Table {number}")
+    return written
+
+
+def in_markdown(document: Mapping[str, Any]) -> str:
+    """The table as Markdown: title, rows, notes, machine."""
+    columns = document["columns"]
+    lines = [f"# Table {document['table']}: {document['title']}", ""]
+    if document["scale"] != 1:
+        lines += [f"**Scaled by {document['scale']:g}**: iterations, resolution, networks and grids are smaller than in the paper; see the notes.", ""]
+    lines += ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    lines += ["| " + " | ".join(shown(row.get(column)) for column in columns) + " |" for row in document["rows"]]
+    lines += ["", *[f"- {note}" for note in document["notes"]], ""]
+    machine = document["hardware"]
+    libraries = ", ".join(f"{name} {version}" for name, version in document["versions"].items())
+    lines.append(f"Measured on {machine['processor']}, {machine['cores']} cores, {machine['device']}; {libraries}.")
+    lines.append("The paper: one RTX 3090.")
+    return "\n".join(lines) + "\n"
+
+
+def shown(value: Any) -> str:
+    """A cell: numbers to four digits, nothing for None."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1000 else f"{value:,.0f}"
+    return str(value)
+
+
+def hardware(device: str) -> dict[str, Any]:
+    """What the figures were measured on: they mean nothing without it."""
+    name = platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    except OSError:
+        pass
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    found: dict[str, Any] = {"processor": name, "cores": cores, "device": device}
+    if hasattr(os, "getloadavg"):
+        found["load"] = [round(x, 2) for x in os.getloadavg()]
+    if device == "cuda":
+        import torch
+
+        found["device"] = torch.cuda.get_device_name()
+    return found
+
+
+def versions() -> dict[str, str]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {}
+    for name in ("efficientnerf", "torch", "numba"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _write(path: Path, text: str) -> None:
+    from stages.io.exporters.aside import written_aside
+
+    with written_aside(path) as aside:
+        aside.write_text(text, encoding="utf-8")

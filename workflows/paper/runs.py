@@ -1,0 +1,277 @@
+"""The runs behind a table: settings from the preset `paper-n4`, shrunk where asked, trained through the engine, and measured.
+
+A row's run is an ordinary run folder, OUT/runs/<scene>/<row>: it resumes after an interruption, and `enerf status` and the rest work on it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from workflows.paper.result import Request
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Camera
+    from pipeline.run import Run
+
+PRESET = "paper-n4"
+FEWEST_DECIBELS = 22.0  # less is not a picture: such a row says nothing about the method
+SCENES_OF = {"transforms_train.json", "transforms.json", "poses_bounds.npy"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One training to be measured.
+
+    name     of its run folder
+    changes  to the train settings of PRESET, as they are in the paper; `scaled` shrinks them like the rest
+    bakes    whether its tree is wanted too
+    """
+
+    name: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    bakes: bool = False
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a row's run came to; seconds are of training steps alone, evaluation excluded, as in the paper.
+
+    psnr             of the network, mean over the held-back views that were drawn, decibels; ssim likewise
+    step             seconds of a step, mean over the run
+    steady           seconds of a step, median over the last fifth of the run
+    hours            of all steps
+    coarse, fine     samples of a training ray that went through the coarse and the fine network, over the last fifth
+    valid, pivotal   shares over rays x N_c of the held-back views (equations 5 and 12)
+    curve            (seconds of training, PSNR of a held-back view)
+    tree             figures of the baked tree, where wanted: psnr, ssim, frames a second, size of a frame
+    """
+
+    psnr: float
+    ssim: float | None
+    step: float
+    steady: float
+    hours: float
+    coarse: float
+    fine: float
+    valid: float
+    pivotal: float
+    curve: tuple[list[float], list[float]]
+    tree: Mapping[str, Any] | None = None
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is a picture."""
+        return self.psnr >= FEWEST_DECIBELS
+
+
+def scenes(data: Path) -> list[Path]:
+    """The data sets of a folder: itself, or those in it."""
+    from pipeline.errors import BadInput
+
+    if any((data / name).exists() for name in SCENES_OF):
+        return [data]
+    found = sorted(folder for folder in data.iterdir() if folder.is_dir() and any((folder / name).exists() for name in SCENES_OF))
+    if not found:
+        raise BadInput(f"{data}: holds no data set (no {', '.join(sorted(SCENES_OF))}, nor folders that do). Give the folder of a scene, or of scenes.")
+    return found
+
+
+def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
+    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, voxels 0.225, batches 0.2, widths 0.15, depths 0.05.
+
+    Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
+    and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
+    matter is, and more rays are looked at whole, to bring back what was pruned by mistake. As in the paper, voxels learn from rays alone: asking about
+    them densely besides pruned them sooner, and chair was no better for it. How often rays meet a voxel depends on the exponent of the voxels: at a
+    scale of 0.001 chair ended with 6.0 % of its samples valid with 0.25, 12.2 % with 0.2, at the same PSNR (the paper: 9.6 %).
+    """
+    if scale == 1:
+        return stages
+    out = {name: dict(entries) for name, entries in stages.items()}
+    train, fifth = out["train"], scale**0.2
+
+    def width(units: int) -> int:
+        return max(16, 16 * round(units * scale**0.15 / 16))
+
+    train["iterations"] = max(60, round(train["iterations"] * scale))
+    train["rays"] = max(64, 32 * round(train["rays"] * fifth / 32))
+    for name in ("hidden", "coarse_hidden"):
+        train[name] = width(train[name])
+    for name in ("layers", "coarse_layers"):
+        train[name] = max(2, round(train[name] * scale**0.05))
+    train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.225 / 8))
+    train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
+    train["rate_steps"] = max(1, round(train["rate_steps"] * scale**0.9))
+    train["warm_up"] = round(train["iterations"] * min(0.35, train["warm_up"] / 1e6 * scale**-0.6))
+    train["refresh_rays"] = min(max(0.05, train["refresh_rays"]), train["refresh_rays"] * scale**-0.3)
+    train["crop_steps"] = min(train["crop_steps"], train["iterations"] // 10)
+    train["checkpoint_every"] = max(50, train["iterations"] // 4)
+    train["preview_every"] = max(10, train["iterations"] // 8)
+    out["poses"]["max_side"] = max(48, 4 * round(800 * scale**0.3 / 4))
+    out["bake"]["resolution"] = max(96, 8 * round(out["bake"]["resolution"] * scale**0.3 / 8))
+    out["bake"]["points"] = max(4, round(out["bake"]["points"] * fifth))
+    out["bake"]["pixels"] = max(50_000, round(1e6 * fifth))
+    out["bake"]["optimise_rays"] = max(4096, 1024 * round(out["bake"]["optimise_rays"] * fifth / 1024))
+    out["evaluate"] |= {"views": 10 if scale < 0.1 else 0, "scale": 1.0}
+    return out
+
+
+def settings_of(row: Row, scale: float) -> dict[str, dict[str, Any]]:
+    """Settings of all stages for a row."""
+    from workflows import asset
+    from workflows.cli.resolve import Settings, read_preset, table_of
+
+    settings = Settings({stage.name: stage.settings for stage in asset.STAGES})
+    settings.put_table(read_preset(PRESET).table, PRESET)
+    settings.put_table({"train": row.changes}, row.name)
+    settings.put_table(scaled(table_of(settings.resolved()), scale), f"--scale {scale}")
+    return table_of(settings.resolved())
+
+
+def measured(request: Request, scene: Path, row: Row) -> Figures:
+    """Train a row on a scene, or go on with it, and measure it."""
+    from pipeline.run import NAME, Run
+    from pipeline.runner import run_stages
+    from workflows import asset
+
+    folder = request.out / "runs" / scene.name / row.name
+    settings = settings_of(row, request.scale)
+    if (folder / NAME).exists():
+        run = Run.open(folder)
+        run.update(source=scene.resolve(), settings=settings, preset=PRESET)
+    else:
+        run = Run.create(folder, scene.resolve(), settings, preset=PRESET, device=request.device)
+    request.say(f"{scene.name}, {row.name}: training {settings['train']['iterations']} steps")
+    stages = [stage for stage in asset.STAGES if stage.name in (("poses", "train", "bake") if row.bakes else ("poses", "train"))]
+    outcomes = run_stages(run, stages, device=request.device, report=request.report)
+    request.say(f"{scene.name}, {row.name}: measuring")
+    quality = _quality(run, str(outcomes[1].digest), settings, request.device)
+    lines = [json.loads(line) for line in (run.folder("train") / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+    return Figures(
+        **{name: quality[name] for name in ("psnr", "ssim", "valid", "pivotal")}, **_pace(lines),
+        tree=_tree_figures(run, settings["evaluate"]["views"], request.device) if row.bakes else None,
+    )  # fmt: skip
+
+
+def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Seconds, samples and the curve from the log of a training."""
+    import statistics
+
+    counts = [after["step"] - before for after, before in zip(lines, [0, *(line["step"] for line in lines)], strict=False)]
+    spent = [line["step_seconds"] * count for line, count in zip(lines, counts, strict=True)]
+    total = math.fsum(spent)
+    late = [line for line in lines if line["step"] > 0.8 * lines[-1]["step"]] or list(lines[-1:])
+    curve: tuple[list[float], list[float]] = ([], [])
+    for n, line in enumerate(lines):
+        if line["held_back_psnr"] is not None:
+            curve[0].append(math.fsum(spent[: n + 1]))
+            curve[1].append(line["held_back_psnr"])
+    rays = sum(line["rays"] for line in late)
+    return {
+        "step": total / lines[-1]["step"],
+        "steady": statistics.median(line["step_seconds"] for line in late),
+        "hours": total / 3600,
+        "coarse": sum(line["valid"] for line in late) / rays,
+        "fine": sum(line["fine"] for line in late) / rays,
+        "curve": curve,
+    }
+
+
+def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], device: str) -> dict[str, Any]:
+    """PSNR, SSIM and shares of the network on held-back views; kept beside the run, and measured anew when the field or the views change."""
+    import numpy as np
+
+    from efficientnerf.evaluation.metrics import psnr, ssim
+    from efficientnerf.rendering.render import SampleCounts
+    from stages.evaluate import held_back, spread, truth_of
+    from stages.io import scene
+    from stages.io.field_file import load_renderer
+    from stages.train import use_all_cores
+
+    kept = run.path / "network.json"
+    key = {"field": digest, "views": settings["evaluate"]["views"]}
+    if kept.exists() and (found := json.loads(kept.read_text(encoding="utf-8")))["of"] == key:
+        return dict(found)
+    use_all_cores()
+    s = scene.load(run.folder("poses"))
+    views, split = held_back(s)
+    renderer = load_renderer(run.folder("train"), device)
+    decibels, similarities, counts = [], [], SampleCounts()
+    for view in [views[k] for k in spread(len(views), settings["evaluate"]["views"])]:
+        rendering = renderer.render(view.camera)
+        truth = truth_of(run.folder("poses"), view, s.background).colour
+        picture = np.clip(rendering.colour, 0, 1)
+        decibels.append(psnr(picture, truth))
+        similarities.append(ssim(picture, truth))
+        counts += rendering.counts
+    quality = {
+        "of": key,
+        "split": split,
+        "psnr": float(np.mean(decibels)),
+        "ssim": float(np.mean(similarities)),
+        "valid": counts.valid_share,
+        "pivotal": counts.pivotal_share,
+        "psnr_of_views": decibels,
+    }
+    kept.write_text(json.dumps(quality, indent=1) + "\n", encoding="utf-8")
+    return quality
+
+
+def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None) -> float:
+    """Seconds of a picture; on a device it stays there."""
+    import time
+
+    from efficientnerf.backends import dispatch
+
+    if tree.device == "cpu" or tree.ndc is not None or not dispatch.triton_usable():
+        begun = time.perf_counter()
+        tree.render(camera, background=background)
+        return time.perf_counter() - begun
+    import torch
+
+    from efficientnerf.backends.triton.tree import draw
+
+    torch.cuda.synchronize()
+    begun = time.perf_counter()
+    draw(tree.on_device, camera, background=background)
+    torch.cuda.synchronize()
+    return time.perf_counter() - begun
+
+
+def _tree_figures(run: Run, wanted: int, device: str) -> dict[str, Any]:
+    """PSNR and SSIM of the baked tree on `wanted` of the held-back views (0: all), those of the network, and how many frames it draws in a second at
+    their size."""
+    import numpy as np
+
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.evaluation.metrics import psnr, ssim
+    from stages.evaluate import held_back, spread, truth_of
+    from stages.io import scene
+
+    tree = NerfTree.load(run.folder("bake") / "asset.nerftree").to(device)
+    s = scene.load(run.folder("poses"))
+    views, _ = held_back(s)
+    drawn = [views[k] for k in spread(len(views), wanted)]
+    _frame_seconds(tree, drawn[0].camera, s.background)  # compiled, and in memory
+    decibels, similarities, seconds = [], [], []
+    for view in drawn:
+        picture = tree.render(view.camera, background=s.background).colour
+        seconds.append(_frame_seconds(tree, view.camera, s.background))
+        truth = truth_of(run.folder("poses"), view, s.background).colour
+        decibels.append(psnr(np.clip(picture, 0, 1), truth))
+        similarities.append(ssim(np.clip(picture, 0, 1), truth))
+    size = (run.folder("bake") / "asset.nerftree").stat().st_size
+    camera = drawn[0].camera
+    return {
+        "psnr": float(np.mean(decibels)),
+        "ssim": float(np.mean(similarities)),
+        "fps": 1 / float(np.median(seconds)),
+        "frame": f"{camera.width}x{camera.height}",
+        "mib": size / 2**20,
+    }

@@ -1,0 +1,86 @@
+"""What a run has made, where, and how good it is."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.runner import Outcome
+from workflows.cli.progress import duration, size
+
+# What people look for in a run, and where it lies.
+ARTIFACTS = {
+    "scene": "poses/scene.json",
+    "field": "train/field.safetensors",
+    "asset": "bake/asset.nerftree",
+    "metrics": "evaluate/metrics.json",
+    "turntable": "turntable/turntable.mp4",
+    "mesh_glb": "mesh/mesh.glb",
+    "mesh_ply": "mesh/mesh.ply",
+    "points": "points/points.ply",
+    "report": "report.html",
+}
+TITLES = {"asset": "asset", "turntable": "turntable", "mesh_glb": "mesh", "mesh_ply": "mesh", "points": "points", "report": "report"}
+
+
+def artifacts(run: Path) -> dict[str, str]:
+    """Name -> absolute path of what there is."""
+    return {name: str(run / path) for name, path in ARTIFACTS.items() if (run / path).exists()}
+
+
+def metrics(run: Path) -> dict[str, Any] | None:
+    """RUN/evaluate/metrics.json, or None where there is none, or none that can be read."""
+    try:
+        found = json.loads((run / ARTIFACTS["metrics"]).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """The facts of the last line of `enerf run --json`, less `ok` and `exit_code`."""
+    return {
+        "run": str(run),
+        "artifacts": artifacts(run),
+        "metrics": metrics(run),
+        "seconds": {outcome.stage: outcome.seconds for outcome in outcomes},
+        "stages": [
+            {"name": each.stage, "action": each.action, "reason": each.reason, "seconds": each.seconds, "bytes": each.size, "digest": each.digest}
+            for each in outcomes
+        ],
+    }
+
+
+def in_words(run: Path, outcomes: Sequence[Outcome]) -> str:
+    """The same for people."""
+    ran = [outcome for outcome in outcomes if outcome.action == "ran"]
+    spent = sum(outcome.seconds for outcome in ran)
+    if ran:
+        parts = ", ".join(f"{outcome.stage} {duration(outcome.seconds)}" for outcome in ran)
+        lines = [f"{run}: done in {duration(spent)} ({parts})" if len(ran) > 1 else f"{run}: {ran[0].stage} done in {duration(spent)}"]
+    else:
+        lines = [f"{run}: everything is up to date"]
+    for name, path in artifacts(run).items():
+        if name in TITLES:
+            shown = os.path.relpath(path) if not os.path.relpath(path).startswith("..") else path
+            lines.append(f"  {TITLES[name]:<10} {shown}  ({size(Path(path).stat().st_size)})")
+    if (quality := quality_in_words(metrics(run))) is not None:
+        lines.append(f"  {'quality':<10} {quality}")
+    return "\n".join(lines)
+
+
+def quality_in_words(found: dict[str, Any] | None) -> str | None:
+    """`network 24.13 dB PSNR, 0.812 SSIM; asset ...`, on how many views."""
+    if found is None:
+        return None
+    parts = []
+    for name in ("network", "asset"):
+        part = found.get(name)
+        if isinstance(part, dict) and isinstance(part.get("psnr"), (int, float)) and isinstance(part.get("ssim"), (int, float)):
+            parts.append(f"{name} {part['psnr']:.2f} dB PSNR, {part['ssim']:.3f} SSIM")
+    views = found.get("views")
+    count = f" (on {len(views)} held-back view{'s' if len(views) != 1 else ''})" if isinstance(views, list) and views else ""
+    return "; ".join(parts) + count if parts else None
