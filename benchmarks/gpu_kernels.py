@@ -57,7 +57,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     from efficientnerf.rendering.harmonics import basis
 
     generator = torch.Generator().manual_seed(0)
-    m = model(Space(BOUNDS, False), TrainSettings(levels=16, log2_table=log2_table, finest=2048), (1.0, 1.0, 1.0), device)
+    m = model(Space(BOUNDS, False), TrainSettings(num_levels=16, log2_hashmap_size=log2_table, finest_resolution=2048), (1.0, 1.0, 1.0), device)
     side = m.voxels.side
     centre = (torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1) + 0.5) / side * 2 - 1
     voxels = ((centre.norm(dim=-1) - 0.7).abs() < 0.08).float().to(device)  # a shell

@@ -147,7 +147,7 @@ def compositing_kernels(seconds: float) -> dict[str, Any]:
     from efficientnerf.rendering.harmonics import basis, harmonics_count
     from efficientnerf.training.settings import TrainSettings
 
-    degree, count = TrainSettings().degree, RAYS * PER_RAY
+    degree, count = TrainSettings().sh_degree, RAYS * PER_RAY
     raw, length, first = torch.randn(count, 1 + 3 * harmonics_count(degree)), torch.full((count,), 0.02), torch.arange(0, count + 1, PER_RAY)
     harmonics = basis(torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1), degree)
     packed = [t.numpy() for t in (raw, length, first, harmonics, torch.rand(RAYS, 3))]

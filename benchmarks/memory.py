@@ -3,7 +3,7 @@
     python benchmarks/memory.py [--count 100] [--width 4000] [--set train.iterations=300] [--json FILE] [--keep FOLDER]
 
 The scene is a patterned ball over a patterned floor under a plain sky, written as JPEGs and a transforms.json. It is trained at full size
-(`poses.max_side` is the width), for a few hundred steps, and baked with a few steps of fitting: quality is not the matter here.
+(`poses.max_image_size` is the width), for a few hundred steps, and baked with a few steps of fitting: quality is not the matter here.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="where to write the figures")
     parser.add_argument("--keep", type=Path, help="folder that is kept, with the photographs and the run; else one that is removed")
     arguments = parser.parse_args()
-    sets = [f"poses.max_side={arguments.width}", "train.iterations=300", "train.preview_every=0", "bake.optimise=8", *arguments.sets]
+    sets = [f"poses.max_image_size={arguments.width}", "train.iterations=300", "train.preview_every=0", "bake.refine_steps=8", *arguments.sets]
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.keep or Path(temporary)
         (folder / "photographs").mkdir(parents=True, exist_ok=True)

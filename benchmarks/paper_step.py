@@ -120,7 +120,7 @@ def measure(steps: int) -> dict[str, Any]:
         cpu.append(time.process_time() - used)
         valid.append(done.valid)
         fine.append(done.fine)
-    rays = m.settings.rays
+    rays = m.settings.max_rays_per_batch
     # Forward, and backward with respect to weights and to inputs; the first layer has no gradient with respect to its input.
     flop = sum(
         2 * n * (3 * products(field) - field.weights[0].numel()) for n, field in ((statistics.mean(valid), m.coarse), (statistics.mean(fine), m.fine))

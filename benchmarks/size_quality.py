@@ -22,7 +22,7 @@ from workflows.paper.document import hardware, versions
 def row_of(run: Path, size: int, settings: dict[str, str]) -> dict[str, Any]:
     """Bake to at most `size` MiB, evaluate, and read what came of it."""
     took = made(run, "bake", {**settings, "bake.max_mib": size})
-    made(run, "evaluate", {"evaluate.views": 1})
+    made(run, "evaluate", {"evaluate.field_views": 1})
     report, metrics = read_json(run / "bake" / "report.json"), read_json(run / "evaluate" / "metrics.json")
     stored = (run / "bake" / "asset.nerftree").stat().st_size / 2**20
     if stored > size:

@@ -32,11 +32,11 @@ from efficientnerf.training.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, 
 
 SKY_DEGREE = 2
 COARSEST = 16
-# Where train.distortion says none. In normalised device coordinates depths crowd less, and fog is a smaller part of them: held-back views of LLFF fern at
+# Where train.distortion_loss_weight says none. In normalised device coordinates depths crowd less, and fog is a smaller part of them: held-back views of LLFF fern at
 # 504x378 after 1000 steps at 0.01: 21.8 dB; 0.002: 22.0; 0: 21.9.
 DISTORTION, DISTORTION_NDC = 0.01, 0.002
-# Where train.voxel_absorption says none. In normalised device coordinates most intervals are valid for long, and asking about them is most of a step; with
-# fewer intervals (train.coarse_samples) and fewer of them valid a step has half as many rays again. The same views with 2^19 entries, after 1000 steps, two
+# Where train.occupancy_alpha_threshold says none. In normalised device coordinates most intervals are valid for long, and asking about them is most of a step; with
+# fewer intervals (train.num_coarse_samples) and fewer of them valid a step has half as many rays again. The same views with 2^19 entries, after 1000 steps, two
 # seeds: N_c 128 and 0.01: 22.5 and 22.3 dB; 96 and 0.01: 22.7; 96 and 0.05: 22.8 and 22.6. At 1008x756 after 3000 steps: 22.2 with the first, 22.6 with
 # the last.
 ABSORPTION, ABSORPTION_NDC = 0.01, 0.05
@@ -86,7 +86,7 @@ class Model:
     @property
     def distortion(self) -> float:
         """Weight of the loss on spread-out densities."""
-        given = self.settings.distortion
+        given = self.settings.distortion_loss_weight
         return given if given is not None else DISTORTION if self.space.ndc is None else DISTORTION_NDC
 
     @property
@@ -141,54 +141,54 @@ def model(
     space: Space, settings: TrainSettings, background: tuple[float, float, float] | None, device: str = "cpu", span: tuple[float, float] | None = None
 ) -> Model:
     """An untrained model; the same settings give the same numbers."""
-    if settings.coarse_samples == 0:
-        settings = replace(settings, coarse_samples=COARSE_SAMPLES if space.ndc is None else COARSE_SAMPLES_NDC)
+    if settings.num_coarse_samples == 0:
+        settings = replace(settings, num_coarse_samples=COARSE_SAMPLES if space.ndc is None else COARSE_SAMPLES_NDC)
     generator = torch.Generator().manual_seed(settings.seed)
     coarse, fine = _fields(settings, generator)
     diagonal = 2 * float(np.linalg.norm(space.half))
-    if settings.far > 0 and (span is None or space.contracted):
-        raise ValueError("train.near and train.far need a scene on a constant background. Leave them 0.")
-    span = span if settings.far > 0 else None
+    if settings.far_plane > 0 and (span is None or space.contracted):
+        raise ValueError("train.near_plane and train.far_plane need a scene on a constant background. Leave them 0.")
+    span = span if settings.far_plane > 0 else None
     reach = diagonal if span is None else span[1] - span[0]
     if space.ndc is not None:  # of a cube as deep as the box: depth, not width, is what is sampled
         reach = 2 * math.sqrt(3) * float(space.half[2])
-    step = reach / settings.coarse_samples
+    step = reach / settings.num_coarse_samples
     slots = math.ceil(diagonal / step) + 1
     if space.contracted:
         # In front of the box and behind it: the contracted distance from the edge of space to the box and back, in steps, with some room
         # for rays that run slantwise through the shell.
         slots += math.ceil(4 * (1 - FARTHEST) * float(space.half.max()) * math.sqrt(3) / step)
-    side = settings.voxels or (192 if space.contracted else 128)
+    side = settings.occupancy_resolution or (192 if space.contracted else 128)
     # A valid voxel absorbs `voxel_absorption` of the light over one coarse interval.
-    absorption = settings.voxel_absorption
+    absorption = settings.occupancy_alpha_threshold
     if absorption is None:
         absorption = ABSORPTION if space.ndc is None else ABSORPTION_NDC
-    threshold = -math.log1p(-min(absorption, 0.999)) / step if settings.voxel_rule == "maximum" else 0.0
+    threshold = -math.log1p(-min(absorption, 0.999)) / step if settings.occupancy_rule == "maximum" else 0.0
     voxels = density_voxels(
-        side, settings.voxel_rule, initial=settings.voxel_initial, beta=settings.voxel_beta, decay=settings.voxel_decay, threshold=threshold, device=device
+        side, settings.occupancy_rule, initial=settings.occupancy_initial_density, beta=settings.occupancy_beta, decay=settings.occupancy_decay, threshold=threshold, device=device
     )
     return Model(space, settings, None if coarse is None else coarse.to(device), fine.to(device), voxels, Sky().to(device), background, step, slots, span)
 
 
 def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField | None, AnyField]:
     """The coarse field, if there is one, and the fine one, untrained."""
-    log2_table, finest = s.log2_table or LOG2_TABLE, s.finest or FINEST
+    log2_table, finest = s.log2_hashmap_size or LOG2_TABLE, s.finest_resolution or FINEST
     if s.field == "hash":
         return None if s.coarse == "voxels" else HashField(
-            levels=max(1, s.levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
-            hidden=s.coarse_hidden, layers=s.coarse_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
+            levels=max(1, s.num_levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
+            hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
         ), HashField(
-            levels=s.levels, log2_table=log2_table, coarsest=COARSEST, finest=finest,
-            hidden=s.hidden, layers=s.layers, degree=s.degree, initial_density=s.initial_density, generator=generator, precision=s.precision,
+            levels=s.num_levels, log2_table=log2_table, coarsest=COARSEST, finest=finest,
+            hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree, initial_density=s.initial_density, generator=generator, precision=s.precision,
         )  # fmt: skip
     if s.field == "nerf":
         return (
-            NerfField(hidden=s.coarse_hidden, layers=s.coarse_layers, generator=generator, precision=s.precision),
-            NerfField(hidden=s.hidden, layers=s.layers, generator=generator, precision=s.precision),
+            NerfField(hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, generator=generator, precision=s.precision),
+            NerfField(hidden=s.hidden_dim, layers=s.num_layers, generator=generator, precision=s.precision),
         )
     return (
-        MlpField(hidden=s.coarse_hidden, layers=s.coarse_layers, degree=s.degree, generator=generator, precision=s.precision),
-        MlpField(hidden=s.hidden, layers=s.layers, degree=s.degree, generator=generator, precision=s.precision),
+        MlpField(hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=s.sh_degree, generator=generator, precision=s.precision),
+        MlpField(hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree, generator=generator, precision=s.precision),
     )
 
 
@@ -209,11 +209,11 @@ def look(
     room                 on CUDA: samples are padded to this many at most, and their number is not waited for
     fine_samples         N_s of this bundle; 0: as the settings say
     """
-    fine_samples = fine_samples or m.settings.fine_samples
+    fine_samples = fine_samples or m.settings.samples_per_pivot
     rays = m.space.rays(origins, directions, near, far)
     bundle = (rays.origins, rays.directions, rays.near, rays.far)
     if m.settings.sampling == "uniform":
-        count = m.settings.coarse_samples + m.settings.importance_samples
+        count = m.settings.num_coarse_samples + m.settings.num_importance_samples
         samples, _ = _even_samples(m, *bundle, offset, count, rng, None if room is None else room.fine)
         raw, out = _seen(m, m.fine, directions, samples, behind)
         nothing = samples.start[:0]
@@ -221,20 +221,20 @@ def look(
         return Look(rays, none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
     for_coarse, for_fine = (None, None) if room is None else room
     if m.settings.sampling == "hierarchical":
-        coarse, at = _even_samples(m, *bundle, offset, m.settings.coarse_samples, rng, for_coarse)
+        coarse, at = _even_samples(m, *bundle, offset, m.settings.num_coarse_samples, rng, for_coarse)
     else:
         coarse, at = _valid_samples(m, *bundle, offset, prune=prune, rng=rng, capacity=for_coarse), None
     if m.coarse is None:
         return _looked_by_voxels(m, rays, directions, offset, behind, coarse, prune=prune, rng=rng, capacity=for_fine, fine_samples=fine_samples)
     coarse_raw, seen = _seen(m, m.coarse, directions, coarse, behind)
     weight = seen.weight.detach()
-    pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
+    pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_threshold, m.settings.max_pivots)
     if m.settings.sampling == "efficient":
-        if rng is not None and m.settings.explored > 0:
-            pivotal = pivotal | _chance(len(pivotal), m.settings.explored, rng, pivotal.device)
+        if rng is not None and m.settings.exploration_fraction > 0:
+            pivotal = pivotal | _chance(len(pivotal), m.settings.exploration_fraction, rng, pivotal.device)
         fine = dispatch.pivotal_samples(m.space, *bundle[:2], offset, coarse, pivotal, fine_samples, for_fine)
     else:
-        quantile = _strata(len(origins), m.settings.importance_samples, rng, offset.device)
+        quantile = _strata(len(origins), m.settings.num_importance_samples, rng, offset.device)
         at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent if at is None else at
         fine = importance_samples(m.space, *bundle[:2], coarse, at, weight, quantile, for_fine)
     fine_raw, out = _seen(m, m.fine, directions, fine, behind)
@@ -248,9 +248,9 @@ def _looked_by_voxels(
     """Pivots by what the density voxels hold, without a coarse field; while nothing is pruned, all intervals, with one sample each."""
     weight = voxel_weights(m.voxels, coarse.point, coarse.length, coarse.first)
     if prune:
-        pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_weight, m.settings.max_pivots)
-        if rng is not None and m.settings.explored > 0:
-            pivotal = pivotal | _chance(len(pivotal), m.settings.explored, rng, pivotal.device)
+        pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_threshold, m.settings.max_pivots)
+        if rng is not None and m.settings.exploration_fraction > 0:
+            pivotal = pivotal | _chance(len(pivotal), m.settings.exploration_fraction, rng, pivotal.device)
         fine = dispatch.pivotal_samples(m.space, rays.origins, rays.directions, offset, coarse, pivotal, fine_samples, capacity)
     else:
         pivotal, fine = torch.ones(len(weight), dtype=torch.bool, device=weight.device), coarse
@@ -288,7 +288,7 @@ def _valid_samples(
 ) -> Samples:  # fmt: skip
     """Coarse samples where the voxels say that something is; of the first rays, which are as random as any, all, where the settings say so."""
     threshold = m.voxels.threshold if prune else -math.inf
-    whole = math.ceil(m.settings.refresh_rays * len(origins)) if rng is not None else 0
+    whole = math.ceil(m.settings.occupancy_update_ray_fraction * len(origins)) if rng is not None else 0
     bundle = (origins, directions, near, far, offset)
     return dispatch.valid_samples(m.space, *bundle, m.step, m.slots, m.voxels.values, threshold, capacity, whole=whole)
 
@@ -299,8 +299,8 @@ def _even_samples(
 ) -> tuple[Samples, Tensor]:  # fmt: skip
     """`count` stratified samples between near and far, or between where the ray enters the box and leaves it; their distances (N,)."""
     if m.space.contracted:  # intervals that grow with the distance, all of them
-        step = m.step * m.settings.coarse_samples / count
-        slots = math.ceil(m.slots * count / m.settings.coarse_samples)
+        step = m.step * m.settings.num_coarse_samples / count
+        slots = math.ceil(m.slots * count / m.settings.num_coarse_samples)
         samples = dispatch.valid_samples(m.space, origins, directions, near, far, offset, step, slots, m.voxels.values, -math.inf, capacity)
         return samples, samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
     if m.span is None:

@@ -46,13 +46,13 @@ class BakeSettings:
         " (1024 in normalised device coordinates)",
         minimum=32, maximum=4096,
     )  # fmt: skip
-    ndc_depth: float | None = setting(
+    ndc_voxel_depth: float | None = setting(
         None, "in normalised device coordinates, how many times as deep as wide a voxel is; none: 2, or 1 where train.discretise has voxels of its own",
         minimum=1.0, maximum=8.0,
     )  # fmt: skip
-    brick: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
-    pixels: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
-    weight: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
+    brick_size: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
+    visibility_rays: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
+    weight_threshold: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
     max_mib: int | None = setting(
         None, "how large the asset may get; its resolution follows, and the time about in proportion; where that is set, the lightest voxels are left out;"
         " none: 24, and in normalised device coordinates 36 bytes for each pixel that the cameras show, but 24 at least and 56 at most",
@@ -69,22 +69,22 @@ class BakeSettings:
         " and anywhere with less than a hundredth of it",
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
-    points: int = setting(8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256)
+    samples_per_voxel: int = setting(8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256)
     seed: int = setting(0, "seed of the jitter, and of the pixels of the optimisation", minimum=0)
-    optimise: int | None = setting(
+    refine_steps: int | None = setting(
         None, "steps in which the baked values are fitted to the training images; 0: they stay as the network says; none: so many that five rays come to a"
         " voxel, 320 at least, and for photographs, whose noise would be learned too, 160",
         minimum=0,
     )  # fmt: skip
-    optimise_rays: int = setting(32768, "training pixels of a step of the optimisation", minimum=1, maximum=1 << 22)
-    density_rate: float = setting(0.3, "optimisation: rate of RMSprop for the logarithm of a voxel's optical thickness", minimum=0.0)
-    colour_rate: float = setting(0.03, "optimisation: rate of RMSprop for the harmonics", minimum=0.0)
-    view_share: float | None = setting(
+    refine_rays_per_batch: int = setting(32768, "training pixels of a step of the optimisation", minimum=1, maximum=1 << 22)
+    density_lr: float = setting(0.3, "optimisation: rate of RMSprop for the logarithm of a voxel's optical thickness", minimum=0.0)
+    sh_lr: float = setting(0.03, "optimisation: rate of RMSprop for the harmonics", minimum=0.0)
+    view_dependent_lr_ratio: float | None = setting(
         None, "optimisation: share of colour_rate for what depends on the direction; none: 1 for cut-out objects, and 0.2 where surroundings are learned,"
         " for noise of photographs and small errors of their cameras would go there",
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
-    final_rate: float = setting(0.3, "optimisation: what is left of the rates at the last step; they fall exponentially", minimum=0.0, maximum=1.0)
+    lr_final_ratio: float = setting(0.3, "optimisation: what is left of the rates at the last step; they fall exponentially", minimum=0.0, maximum=1.0)
     licence: str = setting("", "licence text to write into the asset")
 
 
@@ -122,24 +122,24 @@ def run(job: Job) -> None:
         from pipeline.errors import StageFailed
 
         found = "no voxel of the box contributes to any training image"
-        raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.box).")
+        raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.crop_box).")
     refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, resolution, mib)
-    shape, voxel = bake.grid_of(bounds, resolution, settings.brick)
+    shape, voxel = bake.grid_of(bounds, resolution, settings.brick_size)
     job.say(f"{resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
-    points = 0 if m.settings.discretise == resolution and depth == 1 else settings.points
+    points = 0 if m.settings.discretise == resolution and depth == 1 else settings.samples_per_voxel
     facts = metadata_of(s, settings, m)
     plain = behind_of(s)
     if plain is None:
         targets = Targets(pixels, None, seen.chosen, seen.before, seen.behind)
     else:
         targets = Targets(pixels, plain, infinite=s.background is None)
-    most = serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick)
+    most = serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick_size)
     # The raw values go in without a name here: they are large, and not needed once the fitting has its own.
     tree, fitted = optimised(
         job,
         tree_from_voxels(
             shape, voxel, low, indices, *_values(job, m, indices, voxel, low, points, space),
-            brick=settings.brick, background=s.background, metadata=facts, ndc=space.ndc, lookup=settings.lookup,
+            brick=settings.brick_size, background=s.background, metadata=facts, ndc=space.ndc, lookup=settings.lookup,
         ),
         targets, most,
     )  # fmt: skip
@@ -211,15 +211,15 @@ NDC_DEPTH = 2.0
 
 def _depth_of(job: Job, m: Any) -> float:
     """How many times as deep as wide voxels are; 1 but in normalised device coordinates."""
-    given, discretise = job.settings.ndc_depth, m.settings.discretise
+    given, discretise = job.settings.ndc_voxel_depth, m.settings.discretise
     if m.space.ndc is None:
         if given is not None:
-            job.warn("bake.ndc_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes")
+            job.warn("bake.ndc_voxel_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes")
         return 1.0
     if given is None:
         return 1.0 if discretise else NDC_DEPTH
     if discretise and given != 1:
-        job.warn(f"bake.ndc_depth={given:g}, but the field was trained on train.discretise={discretise}: on other voxels than are baked")
+        job.warn(f"bake.ndc_voxel_depth={given:g}, but the field was trained on train.discretise={discretise}: on other voxels than are baked")
     return float(given)
 
 
@@ -235,7 +235,7 @@ def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) 
     from stages.baking.resolution import Choice, affordable_resolution, finest_resolution
 
     settings: BakeSettings = job.settings
-    bounds, brick = space.bounds, settings.brick
+    bounds, brick = space.bounds, settings.brick_size
 
     def room(resolution: int) -> int:
         shape, _ = bake.grid_of(bounds, resolution, brick)
@@ -258,8 +258,8 @@ def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) 
             last = None
             job.safe_point()
             shape, voxel = bake.grid_of(bounds, resolution, brick)
-            coarse = seen if resolution == finest.resolution else bake.coarsened(seen, top_shape, top_voxel, shape, voxel, brick, settings.weight)
-            last = resolution, coarse, bake.chosen_voxels(coarse, shape, brick, settings.weight, settings.dilate)
+            coarse = seen if resolution == finest.resolution else bake.coarsened(seen, top_shape, top_voxel, shape, voxel, brick, settings.weight_threshold)
+            last = resolution, coarse, bake.chosen_voxels(coarse, shape, brick, settings.weight_threshold, settings.dilate)
         return last
 
     choice = affordable_resolution(finest, lambda at: len(look(at)[2]), lambda at: int(DENSE * room(at)))
@@ -285,7 +285,7 @@ def _seen(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: 
         job.progress(done, total, "finding the voxels that matter")
         job.safe_point()
 
-    seen = bake.visible_voxels(m, pixels, shape, voxel, low, settings.brick, settings.pixels, looked, space)
+    seen = bake.visible_voxels(m, pixels, shape, voxel, low, settings.brick_size, settings.visibility_rays, looked, space)
     for name in names:
         part = getattr(seen, name)
         _write_npy(np.empty(0, np.float16) if part is None else part, job.work / f"seen_{name}.npy")
@@ -297,14 +297,14 @@ def _kept(job: Job, seen: Visible, shape: tuple[int, int, int], most: int) -> np
     from efficientnerf.asset import bake
 
     settings: BakeSettings = job.settings
-    threshold = settings.weight
-    indices = bake.chosen_voxels(seen, shape, settings.brick, threshold, settings.dilate)
+    threshold = settings.weight_threshold
+    indices = bake.chosen_voxels(seen, shape, settings.brick_size, threshold, settings.dilate)
     weights = np.sort(seen.greatest[seen.greatest > threshold])
     while len(indices) > most and len(weights) > 1:
         job.safe_point()
         # Grown voxels are about in proportion to the kept ones; a little less, so that this ends soon.
         weights = weights[-max(1, int(0.95 * len(weights) * most / len(indices))) :]
-        indices = bake.chosen_voxels(seen, shape, settings.brick, float(weights[0]), settings.dilate)
+        indices = bake.chosen_voxels(seen, shape, settings.brick_size, float(weights[0]), settings.dilate)
     return indices
 
 
@@ -317,13 +317,13 @@ def _seen_by_enough(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> n
     from stages.framing.view_coverage import often_seen
     from stages.io import scene
 
-    if not m.space.contracted or m.settings.observers == 0:
+    if not m.space.contracted or m.settings.min_views == 0:
         return indices
     cameras = [view.camera for view in scene.views_of(s, "train")]
     low, high = np.asarray(m.space.bounds, np.float64)
     voxel = float((high - low).max()) / resolution
     parts = (indices[at : at + CENTRES] for at in range(0, len(indices), CENTRES))
-    keep = [often_seen((part + 0.5) * voxel + low, cameras, m.settings.observers) for part in parts]
+    keep = [often_seen((part + 0.5) * voxel + low, cameras, m.settings.min_views) for part in parts]
     return indices[np.concatenate(keep)] if keep else indices
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from efficientnerf.evaluation.lpips import Lpips
 
 FORMAT = 1
-NETWORK_SIDE = 400  # pixels: the longest side of what the network draws where evaluate.scale does not say
+NETWORK_SIDE = 400  # pixels: the longest side of what the network draws where evaluate.field_image_scale does not say
 PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal images get this
 SHEET_ROWS = 8
 SHEET_SIDE = 320
@@ -44,11 +44,11 @@ NETWORKS = ("alex", "vgg")  # of LPIPS
 class EvaluateSettings:
     """How much is measured."""
 
-    views: int = setting(4, "How many held-back views the network is drawn for, spread evenly; 0: all of them.", minimum=0)
-    scale: float | None = setting(
+    field_views: int = setting(4, "How many held-back views the network is drawn for, spread evenly; 0: all of them.", minimum=0)
+    field_image_scale: float | None = setting(
         None, f"One over the thinning of the pixels the network draws; none: at most {NETWORK_SIDE} along the longest side.", minimum=0.01, maximum=1
     )
-    background_pixels: int = setting(
+    field_background_rays: int = setting(
         500_000, "On photographs, pixels in all that the network draws as background for the asset on other views (then enlarged).", minimum=1
     )
     lpips: str = setting("none", "Whether LPIPS is measured too, by which networks; their weights are files of their own.", choices=("none", *NETWORKS, "both"))
@@ -93,10 +93,10 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
     views, split = held_back(scene)
     if split == "train":
         job.warn("no view was held back from training: the figures below are of views that training saw")
-    drawn = set(spread(len(views), settings.views))
+    drawn = set(spread(len(views), settings.field_views))
     longest = max(max(view.camera.width, view.camera.height) for view in views)
-    stride = max(1, math.ceil(longest / NETWORK_SIDE if settings.scale is None else 1.0 / settings.scale - 1e-6))
-    rest = background_stride([view for k, view in enumerate(views) if k not in drawn], settings.background_pixels)
+    stride = max(1, math.ceil(longest / NETWORK_SIDE if settings.field_image_scale is None else 1.0 / settings.field_image_scale - 1e-6))
+    rest = background_stride([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
     wanted = {"none": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
     perceptual = {f"lpips_{network}": load_lpips(network, settings.lpips_weights) for network in wanted}
     field: Any = None

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MeshSettings:
-    faces: int = setting(200_000, "most faces of the mesh; it is decimated to this many", minimum=100)
-    threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
+    max_faces: int = setting(200_000, "most faces of the mesh; it is decimated to this many", minimum=100)
+    density_threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
     min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area are removed", minimum=0.0, maximum=1.0)
-    smooth: int = setting(10, "rounds of smoothing (Taubin's, which keeps the volume); 0: none", minimum=0, maximum=200)
+    smoothing_iterations: int = setting(10, "rounds of smoothing (Taubin's, which keeps the volume); 0: none", minimum=0, maximum=200)
 
 
 def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:
@@ -33,15 +33,15 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
     try:
         return surface(
             tree,
-            settings.threshold,
-            faces=settings.faces,
+            settings.density_threshold,
+            faces=settings.max_faces,
             min_component=settings.min_component,
-            rounds=settings.smooth,
+            rounds=settings.smoothing_iterations,
             viewpoints=orbit_places(tree.metadata),
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"mesh: {error}. {remedy('mesh', settings.threshold)}") from error
+        raise StageFailed(f"mesh: {error}. {remedy('mesh', settings.density_threshold)}") from error
 
 
 def orbit_places(metadata: Mapping[str, Any]) -> np.ndarray:

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PointsSettings:
-    count: int = setting(200_000, "points", minimum=1)
-    threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
+    num_points: int = setting(200_000, "points", minimum=1)
+    density_threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
     min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area get no points", minimum=0.0, maximum=1.0)
-    smooth: int = setting(10, "rounds of smoothing of the surface that the points lie on; 0: none", minimum=0, maximum=200)
+    smoothing_iterations: int = setting(10, "rounds of smoothing of the surface that the points lie on; 0: none", minimum=0, maximum=200)
     seed: int = setting(0, "where on the surface the points fall", minimum=0)
 
 
@@ -33,16 +33,16 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
     try:
         cloud = points(
             tree,
-            settings.count,
-            settings.threshold,
+            settings.num_points,
+            settings.density_threshold,
             min_component=settings.min_component,
-            rounds=settings.smooth,
+            rounds=settings.smoothing_iterations,
             seed=settings.seed,
             viewpoints=orbit_places(tree.metadata),
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"points: {error}. {remedy('points', settings.threshold)}") from error
+        raise StageFailed(f"points: {error}. {remedy('points', settings.density_threshold)}") from error
     back = frame.world_from_capture.inverse()
     return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
 

@@ -32,12 +32,12 @@ class PosesSettings:
     """How a source is read and framed."""
 
     format: str = setting("auto", "Format of the source; auto looks at what is there.", choices=importers.FORMATS)
-    max_side: int = setting(1024, "Longest side of the images that later stages read; larger ones are reduced.", minimum=32, maximum=16384, unit="pixels")
+    max_image_size: int = setting(1024, "Longest side of the images that later stages read; larger ones are reduced.", minimum=32, maximum=16384, unit="pixels")
     up: str = setting("auto", "Axis of the capture's frame that points up; auto estimates it.", choices=("auto", "x", "y", "z", "-x", "-y", "-z"))
-    box: tuple[float, float, float, float, float, float] | None = setting(
+    crop_box: tuple[float, float, float, float, float, float] | None = setting(
         None, "Crop box in the capture's frame: x y z of one corner, then of the opposite one; none estimates it."
     )
-    margin: float = setting(0.05, "Room left on each side of an estimated box, as a fraction of its longest side.", minimum=0.0, maximum=2.0)
+    box_margin: float = setting(0.05, "Room left on each side of an estimated box, as a fraction of its longest side.", minimum=0.0, maximum=2.0)
     space: str = setting(
         "auto",
         "Where the field lives: box (what lies beyond is a backdrop without depth), contracted (the box and all beyond), ndc (normalised device coordinates, "
@@ -58,8 +58,8 @@ class PosesSettings:
         "Which photographs are compared: all pairs, or each with those that follow; auto goes by their number.",
         choices=("auto", "exhaustive", "sequential"),
     )
-    features: int = setting(4096, "Most features found in a photograph.", minimum=256, maximum=65536)
-    feature_side: int = setting(1600, "Longest side of the photographs at which features are found.", minimum=320, maximum=8192, unit="pixels")
+    max_features: int = setting(4096, "Most features found in a photograph.", minimum=256, maximum=65536)
+    feature_image_size: int = setting(1600, "Longest side of the photographs at which features are found.", minimum=320, maximum=8192, unit="pixels")
     seed: int = setting(0, "Seed of every random choice in finding cameras.", minimum=0, maximum=2**31 - 1)
 
 
@@ -82,7 +82,7 @@ def run(job: Job) -> None:
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].module == "transforms")
     capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
-    framed = framing.frame(capture, up=settings.up, box=settings.box, margin=settings.margin, space=settings.space)
+    framed = framing.frame(capture, up=settings.up, box=settings.crop_box, margin=settings.box_margin, space=settings.space)
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = tuple(
@@ -149,8 +149,8 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     return find_cameras(
         source.root,
         [source.name_of(path) for path in images],
-        max_side=settings.feature_side,
-        features=settings.features,
+        max_side=settings.feature_image_size,
+        features=settings.max_features,
         matching=settings.matching,
         seed=settings.seed,
         masks={source.name_of(image): mask for image, mask in masks_of(source, images).items()},
@@ -179,7 +179,7 @@ def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tu
         job.safe_point()
         job.progress(index, len(capture.photos), "preparing images")
         try:
-            written.append(working_images.write(photo, job.out, relative[index], max_side=job.settings.max_side, keep_alpha=keep_alpha))
+            written.append(working_images.write(photo, job.out, relative[index], max_side=job.settings.max_image_size, keep_alpha=keep_alpha))
             odd += written[-1].warnings
             kept.append(index)
         except UnreadableImage as error:

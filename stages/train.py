@@ -59,7 +59,7 @@ def run(job: Job) -> None:
     t = loop.trainer(m, len(views))
     log = job.work / "log.jsonl"
     spent = _resume(t, job, log)
-    budget = Budget(settings, job.work, spent, clock) if settings.budget else None
+    budget = Budget(settings, job.work, spent, clock) if settings.time_budget else None
     if budget is not None:
         m.settings = budget.planned()
 
@@ -87,7 +87,7 @@ def run(job: Job) -> None:
         if shown or drawn is not None:
             lines.append(json.dumps(_line(done, loss, share, seconds, working / (done.step - logged), drawn), sort_keys=True))
             working, logged = 0.0, done.step
-        goal = settings.warm_up + TIMED if m.settings.iterations == MOST else m.settings.iterations
+        goal = settings.occupancy_warmup_steps + TIMED if m.settings.iterations == MOST else m.settings.iterations
         if shown or not pace:
             pace = _pace(done, share, seconds - spent, done.step - first, goal)
         facts = {"loss": loss, "psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), **({} if held_back is None else {"held_back_psnr": held_back})}
@@ -115,8 +115,8 @@ def _check(settings: TrainSettings) -> None:
 
     if len(settings.rate_aims) % 2:
         raise UsageError(f"train.rate_aims={list(settings.rate_aims)}: expected pairs, a number of steps and the step up to which it was aimed at.")
-    if settings.coarse == "voxels" and (settings.field, settings.sampling, settings.voxel_rule) != ("hash", "efficient", "maximum"):
-        raise UsageError("train.coarse=voxels needs train.field=hash, train.sampling=efficient and train.voxel_rule=maximum.")
+    if settings.coarse == "voxels" and (settings.field, settings.sampling, settings.occupancy_rule) != ("hash", "efficient", "maximum"):
+        raise UsageError("train.coarse=voxels needs train.field=hash, train.sampling=efficient and train.occupancy_rule=maximum.")
 
 
 def _close(m: Model, views: tuple[View, ...], job: Job) -> None:
@@ -126,10 +126,10 @@ def _close(m: Model, views: tuple[View, ...], job: Job) -> None:
     from efficientnerf.sampling.occupancy import close
     from stages.framing.view_coverage import seldom_seen
 
-    if not m.space.contracted or m.settings.observers == 0:
+    if not m.space.contracted or m.settings.min_views == 0:
         return
     job.progress(0, m.settings.iterations, "looking for what few photographs show")
-    close(m.voxels, torch.from_numpy(seldom_seen(m.space, [view.camera for view in views], m.settings.observers, m.voxels.side)))
+    close(m.voxels, torch.from_numpy(seldom_seen(m.space, [view.camera for view in views], m.settings.min_views, m.voxels.side)))
 
 
 def gains_of(t: Trainer, views: tuple[View, ...]) -> dict[str, np.ndarray] | None:
@@ -146,7 +146,7 @@ def _settle_steps(job: Job, m: Model, budget: Budget, step: int) -> None:
     known = m.settings.iterations
     if (settled := budget.after(step)) is not None:
         m.settings = settled
-        job.say(f"{settled.iterations} steps fit into the budget of {job.settings.budget:g} s" + ("" if known == MOST else f" (so far: {known})"))
+        job.say(f"{settled.iterations} steps fit into the budget of {job.settings.time_budget:g} s" + ("" if known == MOST else f" (so far: {known})"))
 
 
 def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> None:
@@ -156,12 +156,12 @@ def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> No
         "iterations": reached.iterations,
         "rate_hold": reached.rate_hold,
         "rate_aims": reached.rate_aims,
-        "budget": job.settings.budget,
+        "budget": job.settings.time_budget,
         "seconds": round(seconds, 1),
         "held_back_psnr": held_back,
         "occupied": t.model.voxels.occupied,
-        "log2_table": reached.log2_table,
-        "finest": reached.finest,
+        "log2_table": reached.log2_hashmap_size,
+        "finest": reached.finest_resolution,
         "again": _again(reached),
     }
     (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
@@ -170,12 +170,12 @@ def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> No
 def _again(reached: TrainSettings) -> str:
     """Options that give the same field again."""
     aims = f" --set train.rate_aims={json.dumps(reached.rate_aims, separators=(',', ':'))}" if reached.rate_aims else ""
-    return f"--set train.budget=0 --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}{aims}"
+    return f"--set train.time_budget=0 --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}{aims}"
 
 
 def _range(s: Scene, pixels: Pixels, settings: TrainSettings) -> tuple[float, float]:
     """Nearest and farthest of all views along their axes; where the settings state them, of the pixels too."""
-    if settings.far > 0:
+    if settings.far_plane > 0:
         near, far = stated_range(s, settings)
         pixels.near[:], pixels.far[:] = near, far
         return near, far
@@ -183,14 +183,14 @@ def _range(s: Scene, pixels: Pixels, settings: TrainSettings) -> tuple[float, fl
 
 
 def stated_range(s: Scene, settings: TrainSettings) -> tuple[float, float]:
-    """train.near and train.far in the training frame."""
+    """train.near_plane and train.far_plane in the training frame."""
     from pipeline.errors import UsageError
 
     if s.background is None:
-        raise UsageError("train.near and train.far are for scenes on a constant background; this one has surroundings. Leave them 0.")
-    if settings.near >= settings.far:
-        raise UsageError(f"train.near={settings.near:g}, train.far={settings.far:g}: rays must end beyond where they begin.")
-    return settings.near * float(s.world_from_capture.scale), settings.far * float(s.world_from_capture.scale)
+        raise UsageError("train.near_plane and train.far_plane are for scenes on a constant background; this one has surroundings. Leave them 0.")
+    if settings.near_plane >= settings.far_plane:
+        raise UsageError(f"train.near_plane={settings.near_plane:g}, train.far_plane={settings.far_plane:g}: rays must end beyond where they begin.")
+    return settings.near_plane * float(s.world_from_capture.scale), settings.far_plane * float(s.world_from_capture.scale)
 
 
 def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:

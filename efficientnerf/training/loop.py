@@ -201,8 +201,8 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         fine_samples = fine_samples_at(settings, way)
 
         # A bundle of rays of about as many samples as the settings ask for.
-        count = int(min(settings.rays, max(FEWEST_RAYS, settings.samples / t.samples_per_ray))) if settings.samples else settings.rays
-        chosen = pixels.choose(count, rng, middle=number <= settings.crop_steps)
+        count = int(min(settings.max_rays_per_batch, max(FEWEST_RAYS, settings.sample_batch_size / t.samples_per_ray))) if settings.sample_batch_size else settings.max_rays_per_batch
+        chosen = pixels.choose(count, rng, middle=number <= settings.precrop_steps)
         origins, directions, near, far, colour = (torch.as_tensor(a, device=device) for a in there.bundle(chosen))
         offset = sent(torch.from_numpy(rng.random(count, np.float32)), device)
         behind = m.behind(directions)
@@ -210,17 +210,17 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             # Behind a space that reaches to infinity nothing lies: a new colour for each ray keeps the field from leaving it half transparent.
             behind = sent(torch.from_numpy(rng.random((count, 3), np.float32)), device)
         if transparent:
-            if settings.backdrop == "random" or m.background is None:
+            if settings.background_color == "random" or m.background is None:
                 # Behind an object cut out of its background anything may lie: a new colour for each ray keeps the field from learning one.
                 behind = sent(torch.from_numpy(rng.random((count, 3), np.float32)), device)
             colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
 
         # Both stages, both losses (weighted equally, as in the authors' release).
-        if late is not None and (number == settings.warm_up + 1 or fine_samples != sampled):
+        if late is not None and (number == settings.occupancy_warmup_steps + 1 or fine_samples != sampled):
             late.forget()
         sampled = fine_samples
         room = None if late is None else late.room(count)
-        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.warm_up, rng=rng, room=room, fine_samples=fine_samples)
+        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.occupancy_warmup_steps, rng=rng, room=room, fine_samples=fine_samples)
         whole = whole_rays(seen.coarse, seen.fine)
         fine_colour, coarse_colour = seen.fine_colour, seen.coarse_colour
         if t.exposure is not None:
@@ -237,13 +237,13 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             loss = loss + share * m.distortion * mean_over(seen.distortion, whole)
             if m.space.contracted:  # in normalised device coordinates rays do not crowd together before the cameras
                 _quieten_near_cameras(m, origins, seen)
-            strength = settings.anchors * max(0.0, 1 - 2 * way)
+            strength = settings.sparse_depth_loss_weight * max(0.0, 1 - 2 * way)
             if anchors is not None and strength > 0:
                 few = max(1, count // ANCHOR_SHARE)
-                loss = loss + strength * anchor_loss(m, anchors, few, rng, late, prune=number > settings.warm_up, fine_samples=fine_samples)
+                loss = loss + strength * anchor_loss(m, anchors, few, rng, late, prune=number > settings.occupancy_warmup_steps, fine_samples=fine_samples)
         loss.backward()
-        ends = (settings.iterations, settings.rate_steps, settings.rate_hold, settings.rate_aims)
-        rate = learning_rate(number, settings.learning_rate, settings.final_rate, *ends)
+        ends = (settings.iterations, settings.lr_decay_steps, settings.rate_hold, settings.rate_aims)
+        rate = learning_rate(number, settings.learning_rate, settings.lr_final_ratio, *ends)
         t.adam.step(number, rate)
 
         _tell_voxels(m, seen, number, rng, room, waits=late is None)
@@ -270,7 +270,7 @@ def _tell_voxels(m: Model, seen: Look, number: int, rng: np.random.Generator, ro
     with torch.no_grad():
         told, raw = (seen.fine, seen.fine_raw) if m.coarse is None else (seen.coarse, seen.coarse_raw)
         remember(m, told.point, raw[:, 0].detach(), count=None if room is None else told.first[-1])
-        due = number % m.settings.refresh_every == 0
+        due = number % m.settings.occupancy_update_interval == 0
         if due:
             refresh(m, number, rng)
         # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
@@ -287,7 +287,7 @@ def fine_samples_at(settings: TrainSettings, way: float) -> int:
     *chair* at 800x800 after 2500 steps: 29.52 dB with 2, 30.00 dB with 4, but 28.7 dB both after 900 steps, and at 200x200 30.8 and 30.2 dB after 700,
     30.8 with 2 and then 4.
     """
-    return settings.first_fine_samples if settings.first_fine_samples and way < 0.5 else settings.fine_samples
+    return settings.early_samples_per_pivot if settings.early_samples_per_pivot and way < 0.5 else settings.samples_per_pivot
 
 
 def anchor_loss(
@@ -300,7 +300,7 @@ def anchor_loss(
     with t_i the middle of interval i, e_i its extent (of a coarse interval for both stages) and d the distance of the point. What is before the
     point is cleared away by it, which photographs alone take long to do: they look as well explained by fog of the right colour. fine_samples: see `look`.
     """
-    fine_samples = fine_samples or m.settings.fine_samples
+    fine_samples = fine_samples or m.settings.samples_per_pivot
     pick = rng.integers(len(anchors), size=count)
     origins, directions, distance = (sent(torch.from_numpy(a[pick]), m.device) for a in (anchors.origins, anchors.directions, anchors.distance))
     offset = sent(torch.from_numpy(rng.random(count, np.float32)), m.device)
@@ -340,12 +340,12 @@ def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
     """Let the voxels forget a little, and ask the coarse field about a share of them: all of them in turn in the warm-up, then random ones."""
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
     fade(m.voxels)
-    if m.settings.refresh_share == 0:
+    if m.settings.occupancy_update_fraction == 0:
         return
-    if number <= m.settings.warm_up:
-        cell, point = sweep_cells(m.voxels, number // m.settings.refresh_every, SWEEP_PARTS, generator)
+    if number <= m.settings.occupancy_warmup_steps:
+        cell, point = sweep_cells(m.voxels, number // m.settings.occupancy_update_interval, SWEEP_PARTS, generator)
     else:
-        cell, point = refresh_cells(m.voxels, int(m.settings.refresh_share * m.voxels.side**3), generator)
+        cell, point = refresh_cells(m.voxels, int(m.settings.occupancy_update_fraction * m.voxels.side**3), generator)
     for part in range(0, len(cell), 2**17):
         remember(m, point[part : part + 2**17], m.scout.density(m.asked(point[part : part + 2**17])), cell[part : part + 2**17])
 

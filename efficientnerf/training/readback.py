@@ -2,7 +2,7 @@
 
 A host that asks a device for a number waits until all that it has launched is done, and the device then idles until the host has launched more. How
 many samples a bundle has is such a number. So once the averages have settled a step makes room for MARGIN times as many samples as rays had of late
-(those that are looked at whole among them, `train.refresh_rays`, which come first and so find room first); rays that find no room are left out of the
+(those that are looked at whole among them, `train.occupancy_update_ray_fraction`, which come first and so find room first); rays that find no room are left out of the
 loss and counted, which is rare, and the counts and losses of a step are read LAG steps after it.
 """
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 CHECKPOINT = "optimisation.safetensors"
 CHECKPOINT_SECONDS = 30.0
 SAMPLE = 2**16  # training pixels that the report's figures are taken from
-# Training pixels per voxel that are looked at to see which voxels show; not fewer than bake.pixels. Four kept a tenth more that no picture missed
+# Training pixels per voxel that are looked at to see which voxels show; not fewer than bake.visibility_rays. Four kept a tenth more that no picture missed
 WEIGHED = 1.0
 WEIGHED_NDC = 0.25  # likewise in normalised device coordinates, where no ray misses and each meets many voxels. Held-back views of fern_8 at 1:
 # 25.33 dB in 23.6 MB; 0.25 (and 1 million): 25.32 in 22.2
@@ -79,9 +79,9 @@ def _decibels(error: float) -> float:
 
 def steps_of(settings: BakeSettings, voxels: int, cut_out: bool) -> int:
     """Steps of the optimisation of so many voxels, of a cut-out object or of photographs with surroundings."""
-    if settings.optimise is not None:
-        return settings.optimise
-    return max(LEAST_STEPS, math.ceil(RAYS_PER_VOXEL * voxels / settings.optimise_rays)) if cut_out else PHOTOGRAPHED_STEPS
+    if settings.refine_steps is not None:
+        return settings.refine_steps
+    return max(LEAST_STEPS, math.ceil(RAYS_PER_VOXEL * voxels / settings.refine_rays_per_batch)) if cut_out else PHOTOGRAPHED_STEPS
 
 
 def _fit(job: Job, o: Optimiser, targets: Targets, steps: int, until: int, pruned: bool) -> None:
@@ -91,9 +91,9 @@ def _fit(job: Job, o: Optimiser, targets: Targets, steps: int, until: int, prune
     settings = job.settings
     written, smooth = time.monotonic(), 0.0
     run = refinement.optimise(
-        o, targets, until=until, steps=steps, rays=settings.optimise_rays, density_rate=settings.density_rate,
-        colour_rate=settings.colour_rate, final=settings.final_rate, seed=settings.seed,
-        view_share=settings.view_share if settings.view_share is not None else 1.0 if o.tree.background is not None else PHOTOGRAPHS,
+        o, targets, until=until, steps=steps, rays=settings.refine_rays_per_batch, density_rate=settings.density_lr,
+        colour_rate=settings.sh_lr, final=settings.lr_final_ratio, seed=settings.seed,
+        view_share=settings.view_dependent_lr_ratio if settings.view_dependent_lr_ratio is not None else 1.0 if o.tree.background is not None else PHOTOGRAPHS,
     )  # fmt: skip
     for error in run:
         smooth = error if not smooth else 0.9 * smooth + 0.1 * error
@@ -109,20 +109,20 @@ def _fit(job: Job, o: Optimiser, targets: Targets, steps: int, until: int, prune
 
 
 def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Optimiser:
-    """Only the voxels that contribute more than bake.weight to a pixel, and of these at most `most`, those that contribute most; no scraps of surroundings."""
+    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most; no scraps of surroundings."""
     from efficientnerf.asset import bake, refinement
 
     settings = job.settings
     o.leave()
     share = WEIGHED if o.tree.ndc is None else WEIGHED_NDC
-    count = min(max(settings.pixels, int(share * len(o.density))), 4 * len(targets.pixels))
+    count = min(max(settings.visibility_rays, int(share * len(o.density))), 4 * len(targets.pixels))
 
     def looked(done: int, total: int) -> None:
         job.progress(done, total, "dropping what does not show")
         job.safe_point()
 
     greatest = refinement.greatest_weights(o.tree, targets, count, settings.seed, looked)
-    keep = greatest > settings.weight
+    keep = greatest > settings.weight_threshold
     if keep.sum() > most:
         order = np.argsort(-greatest, kind="stable")
         keep = np.zeros(len(keep), bool)

@@ -126,7 +126,7 @@ def _failure(folder: Path, images: Sequence[WorkImage], models: Sequence[Any], r
     hints = ["more photographs with at least 60 % overlap between neighbours, sharp, of a subject with texture"]
     if how == "sequential":
         hints.append("--set poses.matching=exhaustive if the names do not follow the path of the camera")
-    hints.append("--set poses.features=8192")
+    hints.append("--set poses.max_features=8192")
     worst = dict(rejected)
     fewest = max(mapping.FEWEST, -(-len(images) // 2))
     return (

@@ -42,7 +42,7 @@ class Plan(NamedTuple):
 
 @dataclass
 class Budget:
-    """How the steps of a run with `train.budget` are found.
+    """How the steps of a run with `train.time_budget` are found.
 
     settings  as given; train.iterations is not heeded
     work      scratch folder, where the plan lies
@@ -62,7 +62,7 @@ class Budget:
     def __post_init__(self) -> None:
         self.started = self.clock()
         self.plan = _read(self.work / FILE)
-        self.marks = [share * self.settings.budget for share in MARKS]
+        self.marks = [share * self.settings.time_budget for share in MARKS]
 
     @property
     def seconds(self) -> float:
@@ -71,26 +71,26 @@ class Budget:
 
     @property
     def hold(self) -> int:
-        return self.settings.rate_hold or self.settings.warm_up + TIMED
+        return self.settings.rate_hold or self.settings.occupancy_warmup_steps + TIMED
 
     def planned(self) -> TrainSettings:
         """The settings to begin or to go on with: those of the plan if there is one, else without an end in sight."""
         plan = self.plan or Plan(MOST, self.hold, ())
-        return replace(self.settings, budget=0.0, **plan._asdict())
+        return replace(self.settings, time_budget=0.0, **plan._asdict())
 
     def after(self, step: int) -> TrainSettings | None:
         """What is settled after a step: the settings with the number of steps, or None where nothing changes. Writes the plan."""
         now = self.seconds
-        if self.timed is None and (self.plan is not None or step >= min(self.settings.warm_up, self.hold - 1)):
+        if self.timed is None and (self.plan is not None or step >= min(self.settings.occupancy_warmup_steps, self.hold - 1)):
             self.timed = step, now
         if not self._due(step, now):
             return None
         iterations = step
-        if now < self.settings.budget:
+        if now < self.settings.time_budget:
             # An attempt may have begun just before the number has to be settled; then all the steps tell, slow ones of the beginning too.
             known = self.timed is not None and step > self.timed[0]
             each = (now - self.timed[1]) / (step - self.timed[0]) if known and self.timed is not None else now / step
-            iterations += max(0, int(((1 - RESERVE) * self.settings.budget - now) / max(each, 1e-6)))
+            iterations += max(0, int(((1 - RESERVE) * self.settings.time_budget - now) / max(each, 1e-6)))
         if self.plan is None:
             self.plan = Plan(iterations, self.hold, ())
         else:
@@ -104,7 +104,7 @@ class Budget:
         """Whether the number of steps is to be settled after this one."""
         passed = [mark for mark in self.marks if mark <= now]
         if self.plan is None:
-            due = step >= self.hold or now >= self.settings.budget
+            due = step >= self.hold or now >= self.settings.time_budget
         else:  # an interrupted run takes steps again that the plan has been made for
             enough = self.timed is not None and step - self.timed[0] >= FEWEST
             due = bool(passed) and enough and self.plan.settled < step < self.plan.iterations

@@ -44,7 +44,7 @@ def sized(settings: TrainSettings, s: Scene, pixels: int) -> TrainSettings:
     log2_table = int(np.clip(round(entries), LOG2_TABLE, LARGEST))
     return replace(
         settings,
-        log2_table=settings.log2_table or log2_table,
-        finest=settings.finest or finest,
-        coarse_samples=settings.coarse_samples or coarse_samples,
+        log2_hashmap_size=settings.log2_hashmap_size or log2_table,
+        finest_resolution=settings.finest_resolution or finest,
+        num_coarse_samples=settings.num_coarse_samples or coarse_samples,
     )

@@ -209,7 +209,7 @@ def test_counts_are_those_of_the_strategies() -> None:
     bundle = [torch.from_numpy(a) for a in (o, d, near, far)]
     found = {}
     for strategy in ("uniform", "hierarchical", "efficient"):
-        made = settings(field="mlp", sampling=strategy, importance_samples=6, coarse_samples=10, near=1.0, far=5.0, explored=0.0)
+        made = settings(field="mlp", sampling=strategy, num_importance_samples=6, num_coarse_samples=10, near_plane=1.0, far_plane=5.0, exploration_fraction=0.0)
         m = model(SPACE, made, (1.0, 1.0, 1.0), "cpu", (1.0, 5.0))
         assert m.step == pytest.approx(0.4)
         found[strategy] = look(m, *bundle, torch.full((20,), 0.5), torch.ones(20, 3))
@@ -217,7 +217,7 @@ def test_counts_are_those_of_the_strategies() -> None:
     assert len(found["hierarchical"].coarse.start) == 20 * 10
     assert 0 < len(found["efficient"].coarse.start) <= 20 * math.ceil(2 * math.sqrt(3) / 0.4)  # those in the box
     with pytest.raises(ValueError, match="constant background"):
-        model(Space(BOUNDS, True), settings(near=1.0, far=5.0), None, "cpu", (1.0, 5.0))
+        model(Space(BOUNDS, True), settings(near_plane=1.0, far_plane=5.0), None, "cpu", (1.0, 5.0))
 
 
 def test_some_rays_are_looked_at_whole_in_training_only() -> None:

@@ -54,8 +54,8 @@ def test_nothing_is_evaluated_twice_and_nothing_that_need_not_be() -> None:
     assert len(torch.unique(fine, dim=0)) == len(fine) == len(seen.fine.start)
     assert (coarse - 0.5).norm(dim=1).max() < 0.3 + math.sqrt(3) / 24  # valid voxels only
     assert len(coarse) < seen.coarse.tried / 2
-    assert len(fine) == m.settings.fine_samples * int(seen.pivotal.sum())
-    assert torch.equal(seen.pivotal, seen.coarse_weight > m.settings.pivotal_weight)
+    assert len(fine) == m.settings.samples_per_pivot * int(seen.pivotal.sum())
+    assert torch.equal(seen.pivotal, seen.coarse_weight > m.settings.pivotal_threshold)
     assert 0 < int(seen.pivotal.sum()) < 0.7 * len(coarse)  # what lies behind the surface is not
     everything = seen_by(m, prune=False)
     assert len(everything.coarse.start) == everything.coarse.tried == seen.coarse.tried
@@ -75,8 +75,8 @@ def test_training_explores_intervals_without_a_pivot_and_rendering_does_not() ->
     assert (one.pivotal | ~drawn.pivotal).all()  # pivots stay pivots
     share = float((one.pivotal & ~drawn.pivotal).sum()) / float((~drawn.pivotal).sum())
     assert 0.4 < share < 0.6
-    assert len(one.fine.start) == m.settings.fine_samples * int(one.pivotal.sum())
-    assert int(none.pivotal.sum()) <= int((none.coarse_weight > m.settings.pivotal_weight).sum())
+    assert len(one.fine.start) == m.settings.samples_per_pivot * int(one.pivotal.sum())
+    assert int(none.pivotal.sum()) <= int((none.coarse_weight > m.settings.pivotal_threshold).sum())
 
 
 def test_rays_that_meet_nothing_show_the_background() -> None:
@@ -100,7 +100,7 @@ def test_the_same_settings_give_the_same_numbers(field: str) -> None:
 
 def test_the_papers_model_has_the_papers_sizes() -> None:
     paper = TrainSettings(
-        field="mlp", degree=3, hidden=256, layers=8, coarse_hidden=128, coarse_layers=4, coarse_samples=64, fine_samples=2, voxels=384, voxel_rule="momentum"
+        field="mlp", sh_degree=3, hidden_dim=256, num_layers=8, coarse_hidden_dim=128, coarse_num_layers=4, num_coarse_samples=64, samples_per_pivot=2, occupancy_resolution=384, occupancy_rule="momentum"
     )
     m = model(Space(BOUNDS, False), paper, (1.0, 1.0, 1.0))
     assert m.fine(torch.rand(2, 3)).shape == (2, 49)

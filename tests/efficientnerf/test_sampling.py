@@ -159,7 +159,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     from efficientnerf.training.settings import TrainSettings
 
     space = Space(np.array([np.negative(half), half]), True)
-    m = model(space, TrainSettings(coarse_samples=coarse_samples, voxels=8, levels=2, log2_table=8), None)
+    m = model(space, TrainSettings(num_coarse_samples=coarse_samples, occupancy_resolution=8, num_levels=2, log2_hashmap_size=8), None)
     rng = np.random.default_rng(5)
     directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

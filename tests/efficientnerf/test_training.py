@@ -41,8 +41,8 @@ def test_it_learns(field: str, rule: str) -> None:
     steps = run(m)
     assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + (2 if field == "hash" else 1)
     assert [step.step for step in steps] == list(range(1, m.settings.iterations + 1))
-    assert all(step.fine == m.settings.fine_samples * step.pivotal and step.pivotal <= step.valid <= step.tried for step in steps)
-    for step in steps[: m.settings.warm_up]:
+    assert all(step.fine == m.settings.samples_per_pivot * step.pivotal and step.pivotal <= step.valid <= step.tried for step in steps)
+    for step in steps[: m.settings.occupancy_warmup_steps]:
         assert step.valid == step.tried  # nothing is pruned in the warm-up
 
 
@@ -52,7 +52,7 @@ def test_intervals_are_sampled_more_finely_in_the_second_half_of_the_schedule() 
     constant = run(untrained(iterations=40, fine_samples=5, first_fine_samples=0))
     assert all(step.fine == 5 * step.pivotal > 0 for step in constant)
     # A schedule that was settled anew counts by its own share, not by steps over all steps: of 40 steps to step 10, then of 20.
-    settled = TrainSettings(fine_samples=5, first_fine_samples=2, iterations=20, rate_aims=(40, 10))
+    settled = TrainSettings(samples_per_pivot=5, early_samples_per_pivot=2, iterations=20, rate_aims=(40, 10))
     found = [fine_samples_at(settled, share_of_fall(n, settled.iterations, settled.rate_hold, settled.rate_aims)) for n in range(1, 21)]
     assert found == [2] * 13 + [5] * 7  # a quarter by step 10, and the rest in ten steps
 
@@ -227,10 +227,10 @@ def test_voxels_alone_can_choose_the_pivots(contracted: bool) -> None:
     steps = run(m, photographs if contracted else None)
     assert not any(name.startswith("coarse") for name, _ in m.parameters())
     assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 2
-    for step in steps[: m.settings.warm_up]:
+    for step in steps[: m.settings.occupancy_warmup_steps]:
         assert step.tried == step.valid == step.pivotal == step.fine  # everything, once
-    for step in steps[m.settings.warm_up :]:
-        assert step.fine == m.settings.fine_samples * step.pivotal
+    for step in steps[m.settings.occupancy_warmup_steps :]:
+        assert step.fine == m.settings.samples_per_pivot * step.pivotal
     assert all(step.valid < step.tried for step in steps[-10:])  # what is empty is found
 
 

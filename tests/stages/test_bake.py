@@ -27,7 +27,7 @@ from stages.io.scene import load
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
 
-QUICK = BakeSettings(resolution=24, points=4, licence="CC0-1.0", optimise=12, optimise_rays=512)
+QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512)
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +204,7 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
 
 
 def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
-    chosen = BakeSettings(optimise_rays=1000)
+    chosen = BakeSettings(refine_rays_per_batch=1000)
     assert [refinement.steps_of(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
     assert {refinement.steps_of(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
     asked = dataclasses.replace(chosen, optimise=7)
@@ -220,7 +220,7 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
     sizes = {}
     for most in (1, 64):
         told: list[dict[str, Any]] = []
-        settings = BakeSettings(resolution=80, points=1, weight=0.0, max_mib=most, layout=layout, optimise=2, optimise_rays=512)
+        settings = BakeSettings(resolution=80, samples_per_voxel=1, weight_threshold=0.0, max_mib=most, layout=layout, refine_steps=2, refine_rays_per_batch=512)
         made = job(tmp_path / str(most), settings, **inputs)
         made._report = told.append
         run(made)

@@ -97,7 +97,7 @@ def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path],
     assert tree.ndc.to_json() == load_renderer(made.out, "cpu").model.space.ndc.to_json()
     assert not [event for event in told if event["event"] == "warning"]
     baked(tmp_path / "other", on_voxels, told, resolution=48, ndc_depth=2.0)
-    assert any("bake.ndc_depth=2" in event["text"] and "train.discretise=48" in event["text"] for event in told if event["event"] == "warning")
+    assert any("bake.ndc_voxel_depth=2" in event["text"] and "train.discretise=48" in event["text"] for event in told if event["event"] == "warning")
 
 
 def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
     tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_depth=2.0)
     assert tree.ndc is None
     assert len(set(tree.resolution)) == 1
-    assert any("bake.ndc_depth" in event["text"] for event in told if event["event"] == "warning")
+    assert any("bake.ndc_voxel_depth" in event["text"] for event in told if event["event"] == "warning")
     m = load_renderer(tmp_path / "train" / "out", "cpu").model
     with pytest.raises(ValueError, match="normalised device coordinates"):
         flattened(m.space, 2.0)

@@ -57,7 +57,7 @@ def report(made: Job) -> dict[str, Any]:
 
 def repeated(said: dict[str, Any]) -> TrainSettings:
     """The settings of a plain run, as the report names them."""
-    return replace(settings(**QUICK), budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"], rate_aims=tuple(said["rate_aims"]))
+    return replace(settings(**QUICK), time_budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"], rate_aims=tuple(said["rate_aims"]))
 
 
 def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_pa
     assert len(said["rate_aims"]) >= 2  # settled anew on the way
     aims = json.dumps(said["rate_aims"], separators=(",", ":"))
     steps = f"--set train.iterations={said['iterations']} --set train.rate_hold={said['rate_hold']}"
-    assert said["again"] == f"--set train.budget=0 {steps} --set train.rate_aims={aims}"
+    assert said["again"] == f"--set train.time_budget=0 {steps} --set train.rate_aims={aims}"
     plain = repeated(said)
     assert digest(job(tmp_path / "b", plain, poses=scene)) == first
     assert load_renderer(budgeted.out).model.settings == plain
@@ -101,7 +101,7 @@ def test_a_budget_that_is_over_before_anything_is_timed_ends_the_training(scene:
 def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
     """The warm-up's steps are slower than those that follow, and say nothing about them."""
     now = [0.0]
-    budget = Budget(settings(warm_up=10, budget=100.0), tmp_path, 0.0, lambda: now[0])
+    budget = Budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 0.0, lambda: now[0])
     assert budget.planned().iterations == MOST
     fixed = None
     for step in range(1, 100):
@@ -111,9 +111,9 @@ def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
     assert step == 10 + TIMED
     assert fixed is not None
     assert fixed.iterations == step + int((99 - 54) / 0.5)
-    assert Budget(settings(warm_up=10, budget=100.0), tmp_path, 54.0, lambda: 0.0).planned() == fixed
+    assert Budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 54.0, lambda: 0.0).planned() == fixed
     (tmp_path / "plan.json").write_text("{")
-    assert Budget(settings(warm_up=10, budget=100.0), tmp_path, 54.0, lambda: 0.0).planned().iterations == MOST
+    assert Budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 54.0, lambda: 0.0).planned().iterations == MOST
 
 
 PACES: dict[str, Callable[[int], float]] = {
@@ -128,7 +128,7 @@ PACES: dict[str, Callable[[int], float]] = {
 def test_steps_that_change_their_pace_end_on_time(tmp_path: Path, pace: Callable[[int], float], stops: tuple[int, ...]) -> None:
     """Also where attempts are interrupted and go on from a checkpoint ten steps before."""
     times, step, spent, began = [0.0], 0, 0.0, 0.0
-    given = settings(warm_up=10, budget=120.0)
+    given = settings(occupancy_warmup_steps=10, time_budget=120.0)
     budget = Budget(given, tmp_path, 0.0, lambda: times[-1])
     planned = budget.planned()
     lost: dict[int, TrainSettings] = {}  # what the steps after the checkpoint were taken with

@@ -101,7 +101,7 @@ def test_figures_are_those_of_the_metrics(tmp_path: Path) -> None:
 
 
 def test_the_network_is_bounded_in_views_and_scale_and_the_asset_is_not(tmp_path: Path) -> None:
-    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t" * 6), EvaluateSettings(views=2, scale=0.5))
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "t" * 6), EvaluateSettings(field_views=2, field_image_scale=0.5))
     field = BallField(TREE, background=WHITE)
     evaluate(TREE, lambda: field, job)
     metrics = figures_of(job)
@@ -122,7 +122,7 @@ def test_val_stands_in_for_test_and_train_for_both_with_a_warning(tmp_path: Path
 
 
 def test_on_photographs_the_asset_lies_over_the_networks_background(tmp_path: Path) -> None:
-    job = job_in(tmp_path, make_scene(tmp_path / "poses", "tttt", background=None), EvaluateSettings(views=2, background_pixels=WIDTH * HEIGHT // 2))
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "tttt", background=None), EvaluateSettings(field_views=2, field_background_rays=WIDTH * HEIGHT // 2))
     field = BallField(TREE)
     evaluate(TREE, lambda: field, job)
     metrics = figures_of(job)
@@ -161,7 +161,7 @@ def test_light_before_the_box_covers_the_asset(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("background", [WHITE, None])
 def test_what_masks_hide_does_not_count(tmp_path: Path, background: tuple[float, float, float] | None) -> None:
-    job = job_in(tmp_path, make_scene(tmp_path / "poses", "tt", background=background, masked=True), EvaluateSettings(views=1))
+    job = job_in(tmp_path, make_scene(tmp_path / "poses", "tt", background=background, masked=True), EvaluateSettings(field_views=1))
     evaluate(TREE, lambda: BallField(TREE, background=background), job)
     metrics = figures_of(job)
     assert metrics["asset"]["psnr"] > 45
@@ -196,13 +196,13 @@ def test_a_network_of_nans_is_told_and_measured_as_black(tmp_path: Path) -> None
 @pytest.mark.parametrize("moment", [1, 2, 4])
 def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp_path: Path, moment: int) -> None:
     poses = make_scene(tmp_path / "poses", "tttt", background=None)
-    whole = job_in(tmp_path / "whole", poses, EvaluateSettings(views=2))
+    whole = job_in(tmp_path / "whole", poses, EvaluateSettings(field_views=2))
     evaluate(TREE, lambda: BallField(TREE), whole)
     asked, first, second = iter(range(100)), BallField(TREE), BallField(TREE)
-    stopped = job_in(tmp_path, poses, EvaluateSettings(views=2), "first", stop=lambda: 2 if next(asked) >= moment else None)
+    stopped = job_in(tmp_path, poses, EvaluateSettings(field_views=2), "first", stop=lambda: 2 if next(asked) >= moment else None)
     with pytest.raises(Interrupted):
         evaluate(TREE, lambda: first, stopped)
-    job = job_in(tmp_path, poses, EvaluateSettings(views=2), "second")
+    job = job_in(tmp_path, poses, EvaluateSettings(field_views=2), "second")
     evaluate(TREE, lambda: second, job)
     for name in ("metrics.json", "contact_sheet.png"):
         assert hashlib.sha256((job.out / name).read_bytes()).digest() == hashlib.sha256((whole.out / name).read_bytes()).digest()

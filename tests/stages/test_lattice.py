@@ -61,24 +61,24 @@ def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
 
 def test_tables_grow_with_the_photographs_between_limits() -> None:
     s = forward_facing(400)
-    assert sized(TrainSettings(), s, 1000).log2_table == LOG2_TABLE
-    assert sized(TrainSettings(), s, 6 << 18).log2_table == 18
-    assert sized(TrainSettings(), s, 10**9).log2_table == LARGEST
-    given = sized(TrainSettings(log2_table=14, finest=512, coarse_samples=77), s, 10**9)
+    assert sized(TrainSettings(), s, 1000).log2_hashmap_size == LOG2_TABLE
+    assert sized(TrainSettings(), s, 6 << 18).log2_hashmap_size == 18
+    assert sized(TrainSettings(), s, 10**9).log2_hashmap_size == LARGEST
+    given = sized(TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=77), s, 10**9)
     assert (given.log2_table, given.finest, given.coarse_samples) == (14, 512, 77)
 
 
 def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_them_and_fog_weighs_less() -> None:
     s = forward_facing(400)
-    small = TrainSettings(log2_table=8, levels=2, voxels=8)
+    small = TrainSettings(log2_hashmap_size=8, num_levels=2, occupancy_resolution=8)
     m, usual = model(space_of(s), small, None), model(Space(BOUNDS, False), small, None)
-    assert m.settings.coarse_samples == sized(TrainSettings(), s, 1000).coarse_samples == COARSE_SAMPLES_NDC
+    assert m.settings.num_coarse_samples == sized(TrainSettings(), s, 1000).num_coarse_samples == COARSE_SAMPLES_NDC
     assert m.step == pytest.approx(2 * math.sqrt(3) / COARSE_SAMPLES_NDC, rel=1e-6)  # the box is 2 deep
     assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.05)
     assert 1 - math.exp(-usual.voxels.threshold * usual.step) == pytest.approx(0.01)
     assert (m.distortion, usual.distortion) == (0.002, 0.01)
     stated = model(space_of(s), dataclasses.replace(small, coarse_samples=64, voxel_absorption=0.2, distortion=0.0), None)
-    assert (stated.settings.coarse_samples, stated.distortion) == (64, 0.0)
+    assert (stated.settings.num_coarse_samples, stated.distortion) == (64, 0.0)
     assert 1 - math.exp(-stated.voxels.threshold * stated.step) == pytest.approx(0.2)
 
 
@@ -87,14 +87,14 @@ def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path:
     found = [sized(TrainSettings(), s, pixels) for pixels in (1, 2**22, 2**24, 2**26, 2**34)]
     assert [each.log2_table for each in found] == [17, 17, 18, 19, 19]
     assert {each.finest for each in found} == {FINEST}
-    assert sized(TrainSettings(log2_table=14, finest=512), s, 2**26) == TrainSettings(log2_table=14, finest=512, coarse_samples=COARSE_SAMPLES)
+    assert sized(TrainSettings(log2_hashmap_size=14, finest_resolution=512), s, 2**26) == TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=COARSE_SAMPLES)
 
 
 def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
-    made = job(tmp_path, settings(log2_table=0, finest=0, iterations=2, samples=256), poses=poses(tmp_path / "poses"))
+    made = job(tmp_path, settings(log2_hashmap_size=0, finest_resolution=0, iterations=2, sample_batch_size=256), poses=poses(tmp_path / "poses"))
     train.run(made)
     m = load_renderer(made.out).model
-    assert (m.settings.log2_table, m.settings.finest) == (LOG2_TABLE, FINEST)
+    assert (m.settings.log2_hashmap_size, m.settings.finest_resolution) == (LOG2_TABLE, FINEST)
     assert max(m.fine.sides) == FINEST
 
 

@@ -54,7 +54,7 @@ def test_the_mesh_lies_in_the_captures_frame(ball: Path, tmp_path: Path) -> None
     from PIL import Image
 
     events: list[dict] = []
-    settings = MeshSettings(faces=4000, threshold=150.0)
+    settings = MeshSettings(max_faces=4000, density_threshold=150.0)
     stage.run(Job(settings=settings, inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work", report=events.append))
     assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["mesh.glb", "mesh.ply", "preview.png", "report.json"]
     mesh = trimesh.load(tmp_path / "out" / "mesh.ply", process=False)
@@ -87,14 +87,14 @@ def test_the_mesh_lies_in_the_captures_frame(ball: Path, tmp_path: Path) -> None
 
 def test_the_same_asset_gives_the_same_bytes(ball: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        stage.run(Job(settings=MeshSettings(faces=1000), inputs={"bake": ball}, out=tmp_path / name, work=tmp_path / "work"))
+        stage.run(Job(settings=MeshSettings(max_faces=1000), inputs={"bake": ball}, out=tmp_path / name, work=tmp_path / "work"))
     for file in (tmp_path / "a").iterdir():
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
 
 
 def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, tmp_path: Path) -> None:
-    with pytest.raises(StageFailed, match=r"nowhere reaches 1e\+04.*Lower mesh.threshold"):
-        stage.run(Job(settings=MeshSettings(threshold=1e4), inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work"))
+    with pytest.raises(StageFailed, match=r"nowhere reaches 1e\+04.*Lower mesh.density_threshold"):
+        stage.run(Job(settings=MeshSettings(density_threshold=1e4), inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work"))
 
 
 def test_an_empty_asset_names_the_remedy(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, obs
     trained = job(tmp_path / "train", balls.settings(iterations=30, observers=observers), poses=tmp_path / "poses")
     train.run(trained)
     made = job(
-        tmp_path / "bake", bake.BakeSettings(resolution=32, pixels=5000, points=2, optimise=4, optimise_rays=1024), poses=tmp_path / "poses", train=trained.out
+        tmp_path / "bake", bake.BakeSettings(resolution=32, visibility_rays=5000, samples_per_voxel=2, refine_steps=4, refine_rays_per_batch=1024), poses=tmp_path / "poses", train=trained.out
     )
     bake.run(made)
     tree = NerfTree.load(made.out / bake.ASSET)

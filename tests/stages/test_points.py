@@ -21,7 +21,7 @@ def bake(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_points_lie_on_the_ball_in_the_captures_frame(bake: Path, tmp_path: Path) -> None:
-    points.run(Job(settings=PointsSettings(count=5000), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
+    points.run(Job(settings=PointsSettings(num_points=5000), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
     header, body = (tmp_path / "out" / "points.ply").read_bytes().split(b"end_header\n", 1)
     assert b"element vertex 5000\n" in header
     assert b"element face" not in header
@@ -35,12 +35,12 @@ def test_points_lie_on_the_ball_in_the_captures_frame(bake: Path, tmp_path: Path
 
 def test_the_same_seed_gives_the_same_points(bake: Path, tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        points.run(Job(settings=PointsSettings(count=500, seed=seed), inputs={"bake": bake}, out=tmp_path / name, work=tmp_path / "work"))
+        points.run(Job(settings=PointsSettings(num_points=500, seed=seed), inputs={"bake": bake}, out=tmp_path / name, work=tmp_path / "work"))
     a, b, c = ((tmp_path / name / "points.ply").read_bytes() for name in "abc")
     assert a == b
     assert a != c
 
 
 def test_a_threshold_out_of_reach_names_the_remedy(bake: Path, tmp_path: Path) -> None:
-    with pytest.raises(StageFailed, match=r"Lower points.threshold"):
-        points.run(Job(settings=PointsSettings(threshold=1e4), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
+    with pytest.raises(StageFailed, match=r"Lower points.density_threshold"):
+        points.run(Job(settings=PointsSettings(density_threshold=1e4), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))

@@ -55,7 +55,7 @@ def test_meshes_lie_in_the_frame_of_the_capture(enerf: Enerf, ball: Path, tmp_pa
 
 
 def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
-    result = enerf("export", ball, "--points", "--to", tmp_path / "ball.ply", tmp_path / "ball.xyz", "--set", "points.count=300")
+    result = enerf("export", ball, "--points", "--to", tmp_path / "ball.ply", tmp_path / "ball.xyz", "--set", "points.num_points=300")
     assert result.code == 0, result.err
     assert "300 points" in result.out
     assert len((tmp_path / "ball.xyz").read_text(encoding="utf-8").splitlines()) == 300
@@ -70,7 +70,7 @@ def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
         (["--to", "no/where/ball.ply"], 2, "does not exist"),
         (["--to", "cameras.json"], 2, "has no cameras"),
         (["--to", "ball.ply", "--set", "mesh.facs=3"], 2, "Nearest: mesh.faces."),
-        (["--to", "ball.ply", "--set", "mesh.threshold=1e9"], 3, "Lower mesh.threshold"),
+        (["--to", "ball.ply", "--set", "mesh.density_threshold=1e9"], 3, "Lower mesh.density_threshold"),
         ([], 2, "--to"),
     ],
 )

@@ -31,14 +31,14 @@ def test_the_papers_presets_are_the_papers() -> None:
         settings = Settings(TYPES)
         settings.put_table(read_preset(name).table, name)
         train, bake = (settings.resolved()[stage] for stage in ("train", "bake"))
-        samples.append((train.coarse_samples, train.fine_samples))
-        assert (train.field, train.degree, train.hidden, train.layers, train.coarse_hidden, train.coarse_layers) == ("mlp", 3, 256, 8, 128, 4)
-        assert (train.voxels, train.voxel_initial, train.voxel_beta, train.voxel_rule) == (384, 10.0, 0.1, "momentum")
-        assert (train.pivotal_weight, train.sampling, train.near, train.far) == (1e-4, "efficient", 2.0, 6.0)
-        assert train.max_pivots >= train.coarse_samples  # the paper drops none
-        assert (train.rays, train.samples, train.iterations, train.learning_rate) == (1024, 0, 1_000_000, 5e-4)
-        assert (train.final_rate, train.rate_steps) == (0.1, 500_000)
-        assert (bake.resolution // bake.brick, bake.brick) == (384, 4)
+        samples.append((train.num_coarse_samples, train.samples_per_pivot))
+        assert (train.field, train.sh_degree, train.hidden_dim, train.num_layers, train.coarse_hidden_dim, train.coarse_num_layers) == ("mlp", 3, 256, 8, 128, 4)
+        assert (train.occupancy_resolution, train.occupancy_initial_density, train.occupancy_beta, train.occupancy_rule) == (384, 10.0, 0.1, "momentum")
+        assert (train.pivotal_threshold, train.sampling, train.near_plane, train.far_plane) == (1e-4, "efficient", 2.0, 6.0)
+        assert train.max_pivots >= train.num_coarse_samples  # the paper drops none
+        assert (train.max_rays_per_batch, train.sample_batch_size, train.iterations, train.learning_rate) == (1024, 0, 1_000_000, 5e-4)
+        assert (train.lr_final_ratio, train.lr_decay_steps) == (0.1, 500_000)
+        assert (bake.resolution // bake.brick_size, bake.brick_size) == (384, 4)
     assert samples == [(64, 2), (64, 3), (96, 4), (128, 5)]
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--from", "start", metavar="STAGE", help="Do this stage and those after it again, even if they are up to date.")
 @device_option
 @click.option("--seed", type=int, help="The seed of every stage that draws random numbers.")
-@click.option("--budget", metavar="TIME", help="Train for so long, as 90s, 10m or 1h, in place of a number of steps: train.budget.")
+@click.option("--budget", metavar="TIME", help="Train for so long, as 90s, 10m or 1h, in place of a number of steps: train.time_budget.")
 @click.option("--strict", is_flag=True, help="Refuse a source of which anything is missing or unreadable.")
 @click.option("--allow-outside", is_flag=True, help="Let a data set name files outside of its folder.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done and why; do nothing.")

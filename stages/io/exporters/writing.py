@@ -48,7 +48,7 @@ def source_frame(metadata: Mapping[str, Any]) -> SourceFrame:
 def check_mesh(mesh: Mesh, path: Path) -> None:
     """Raise BadInput for a mesh that would make a broken file: no faces, numbers that are not finite, faces that name no vertex."""
     if not len(mesh.faces):
-        raise BadInput(f"{path}: the mesh has no faces. Lower the threshold (`--set mesh.threshold=...`) or train longer.")
+        raise BadInput(f"{path}: the mesh has no faces. Lower the threshold (`--set mesh.density_threshold=...`) or train longer.")
     _check_finite({"vertices": mesh.vertices, "normals": mesh.normals, "colours": mesh.colours}, path)
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise BadInput(f"{path}: faces name vertices {mesh.faces.min()} to {mesh.faces.max()}, expected 0 to {len(mesh.vertices) - 1}. Make the mesh again.")
@@ -57,7 +57,7 @@ def check_mesh(mesh: Mesh, path: Path) -> None:
 def check_points(points: PointCloud, path: Path) -> None:
     """Raise BadInput for a cloud that would make a broken file: empty, or with numbers that are not finite."""
     if not len(points.positions):
-        raise BadInput(f"{path}: the point cloud is empty. Lower the threshold (`--set points.threshold=...`) or train longer.")
+        raise BadInput(f"{path}: the point cloud is empty. Lower the threshold (`--set points.density_threshold=...`) or train longer.")
     _check_finite({"positions": points.positions, "normals": points.normals, "colours": points.colours}, path)
 
 
