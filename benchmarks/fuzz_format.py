@@ -81,7 +81,7 @@ def with_bytes(rng: Rng, data: bytes, begin: int, end: int) -> bytes:
             source = number(rng, len(out))
             out[at : at + count] = out[source : source + count]
         elif kind == 5:
-            out[at : at + 1] = b"0123456789-.eE[]{},:\"\\ "[number(rng, 23) :][:1]
+            out[at : at + 1] = b'0123456789-.eE[]{},:"\\ '[number(rng, 23) :][:1]
         else:
             del out[at:]
     return bytes(out)

@@ -122,9 +122,7 @@ def measure(steps: int) -> dict[str, Any]:
         fine.append(done.fine)
     rays = m.settings.max_rays_per_batch
     # Forward, and backward with respect to weights and to inputs; the first layer has no gradient with respect to its input.
-    flop = sum(
-        2 * n * (3 * products(field) - field.weights[0].numel()) for n, field in ((statistics.mean(valid), m.coarse), (statistics.mean(fine), m.fine))
-    )
+    flop = sum(2 * n * (3 * products(field) - field.weights[0].numel()) for n, field in ((statistics.mean(valid), m.coarse), (statistics.mean(fine), m.fine)))
     median = statistics.median(seconds)
     return {
         "seconds_per_step": {"median": round(median, 4), "fastest": round(min(seconds), 4), "slowest": round(max(seconds), 4), "steps": steps},

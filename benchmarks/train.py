@@ -74,12 +74,12 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     from stages.io.field_file import space_of
     from stages.train import anchors_of, pixels_of, stated_range
     from stages.training.budget import MOST, TIMED
-    from stages.training.hash_resolution import sized
+    from stages.training.hash_resolution import with_auto_sizes
 
     s, settings = scene.load(poses), settings_of(preset)
     views = scene.views_of(s, "train")
     pixels = pixels_of(poses, views)
-    settings = sized(settings, s, len(pixels))
+    settings = with_auto_sizes(settings, s, len(pixels))
     near, far = min(view.near for view in s.views), max(view.far for view in s.views)
     if settings.far > 0:
         near, far = stated_range(s, settings)

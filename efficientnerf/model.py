@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from efficientnerf.backends import dispatch
-from efficientnerf.backends.transfer import sent
+from efficientnerf.backends.transfer import to_device
 from efficientnerf.fields.hash import HashField
 from efficientnerf.fields.mlp import MlpField
 from efficientnerf.fields.nerf import NerfField
@@ -27,15 +27,17 @@ from efficientnerf.rendering.compositing import Composite, ray_of_sample
 from efficientnerf.rendering.harmonics import basis, harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels, voxel_weights
 from efficientnerf.sampling.samples import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples
-from efficientnerf.training.readback import Room
+from efficientnerf.training.readback import SampleCapacity
 from efficientnerf.training.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
 
 SKY_DEGREE = 2
 COARSEST = 16
-# Where train.distortion_loss_weight says none. In normalised device coordinates depths crowd less, and fog is a smaller part of them: held-back views of LLFF fern at
+# Where train.distortion_loss_weight says none. In normalised device coordinates depths crowd less, and fog is a smaller part of them: held-back views
+# of LLFF fern at
 # 504x378 after 1000 steps at 0.01: 21.8 dB; 0.002: 22.0; 0: 21.9.
 DISTORTION, DISTORTION_NDC = 0.01, 0.002
-# Where train.occupancy_alpha_threshold says none. In normalised device coordinates most intervals are valid for long, and asking about them is most of a step; with
+# Where train.occupancy_alpha_threshold says none. In normalised device coordinates most intervals are valid for long, and asking about them is most
+# of a step; with
 # fewer intervals (train.num_coarse_samples) and fewer of them valid a step has half as many rays again. The same views with 2^19 entries, after 1000 steps, two
 # seeds: N_c 128 and 0.01: 22.5 and 22.3 dB; 96 and 0.01: 22.7; 96 and 0.05: 22.8 and 22.6. At 1008x756 after 3000 steps: 22.2 with the first, 22.6 with
 # the last.
@@ -94,11 +96,11 @@ class Model:
         return self.voxels.values.device
 
     @property
-    def scout(self) -> AnyField:
+    def proposal_field(self) -> AnyField:
         """The field whose density the voxels remember."""
         return self.fine if self.coarse is None else self.coarse
 
-    def asked(self, points: Tensor) -> Tensor:
+    def snapped_points(self, points: Tensor) -> Tensor:
         """Where the fields are asked for what lies at points (N, 3) in grid coordinates: there, or at the centres of voxels where the settings say so."""
         return voxel_centres(self.space, points, self.settings.discretise) if self.settings.discretise else points
 
@@ -116,7 +118,7 @@ class Model:
         return torch.stack([torch.full((len(directions),), value, device=directions.device) for value in self.background], dim=1)
 
 
-class Look(NamedTuple):
+class RayOutputs(NamedTuple):
     """What one bundle of rays met: samples of both stages, what the fields said, and whether each coarse sample was pivotal.
 
     Uniform sampling has no coarse stage: no coarse samples then, and no coarse colour. Samples lie on `rays`, in the frame of the space.
@@ -165,7 +167,13 @@ def model(
         absorption = ABSORPTION if space.ndc is None else ABSORPTION_NDC
     threshold = -math.log1p(-min(absorption, 0.999)) / step if settings.occupancy_rule == "maximum" else 0.0
     voxels = density_voxels(
-        side, settings.occupancy_rule, initial=settings.occupancy_initial_density, beta=settings.occupancy_beta, decay=settings.occupancy_decay, threshold=threshold, device=device
+        side,
+        settings.occupancy_rule,
+        initial=settings.occupancy_initial_density,
+        beta=settings.occupancy_beta,
+        decay=settings.occupancy_decay,
+        threshold=threshold,
+        device=device,
     )
     return Model(space, settings, None if coarse is None else coarse.to(device), fine.to(device), voxels, Sky().to(device), background, step, slots, span)
 
@@ -192,10 +200,10 @@ def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField | No
     )
 
 
-def look(
+def render_rays(
     m: Model, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, behind: Tensor, *,
-    prune: bool = True, rng: np.random.Generator | None = None, room: Room | None = None, fine_samples: int = 0,
-) -> Look:  # fmt: skip
+    prune: bool = True, rng: np.random.Generator | None = None, room: SampleCapacity | None = None, fine_samples: int = 0,
+) -> RayOutputs:  # fmt: skip
     """Both stages along a bundle of rays: valid samples through the coarse field, pivotal ones through the fine one, or as `settings.sampling` says.
 
     origins, directions  (R, 3) world frame, unit directions
@@ -218,7 +226,7 @@ def look(
         raw, out = _seen(m, m.fine, directions, samples, behind)
         nothing = samples.start[:0]
         none = Samples(torch.zeros_like(samples.first), nothing, nothing, nothing, samples.point[:0], samples.tried)
-        return Look(rays, none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
+        return RayOutputs(rays, none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
     for_coarse, for_fine = (None, None) if room is None else room
     if m.settings.sampling == "hierarchical":
         coarse, at = _even_samples(m, *bundle, offset, m.settings.num_coarse_samples, rng, for_coarse)
@@ -238,13 +246,13 @@ def look(
         at = coarse.start + offset[ray_of_sample(coarse.first, len(coarse.start))] * coarse.extent if at is None else at
         fine = importance_samples(m.space, *bundle[:2], coarse, at, weight, quantile, for_fine)
     fine_raw, out = _seen(m, m.fine, directions, fine, behind)
-    return Look(rays, coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
+    return RayOutputs(rays, coarse, coarse_raw, seen.weight, seen.colour, pivotal, fine, fine_raw, *_summed(out, seen.distortion))
 
 
 def _looked_by_voxels(
     m: Model, rays: FrameRays, directions: Tensor, offset: Tensor, behind: Tensor, coarse: Samples, *, prune: bool, rng: np.random.Generator | None,
     capacity: int | None, fine_samples: int,
-) -> Look:  # fmt: skip
+) -> RayOutputs:  # fmt: skip
     """Pivots by what the density voxels hold, without a coarse field; while nothing is pruned, all intervals, with one sample each."""
     weight = voxel_weights(m.voxels, coarse.point, coarse.length, coarse.first)
     if prune:
@@ -255,7 +263,7 @@ def _looked_by_voxels(
     else:
         pivotal, fine = torch.ones(len(weight), dtype=torch.bool, device=weight.device), coarse
     fine_raw, out = _seen(m, m.fine, directions, fine, behind)
-    return Look(rays, coarse, fine_raw[:0], weight, None, pivotal, fine, fine_raw, *_summed(out, 0.0))
+    return RayOutputs(rays, coarse, fine_raw[:0], weight, None, pivotal, fine, fine_raw, *_summed(out, 0.0))
 
 
 def _chance(count: int, share: float, rng: np.random.Generator, device: torch.device) -> Tensor:
@@ -268,7 +276,7 @@ def _chance(count: int, share: float, rng: np.random.Generator, device: torch.de
 
 def _seen(m: Model, field: AnyField, directions: Tensor, samples: Samples, behind: Tensor) -> tuple[Tensor, Composite]:
     """What a field says at samples (N, 1 + 3K), and how it looks along their rays."""
-    point = m.asked(samples.point)
+    point = m.snapped_points(samples.point)
     if isinstance(field, NerfField):
         raw = field(point, directions[ray_of_sample(samples.first, len(samples.start))])
         harmonics = torch.ones_like(directions[:, :1])  # the colour is what the network says
@@ -307,14 +315,14 @@ def _even_samples(
         near, far = clip_to_space(m.space, origins, directions, near, far)
     jitter = offset[:, None].expand(-1, count)
     if rng is not None:
-        jitter = sent(torch.from_numpy(rng.random((len(origins), count), np.float32)), offset.device)
+        jitter = to_device(torch.from_numpy(rng.random((len(origins), count), np.float32)), offset.device)
     return stratified_samples(m.space, origins, directions, near, far, jitter, outside=m.settings.field != "hash", capacity=capacity)
 
 
 def _strata(rays: int, count: int, rng: np.random.Generator | None, device: torch.device) -> Tensor:
     """(rays, count) quantiles, one in each of `count` equal parts of [0, 1]: random in training, the middles in rendering."""
     within = torch.full((rays, count), 0.5) if rng is None else torch.from_numpy(rng.random((rays, count), np.float32))
-    return sent((torch.arange(count) + within) / count, device)
+    return to_device((torch.arange(count) + within) / count, device)
 
 
 def state_of(m: Model) -> dict[str, Tensor]:

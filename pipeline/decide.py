@@ -1,10 +1,10 @@
 """Whether a stage has to run, and why. Looks, and changes nothing: neither the run nor the source.
 
-    missing  never run
-    fresh    nothing to do
-    stale    made by another request: other settings, other inputs, another version
-    partial  work on the present request was cut short; what stands, if anything does, is of another request
-    corrupt  what lies on disk is not what was written
+missing  never run
+fresh    nothing to do
+stale    made by another request: other settings, other inputs, another version
+partial  work on the present request was cut short; what stands, if anything does, is of another request
+corrupt  what lies on disk is not what was written
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 """Everything that the engine raises on purpose. Each carries one or two lines for the user and the exit code of the process.
 
-    PipelineError
-    ├── BadInput           2   the source, the run folder or a file given by the user cannot be used
-    ├── UsageError         2   the request itself is wrong: a value of a wrong type, a stage that does not exist
-    │   └── UnknownSetting 2   a setting that does not exist; names the nearest one
-    ├── StageFailed        3   a stage raised; the original is its __cause__
-    │   └── DiskFull       3   ... because the disk, or the quota, is full
-    ├── CorruptArtifact    4   what a run holds is not what was written
-    ├── RunLocked          5   another process is writing this run
-    └── Interrupted        130 by Ctrl-C, 143 by SIGTERM
+PipelineError
+├── BadInput           2   the source, the run folder or a file given by the user cannot be used
+├── UsageError         2   the request itself is wrong: a value of a wrong type, a stage that does not exist
+│   └── UnknownSetting 2   a setting that does not exist; names the nearest one
+├── StageFailed        3   a stage raised; the original is its __cause__
+│   └── DiskFull       3   ... because the disk, or the quota, is full
+├── CorruptArtifact    4   what a run holds is not what was written
+├── RunLocked          5   another process is writing this run
+└── Interrupted        130 by Ctrl-C, 143 by SIGTERM
 """
 
 from __future__ import annotations

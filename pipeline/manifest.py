@@ -1,10 +1,10 @@
 """What made an artifact, and what it consists of: manifest.json, the last file written into an artifact's folder.
 
-    request   stage, version, settings, digests of the inputs, digests of the source's files. Its SHA-256 names the work folder
-    outputs   name -> SHA-256, size, and whether it depends on the clock (volatile)
-    digest    of the names and SHA-256 of the outputs that do not: all that later requests see
-    the rest  seconds, peak memory, tool versions: for people, outside of every digest
-    checksum  of all of the above, so that a damaged manifest is known as such
+request   stage, version, settings, digests of the inputs, digests of the source's files. Its SHA-256 names the work folder
+outputs   name -> SHA-256, size, and whether it depends on the clock (volatile)
+digest    of the names and SHA-256 of the outputs that do not: all that later requests see
+the rest  seconds, peak memory, tool versions: for people, outside of every digest
+checksum  of all of the above, so that a damaged manifest is known as such
 """
 
 from __future__ import annotations

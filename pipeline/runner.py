@@ -256,9 +256,7 @@ def _emit(report: Report | None, event: str, stage: str, **facts: Any) -> None:
         report({**facts, "event": event, "stage": stage, "time": time.time()})
 
 
-def _selection(
-    stages: Sequence[Stage], *, until: str | None, start: str | None, only: str | None, force: bool
-) -> tuple[list[Stage], frozenset[str]]:
+def _selection(stages: Sequence[Stage], *, until: str | None, start: str | None, only: str | None, force: bool) -> tuple[list[Stage], frozenset[str]]:
     """(the stages to look at, the names of those to run even if fresh)."""
     names = _checked_names(stages)
     for name in (until, start, only):
@@ -328,4 +326,3 @@ def _only_follows(decision: Decision) -> bool:
     """Whether it is stale for no other reason than that a stage before it has to run."""
     made, request = decision.manifest, decision.request
     return decision.state == "stale" and decision.reason != "forced" and made is not None and request is not None and made.request == request
-

@@ -69,7 +69,9 @@ class BakeSettings:
         " and anywhere with less than a hundredth of it",
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
-    samples_per_voxel: int = setting(8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256)
+    samples_per_voxel: int = setting(
+        8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256
+    )
     seed: int = setting(0, "seed of the jitter, and of the pixels of the optimisation", minimum=0)
     refine_steps: int | None = setting(
         None, "steps in which the baked values are fitted to the training images; 0: they stay as the network says; none: so many that five rays come to a"
@@ -314,7 +316,7 @@ CENTRES = 2**20  # that are looked for in the pictures at once
 def _seen_by_enough(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
     """The voxels that as many photographs have in view as training asked for, where surroundings are learned: its own voxels, which it closed to
     matter elsewhere (`stages.framing.view_coverage`), are larger, and what they hold sticks out as a rim."""
-    from stages.framing.view_coverage import often_seen
+    from stages.framing.view_coverage import has_min_views
     from stages.io import scene
 
     if not m.space.contracted or m.settings.min_views == 0:
@@ -323,7 +325,7 @@ def _seen_by_enough(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> n
     low, high = np.asarray(m.space.bounds, np.float64)
     voxel = float((high - low).max()) / resolution
     parts = (indices[at : at + CENTRES] for at in range(0, len(indices), CENTRES))
-    keep = [often_seen((part + 0.5) * voxel + low, cameras, m.settings.min_views) for part in parts]
+    keep = [has_min_views((part + 0.5) * voxel + low, cameras, m.settings.min_views) for part in parts]
     return indices[np.concatenate(keep)] if keep else indices
 
 

@@ -26,7 +26,7 @@ from stages.training.budget import MOST, TIMED, Budget
 
 if TYPE_CHECKING:
     from efficientnerf.model import Model
-    from efficientnerf.training.loop import Anchors, Progress, Trainer
+    from efficientnerf.training.loop import Progress, SparseDepthRays, Trainer
     from efficientnerf.training.pixels import Pixels
     from stages.io.scene import Scene, View
 
@@ -41,9 +41,9 @@ def run(job: Job) -> None:
     from efficientnerf.model import model
     from efficientnerf.rendering.render import FieldRenderer
     from efficientnerf.training import loop
-    from efficientnerf.training.readback import LateShare
+    from efficientnerf.training.readback import AsyncOccupancy
     from stages.io import field_file, scene
-    from stages.training.hash_resolution import sized
+    from stages.training.hash_resolution import with_auto_sizes
 
     _check(job.settings)
     use_all_cores()
@@ -52,7 +52,7 @@ def run(job: Job) -> None:
     views = scene.views_of(s, "train")
     job.progress(0, job.settings.iterations, "reading images")
     pixels = pixels_of(folder, views)
-    settings = sized(job.settings, s, len(pixels))
+    settings = with_auto_sizes(job.settings, s, len(pixels))
     near, far = _range(s, pixels, settings)
     m = model(field_file.space_of(s), settings, s.background, job.device, (near, far))
     _close(m, views, job)
@@ -69,7 +69,7 @@ def run(job: Job) -> None:
     lines: list[str] = []
     started, first, loss = clock(), t.step, 0.0
     held_back: float | None = None
-    occupied = LateShare(m.voxels)
+    occupied = AsyncOccupancy(m.voxels)
     pace: dict[str, Any] = {}
     working, logged, resumed = 0.0, first, clock()  # seconds of steps alone, since the last line of the log
     for done in loop.train(t, pixels, anchors_of(folder, s)):
@@ -123,13 +123,13 @@ def _close(m: Model, views: tuple[View, ...], job: Job) -> None:
     """Close the voxels whose matter would be seen by too few photographs for them to tell where it is."""
     import torch
 
-    from efficientnerf.sampling.occupancy import close
-    from stages.framing.view_coverage import seldom_seen
+    from efficientnerf.sampling.occupancy import mask_cells
+    from stages.framing.view_coverage import cells_below_min_views
 
     if not m.space.contracted or m.settings.min_views == 0:
         return
     job.progress(0, m.settings.iterations, "looking for what few photographs show")
-    close(m.voxels, torch.from_numpy(seldom_seen(m.space, [view.camera for view in views], m.settings.min_views, m.voxels.side)))
+    mask_cells(m.voxels, torch.from_numpy(cells_below_min_views(m.space, [view.camera for view in views], m.settings.min_views, m.voxels.side)))
 
 
 def gains_of(t: Trainer, views: tuple[View, ...]) -> dict[str, np.ndarray] | None:
@@ -205,10 +205,10 @@ def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
     return Pixels([view.camera for view in views], images, masks, near, far, channels)
 
 
-def anchors_of(folder: Path, s: Scene) -> Anchors | None:
+def anchors_of(folder: Path, s: Scene) -> SparseDepthRays | None:
     """Rays of training cameras to the sparse points that were seen there; only points that three photographs or more agree on, and only
     from cameras they lie before: posed data sets name points behind a camera, or in it, too."""
-    from efficientnerf.training.loop import Anchors
+    from efficientnerf.training.loop import SparseDepthRays
     from stages.io import scene
 
     if not s.points:
@@ -227,7 +227,7 @@ def anchors_of(folder: Path, s: Scene) -> Anchors | None:
     if not before.any():
         return None
     away, distance, view = away[before], distance[before], view[before]
-    return Anchors(centres[view].astype(np.float32), (away / distance[:, None]).astype(np.float32), distance.astype(np.float32))
+    return SparseDepthRays(centres[view].astype(np.float32), (away / distance[:, None]).astype(np.float32), distance.astype(np.float32))
 
 
 def use_all_cores() -> None:

@@ -38,9 +38,7 @@ def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # a
     from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames, turntable_cameras
 
     s: TurntableSettings = job.settings
-    cameras = turntable_cameras(
-        tree, frames=s.frames, width=s.width, height=s.height, elevation=s.elevation, radius=s.radius, fov=s.fov, sway=s.sway
-    )
+    cameras = turntable_cameras(tree, frames=s.frames, width=s.width, height=s.height, elevation=s.elevation, radius=s.radius, fov=s.fov, sway=s.sway)
     options = RenderOptions(background=s.background, supersample=s.supersample, exr=s.exr, fps=s.fps, crf=s.crf)
 
     def each(done: int, total: int) -> None:

@@ -20,7 +20,7 @@ import torch
 
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.spaces import Space
-from efficientnerf.model import Model, look
+from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
 from efficientnerf.rendering.render import split_by_box
 from efficientnerf.sampling.occupancy import cell_of
@@ -89,7 +89,7 @@ def visible_voxels(
         bundle = pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])
         origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
         behind = m.behind(directions)
-        seen = look(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
+        seen = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
         if m.background is None:
             parts = split_by_box(m, origins, directions, torch.ones_like(near), seen, behind)
             surroundings.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
@@ -188,7 +188,7 @@ def voxel_values(
         jitter = torch.from_numpy(rng.random((len(block), points, 3), np.float32)) if jittered else torch.full((len(block), 1, 3), 0.5)
         world = (block[:, None] + jitter) * voxel + low
         point = space.grid(world.reshape(-1, 3)).to(m.device)
-        raw = m.fine(m.asked(point))
+        raw = m.fine(m.snapped_points(point))
         valid = m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold
         density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
         density = density * _looked_into(m, space.grid((block + 0.5) * voxel + low))[:, None]
@@ -205,7 +205,7 @@ def _looked_into(m: Model, grid: torch.Tensor) -> torch.Tensor:
     """
     if m.coarse is None or m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
         return torch.ones(len(grid), dtype=torch.bool, device=m.device)
-    raw = m.coarse(m.asked(grid.float().to(m.device)))[:, 0]
+    raw = m.coarse(m.snapped_points(grid.float().to(m.device)))[:, 0]
     return activate(raw, m.coarse.activation) > m.voxels.threshold
 
 

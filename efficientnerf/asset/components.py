@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 SPECK = 0.01  # of `share`: a piece with less than that is left out wherever it hangs
 
 
-def scraps(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarray:
+def small_components(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarray:
     """Which of the stored voxels that are to be kept, (N,) bool, belong to scraps: (N,) bool.
 
     Coarse cells that hold a kept voxel and touch, at a corner too, are one piece: matter a coarse cell apart is apart. Scraps are pieces with less

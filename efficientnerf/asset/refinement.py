@@ -115,7 +115,7 @@ class Targets:
         """Rows `at` of an array, or of a tensor on the pixels' device, in float32."""
         if isinstance(self.pixels, Pixels):
             return part[at].astype(np.float32)
-        return part[self.pixels.sent(at)].float()
+        return part[self.pixels.to_device(at)].float()
 
 
 @dataclass
@@ -137,7 +137,7 @@ class Optimiser:
     def fetch(self) -> None:
         """Have the arrays as they are after the last step."""
         if self.away is not None:
-            found = self.away.fetched()
+            found = self.away.to_host_async()
             self.tree = replace(self.tree, density_values=found["density"], harmonics=found["sh"].reshape(self.tree.sh.shape))
             for name in SQUARES:
                 setattr(self, name, found[name])
@@ -193,7 +193,16 @@ def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tu
 
 
 def optimise(
-    o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int,
+    o: Optimiser,
+    targets: Targets,
+    *,
+    until: int,
+    steps: int,
+    rays: int,
+    density_rate: float,
+    colour_rate: float,
+    final: float,
+    seed: int,
     view_share: float = 1.0,
 ) -> Iterator[float]:
     """Go on to step `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.

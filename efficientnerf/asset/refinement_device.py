@@ -16,7 +16,7 @@ from torch import Tensor
 
 from efficientnerf.asset.refinement import DECAY, EPSILON, STATE, Bundle, Optimiser, Targets, randomness
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.transfer import constant, fetched
+from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
 from efficientnerf.training.device_pixels import DevicePixels
@@ -42,7 +42,7 @@ class DeviceFit:
         self.by_sh = torch.zeros(count, width, dtype=torch.int64, device=device)
         self.stamp = torch.zeros(count, dtype=torch.int32, device=device)
 
-    def fetched(self) -> dict[str, np.ndarray]:
+    def to_host_async(self) -> dict[str, np.ndarray]:
         """The arrays on the host."""
         return {name: values.cpu().numpy() for name, values in self.values.items()}
 
@@ -67,7 +67,16 @@ def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
 
 
 def optimise(
-    o: Optimiser, targets: Targets, *, until: int, steps: int, rays: int, density_rate: float, colour_rate: float, final: float, seed: int,
+    o: Optimiser,
+    targets: Targets,
+    *,
+    until: int,
+    steps: int,
+    rays: int,
+    density_rate: float,
+    colour_rate: float,
+    final: float,
+    seed: int,
     view_share: float = 1.0,
 ) -> Iterator[float]:
     """See `efficientnerf.asset.refinement.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
@@ -81,7 +90,7 @@ def optimise(
         origins, directions, seen = targets.draw(rays, randomness(seed, number))
         fall = final ** (number / steps)
         loss = fit.step(number, rays_in_voxels(o.tree, origins, directions), seen, density_rate * fall, colour_rate * fall, view_share)
-        pending.append(fetched(loss.mean() / 3))
+        pending.append(to_host_async(loss.mean() / 3))
         o.step = number
         if error is None or len(pending) > LAG:
             value, arrived = pending.popleft()

@@ -77,7 +77,7 @@ def valid_samples(
     return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
 
 
-def tell_largest(values: Tensor, point: Tensor, raw: Tensor, activation: str) -> bool:
+def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str) -> bool:
     """What `efficientnerf.sampling.occupancy.update` does under "maximum", with samples at `point` (N, 3) in grid coordinates
 
     False where there is no kernel for it."""
@@ -85,7 +85,7 @@ def tell_largest(values: Tensor, point: Tensor, raw: Tensor, activation: str) ->
         return False
     from efficientnerf.backends.numba import voxels as cpu_voxels
 
-    cpu_voxels.tell_largest(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
+    cpu_voxels.update_occupancy_maximum(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
     return True
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 
-def sent(values: Tensor, device: torch.device) -> Tensor:
+def to_device(values: Tensor, device: torch.device) -> Tensor:
     """A tensor of the host on `device`. Through pinned memory, from where a device fetches on its own; from other memory the host waits for it."""
     if device.type != "cuda":
         return values.to(device)
@@ -22,7 +22,7 @@ def remote(values: Tensor) -> bool:
     return values.is_cuda
 
 
-def fetched(values: Tensor) -> tuple[Tensor, Any]:
+def to_host_async(values: Tensor) -> tuple[Tensor, Any]:
     """A tensor of a device on its way to the host, and the event at whose end it has arrived; None where there is nothing to wait for."""
     if not values.is_cuda:
         return values, None

@@ -218,11 +218,13 @@ def pose_from_llff(matrix: np.ndarray) -> np.ndarray:
 def pose_from_colmap(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """COLMAP's world to camera (quaternion w x y z, translation (3,)) -> (4, 4) camera to world."""
     w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ np.asarray(translation, np.float64)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from efficientnerf.backends import dispatch
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.model import Look, Model, look
+from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.rendering.compositing import activate, ray_of_sample
 from efficientnerf.rendering.harmonics import basis
 
@@ -142,14 +142,14 @@ class FieldRendering:
     counts: SampleCounts = SampleCounts()
 
 
-def valid_count(m: Model, seen: Look) -> int:
+def valid_count(m: Model, seen: RayOutputs) -> int:
     """How many coarse samples were valid: those that the density voxels left, or, where nothing is pruned, those whose density the voxels would call
     valid. That is how section 3.3 of EfficientNeRF counts on a trained NeRF (equation 5)."""
     if m.prunes:
         return len(seen.coarse.start)
     density = seen.coarse_raw[:, 0]
     if m.voxels.rule == "maximum":
-        density = activate(density, m.scout.activation)
+        density = activate(density, m.proposal_field.activation)
     return int((density > m.voxels.threshold).sum())
 
 
@@ -168,14 +168,18 @@ class FieldRenderer:
         count = camera.width * camera.height
         parts, counts = [], SampleCounts()
         # Where nothing is pruned a ray has as many samples as there are.
-        block = FIELD_RAYS_PER_BLOCK if m.prunes else min(FIELD_RAYS_PER_BLOCK, max(64, 2**19 // (m.settings.num_coarse_samples + m.settings.num_importance_samples)))
+        block = (
+            FIELD_RAYS_PER_BLOCK
+            if m.prunes
+            else min(FIELD_RAYS_PER_BLOCK, max(64, 2**19 // (m.settings.num_coarse_samples + m.settings.num_importance_samples)))
+        )
         for begin in range(0, count, block):
             index = np.arange(begin, min(count, begin + block))
             pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)
             origins, directions = (torch.as_tensor(a, dtype=torch.float32, device=m.device) for a in rays(camera, pixels))
             slant = (directions @ torch.as_tensor(camera.forward, dtype=torch.float32, device=m.device)).clamp(min=1e-3)
             beyond = m.behind(directions)
-            seen = look(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), beyond)
+            seen = render_rays(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), beyond)
             intervals = seen.coarse.tried if m.space.contracted else len(index) * (self.far - self.near) / m.step
             counts += SampleCounts(len(index), intervals, valid_count(m, seen), int(seen.pivotal.sum()), len(seen.fine.start))
             parts.append([part.cpu().numpy() for part in split_by_box(m, origins, directions, slant, seen, beyond)])
@@ -187,7 +191,7 @@ class FieldRenderer:
         return FieldRendering(colour, opacity, depth, before, behind, inside, counts)
 
 
-def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, seen: Look, behind: Tensor) -> tuple[Tensor, ...]:
+def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, seen: RayOutputs, behind: Tensor) -> tuple[Tensor, ...]:
     """The fields of a FieldRendering for rays (R, ...): each fine sample belongs in front of the box, in it or beyond it."""
     count = len(origins)
     ray = ray_of_sample(seen.fine.first, len(seen.fine.start))

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.backends import transfer
-from efficientnerf.backends.transfer import sent
+from efficientnerf.backends.transfer import to_device
 from efficientnerf.rendering.compositing import sample_weights
 
 
@@ -90,12 +90,12 @@ def update(voxels: DensityVoxels, cell: Tensor, density: Tensor, count: Tensor |
     flat[seen] = torch.where(torch.isneginf(old), old, (1 - voxels.beta) * old + voxels.beta * mean)
 
 
-def close(voxels: DensityVoxels, chosen: Tensor) -> None:
+def mask_cells(voxels: DensityVoxels, chosen: Tensor) -> None:
     """No matter may be in these voxels, (D, D, D) bool, from now on."""
     voxels.values.masked_fill_(chosen.to(voxels.values.device), -torch.inf)
 
 
-def reopen(voxels: DensityVoxels, wanted: Tensor | None = None) -> None:
+def reset_cells(voxels: DensityVoxels, wanted: Tensor | None = None) -> None:
     """Have all voxels but the closed ones as they were at first; only if `wanted`, a bool that may lie on a device, says so."""
     as_they_are = torch.isneginf(voxels.values)
     if wanted is not None:
@@ -135,7 +135,7 @@ def voxel_weights(voxels: DensityVoxels, point: Tensor, length: Tensor, first: T
 LEAST_DECAY = 1e-30  # nothing is kept either, but what is closed stays so
 
 
-def fade(voxels: DensityVoxels) -> None:
+def apply_decay(voxels: DensityVoxels) -> None:
     """Forget a little, where the rule is "maximum": v <- decay v."""
     if voxels.rule == "maximum":
         voxels.values.mul_(max(voxels.decay, LEAST_DECAY))
@@ -149,12 +149,12 @@ def sweep_cells(voxels: DensityVoxels, part: int, parts: int, generator: torch.G
 
 def _point_in(cell: Tensor, side: int, generator: torch.Generator) -> Tensor:
     corner = torch.stack([cell // (side * side), cell // side % side, cell % side], dim=1)
-    return (corner + sent(torch.rand(len(cell), 3, generator=generator), cell.device)) / side
+    return (corner + to_device(torch.rand(len(cell), 3, generator=generator), cell.device)) / side
 
 
 def _chosen_on_device(valid: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """(count,) cells, half anywhere and half among the valid (D^3,), wherever there are any; how many there are stays on the device."""
-    chance = sent(torch.rand(count, generator=generator, dtype=torch.float64), valid.device)
+    chance = to_device(torch.rand(count, generator=generator, dtype=torch.float64), valid.device)
     anywhere = (chance * len(valid)).long()
     before = torch.cumsum(valid, dim=0)
     among = torch.searchsorted(before, (chance * before[-1]).long(), right=True).clamp(max=len(valid) - 1)

@@ -209,9 +209,7 @@ def _on_seams(local: np.ndarray, low: np.ndarray, high: np.ndarray, grid: np.nda
     return rows, ((corner[:, 0] * (grid[1] + 3) + corner[:, 1]) * (grid[2] + 3) + corner[:, 2]) * 3 + axis
 
 
-def visible_parts(
-    vertices: np.ndarray, faces: np.ndarray, min_component: float, viewpoints: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
+def visible_parts(vertices: np.ndarray, faces: np.ndarray, min_component: float, viewpoints: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
     """The closed mesh without what nobody needs: small pieces, hollows, and what lies in hollows.
 
     min_component   pieces with less than this share of the largest piece's area are removed

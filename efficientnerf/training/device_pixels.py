@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.backends.transfer import sent
+from efficientnerf.backends.transfer import to_device
 from efficientnerf.training.pixels import Pixels
 
 MOST_OF_MEMORY = 0.5  # of the device's free memory: photographs that would take more stay on the host
@@ -34,14 +34,14 @@ class DevicePixels:
         """See `Pixels.choose`."""
         return self.pixels.choose(count, rng, middle=middle)
 
-    def sent(self, values: np.ndarray) -> Tensor:
+    def to_device(self, values: np.ndarray) -> Tensor:
         """An array on the device; nothing waits for it."""
-        return sent(torch.from_numpy(np.ascontiguousarray(values)), self.device)
+        return to_device(torch.from_numpy(np.ascontiguousarray(values)), self.device)
 
     def bundle(self, index: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """`Pixels.bundle` on the device."""
-        at = self.sent(index)
-        colour = self.sent(self.pixels.images[index]) if self.images is None else self.images[at]
+        at = self.to_device(index)
+        colour = self.to_device(self.pixels.images[index]) if self.images is None else self.images[at]
         view = torch.searchsorted(self.offsets, at, right=True) - 1
         rotation = self.rotation[view]  # (R, 3, 3)
         directions = (rotation * self._in_camera(at - self.offsets[view], view)[:, None]).sum(dim=2)

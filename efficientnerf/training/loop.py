@@ -21,14 +21,14 @@ import torch
 from torch import Tensor
 
 from efficientnerf.backends import dispatch
-from efficientnerf.backends.transfer import sent
-from efficientnerf.model import Look, Model, look
+from efficientnerf.backends.transfer import to_device
+from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.rendering.compositing import activate, ray_of_sample
-from efficientnerf.sampling.occupancy import cell_of, fade, refresh_cells, reopen, sweep_cells, update
+from efficientnerf.sampling.occupancy import apply_decay, cell_of, refresh_cells, reset_cells, sweep_cells, update
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure import exposed, exposure_loss
 from efficientnerf.training.pixels import Pixels
-from efficientnerf.training.readback import Counted, Late, Room, mean_over, whole_rays
+from efficientnerf.training.readback import AsyncReadback, SampleCapacity, StepCounts, mean_over, whole_rays
 from efficientnerf.training.settings import TrainSettings
 
 RATE_WARM_UP = 100  # steps in which the rate rises, or the first tenth of a shorter run
@@ -40,7 +40,7 @@ SWEEP_PARTS = 8  # refreshes of the warm-up that together ask about every voxel
 
 
 @dataclass(frozen=True)
-class Anchors:
+class SparseDepthRays:
     """Rays from training cameras to sparse points that structure from motion saw there.
 
     origins, directions  (A, 3) float32, unit directions
@@ -186,12 +186,12 @@ def learning_rate(step: int, settings_rate: float, final: float, iterations: int
     return settings_rate * min(1.0, step / rise) * final**share
 
 
-def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterator[Progress]:
+def train(t: Trainer, pixels: Pixels, anchors: SparseDepthRays | None = None) -> Iterator[Progress]:
     """Train until the settings' last step, yielding after each. The model's settings may change on the way: the number of steps, while the rate is held."""
     m = t.model
     device = m.device
     transparent = pixels.images.shape[1] == 4
-    late = Late() if dispatch.on_device(m.voxels.values) else None  # then nothing waits for the device
+    late = AsyncReadback() if dispatch.on_device(m.voxels.values) else None  # then nothing waits for the device
     there = DevicePixels(pixels, device) if device.type == "cuda" else pixels
     sampled = 0  # N_s of the step before
     while t.step < m.settings.iterations:
@@ -201,18 +201,22 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
         fine_samples = fine_samples_at(settings, way)
 
         # A bundle of rays of about as many samples as the settings ask for.
-        count = int(min(settings.max_rays_per_batch, max(FEWEST_RAYS, settings.sample_batch_size / t.samples_per_ray))) if settings.sample_batch_size else settings.max_rays_per_batch
+        count = (
+            int(min(settings.max_rays_per_batch, max(FEWEST_RAYS, settings.sample_batch_size / t.samples_per_ray)))
+            if settings.sample_batch_size
+            else settings.max_rays_per_batch
+        )
         chosen = pixels.choose(count, rng, middle=number <= settings.precrop_steps)
         origins, directions, near, far, colour = (torch.as_tensor(a, device=device) for a in there.bundle(chosen))
-        offset = sent(torch.from_numpy(rng.random(count, np.float32)), device)
+        offset = to_device(torch.from_numpy(rng.random(count, np.float32)), device)
         behind = m.behind(directions)
         if m.space.ndc is not None and m.background is None:
             # Behind a space that reaches to infinity nothing lies: a new colour for each ray keeps the field from leaving it half transparent.
-            behind = sent(torch.from_numpy(rng.random((count, 3), np.float32)), device)
+            behind = to_device(torch.from_numpy(rng.random((count, 3), np.float32)), device)
         if transparent:
             if settings.background_color == "random" or m.background is None:
                 # Behind an object cut out of its background anything may lie: a new colour for each ray keeps the field from learning one.
-                behind = sent(torch.from_numpy(rng.random((count, 3), np.float32)), device)
+                behind = to_device(torch.from_numpy(rng.random((count, 3), np.float32)), device)
             colour = colour[:, :3] * colour[:, 3:] + behind * (1 - colour[:, 3:])
 
         # Both stages, both losses (weighted equally, as in the authors' release).
@@ -220,11 +224,13 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             late.forget()
         sampled = fine_samples
         room = None if late is None else late.room(count)
-        seen = look(m, origins, directions, near, far, offset, behind, prune=number > settings.occupancy_warmup_steps, rng=rng, room=room, fine_samples=fine_samples)
+        seen = render_rays(
+            m, origins, directions, near, far, offset, behind, prune=number > settings.occupancy_warmup_steps, rng=rng, room=room, fine_samples=fine_samples
+        )
         whole = whole_rays(seen.coarse, seen.fine)
         fine_colour, coarse_colour = seen.fine_colour, seen.coarse_colour
         if t.exposure is not None:
-            view = sent(torch.from_numpy(pixels.view_of(chosen)), device)
+            view = to_device(torch.from_numpy(pixels.view_of(chosen)), device)
             fine_colour = exposed(fine_colour, view, t.exposure)
             coarse_colour = None if coarse_colour is None else exposed(coarse_colour, view, t.exposure)
         fine_loss = mean_over((fine_colour - colour) ** 2, whole)
@@ -253,13 +259,13 @@ def train(t: Trainer, pixels: Pixels, anchors: Anchors | None = None) -> Iterato
             counted = late.note(count, fine_loss, seen.coarse, seen.pivotal, seen.fine)
             t.samples_per_ray = max(late.fine_per_ray + (0.0 if m.coarse is None else late.valid_per_ray), 1.0)
         else:
-            counted = Counted(float(fine_loss.detach()), seen.coarse.tried, len(seen.coarse.start), int(seen.pivotal.sum()), len(seen.fine.start))
+            counted = StepCounts(float(fine_loss.detach()), seen.coarse.tried, len(seen.coarse.start), int(seen.pivotal.sum()), len(seen.fine.start))
             asked = counted.fine if m.coarse is None else counted.fine + counted.valid  # of a network
             t.samples_per_ray = 0.9 * t.samples_per_ray + 0.1 * max(asked / count, 1.0)
         yield Progress(number, counted.loss, count, *counted[1:])
 
 
-def _tell_voxels(m: Model, seen: Look, number: int, rng: np.random.Generator, room: Room | None, *, waits: bool) -> None:
+def _tell_voxels(m: Model, seen: RayOutputs, number: int, rng: np.random.Generator, room: SampleCapacity | None, *, waits: bool) -> None:
     """The voxels remember what the coarse field said on the rays of a step, and are refreshed at random.
 
     room   what samples were padded to
@@ -275,9 +281,9 @@ def _tell_voxels(m: Model, seen: Look, number: int, rng: np.random.Generator, ro
             refresh(m, number, rng)
         # Where nothing is sampled nothing has a gradient: an empty scene could never come back by itself.
         if not waits and due:
-            reopen(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
+            reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
         elif waits and len(seen.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
-            reopen(m.voxels)
+            reset_cells(m.voxels)
 
 
 def fine_samples_at(settings: TrainSettings, way: float) -> int:
@@ -291,22 +297,23 @@ def fine_samples_at(settings: TrainSettings, way: float) -> int:
 
 
 def anchor_loss(
-    m: Model, anchors: Anchors, count: int, rng: np.random.Generator, late: Late | None = None, *, prune: bool, fine_samples: int = 0
+    m: Model, anchors: SparseDepthRays, count: int, rng: np.random.Generator, late: AsyncReadback | None = None, *, prune: bool, fine_samples: int = 0
 ) -> Tensor:
     """How much of the light on some rays is not absorbed close to the point that was seen there, for both stages: 0 to 2.
 
         1 - sum_i w_i max(0, 1 - |t_i - d| / (ANCHOR_WIDTH e_i))
 
     with t_i the middle of interval i, e_i its extent (of a coarse interval for both stages) and d the distance of the point. What is before the
-    point is cleared away by it, which photographs alone take long to do: they look as well explained by fog of the right colour. fine_samples: see `look`.
+    point is cleared away by it, which photographs alone take long to do: they look as well explained by fog of the right colour. fine_samples: see
+    `render_rays`.
     """
     fine_samples = fine_samples or m.settings.samples_per_pivot
     pick = rng.integers(len(anchors), size=count)
-    origins, directions, distance = (sent(torch.from_numpy(a[pick]), m.device) for a in (anchors.origins, anchors.directions, anchors.distance))
-    offset = sent(torch.from_numpy(rng.random(count, np.float32)), m.device)
+    origins, directions, distance = (to_device(torch.from_numpy(a[pick]), m.device) for a in (anchors.origins, anchors.directions, anchors.distance))
+    offset = to_device(torch.from_numpy(rng.random(count, np.float32)), m.device)
     near, far = 0.1 * distance, 4 * distance
     room = None if late is None else late.room(2 * count)  # they begin closer to the camera, and end farther away
-    seen = look(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng, room=room, fine_samples=fine_samples)
+    seen = render_rays(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng, room=room, fine_samples=fine_samples)
     whole = whole_rays(seen.coarse, seen.fine)
     distance = seen.rays.frame(distance)
     loss = origins.new_zeros(())
@@ -321,13 +328,13 @@ def anchor_loss(
     return loss
 
 
-def _quieten_near_cameras(m: Model, origins: Tensor, seen: Look) -> None:
+def _quieten_near_cameras(m: Model, origins: Tensor, seen: RayOutputs) -> None:
     """Scale gradients by the square of the distance to the camera, up to the distance of the box's centre.
 
     Close to a camera rays crowd together, so that samples there are pulled far more often than those on the subject, and matter hangs before
     the lens. Philip and Deschaintre 2023, "Floaters no more: radiance field gradient scaling for improved near-camera training".
     """
-    subject = (origins - sent(torch.as_tensor(m.space.centre, dtype=origins.dtype), origins.device)).norm(dim=-1)
+    subject = (origins - to_device(torch.as_tensor(m.space.centre, dtype=origins.dtype), origins.device)).norm(dim=-1)
     for samples, raw in ((seen.coarse, seen.coarse_raw), (seen.fine, seen.fine_raw)):
         if not raw.requires_grad:  # uniform sampling has no coarse stage
             continue
@@ -339,7 +346,7 @@ def _quieten_near_cameras(m: Model, origins: Tensor, seen: Look) -> None:
 def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
     """Let the voxels forget a little, and ask the coarse field about a share of them: all of them in turn in the warm-up, then random ones."""
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    fade(m.voxels)
+    apply_decay(m.voxels)
     if m.settings.occupancy_update_fraction == 0:
         return
     if number <= m.settings.occupancy_warmup_steps:
@@ -347,12 +354,17 @@ def refresh(m: Model, number: int, rng: np.random.Generator) -> None:
     else:
         cell, point = refresh_cells(m.voxels, int(m.settings.occupancy_update_fraction * m.voxels.side**3), generator)
     for part in range(0, len(cell), 2**17):
-        remember(m, point[part : part + 2**17], m.scout.density(m.asked(point[part : part + 2**17])), cell[part : part + 2**17])
+        remember(m, point[part : part + 2**17], m.proposal_field.density(m.snapped_points(point[part : part + 2**17])), cell[part : part + 2**17])
 
 
 def remember(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:
     """Update the density voxels with what the coarse field said, before its activation, at points in grid coordinates; `count` as for `update`."""
-    if cell is None and count is None and m.voxels.rule == "maximum" and dispatch.tell_largest(m.voxels.values, point, raw, m.scout.activation):
+    if (
+        cell is None
+        and count is None
+        and m.voxels.rule == "maximum"
+        and dispatch.update_occupancy_maximum(m.voxels.values, point, raw, m.proposal_field.activation)
+    ):
         return
     cell = cell_of(point, m.voxels.side) if cell is None else cell
-    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.scout.activation), count)
+    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.proposal_field.activation), count)

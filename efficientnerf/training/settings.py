@@ -89,12 +89,16 @@ class TrainSettings:
         "field", "hash: what pivots are chosen by; field: a lighter field that gives densities alone; voxels: the density voxels, and no coarse field",
         choices=("field", "voxels"),
     )  # fmt: skip
-    exploration_fraction: float = _setting(0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0)
+    exploration_fraction: float = _setting(
+        0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0
+    )
     distortion_loss_weight: float | None = _setting(
         None, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog; none: 0.01, in normalised device coordinates 0.002",
         minimum=0.0,
     )  # fmt: skip
-    sparse_depth_loss_weight: float = _setting(0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0)
+    sparse_depth_loss_weight: float = _setting(
+        0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0
+    )
     exposure: str = _setting(
         "off", "gain: a factor for each colour and photograph is learned beside the field and left out of it, where surroundings are learned; off: none",
         choices=("off", "gain"),
@@ -117,7 +121,9 @@ class TrainSettings:
         minimum=0.0, maximum=1.0,
     )  # fmt: skip
     occupancy_update_interval: int = _setting(16, "steps between looks at random voxels, which let pruned space return", minimum=1)
-    occupancy_update_fraction: float = _setting(0.03125, "share of the voxels looked at in a refresh; in the warm-up an eighth, unless 0", minimum=0.0, maximum=1.0)
+    occupancy_update_fraction: float = _setting(
+        0.03125, "share of the voxels looked at in a refresh; in the warm-up an eighth, unless 0", minimum=0.0, maximum=1.0
+    )
     occupancy_update_ray_fraction: float = _setting(
         0.0, "share of the rays of a step whose pruned samples are looked at too, which lets pruned space return (the authors' release: 0.01)",
         minimum=0.0, maximum=1.0,

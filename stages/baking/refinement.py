@@ -109,7 +109,7 @@ def _fit(job: Job, o: Optimiser, targets: Targets, steps: int, until: int, prune
 
 
 def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Optimiser:
-    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most; no scraps of surroundings."""
+    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most."""
     from efficientnerf.asset import bake, refinement
 
     settings = job.settings
@@ -132,9 +132,9 @@ def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Opti
     if not keep.any():
         return o
     if o.tree.background is None:
-        from efficientnerf.asset.components import scraps
+        from efficientnerf.asset.components import small_components
 
-        keep &= ~scraps(o.tree, keep, settings.min_component)
+        keep &= ~small_components(o.tree, keep, settings.min_component)
     return refinement.kept(o, keep, bake.with_voxels(o.tree, keep))
 
 

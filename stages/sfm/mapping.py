@@ -217,5 +217,3 @@ def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: floa
             agreeing += int((sine * focal < tolerance).sum())
             total += len(inliers)
     return agreeing / total if total else 1.0
-
-

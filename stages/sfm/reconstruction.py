@@ -25,6 +25,7 @@ from stages.sfm.matches import WorkImage
 EXHAUSTIVE_UP_TO = 100  # photographs; beyond it, every pair would take longer than everything else together
 NAMED = 8  # photographs that an error lists by name
 
+
 def find_cameras(
     folder: Path,
     names: Sequence[str],
@@ -135,9 +136,7 @@ def _failure(folder: Path, images: Sequence[WorkImage], models: Sequence[Any], r
     )
 
 
-def _capture(
-    folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Mapping[str, Path], rejected: list[tuple[str, str]]
-) -> Capture:
+def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Mapping[str, Path], rejected: list[tuple[str, str]]) -> Capture:
     by_file = {image.file: image for image in images}
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     at_work = [mapping.camera_of(model, image, by_file[image.name]) for image in registered]  # at working size

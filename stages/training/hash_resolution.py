@@ -30,7 +30,7 @@ LARGEST = 19  # log2 of the entries at most
 MOST = 4096  # lattice points a side
 
 
-def sized(settings: TrainSettings, s: Scene, pixels: int) -> TrainSettings:
+def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSettings:
     """The settings with `log2_table`, `finest` and `coarse_samples` where these leave them to be chosen.
 
     pixels  how many the training images have

@@ -283,5 +283,3 @@ def without_entry(name: str, of: str = "sparse") -> bytes:
     header, meta, data = parts(blob(of))
     del header[name]
     return joined(header, meta, data)
-
-

@@ -13,7 +13,7 @@ from efficientnerf.asset import bake
 from efficientnerf.asset.bake import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.spaces import Space
-from efficientnerf.model import Model, look
+from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
@@ -232,7 +232,7 @@ def test_what_was_trained_on_voxel_centres_is_baked_as_it_is(field: str) -> None
     bundle = pixels(2, 24).bundle(np.arange(2 * 24 * 24))
     origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)) for a in bundle[:4])
     with torch.no_grad():
-        seen = look(m, origins, directions, near, far, torch.full_like(near, 0.3), m.behind(directions))
+        seen = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.3), m.behind(directions))
     said = activate(seen.fine_raw[:, 0], m.fine.activation).numpy()
     shape, voxel = grid_of(BOUNDS, side, 4)
     indices = np.argwhere(np.ones([n * 4 for n in shape], bool)).astype(np.int32)

@@ -10,7 +10,18 @@ import torch
 
 from efficientnerf.backends import dispatch
 from efficientnerf.rendering.compositing import activate
-from efficientnerf.sampling.occupancy import DEEPEST, cell_of, close, density_voxels, fade, refresh_cells, reopen, sweep_cells, update, voxel_weights
+from efficientnerf.sampling.occupancy import (
+    DEEPEST,
+    apply_decay,
+    cell_of,
+    density_voxels,
+    mask_cells,
+    refresh_cells,
+    reset_cells,
+    sweep_cells,
+    update,
+    voxel_weights,
+)
 from tests import reference
 
 SIDE = 3
@@ -38,14 +49,14 @@ def test_samples_tell_the_largest_in_one_go_as_they_do_step_by_step(activation: 
     side = 7
     ours, theirs = (density_voxels(side, "maximum", threshold=0.2) for _ in range(2))
     for voxels in (ours, theirs):
-        close(voxels, torch.arange(side**3).reshape(side, side, side) % 5 == 0)
+        mask_cells(voxels, torch.arange(side**3).reshape(side, side, side) % 5 == 0)
     for count in (0, 1, 3000):
         point = torch.from_numpy(rng.uniform(-0.05, 1.05, (count, 3)).astype(np.float32))  # beyond the faces, too: the outermost voxels are told
         raw = torch.from_numpy(rng.normal(size=(count, 4)).astype(np.float32) * 6)[:, 0]
-        assert dispatch.tell_largest(ours.values, point, raw, activation)
+        assert dispatch.update_occupancy_maximum(ours.values, point, raw, activation)
         update(theirs, cell_of(point, side), activate(raw, activation))
         torch.testing.assert_close(ours.values, theirs.values, rtol=1e-5, atol=1e-6)
-    assert not dispatch.tell_largest(ours.values, point.double(), raw.double(), activation)
+    assert not dispatch.update_occupancy_maximum(ours.values, point.double(), raw.double(), activation)
 
 
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
@@ -75,7 +86,7 @@ def test_a_voxel_of_raw_density_minus_five_is_pruned_at_its_eleventh_visit() -> 
 
 def test_momentum_does_not_fade() -> None:
     voxels = density_voxels(SIDE, "momentum")
-    fade(voxels)
+    apply_decay(voxels)
     assert (voxels.values == 10).all()
 
 
@@ -84,7 +95,7 @@ def test_maximum_keeps_the_largest_and_forgets() -> None:
     assert (voxels.values == 2).all()
     cell, density = samples()
     update(voxels, cell, density)
-    fade(voxels)
+    apply_decay(voxels)
     expected = [max([2.0, *density[cell == n].tolist()]) / 2 for n in range(SIDE**3)]
     np.testing.assert_allclose(voxels.values.reshape(-1), expected, rtol=1e-6)
 
@@ -103,12 +114,12 @@ def test_closed_voxels_stay_closed_whatever_they_are_told_and_others_do_not_noti
     voxels, plain = (density_voxels(SIDE, rule, threshold=1.0, beta=beta, decay=decay) for _ in range(2))
     closed = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
     closed[1] = True
-    close(voxels, closed)
+    mask_cells(voxels, closed)
     for _ in range(3):
         cell, density = samples()
         for each in (voxels, plain):
             update(each, cell, density, torch.tensor(len(cell)) if padded else None)
-            fade(each)
+            apply_decay(each)
     assert torch.isneginf(voxels.values[closed]).all()
     assert torch.equal(voxels.values[~closed], plain.values[~closed])
     assert voxels.occupied == float((plain.values[~closed] > plain.threshold).sum()) / SIDE**3
@@ -118,13 +129,13 @@ def test_beginning_anew_leaves_closed_voxels_closed() -> None:
     voxels = density_voxels(SIDE, "maximum", threshold=1.0)
     closed = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
     closed[0, 1] = True
-    close(voxels, closed)
+    mask_cells(voxels, closed)
     voxels.values[~closed] = 0.25
-    reopen(voxels, torch.tensor(False))
+    reset_cells(voxels, torch.tensor(False))
     assert (voxels.values[~closed] == 0.25).all()
     for wanted in (None, torch.tensor(True)):
         voxels.values[~closed] = 0.25
-        reopen(voxels, wanted)
+        reset_cells(voxels, wanted)
         assert (voxels.values[~closed] == voxels.start).all()
         assert torch.isneginf(voxels.values[closed]).all()
 
@@ -167,7 +178,7 @@ def test_refreshing_lets_pruned_space_return(rule: str, empty: float, full: floa
     shares = []
     for density in (empty, full):
         for _ in range(300):
-            fade(voxels)
+            apply_decay(voxels)
             cell, _ = refresh_cells(voxels, 20, generator)
             update(voxels, cell, torch.full((len(cell),), density))
         shares.append(voxels.occupied)

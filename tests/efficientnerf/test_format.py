@@ -28,6 +28,8 @@ from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.trees import random_tree, rays_at
 
 GOLDEN = Path(__file__).parents[1] / "data" / "golden"
+
+
 def refusal(data: bytes, folder: Path) -> str:
     path = folder / "hostile.nerftree"
     path.write_bytes(data)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from efficientnerf.geometry.spaces import Space
-from efficientnerf.model import look
+from efficientnerf.model import render_rays
 from efficientnerf.rendering.compositing import composite
 from efficientnerf.rendering.render import valid_count
 from efficientnerf.sampling import samples as sampling
@@ -185,7 +185,7 @@ def test_every_strategy_serves_every_field(field: str, strategy: str, contracted
     o, d, near, far, _ = some.bundle(some.choose(20, np.random.default_rng(0)))
     bundle = [torch.from_numpy(a) for a in (o, d, near, far)]
     offset, behind = torch.full((20,), 0.5), torch.ones(20, 3)
-    first, again = (look(m, *bundle, offset, behind, rng=np.random.default_rng(7)) for _ in range(2))
+    first, again = (render_rays(m, *bundle, offset, behind, rng=np.random.default_rng(7)) for _ in range(2))
     assert torch.equal(first.fine.point, again.fine.point)
     assert torch.isfinite(first.fine_colour).all()
     assert float(first.fine_opacity.detach().max()) > 0
@@ -194,7 +194,7 @@ def test_every_strategy_serves_every_field(field: str, strategy: str, contracted
     moved = {name.partition(".")[0] for name, p in m.parameters() if p.grad is not None and p.grad.abs().sum() > 0}
     assert moved >= ({"fine"} if strategy == "uniform" else {"coarse", "fine"})
     assert (len(first.coarse.start) == 0) == (strategy == "uniform")
-    still, too = (look(m, *bundle, offset, behind) for _ in range(2))  # pictures are drawn without chance
+    still, too = (render_rays(m, *bundle, offset, behind) for _ in range(2))  # pictures are drawn without chance
     assert torch.equal(still.fine_colour, too.fine_colour)
 
 
@@ -209,10 +209,12 @@ def test_counts_are_those_of_the_strategies() -> None:
     bundle = [torch.from_numpy(a) for a in (o, d, near, far)]
     found = {}
     for strategy in ("uniform", "hierarchical", "efficient"):
-        made = settings(field="mlp", sampling=strategy, num_importance_samples=6, num_coarse_samples=10, near_plane=1.0, far_plane=5.0, exploration_fraction=0.0)
+        made = settings(
+            field="mlp", sampling=strategy, num_importance_samples=6, num_coarse_samples=10, near_plane=1.0, far_plane=5.0, exploration_fraction=0.0
+        )
         m = model(SPACE, made, (1.0, 1.0, 1.0), "cpu", (1.0, 5.0))
         assert m.step == pytest.approx(0.4)
-        found[strategy] = look(m, *bundle, torch.full((20,), 0.5), torch.ones(20, 3))
+        found[strategy] = render_rays(m, *bundle, torch.full((20,), 0.5), torch.ones(20, 3))
     assert len(found["uniform"].fine.start) == len(found["hierarchical"].fine.start) == 20 * 16
     assert len(found["hierarchical"].coarse.start) == 20 * 10
     assert 0 < len(found["efficient"].coarse.start) <= 20 * math.ceil(2 * math.sqrt(3) / 0.4)  # those in the box
@@ -226,11 +228,11 @@ def test_some_rays_are_looked_at_whole_in_training_only() -> None:
     some = pixels()
     bundle = [torch.from_numpy(a) for a in some.bundle(np.arange(100, 140))[:4]]
     offset, behind = torch.full((40,), 0.5), torch.ones(40, 3)
-    seen = look(m, *bundle, offset, behind, rng=np.random.default_rng(0))
+    seen = render_rays(m, *bundle, offset, behind, rng=np.random.default_rng(0))
     per_ray = seen.coarse.first.diff()
     assert (per_ray[:10] > 0).all()
     assert (per_ray[10:] == 0).all()
-    assert len(look(m, *bundle, offset, behind).coarse.start) == 0
+    assert len(render_rays(m, *bundle, offset, behind).coarse.start) == 0
 
 
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
@@ -238,7 +240,7 @@ def test_valid_samples_of_what_is_not_pruned_are_those_that_the_voxels_would_kee
     """Equation 5 on a trained NeRF: density above zero, read as the voxels read it."""
     m = untrained(field="mlp", sampling="hierarchical", voxel_rule=rule, importance_samples=6, coarse_samples=10)
     bundle = [torch.from_numpy(a) for a in pixels().bundle(np.arange(100, 140))[:4]]
-    seen = look(m, *bundle, torch.full((40,), 0.5), torch.ones(40, 3))
+    seen = render_rays(m, *bundle, torch.full((40,), 0.5), torch.ones(40, 3))
     raw = seen.coarse_raw[:, 0].detach()
     expected = int((raw > 0).sum()) if rule == "momentum" else int((torch.nn.functional.softplus(raw) > m.voxels.threshold).sum())
     assert valid_count(m, seen) == expected > 0

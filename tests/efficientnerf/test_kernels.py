@@ -92,7 +92,6 @@ def test_lines_of_a_table_are_stepped_like_single_numbers(size: int) -> None:
         assert (after[~stays] != before[~stays]).all()
 
 
-
 @pytest.mark.gpu
 def test_adam_on_the_device_is_that_of_the_kernel() -> None:
     if not torch.cuda.is_available():

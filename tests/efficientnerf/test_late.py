@@ -21,7 +21,7 @@ from efficientnerf.sampling.samples import Samples
 from efficientnerf.training import loop
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.loop import readback as late
-from efficientnerf.training.readback import Late, LateShare, Room, mean_over, whole_rays
+from efficientnerf.training.readback import AsyncOccupancy, AsyncReadback, SampleCapacity, mean_over, whole_rays
 from tests.efficientnerf.balls import BOUNDS, pixels, settings
 from tests.efficientnerf.device import DEVICE
 
@@ -37,7 +37,7 @@ def samples(counts: list[int], tried: int = 50, room: int | None = None) -> Samp
 def test_counts_arrive_late_once_they_have_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(late, "SETTLED", 3)
     monkeypatch.setattr(late, "LAG", 2)
-    kept = Late()
+    kept = AsyncReadback()
     arrived, rooms = [], []
     for step in range(1, 9):
         rooms.append(kept.room(4))
@@ -46,7 +46,7 @@ def test_counts_arrive_late_once_they_have_settled(monkeypatch: pytest.MonkeyPat
     assert [loss for loss, _, _ in arrived] == [1, 2, 2, 2, 3, 4, 5, 6]
     assert all(fine == 2 * valid for _, valid, fine in arrived)
     assert rooms[:3] == [None] * 3
-    assert rooms[3] == Room(late.GRAIN, late.GRAIN)
+    assert rooms[3] == SampleCapacity(late.GRAIN, late.GRAIN)
     assert kept.fine_per_ray == pytest.approx(2 * kept.valid_per_ray)
     big = kept.room(10**6)
     assert big is not None
@@ -76,10 +76,10 @@ def test_rays_that_were_left_out_are_counted_and_room_is_made_for_them(monkeypat
     monkeypatch.setattr(late, "SETTLED", 2)
     monkeypatch.setattr(late, "LAG", 0)
     monkeypatch.setattr(late, "GRAIN", 10)
-    kept, left_out = Late(), []
+    kept, left_out = AsyncReadback(), []
     for step in range(40):
         each = 3 if step < 4 else 30
-        room = kept.room(100) or Room(3000, 3000)
+        room = kept.room(100) or SampleCapacity(3000, 3000)
         found = samples([each] * 100, room=room.coarse), samples([each] * 100, room=room.fine)
         left_out.append(kept.note(100, torch.tensor(0.0), found[0], torch.ones(len(found[0].start), dtype=torch.bool), found[1]).left_out)
     assert left_out[:4] == [0] * 4
@@ -90,7 +90,7 @@ def test_rays_that_were_left_out_are_counted_and_room_is_made_for_them(monkeypat
 
 def test_a_share_is_told_late_on_a_device_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = density_voxels(2, "momentum")
-    share, arrived = LateShare(voxels), []
+    share, arrived = AsyncOccupancy(voxels), []
     assert share() == 1
     voxels.values[0] = -1
     assert share() == 0.5
@@ -101,7 +101,7 @@ def test_a_share_is_told_late_on_a_device_alone(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(late, "fetched", lambda values: (values, Event()))
     voxels.values.fill_(10)
-    share = LateShare(voxels)
+    share = AsyncOccupancy(voxels)
     assert share() == 1
     voxels.values[0] = -1
     assert share() == 1
@@ -237,7 +237,7 @@ def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: No
     monkeypatch.setattr(dispatch, "composite", compositing.composite)
     m = model_of("contracted", iterations=9, exposure="gain", explored=0.1, discretise=discretise)
     origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
-    anchors = loop.Anchors(origins, directions, np.full(8, 3.0, np.float32))
+    anchors = loop.SparseDepthRays(origins, directions, np.full(8, 3.0, np.float32))
     running = loop.train(loop.trainer(m, 3), pixels(3, 8), anchors)
     assert lines_that_wait(running) == []
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from efficientnerf.geometry.spaces import Space
-from efficientnerf.model import Model, look, model, restore, state_of
+from efficientnerf.model import Model, model, render_rays, restore, state_of
 from efficientnerf.training.settings import TrainSettings
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
@@ -22,10 +22,10 @@ class Counting(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.asked: list[Tensor] = []
+        self.snapped_points: list[Tensor] = []
 
     def forward(self, points: Tensor) -> Tensor:
-        self.asked.append(points)
+        self.snapped_points.append(points)
         inside = (points - 0.5).norm(dim=1) < 0.25
         return torch.cat([torch.where(inside, 6.0, -6.0)[:, None], torch.zeros(len(points), 3)], dim=1)
 
@@ -38,7 +38,7 @@ def bundle(count: int = 64) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
 
 def seen_by(m: Model, *, prune: bool = True, rays: tuple[Tensor, ...] | None = None):  # type: ignore[no-untyped-def]
     rays = rays or bundle()
-    return look(m, *rays, torch.ones(len(rays[0]), 3), prune=prune)  # type: ignore[misc]
+    return render_rays(m, *rays, torch.ones(len(rays[0]), 3), prune=prune)  # type: ignore[misc]
 
 
 def test_nothing_is_evaluated_twice_and_nothing_that_need_not_be() -> None:
@@ -49,7 +49,7 @@ def test_nothing_is_evaluated_twice_and_nothing_that_need_not_be() -> None:
     away = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).norm(dim=-1)
     inside.copy_(torch.where(away < 0.3, 1e3, 0.0))
     seen = seen_by(m)
-    (coarse,), (fine,) = m.coarse.asked, m.fine.asked
+    (coarse,), (fine,) = m.coarse.snapped_points, m.fine.snapped_points
     assert len(torch.unique(coarse, dim=0)) == len(coarse) == len(seen.coarse.start)
     assert len(torch.unique(fine, dim=0)) == len(fine) == len(seen.fine.start)
     assert (coarse - 0.5).norm(dim=1).max() < 0.3 + math.sqrt(3) / 24  # valid voxels only
@@ -68,9 +68,9 @@ def test_training_explores_intervals_without_a_pivot_and_rendering_does_not() ->
     behind = torch.ones(len(rays[0]), 3)
     with torch.no_grad():
         m.coarse, m.fine = Counting(), Counting()
-        drawn = look(m, *rays, behind)
-        one, same = (look(m, *rays, behind, rng=np.random.default_rng(3)) for _ in range(2))
-        none = look(untrained(explored=0.0), *rays, behind, rng=np.random.default_rng(3))
+        drawn = render_rays(m, *rays, behind)
+        one, same = (render_rays(m, *rays, behind, rng=np.random.default_rng(3)) for _ in range(2))
+        none = render_rays(untrained(explored=0.0), *rays, behind, rng=np.random.default_rng(3))
     assert torch.equal(one.pivotal, same.pivotal)
     assert (one.pivotal | ~drawn.pivotal).all()  # pivots stay pivots
     share = float((one.pivotal & ~drawn.pivotal).sum()) / float((~drawn.pivotal).sum())
@@ -100,7 +100,16 @@ def test_the_same_settings_give_the_same_numbers(field: str) -> None:
 
 def test_the_papers_model_has_the_papers_sizes() -> None:
     paper = TrainSettings(
-        field="mlp", sh_degree=3, hidden_dim=256, num_layers=8, coarse_hidden_dim=128, coarse_num_layers=4, num_coarse_samples=64, samples_per_pivot=2, occupancy_resolution=384, occupancy_rule="momentum"
+        field="mlp",
+        sh_degree=3,
+        hidden_dim=256,
+        num_layers=8,
+        coarse_hidden_dim=128,
+        coarse_num_layers=4,
+        num_coarse_samples=64,
+        samples_per_pivot=2,
+        occupancy_resolution=384,
+        occupancy_rule="momentum",
     )
     m = model(Space(BOUNDS, False), paper, (1.0, 1.0, 1.0))
     assert m.fine(torch.rand(2, 3)).shape == (2, 49)

@@ -10,9 +10,21 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.model import Model, look
+from efficientnerf.model import Model, render_rays
 from efficientnerf.training import loop
-from efficientnerf.training.loop import Adam, Anchors, Progress, anchor_loss, fine_samples_at, learning_rate, restore, share_of_fall, state_of, train, trainer
+from efficientnerf.training.loop import (
+    Adam,
+    Progress,
+    SparseDepthRays,
+    anchor_loss,
+    fine_samples_at,
+    learning_rate,
+    restore,
+    share_of_fall,
+    state_of,
+    train,
+    trainer,
+)
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
@@ -72,7 +84,7 @@ def test_a_thin_white_scene_does_not_collapse_to_its_background(field: str) -> N
     run(m, thin)
     origins, directions, near, far = (torch.from_numpy(a) for a in thin.bundle(np.arange(len(thin)))[:4])
     with torch.no_grad():
-        opacity = look(m, origins, directions, near, far, torch.full_like(near, 0.5), torch.ones(len(thin), 3)).fine_opacity.numpy()
+        opacity = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), torch.ones(len(thin), 3)).fine_opacity.numpy()
     on_ball = thin.images[:, 3] > 200
     assert 0 < on_ball.mean() < 0.06
     if field == "hash":
@@ -155,7 +167,7 @@ def test_anchors_pull_the_light_to_their_points() -> None:
     origins = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (4, 1))
     directions = np.float32([[1, 0, 0], [0.995, 0.0998, 0], [0.995, 0, 0.0998], [0.995, -0.0998, 0]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    anchors = Anchors(origins, directions, np.full(4, 3.0, np.float32))
+    anchors = SparseDepthRays(origins, directions, np.full(4, 3.0, np.float32))
     adam = Adam(m.parameters())
     losses = []
     for step in range(1, 41):
@@ -185,7 +197,7 @@ def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
     assert steps[-1].valid < 0.2 * steps[200].valid  # most is pruned
     origins, directions, near, far = (torch.from_numpy(a) for a in thin.bundle(np.arange(len(thin)))[:4])
     with torch.no_grad():
-        opacity = look(m, origins, directions, near, far, torch.full_like(near, 0.5), torch.ones(len(thin), 3)).fine_opacity.numpy()
+        opacity = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), torch.ones(len(thin), 3)).fine_opacity.numpy()
     on_ball = thin.images[:, 3] > 200
     assert opacity[on_ball].mean() > 0.35
     assert opacity[~on_ball].mean() < 0.02

@@ -220,7 +220,9 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
     sizes = {}
     for most in (1, 64):
         told: list[dict[str, Any]] = []
-        settings = BakeSettings(resolution=80, samples_per_voxel=1, weight_threshold=0.0, max_mib=most, layout=layout, refine_steps=2, refine_rays_per_batch=512)
+        settings = BakeSettings(
+            resolution=80, samples_per_voxel=1, weight_threshold=0.0, max_mib=most, layout=layout, refine_steps=2, refine_rays_per_batch=512
+        )
         made = job(tmp_path / str(most), settings, **inputs)
         made._report = told.append
         run(made)

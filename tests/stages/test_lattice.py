@@ -21,7 +21,7 @@ from stages.framing.forward_facing import forward_of
 from stages.io.field_file import load_renderer, space_of
 from stages.io.scene import Scene, View
 from stages.io.scene import load as load_scene
-from stages.training.hash_resolution import LARGEST, MOST, sized
+from stages.training.hash_resolution import LARGEST, MOST, with_auto_sizes
 from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import ORBIT, SIMILARITY, job, poses
 from tests.stages.test_forward import depths, row
@@ -47,7 +47,7 @@ def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
         s = forward_facing(side)
         assert s.forward is not None
         pixels = sum(v.camera.width * v.camera.height for v in s.views)
-        found = sized(TrainSettings(), s, pixels)
+        found = with_auto_sizes(TrainSettings(), s, pixels)
         wide = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
         assert found.finest == max(FINEST, min(MOST, math.ceil(wide / ndc_pixel(s, s.forward))))
         # What is called a pixel is one: two points a lattice step apart, at any depth, are seen a pixel apart.
@@ -61,10 +61,10 @@ def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
 
 def test_tables_grow_with_the_photographs_between_limits() -> None:
     s = forward_facing(400)
-    assert sized(TrainSettings(), s, 1000).log2_hashmap_size == LOG2_TABLE
-    assert sized(TrainSettings(), s, 6 << 18).log2_hashmap_size == 18
-    assert sized(TrainSettings(), s, 10**9).log2_hashmap_size == LARGEST
-    given = sized(TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=77), s, 10**9)
+    assert with_auto_sizes(TrainSettings(), s, 1000).log2_hashmap_size == LOG2_TABLE
+    assert with_auto_sizes(TrainSettings(), s, 6 << 18).log2_hashmap_size == 18
+    assert with_auto_sizes(TrainSettings(), s, 10**9).log2_hashmap_size == LARGEST
+    given = with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=77), s, 10**9)
     assert (given.log2_table, given.finest, given.coarse_samples) == (14, 512, 77)
 
 
@@ -72,7 +72,7 @@ def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_
     s = forward_facing(400)
     small = TrainSettings(log2_hashmap_size=8, num_levels=2, occupancy_resolution=8)
     m, usual = model(space_of(s), small, None), model(Space(BOUNDS, False), small, None)
-    assert m.settings.num_coarse_samples == sized(TrainSettings(), s, 1000).num_coarse_samples == COARSE_SAMPLES_NDC
+    assert m.settings.num_coarse_samples == with_auto_sizes(TrainSettings(), s, 1000).num_coarse_samples == COARSE_SAMPLES_NDC
     assert m.step == pytest.approx(2 * math.sqrt(3) / COARSE_SAMPLES_NDC, rel=1e-6)  # the box is 2 deep
     assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.05)
     assert 1 - math.exp(-usual.voxels.threshold * usual.step) == pytest.approx(0.01)
@@ -84,10 +84,12 @@ def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_
 
 def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path: Path) -> None:
     s = load_scene(poses(tmp_path))
-    found = [sized(TrainSettings(), s, pixels) for pixels in (1, 2**22, 2**24, 2**26, 2**34)]
+    found = [with_auto_sizes(TrainSettings(), s, pixels) for pixels in (1, 2**22, 2**24, 2**26, 2**34)]
     assert [each.log2_table for each in found] == [17, 17, 18, 19, 19]
     assert {each.finest for each in found} == {FINEST}
-    assert sized(TrainSettings(log2_hashmap_size=14, finest_resolution=512), s, 2**26) == TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=COARSE_SAMPLES)
+    assert with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512), s, 2**26) == TrainSettings(
+        log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=COARSE_SAMPLES
+    )
 
 
 def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from efficientnerf.asset.bake import voxel_coordinates
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.geometry.spaces import Space
-from efficientnerf.model import look
+from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
 from stages import bake, train
-from stages.framing.view_coverage import often_seen, seldom_seen, spread_order
+from stages.framing.view_coverage import cells_below_min_views, has_min_views, spread_order
 from stages.io.field_file import load_renderer, space_of
 from stages.io.scene import Scene, views_of
 from stages.io.scene import load as load_scene
@@ -62,7 +62,7 @@ def test_it_is_the_voxels_in_the_box_that_few_cameras_project_into_their_picture
             views += int(depth[0] > 0 and 0 <= pixel[0, 0] <= camera.width and 0 <= pixel[0, 1] <= camera.height)
         expected[tuple(at)] = views < observers
     assert 0.05 < expected[inside].mean() < 0.95
-    np.testing.assert_array_equal(seldom_seen(SPACE, cameras, observers, side), expected)
+    np.testing.assert_array_equal(cells_below_min_views(SPACE, cameras, observers, side), expected)
 
 
 @pytest.mark.parametrize(("watching", "observers", "closed"), [(0, 2, True), (1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
@@ -70,7 +70,7 @@ def test_a_place_that_enough_cameras_see_is_open_and_one_that_fewer_see_is_not(w
     """Twelve cameras look at the middle; a place beside it is seen by those alone that look there."""
     beside = np.array([0.85, 0.8, 1.05])
     cameras = [*aimed(np.zeros(3), 12), *aimed(beside, watching)]
-    found = seldom_seen(SPACE, cameras, observers, SIDE)
+    found = cells_below_min_views(SPACE, cameras, observers, SIDE)
     world, inside = centres()
     (lump,) = np.argwhere(inside)[[np.argmin(np.linalg.norm(world[inside] - beside, axis=-1))]]
     (middle,) = np.argwhere(inside)[[np.argmin(np.linalg.norm(world[inside], axis=-1))]]
@@ -87,8 +87,8 @@ def test_no_more_are_asked_for_than_a_quarter_of_the_cameras(count: int, needed:
     lump = tuple(np.argwhere(inside)[np.argmin(np.linalg.norm(world[inside] - beside, axis=-1))])
     for watching in (needed - 1, needed):
         cameras = [*aimed(np.zeros(3), count - watching), *aimed(beside, watching)]
-        assert seldom_seen(SPACE, cameras, 3, SIDE)[lump] == (1 < needed > watching)
-    assert not seldom_seen(SPACE, cameras, 0, SIDE).any()
+        assert cells_below_min_views(SPACE, cameras, 3, SIDE)[lump] == (1 < needed > watching)
+    assert not cells_below_min_views(SPACE, cameras, 0, SIDE).any()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
@@ -112,13 +112,13 @@ def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_pa
     train.run(made)
     m = load_renderer(made.out).model
     cameras = [view.camera for view in views_of(s, "train")]
-    closed = torch.from_numpy(seldom_seen(space_of(s), cameras, m.settings.observers, m.voxels.side))
+    closed = torch.from_numpy(cells_below_min_views(space_of(s), cameras, m.settings.observers, m.voxels.side))
     assert 0.01 < float(closed.float().mean()) < 0.12
     assert torch.equal(torch.isneginf(m.voxels.values), closed)
     for prune in (False, True):
         pixels = Pixels(cameras, [balls.photograph(c) for c in cameras], [None] * len(cameras), np.full(len(cameras), 1.0), np.full(len(cameras), 50.0))
         rays = [torch.from_numpy(np.ascontiguousarray(a)) for a in pixels.bundle(np.arange(len(pixels)))[:4]]
-        seen = look(m, *rays, torch.full_like(rays[2], 0.5), m.behind(rays[1]), prune=prune, rng=np.random.default_rng(0))
+        seen = render_rays(m, *rays, torch.full_like(rays[2], 0.5), m.behind(rays[1]), prune=prune, rng=np.random.default_rng(0))
         at = (seen.coarse.point * m.voxels.side).long().clamp(0, m.voxels.side - 1)
         assert len(at) > 100
         assert not closed[at[:, 0], at[:, 1], at[:, 2]].any()
@@ -130,12 +130,15 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, obs
     trained = job(tmp_path / "train", balls.settings(iterations=30, observers=observers), poses=tmp_path / "poses")
     train.run(trained)
     made = job(
-        tmp_path / "bake", bake.BakeSettings(resolution=32, visibility_rays=5000, samples_per_voxel=2, refine_steps=4, refine_rays_per_batch=1024), poses=tmp_path / "poses", train=trained.out
+        tmp_path / "bake",
+        bake.BakeSettings(resolution=32, visibility_rays=5000, samples_per_voxel=2, refine_steps=4, refine_rays_per_batch=1024),
+        poses=tmp_path / "poses",
+        train=trained.out,
     )
     bake.run(made)
     tree = NerfTree.load(made.out / bake.ASSET)
     centre = tree.bounds_min + (voxel_coordinates(tree) + 0.5) * tree.voxel
-    few = ~often_seen(centre, [view.camera for view in views_of(s, "train")], 2)
+    few = ~has_min_views(centre, [view.camera for view in views_of(s, "train")], 2)
     assert len(few) > 1000
     assert few.any() == (observers == 0)
 

@@ -32,7 +32,14 @@ def test_the_papers_presets_are_the_papers() -> None:
         settings.put_table(read_preset(name).table, name)
         train, bake = (settings.resolved()[stage] for stage in ("train", "bake"))
         samples.append((train.num_coarse_samples, train.samples_per_pivot))
-        assert (train.field, train.sh_degree, train.hidden_dim, train.num_layers, train.coarse_hidden_dim, train.coarse_num_layers) == ("mlp", 3, 256, 8, 128, 4)
+        assert (train.field, train.sh_degree, train.hidden_dim, train.num_layers, train.coarse_hidden_dim, train.coarse_num_layers) == (
+            "mlp",
+            3,
+            256,
+            8,
+            128,
+            4,
+        )
         assert (train.occupancy_resolution, train.occupancy_initial_density, train.occupancy_beta, train.occupancy_rule) == (384, 10.0, 0.1, "momentum")
         assert (train.pivotal_threshold, train.sampling, train.near_plane, train.far_plane) == (1e-4, "efficient", 2.0, 6.0)
         assert train.max_pivots >= train.num_coarse_samples  # the paper drops none

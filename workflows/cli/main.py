@@ -15,8 +15,10 @@ from workflows.cli import assets, files, paper, presets, run, state
 from workflows.cli.failures import report_failure
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}, epilog="Exit codes: 0 done; 2 usage or bad input; "
-    "3 a stage failed; 4 corrupt artifact; 5 run locked; 6 assets differ; 130, 143 interrupted.")
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="Exit codes: 0 done; 2 usage or bad input; 3 a stage failed; 4 corrupt artifact; 5 run locked; 6 assets differ; 130, 143 interrupted.",
+)
 @click.version_option(package_name="efficientnerf", prog_name="enerf")
 def enerf() -> None:
     """Photographs or posed data sets in, a baked 3D asset out.

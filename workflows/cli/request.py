@@ -123,7 +123,5 @@ def _source(given: Path | None, standing: Run | None) -> Path | None:
     source = Path(os.path.abspath(given))
     unchanged = recorded is None or os.path.realpath(source) == os.path.realpath(recorded)
     if standing is not None and not unchanged and standing.folder("poses").exists() and recorded is not None and recorded.exists():
-        raise UsageError(
-            f"{standing.path}: was made from {recorded}, not from {source}. Give a new folder for another source, or go on: {standing.command()}"
-        )
+        raise UsageError(f"{standing.path}: was made from {recorded}, not from {source}. Give a new folder for another source, or go on: {standing.command()}")
     return source

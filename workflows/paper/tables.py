@@ -209,5 +209,3 @@ def _data(request: Request) -> Any:
 def _mean(values: Any) -> float:
     values = list(values)
     return math.fsum(values) / len(values)
-
-

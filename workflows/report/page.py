@@ -91,7 +91,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Any]], numbers: frozense
     """`numbers` are the columns set to the right."""
 
     def cells(tag: str, values: Sequence[Any]) -> str:
-        return "".join(f'<{tag}{" class=n" if n in numbers else ""}>{_text(value)}</{tag}>' for n, value in enumerate(values))
+        return "".join(f"<{tag}{' class=n' if n in numbers else ''}>{_text(value)}</{tag}>" for n, value in enumerate(values))
 
     return f"<table><tr>{cells('th', head)}</tr>" + "".join(f"<tr>{cells('td', row)}</tr>" for row in rows) + "</table>"
 

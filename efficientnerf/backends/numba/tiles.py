@@ -32,7 +32,6 @@ DOTS = {"+avx512f", "+avx512bf16", "+avx512vl"} <= FEATURES
 ROWS, VECTORS = (8, 2) if "+avx512f" in FEATURES else (4, 1)
 
 
-
 class _BFloat(ir.Type):
     """LLVM's bfloat16, which llvmlite has no class for."""
 

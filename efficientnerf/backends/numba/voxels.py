@@ -82,7 +82,7 @@ def carry(cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tupl
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def tell_largest(point, raw, exponential, values):  # type: ignore[no-untyped-def]
+def update_occupancy_maximum(point, raw, exponential, values):  # type: ignore[no-untyped-def]
     """Raise `values` (D, D, D) to the density of samples at `point` (N, 3) in grid coordinates, which is `raw` (N,) activated; closed voxels stay closed.
 
     All cores find voxels and densities, then one takes the largest.

@@ -18,7 +18,7 @@ import torch
 import triton
 from torch import Tensor
 
-from efficientnerf.backends.transfer import constant, sent
+from efficientnerf.backends.transfer import constant, to_device
 from efficientnerf.backends.triton.hash_grid import INTERPRETED
 from efficientnerf.backends.triton.tree_march import march
 from efficientnerf.geometry.cameras import Camera, rays
@@ -167,7 +167,7 @@ def draw(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float
         flat = _launch(t, height * width, None, tuple(float(x) for x in (*place, *lens)), (width, height), over)
     else:
         local = _lens(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
-        rotation = sent(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), local.device)
+        rotation = to_device(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), local.device)
         place = tuple(float(x) for x in (camera.centre - t.low) / t.voxel)
         start = torch.stack([torch.full_like(local[:, 0], x) for x in place], dim=1)
         along = local @ rotation

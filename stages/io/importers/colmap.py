@@ -101,9 +101,7 @@ def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], 
     return found, places, extensions
 
 
-def _photos(
-    source: Source, model: Model, here: dict[int, Path], where: str
-) -> tuple[tuple[Photo, ...], dict[int, int], list[tuple[str, str]], list[str]]:
+def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> tuple[tuple[Photo, ...], dict[int, int], list[tuple[str, str]], list[str]]:
     """Photos sorted by name; COLMAP's image id -> index of its photo; the rejected; warnings."""
     masks = masks_of(source, list(here.values()))
     kept: list[tuple[int, Photo]] = []

@@ -23,9 +23,7 @@ def photographs(folder: Path) -> list[Path]:
     found = images_in(folder) or images_in(folder / "images")
     if not found:
         everything = walk(folder)
-        found = sorted(
-            path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not _NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1])
-        )
+        found = sorted(path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not _NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1]))
         if not found:
             raise BadInput(_nothing(folder, everything))
     if len(found) > MOST_FRAMES:

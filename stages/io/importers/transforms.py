@@ -71,7 +71,7 @@ def json_files(folder: Path) -> list[Path]:
 
 
 def dialect(folder: Path) -> str:
-    """"blender", "nerfstudio" or "instant-ngp", by the keys that only one of them has."""
+    """ "blender", "nerfstudio" or "instant-ngp", by the keys that only one of them has."""
     document = _document(json_files(folder)[0])
     frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
     if any(key in document for key in _NERFSTUDIO_KEYS) or any("mask_path" in frame or "depth_file_path" in frame for frame in frames):

@@ -319,12 +319,26 @@ def trace(shot, behind, packed, painted, brick, nearest, stretch, scale, degree,
         values[worker, blocks * size :] = 0
         whole[worker, 8 : 8 + QUEUE] = blocks * size
         pool = Pool(
-            size, blocks, pointer(slot[worker]), pointer(owner[worker]), pointer(kind[worker]), pointer(whole[worker, :8]), pointer(values[worker]),
-            pointer(words[worker]), pointer(painted), len(painted) - 1, pointer(voxels[worker]), pointer(whole[worker, 8:]),
+            size,
+            blocks,
+            pointer(slot[worker]),
+            pointer(owner[worker]),
+            pointer(kind[worker]),
+            pointer(whole[worker, :8]),
+            pointer(values[worker]),
+            pointer(words[worker]),
+            pointer(painted),
+            len(painted) - 1,
+            pointer(voxels[worker]),
+            pointer(whole[worker, 8:]),
         )
         bench = Bench(
-            pointer(room[worker, 32:48]), pointer(room[worker, 48:64]), pointer(room[worker, 64:80]), pointer(room[worker, 80:96]),
-            pointer(room[worker, 96:128]), pointer(room[worker, 128:160]),
+            pointer(room[worker, 32:48]),
+            pointer(room[worker, 48:64]),
+            pointer(room[worker, 64:80]),
+            pointer(room[worker, 80:96]),
+            pointer(room[worker, 96:128]),
+            pointer(room[worker, 128:160]),
         )
         grid, rays, view = grid_of(packed, brick), rays_of(shot), View(pointer(shot.toward), stretch, nearest, scale, degree)
         seen, face = pointer(room[worker, 160:192]), pointer(room[worker, 192:])
