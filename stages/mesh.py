@@ -57,8 +57,8 @@ def orbit_places(metadata: Mapping[str, Any]) -> np.ndarray:
 def remedy(stage: str, threshold: float | None) -> str:
     """What to do where no surface was found."""
     if threshold is None:
-        return f"The asset is nearly empty: train longer, or set {stage}.threshold by hand."
-    return f"Lower {stage}.threshold (found {threshold:g}), or leave it out to have it chosen."
+        return f"The asset is nearly empty: train longer, or set {stage}.density_threshold by hand."
+    return f"Lower {stage}.density_threshold (found {threshold:g}), or leave it out to have it chosen."
 
 
 def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:

@@ -30,7 +30,7 @@ class Ball(nn.Module):
 
 
 def model_of_a_ball(**changes: Any) -> Model:
-    m = untrained(coarse_samples=64, **changes)
+    m = untrained(num_coarse_samples=64, **changes)
     m.coarse, m.fine = Ball(), Ball()
     return m
 
@@ -226,7 +226,7 @@ def test_nothing_is_baked_where_the_voxels_are_empty() -> None:
 def test_what_was_trained_on_voxel_centres_is_baked_as_it_is(field: str) -> None:
     """The nearest voxel's density is what the network said of the sample, whichever of the voxel's points that was."""
     side = 24
-    m = untrained(field=field, discretise=side, voxel_rule="momentum", pivotal_weight=0.0)
+    m = untrained(field=field, discretise=side, occupancy_rule="momentum", pivotal_threshold=0.0)
     for parameter in m.fine.parameters():  # so that it differs from place to place
         torch.nn.init.normal_(parameter, std=0.5, generator=torch.Generator().manual_seed(1))
     bundle = pixels(2, 24).bundle(np.arange(2 * 24 * 24))

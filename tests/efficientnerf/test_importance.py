@@ -180,7 +180,7 @@ def test_colours_are_differentiable_through_every_sampler() -> None:
 @pytest.mark.parametrize("strategy", ["uniform", "hierarchical", "valid", "efficient"])
 @pytest.mark.parametrize("contracted", [False, True])
 def test_every_strategy_serves_every_field(field: str, strategy: str, contracted: bool) -> None:
-    m = untrained(contracted=contracted, field=field, sampling=strategy, importance_samples=6, coarse_samples=10)
+    m = untrained(contracted=contracted, field=field, sampling=strategy, num_importance_samples=6, num_coarse_samples=10)
     some = pixels()
     o, d, near, far, _ = some.bundle(some.choose(20, np.random.default_rng(0)))
     bundle = [torch.from_numpy(a) for a in (o, d, near, far)]
@@ -223,7 +223,7 @@ def test_counts_are_those_of_the_strategies() -> None:
 
 
 def test_some_rays_are_looked_at_whole_in_training_only() -> None:
-    m = untrained(refresh_rays=0.25)
+    m = untrained(occupancy_update_ray_fraction=0.25)
     m.voxels.values.fill_(-1.0)
     some = pixels()
     bundle = [torch.from_numpy(a) for a in some.bundle(np.arange(100, 140))[:4]]
@@ -238,7 +238,7 @@ def test_some_rays_are_looked_at_whole_in_training_only() -> None:
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
 def test_valid_samples_of_what_is_not_pruned_are_those_that_the_voxels_would_keep(rule: str) -> None:
     """Equation 5 on a trained NeRF: density above zero, read as the voxels read it."""
-    m = untrained(field="mlp", sampling="hierarchical", voxel_rule=rule, importance_samples=6, coarse_samples=10)
+    m = untrained(field="mlp", sampling="hierarchical", occupancy_rule=rule, num_importance_samples=6, num_coarse_samples=10)
     bundle = [torch.from_numpy(a) for a in pixels().bundle(np.arange(100, 140))[:4]]
     seen = render_rays(m, *bundle, torch.full((40,), 0.5), torch.ones(40, 3))
     raw = seen.coarse_raw[:, 0].detach()

@@ -63,14 +63,14 @@ def test_nothing_is_evaluated_twice_and_nothing_that_need_not_be() -> None:
 
 
 def test_training_explores_intervals_without_a_pivot_and_rendering_does_not() -> None:
-    m = untrained(explored=0.5)
+    m = untrained(exploration_fraction=0.5)
     rays = bundle()
     behind = torch.ones(len(rays[0]), 3)
     with torch.no_grad():
         m.coarse, m.fine = Counting(), Counting()
         drawn = render_rays(m, *rays, behind)
         one, same = (render_rays(m, *rays, behind, rng=np.random.default_rng(3)) for _ in range(2))
-        none = render_rays(untrained(explored=0.0), *rays, behind, rng=np.random.default_rng(3))
+        none = render_rays(untrained(exploration_fraction=0.0), *rays, behind, rng=np.random.default_rng(3))
     assert torch.equal(one.pivotal, same.pivotal)
     assert (one.pivotal | ~drawn.pivotal).all()  # pivots stay pivots
     share = float((one.pivotal & ~drawn.pivotal).sum()) / float((~drawn.pivotal).sum())
@@ -121,7 +121,7 @@ def test_the_papers_model_has_the_papers_sizes() -> None:
 
 
 def test_the_maximum_rules_threshold_is_an_absorption_over_an_interval() -> None:
-    m = untrained(voxel_rule="maximum", voxel_absorption=0.01)
+    m = untrained(occupancy_rule="maximum", occupancy_alpha_threshold=0.01)
     assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.01)
     assert m.voxels.occupied == 1.0
 

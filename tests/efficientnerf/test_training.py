@@ -29,7 +29,7 @@ from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
 
-MLP = {"field": "mlp", "hidden": 24, "layers": 2, "coarse_layers": 1, "learning_rate": 1e-2}
+MLP = {"field": "mlp", "hidden_dim": 24, "num_layers": 2, "coarse_num_layers": 1, "learning_rate": 1e-2}
 
 
 @pytest.fixture(autouse=True)
@@ -49,7 +49,7 @@ def psnr_of(steps: list[Progress]) -> float:
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
 @pytest.mark.parametrize("field", ["hash", "mlp"])
 def test_it_learns(field: str, rule: str) -> None:
-    m = untrained(voxel_rule=rule, **(dict(MLP, iterations=40) if field == "mlp" else {}))
+    m = untrained(occupancy_rule=rule, **(dict(MLP, iterations=40) if field == "mlp" else {}))
     steps = run(m)
     assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + (2 if field == "hash" else 1)
     assert [step.step for step in steps] == list(range(1, m.settings.iterations + 1))
@@ -59,9 +59,9 @@ def test_it_learns(field: str, rule: str) -> None:
 
 
 def test_intervals_are_sampled_more_finely_in_the_second_half_of_the_schedule() -> None:
-    steps = run(untrained(iterations=40, fine_samples=5, first_fine_samples=2))
+    steps = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot=2))
     assert [step.fine for step in steps] == [(2 if step.step < 20 else 5) * step.pivotal for step in steps]
-    constant = run(untrained(iterations=40, fine_samples=5, first_fine_samples=0))
+    constant = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot=0))
     assert all(step.fine == 5 * step.pivotal > 0 for step in constant)
     # A schedule that was settled anew counts by its own share, not by steps over all steps: of 40 steps to step 10, then of 20.
     settled = TrainSettings(samples_per_pivot=5, early_samples_per_pivot=2, iterations=20, rate_aims=(40, 10))
@@ -97,7 +97,7 @@ def test_a_thin_white_scene_does_not_collapse_to_its_background(field: str) -> N
 def test_two_runs_give_the_same_bytes_and_another_seed_others() -> None:
     states = []
     for seed in (3, 3, 4):
-        t = trainer(untrained(iterations=12, warm_up=4, seed=seed))
+        t = trainer(untrained(iterations=12, occupancy_warmup_steps=4, seed=seed))
         list(train(t, pixels()))
         states.append({name: tensor.numpy().tobytes() for name, tensor in state_of(t).items()})
     assert states[0] == states[1]
@@ -129,11 +129,11 @@ def test_a_finished_run_has_nothing_left_to_do() -> None:
 
 
 def test_the_number_of_rays_follows_the_samples_they_need() -> None:
-    steps = run(untrained(iterations=30, warm_up=5, samples=8192))
+    steps = run(untrained(iterations=30, occupancy_warmup_steps=5, sample_batch_size=8192))
     used = [step.valid + step.fine for step in steps[-10:]]
     assert 0.7 * 8192 < np.mean(used) < 1.3 * 8192
     assert steps[-1].rays > steps[0].rays  # at first, all intervals were expected to be sampled
-    assert run(untrained(iterations=1, rays=70))[0].rays <= 70
+    assert run(untrained(iterations=1, max_rays_per_batch=70))[0].rays <= 70
 
 
 def test_the_rate_rises_and_falls() -> None:
@@ -191,7 +191,7 @@ def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
     steps, the ball fades away (opacity below 0.15 after as many steps).
     """
     paper = {"backdrop": "scene", "voxel_rule": "momentum", "refresh_share": 0.0, "refresh_rays": 0.05, "explored": 0.0, "samples": 0, "rays": 256}
-    m = untrained(**paper, **MLP, iterations=300, warm_up=220, crop_steps=60)
+    m = untrained(**paper, **MLP, iterations=300, occupancy_warmup_steps=220, precrop_steps=60)
     thin = pixels(8, 20, 0.25)
     steps = run(m, thin)
     assert steps[-1].valid < 0.2 * steps[200].valid  # most is pruned
@@ -219,7 +219,7 @@ def test_the_middle_of_the_pictures_comes_first() -> None:
 @pytest.mark.parametrize("strategy", ["uniform", "hierarchical", "valid"])
 @pytest.mark.parametrize("field", ["mlp", "nerf"])
 def test_other_samplings_learn_too_and_only_those_that_prune_touch_the_voxels(field: str, strategy: str) -> None:
-    m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, importance_samples=16, samples=0, rays=128)
+    m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, num_importance_samples=16, sample_batch_size=0, max_rays_per_batch=128)
     steps = run(m)
     assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 1
     assert {step.rays for step in steps} == {128}  # a fixed batch

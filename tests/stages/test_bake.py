@@ -34,7 +34,7 @@ QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refi
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("bake")
     scene = poses(folder / "poses")
-    train.run(job(folder / "train", settings(iterations=30, samples=4096, warm_up=10), poses=scene))
+    train.run(job(folder / "train", settings(iterations=30, sample_batch_size=4096, occupancy_warmup_steps=10), poses=scene))
     return {"poses": scene, "train": folder / "train" / "out"}
 
 
@@ -235,7 +235,7 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
 
 def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: Path, inputs: dict[str, Path]) -> None:
     scene = inputs["poses"]
-    train.run(job(tmp_path / "train", settings(iterations=30, samples=4096, warm_up=10, discretise=20), poses=scene))
+    train.run(job(tmp_path / "train", settings(iterations=30, sample_batch_size=4096, occupancy_warmup_steps=10, discretise=20), poses=scene))
     given = {"poses": scene, "train": tmp_path / "train" / "out"}
     near = dataclasses.replace(QUICK, resolution=0, lookup="nearest", layout="sparse", optimise=0)
     made = job(tmp_path / "raw", near, **given)

@@ -44,7 +44,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         write_png(np.round(255 * colour).astype(np.uint8).reshape(camera.height, camera.width, 3), folder / "poses" / "images" / camera.name)
     views = tuple(View(f"images/{c.name}", None, "test" if k == 0 else "train", c, c, 3.0, 40.0) for k, c in enumerate(cameras))
     save(Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found), folder / "poses")
-    train.run(job(folder / "train", settings(iterations=80, samples=4096, warm_up=10), poses=folder / "poses"))
+    train.run(job(folder / "train", settings(iterations=80, sample_batch_size=4096, occupancy_warmup_steps=10), poses=folder / "poses"))
     return {"poses": folder / "poses", "train": folder / "train" / "out"}
 
 
@@ -88,7 +88,7 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
 
 
 def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path], tmp_path: Path) -> None:
-    made = job(tmp_path / "train", settings(iterations=12, samples=2048, warm_up=4, discretise=48), poses=inputs["poses"])
+    made = job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4, discretise=48), poses=inputs["poses"])
     train.run(made)
     on_voxels = {**inputs, "train": made.out}
     told: list[dict[str, Any]] = []
@@ -102,7 +102,7 @@ def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path],
 
 def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
     scene = poses(tmp_path / "poses")
-    train.run(job(tmp_path / "train", settings(iterations=12, samples=2048, warm_up=4), poses=scene))
+    train.run(job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4), poses=scene))
     told: list[dict[str, Any]] = []
     tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_depth=2.0)
     assert tree.ndc is None

@@ -108,11 +108,11 @@ def narrow_scene(folder: Path) -> Scene:
 
 def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_path: Path) -> None:
     s = narrow_scene(tmp_path / "poses")
-    made = job(tmp_path, balls.settings(iterations=30, refresh_rays=0.1), poses=tmp_path / "poses")
+    made = job(tmp_path, balls.settings(iterations=30, occupancy_update_ray_fraction=0.1), poses=tmp_path / "poses")
     train.run(made)
     m = load_renderer(made.out).model
     cameras = [view.camera for view in views_of(s, "train")]
-    closed = torch.from_numpy(cells_below_min_views(space_of(s), cameras, m.settings.observers, m.voxels.side))
+    closed = torch.from_numpy(cells_below_min_views(space_of(s), cameras, m.settings.min_views, m.voxels.side))
     assert 0.01 < float(closed.float().mean()) < 0.12
     assert torch.equal(torch.isneginf(m.voxels.values), closed)
     for prune in (False, True):
@@ -127,7 +127,7 @@ def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_pa
 @pytest.mark.parametrize("observers", [2, 0])
 def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, observers: int) -> None:
     s = narrow_scene(tmp_path / "poses")
-    trained = job(tmp_path / "train", balls.settings(iterations=30, observers=observers), poses=tmp_path / "poses")
+    trained = job(tmp_path / "train", balls.settings(iterations=30, min_views=observers), poses=tmp_path / "poses")
     train.run(trained)
     made = job(
         tmp_path / "bake",
@@ -145,7 +145,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, obs
 
 def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_the_box(tmp_path: Path) -> None:
     narrow_scene(tmp_path / "poses")
-    anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, observers=0), poses=tmp_path / "poses")
+    anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, min_views=0), poses=tmp_path / "poses")
     cut_out = job(tmp_path / "cut_out", balls.settings(iterations=2), poses=poses(tmp_path / "cut", count=10))
     for made in (anywhere, cut_out):
         train.run(made)

@@ -96,7 +96,7 @@ def test_jpegs_are_copied_and_reduced_ones_become_png(tmp_path: Path) -> None:
     made, _ = run(source, tmp_path / "a")
     assert made.views[0].image == "images/img_0.jpg"
     assert (tmp_path / "a/poses/images/img_0.jpg").read_bytes() == (source / "images_4/img_0.jpg").read_bytes()
-    small, _ = run(source, tmp_path / "b", max_side=16)  # below the limit of the setting, which only the command line checks
+    small, _ = run(source, tmp_path / "b", max_image_size=16)  # below the limit of the setting, which only the command line checks
     assert small.views[0].image == "images/img_0.png"
     assert (small.views[0].camera.width, small.views[0].camera.height) == (16, 12)
     assert small.views[0].source_camera.width == WIDTH
@@ -177,7 +177,7 @@ def test_colours_of_transparent_pixels_do_not_bleed(tmp_path: Path) -> None:
         pixels[:, ::2] = (255, 0, 0, 255)
         pixels[:, 1::2] = (0, 255, 0, 0)
         captures.write_picture(path, pixels)
-    made, _ = run(source, tmp_path, max_side=16)
+    made, _ = run(source, tmp_path, max_image_size=16)
     small = scene.read_image(tmp_path / "poses", made.views[0])
     assert small.shape == (12, 16, 4)
     assert (small[..., :3] == (255, 0, 0)).all()
@@ -250,7 +250,7 @@ def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest
         return Capture(kind="photographs", photos=found, background=None, rejected=(("img_5.png", "overlaps no other"),), warnings=("one found no place",))
 
     monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find_cameras)
-    whole, warnings = run(source, tmp_path / "a", features=1000, matching="sequential", feature_side=800, seed=3)
+    whole, warnings = run(source, tmp_path / "a", max_features=1000, matching="sequential", feature_image_size=800, seed=3)
     assert (asked["features"], asked["matching"], asked["max_side"], asked["seed"]) == (1000, "sequential", 800, 3)
     assert asked["names"] == [camera.name for camera in made]
     assert asked["work"].is_relative_to(tmp_path / "a/work")
@@ -271,7 +271,7 @@ def test_photographs_linked_from_elsewhere(tmp_path: Path) -> None:
 
 
 def test_a_box_and_an_up_axis_can_be_set(tmp_path: Path) -> None:
-    made, _ = run(captures.colmap_bin(tmp_path / "source"), tmp_path, up="z", box=(-1.0, -0.5, -0.25, 1.0, 0.5, 0.25))
+    made, _ = run(captures.colmap_bin(tmp_path / "source"), tmp_path, up="z", crop_box=(-1.0, -0.5, -0.25, 1.0, 0.5, 0.25))
     np.testing.assert_allclose(made.bounds, [[-1, -0.5, -0.25], [1, 0.5, 0.25]], atol=1e-12)
     np.testing.assert_allclose(made.world_from_capture.matrix(), np.eye(4), atol=1e-12)
 
@@ -295,7 +295,7 @@ def test_real_photographs_with_colmap_cameras(tmp_path: Path) -> None:
     source = SHARED / "lund_door_colmap"
     if not source.is_dir():
         pytest.skip(f"{source} is not there")
-    made, warnings = run(source, tmp_path, max_side=256)
+    made, warnings = run(source, tmp_path, max_image_size=256)
     assert not warnings
     assert len(made.views) == 12
     points = scene.read_points(tmp_path / "poses")

@@ -12,8 +12,9 @@ import torch
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = {
-    "levels": 4, "log2_table": 11, "finest": 64, "hidden": 16, "layers": 1, "coarse_hidden": 16, "coarse_layers": 1, "degree": 1, "voxels": 24,
-    "coarse_samples": 16, "fine_samples": 2, "samples": 6144, "warm_up": 20, "refresh_every": 4, "learning_rate": 3e-2,
+    "num_levels": 4, "log2_hashmap_size": 11, "finest_resolution": 64, "hidden_dim": 16, "num_layers": 1, "coarse_hidden_dim": 16,
+    "coarse_num_layers": 1, "sh_degree": 1, "occupancy_resolution": 24, "num_coarse_samples": 16, "samples_per_pivot": 2, "sample_batch_size": 6144,
+    "occupancy_warmup_steps": 20, "occupancy_update_interval": 4, "learning_rate": 3e-2,
 }  # fmt: skip
 
 
