@@ -185,7 +185,7 @@ def test_targets_on_the_device_say_the_same(kind: str) -> None:
 
 @pytest.mark.parametrize("stride", [1, 8])
 def test_rays_of_pixels_are_those_of_the_host(stride: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.training.loop import pixels as module
+    from efficientnerf.training import pixels as module
 
     monkeypatch.setattr(module, "EXACT", 2**23 if stride == 1 else 0)
     lens = ("OPENCV", (30.0, 33.0, 9.0, 12.0, 0.05, -0.02, 0.003, 0.002))

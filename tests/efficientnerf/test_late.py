@@ -20,7 +20,7 @@ from efficientnerf.sampling.occupancy import density_voxels
 from efficientnerf.sampling.samples import Samples
 from efficientnerf.training import loop
 from efficientnerf.training.device_pixels import DevicePixels
-from efficientnerf.training.loop import readback as late
+from efficientnerf.training import readback as late
 from efficientnerf.training.readback import AsyncOccupancy, AsyncReadback, SampleCapacity, mean_over, whole_rays
 from tests.efficientnerf.balls import BOUNDS, pixels, settings
 from tests.efficientnerf.device import DEVICE
@@ -99,7 +99,7 @@ def test_a_share_is_told_late_on_a_device_alone(monkeypatch: pytest.MonkeyPatch)
         def synchronize(self) -> None:
             arrived.append(self)
 
-    monkeypatch.setattr(late, "fetched", lambda values: (values, Event()))
+    monkeypatch.setattr(late, "to_host_async", lambda values: (values, Event()))
     voxels.values.fill_(10)
     share = AsyncOccupancy(voxels)
     assert share() == 1
@@ -110,19 +110,20 @@ def test_a_share_is_told_late_on_a_device_alone(monkeypatch: pytest.MonkeyPatch)
 
 
 PAPER = {
-    "field": "mlp", "hidden": 16, "layers": 2, "coarse_layers": 1, "learning_rate": 3e-3, "voxel_rule": "momentum", "voxel_initial": 0.3, "voxel_beta": 0.5,
-    "refresh_share": 0.0, "refresh_rays": 0.2, "importance_samples": 5, "coarse_samples": 8,
+    "field": "mlp", "hidden_dim": 16, "num_layers": 2, "coarse_num_layers": 1, "learning_rate": 3e-3, "occupancy_rule": "momentum",
+    "occupancy_initial_density": 0.3, "occupancy_beta": 0.5,
+    "occupancy_update_fraction": 0.0, "occupancy_update_ray_fraction": 0.2, "num_importance_samples": 5, "num_coarse_samples": 8,
 }  # fmt: skip
 # As tables 4 to 6 of the paper have them, and what else there is.
 STRATEGIES: dict[str, dict[str, Any]] = {
     "efficient": PAPER,
-    "spanned": {**PAPER, "near": 1.0, "far": 5.0},
+    "spanned": {**PAPER, "near_plane": 1.0, "far_plane": 5.0},
     "valid": {**PAPER, "sampling": "valid"},
     "hierarchical": {**PAPER, "sampling": "hierarchical"},
-    "nerf": {**PAPER, "sampling": "hierarchical", "field": "nerf", "near": 1.0, "far": 5.0},
-    "uniform": {**PAPER, "sampling": "uniform", "field": "nerf", "near": 1.0, "far": 5.0},
+    "nerf": {**PAPER, "sampling": "hierarchical", "field": "nerf", "near_plane": 1.0, "far_plane": 5.0},
+    "uniform": {**PAPER, "sampling": "uniform", "field": "nerf", "near_plane": 1.0, "far_plane": 5.0},
     "hash": {},
-    "contracted": {"refresh_rays": 0.2},
+    "contracted": {"occupancy_update_ray_fraction": 0.2},
     "voxels": {"coarse": "voxels"},
 }
 
@@ -133,7 +134,10 @@ EMPTY = -1.0  # what half of the voxels begin with
 def model_of(strategy: str, **changes: Any) -> Model:
     """On a device where there is one."""
 
-    wanted = {**STRATEGIES[strategy], "samples": 0, "rays": 6, "warm_up": 1, "refresh_every": 3, "explored": 0.0, **changes}
+    wanted = {
+        **STRATEGIES[strategy], "sample_batch_size": 0, "max_rays_per_batch": 6, "occupancy_warmup_steps": 1, "occupancy_update_interval": 3,
+        "exploration_fraction": 0.0, **changes,
+    }  # fmt: skip
     contracted = strategy == "contracted"
     m = model(Space(BOUNDS, contracted), settings(**wanted), None if contracted else (1.0, 1.0, 1.0), DEVICE, None if contracted else (1.0, 5.0))
     m.voxels.values[(torch.rand(m.voxels.values.shape, generator=torch.Generator().manual_seed(1)) < 0.5).to(DEVICE)] = EMPTY
@@ -169,7 +173,7 @@ def test_padded_steps_learn_what_counted_ones_do(strategy: str, interpreted: Non
         assert (ours.rays, ours.tried, ours.valid, ours.pivotal, ours.fine) == (theirs.rays, theirs.tried, theirs.valid, theirs.pivotal, theirs.fine)
         assert ours.left_out == 0  # there was room for all
     torch.testing.assert_close(voxels[2], voxels[1000], rtol=1e-3, atol=1e-3)
-    whole = STRATEGIES[strategy].get("refresh_rays", 0) > 0
+    whole = STRATEGIES[strategy].get("occupancy_update_ray_fraction", 0) > 0
     if m.prunes:
         assert all(0.3 < step.valid / step.tried < 0.9 for step in steps[2][1:])
         # Only whole rays, and what is asked about at random, tell of what is pruned.
@@ -215,7 +219,7 @@ def test_lines_that_wait_are_found() -> None:
         pivotal_samples(space, torch.zeros(2, 3), torch.ones(2, 3), torch.zeros(2), found, torch.tensor([True, False, True]), 2)
         assert density_voxels(2, "momentum").occupied == 1
     assert {line.partition(":")[0] for line in waits.lines} == {"index", "_local_scalar_dense"}
-    assert any("sampling.py" in line for line in waits.lines)
+    assert any("samples.py" in line for line in waits.lines)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
@@ -235,7 +239,7 @@ def test_no_line_that_makes_a_bundle_waits() -> None:
 def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """With exposures, anchors, and explored intervals."""
     monkeypatch.setattr(dispatch, "composite", compositing.composite)
-    m = model_of("contracted", iterations=9, exposure="gain", explored=0.1, discretise=discretise)
+    m = model_of("contracted", iterations=9, exposure="gain", exploration_fraction=0.1, discretise=discretise)
     origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
     anchors = loop.SparseDepthRays(origins, directions, np.full(8, 3.0, np.float32))
     running = loop.train(loop.trainer(m, 3), pixels(3, 8), anchors)
@@ -247,7 +251,7 @@ def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: No
 def test_no_step_waits_for_the_device(strategy: str) -> None:
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    running = loop.train(loop.trainer(model_of(strategy, iterations=late.SETTLED + 20, rays=64, explored=0.1)), pixels(3, 8))
+    running = loop.train(loop.trainer(model_of(strategy, iterations=late.SETTLED + 20, max_rays_per_batch=64, exploration_fraction=0.1)), pixels(3, 8))
     for _ in range(late.SETTLED + 4):
         next(running)
     with warnings.catch_warnings(record=True) as caught:
