@@ -19,8 +19,8 @@ from efficientnerf.rendering import compositing
 from efficientnerf.sampling.occupancy import density_voxels
 from efficientnerf.sampling.samples import Samples
 from efficientnerf.training import loop
-from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training import readback as late
+from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.readback import AsyncOccupancy, AsyncReadback, SampleCapacity, mean_over, whole_rays
 from tests.efficientnerf.balls import BOUNDS, pixels, settings
 from tests.efficientnerf.device import DEVICE

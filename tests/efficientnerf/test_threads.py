@@ -20,7 +20,7 @@ from tests.efficientnerf.test_cpu_mlp import passes, weights_of
 from tests.efficientnerf.trees import random_tree, rays_at
 
 print(numba.get_num_threads())
-t = trainer(untrained(contracted=True, iterations=5, warm_up=2))
+t = trainer(untrained(contracted=True, iterations=5, occupancy_warmup_steps=2))
 list(train(t, pixels()))
 for name, tensor in sorted(state_of(t).items()):
     print(name, hashlib.sha256(tensor.numpy().tobytes()).hexdigest())

@@ -107,7 +107,7 @@ def test_two_runs_give_the_same_bytes_and_another_seed_others() -> None:
 @pytest.mark.parametrize("field", ["hash", "mlp"])
 @pytest.mark.parametrize("at", [1, 4, 7])
 def test_a_restored_trainer_goes_on_to_the_same_bytes(field: str, at: int) -> None:
-    changes = dict(MLP if field == "mlp" else {}, iterations=10, warm_up=5, samples=2048)
+    changes = dict(MLP if field == "mlp" else {}, iterations=10, occupancy_warmup_steps=5, sample_batch_size=2048)
     whole = trainer(untrained(**changes))
     kept = {}
     for done in train(whole, pixels()):
@@ -190,7 +190,10 @@ def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
     The middle of the pictures comes first, and pruning waits until the coarse network knows where matter is: without the first, or pruned after 80
     steps, the ball fades away (opacity below 0.15 after as many steps).
     """
-    paper = {"backdrop": "scene", "voxel_rule": "momentum", "refresh_share": 0.0, "refresh_rays": 0.05, "explored": 0.0, "samples": 0, "rays": 256}
+    paper = {
+        "background_color": "scene", "occupancy_rule": "momentum", "occupancy_update_fraction": 0.0,
+        "occupancy_update_ray_fraction": 0.05, "exploration_fraction": 0.0, "sample_batch_size": 0, "max_rays_per_batch": 256,
+    }  # fmt: skip
     m = untrained(**paper, **MLP, iterations=300, occupancy_warmup_steps=220, precrop_steps=60)
     thin = pixels(8, 20, 0.25)
     steps = run(m, thin)

@@ -22,7 +22,9 @@ from stages.training.budget import MOST, TIMED, Budget
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
-QUICK: dict[str, Any] = {"checkpoint_every": 10, "samples": 512, "warm_up": 4, "preview_every": 0, "iterations": 5, "budget": 40.0}
+QUICK: dict[str, Any] = {
+    "checkpoint_every": 10, "sample_batch_size": 512, "occupancy_warmup_steps": 4, "preview_every": 0, "iterations": 5, "time_budget": 40.0,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +39,7 @@ def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def timed(t: Trainer, *rest: Any) -> Iterator[Progress]:
         for done in steps(t, *rest):
-            now[0] += 2.0 if done.step <= QUICK["warm_up"] else 0.5
+            now[0] += 2.0 if done.step <= QUICK["occupancy_warmup_steps"] else 0.5
             yield done
 
     monkeypatch.setattr(train, "clock", lambda: now[0])
@@ -64,8 +66,8 @@ def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_pa
     budgeted = job(tmp_path / "a", settings(**QUICK), poses=scene)
     first = digest(budgeted)
     said = report(budgeted)
-    assert said["iterations"] > QUICK["warm_up"] + TIMED  # it was long enough to be planned
-    assert 0.95 * QUICK["budget"] <= said["seconds"] <= QUICK["budget"]
+    assert said["iterations"] > QUICK["occupancy_warmup_steps"] + TIMED  # it was long enough to be planned
+    assert 0.95 * QUICK["time_budget"] <= said["seconds"] <= QUICK["time_budget"]
     assert len(said["rate_aims"]) >= 2  # settled anew on the way
     aims = json.dumps(said["rate_aims"], separators=(",", ":"))
     steps = f"--set train.iterations={said['iterations']} --set train.rate_hold={said['rate_hold']}"
@@ -82,19 +84,19 @@ def test_an_interrupted_run_keeps_to_its_plan(scene: Path, tmp_path: Path, at: i
     with pytest.raises(Interrupted):
         train.run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop))
     plan = tmp_path / "work" / "plan.json"
-    assert plan.exists() == (at > QUICK["warm_up"] + TIMED)
+    assert plan.exists() == (at > QUICK["occupancy_warmup_steps"] + TIMED)
     again = job(tmp_path, settings(**QUICK), poses=scene, stop=stop)
     first = digest(again)
     said = report(again)
-    assert 0.95 * QUICK["budget"] <= said["seconds"] <= QUICK["budget"]  # what was spent before counts
+    assert 0.95 * QUICK["time_budget"] <= said["seconds"] <= QUICK["time_budget"]  # what was spent before counts
     plain = repeated(said)
     assert digest(job(tmp_path / "plain", plain, poses=scene)) == first
 
 
 def test_a_budget_that_is_over_before_anything_is_timed_ends_the_training(scene: Path, tmp_path: Path) -> None:
-    made = job(tmp_path, settings(**{**QUICK, "budget": 2.0}), poses=scene)
+    made = job(tmp_path, settings(**{**QUICK, "time_budget": 2.0}), poses=scene)
     train.run(made)
-    assert 1 <= report(made)["iterations"] < QUICK["warm_up"] + TIMED
+    assert 1 <= report(made)["iterations"] < QUICK["occupancy_warmup_steps"] + TIMED
     assert load_renderer(made.out).model.settings.iterations == report(made)["iterations"]
 
 

@@ -49,7 +49,7 @@ def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
         pixels = sum(v.camera.width * v.camera.height for v in s.views)
         found = with_auto_sizes(TrainSettings(), s, pixels)
         wide = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
-        assert found.finest == max(FINEST, min(MOST, math.ceil(wide / ndc_pixel(s, s.forward))))
+        assert found.finest_resolution == max(FINEST, min(MOST, math.ceil(wide / ndc_pixel(s, s.forward))))
         # What is called a pixel is one: two points a lattice step apart, at any depth, are seen a pixel apart.
         camera = s.views[0].camera
         middle = np.array([[camera.width / 2, camera.height / 2], [camera.width / 2 + 1, camera.height / 2]])
@@ -65,7 +65,7 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
     assert with_auto_sizes(TrainSettings(), s, 6 << 18).log2_hashmap_size == 18
     assert with_auto_sizes(TrainSettings(), s, 10**9).log2_hashmap_size == LARGEST
     given = with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=77), s, 10**9)
-    assert (given.log2_table, given.finest, given.coarse_samples) == (14, 512, 77)
+    assert (given.log2_hashmap_size, given.finest_resolution, given.num_coarse_samples) == (14, 512, 77)
 
 
 def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_them_and_fog_weighs_less() -> None:
@@ -77,7 +77,7 @@ def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_
     assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.05)
     assert 1 - math.exp(-usual.voxels.threshold * usual.step) == pytest.approx(0.01)
     assert (m.distortion, usual.distortion) == (0.002, 0.01)
-    stated = model(space_of(s), dataclasses.replace(small, coarse_samples=64, voxel_absorption=0.2, distortion=0.0), None)
+    stated = model(space_of(s), dataclasses.replace(small, num_coarse_samples=64, occupancy_alpha_threshold=0.2, distortion_loss_weight=0.0), None)
     assert (stated.settings.num_coarse_samples, stated.distortion) == (64, 0.0)
     assert 1 - math.exp(-stated.voxels.threshold * stated.step) == pytest.approx(0.2)
 
@@ -85,8 +85,8 @@ def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_
 def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path: Path) -> None:
     s = load_scene(poses(tmp_path))
     found = [with_auto_sizes(TrainSettings(), s, pixels) for pixels in (1, 2**22, 2**24, 2**26, 2**34)]
-    assert [each.log2_table for each in found] == [17, 17, 18, 19, 19]
-    assert {each.finest for each in found} == {FINEST}
+    assert [each.log2_hashmap_size for each in found] == [17, 17, 18, 19, 19]
+    assert {each.finest_resolution for each in found} == {FINEST}
     assert with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512), s, 2**26) == TrainSettings(
         log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=COARSE_SAMPLES
     )
@@ -100,7 +100,7 @@ def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
     assert max(m.fine.sides) == FINEST
 
 
-@pytest.mark.parametrize(("name", "least"), [("log2_table", 8), ("finest", 16), ("coarse_samples", 8)])
+@pytest.mark.parametrize(("name", "least"), [("log2_hashmap_size", 8), ("finest_resolution", 16), ("num_coarse_samples", 8)])
 def test_a_table_too_small_is_refused_when_settings_are_read(name: str, least: int) -> None:
     for wrong in (-1, 1, least - 1):
         with pytest.raises(UsageError, match=rf"train\.{name}: found {wrong} \(int\), expected at least {least}, or 0$"):

@@ -19,7 +19,7 @@ from stages.io.field_file import FILE, load_gains, load_renderer
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
-QUICK = {"iterations": 13, "checkpoint_every": 4, "samples": 1024, "warm_up": 6, "preview_every": 5}
+QUICK = {"iterations": 13, "checkpoint_every": 4, "sample_batch_size": 1024, "occupancy_warmup_steps": 6, "preview_every": 5}
 
 
 @pytest.fixture(scope="module")
