@@ -18,13 +18,14 @@ from typing import Any
 import numpy as np
 from stage_runs import linked_copy, made, read_json
 
+from stages.artifacts import BakeOutputs
 from workflows.paper.document import hardware, versions
 
 
 def row_of(run: Path, resolution: int, settings: dict[str, str]) -> dict[str, Any]:
     """Bake at a resolution, and say what it took."""
     took = made(run, "bake", {"bake.max_mib": 4096, **settings, "bake.resolution": resolution})
-    report = read_json(run / "bake" / "report.json")
+    report = read_json(BakeOutputs.of_run(run).report)
     cells, voxels = math.prod(report["resolution"]), report["voxels"]
     print(f"{resolution:5}: {voxels:11,} voxels of {cells:13,} cells: {took['seconds']:.1f} s, {took['cpu_seconds']:.1f} s of all cores, "
           f"{took['peak_mib']:.0f} MiB", flush=True)  # fmt: skip

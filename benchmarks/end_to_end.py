@@ -19,6 +19,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from stages.artifacts import BakeOutputs, EvaluateOutputs
+
 LIBRARIES = ("torch", "numba", "numpy", "pycolmap")
 
 
@@ -34,14 +36,14 @@ def summary_of(source: Path, run: Path) -> dict[str, Any]:
 
 def row_of(source: Path, run: Path) -> dict[str, Any]:
     summary = summary_of(source, run)
-    metrics = json.loads((run / "evaluate" / "metrics.json").read_text(encoding="utf-8"))
+    metrics = json.loads(EvaluateOutputs.of_run(run).metrics.read_text(encoding="utf-8"))
     status = json.loads(subprocess.run([sys.executable, "-m", "workflows.cli.main", "status", str(run), "--json"], stdout=subprocess.PIPE, check=True).stdout)
     return {
         "source": source.name,
         "seconds": {stage["name"]: stage["seconds"] for stage in status["stages"]},
         "network": {name: metrics["network"][name] for name in ("psnr", "ssim", "psnr_in_box", "views", "scale")},
         "asset": {name: metrics["asset"][name] for name in ("psnr", "ssim", "psnr_in_box", "views")},
-        "asset_bytes": (run / "bake" / "asset.nerftree").stat().st_size,
+        "asset_bytes": BakeOutputs.of_run(run).asset.stat().st_size,
         "ok": summary["ok"],
     }
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from stage_runs import linked_copy, made, read_json
 
+from stages.artifacts import BakeOutputs, EvaluateOutputs
 from workflows.paper.document import hardware, versions
 
 
@@ -23,8 +24,8 @@ def row_of(run: Path, size: int, settings: dict[str, str]) -> dict[str, Any]:
     """Bake to at most `size` MiB, evaluate, and read what came of it."""
     took = made(run, "bake", {**settings, "bake.max_mib": size})
     made(run, "evaluate", {"evaluate.field_views": 1})
-    report, metrics = read_json(run / "bake" / "report.json"), read_json(run / "evaluate" / "metrics.json")
-    stored = (run / "bake" / "asset.nerftree").stat().st_size / 2**20
+    report, metrics = read_json(BakeOutputs.of_run(run).report), read_json(EvaluateOutputs.of_run(run).metrics)
+    stored = BakeOutputs.of_run(run).asset.stat().st_size / 2**20
     if stored > size:
         raise SystemExit(f"bake.max_mib={size}: the asset has {stored:.1f} MiB")
     return {
@@ -82,8 +83,8 @@ def main() -> None:
         for size in sorted(int(word) for word in given.sizes.split(",")):
             rows.append(row_of(work, size, settings))
             print(f"{size:5} MiB: {rows[-1]['mib']:.1f} MiB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
-        measured = given.run / "evaluate" / "metrics.json"  # of more views than one, where the run has been evaluated
-        network = read_json(measured if measured.exists() else work / "evaluate" / "metrics.json")["network"]
+        measured = EvaluateOutputs.of_run(given.run).metrics  # of more views than one, where the run has been evaluated
+        network = read_json(measured if measured.exists() else EvaluateOutputs.of_run(work).metrics)["network"]
     name = given.run.resolve().name
     document = {"run": name, "settings": settings, "rows": rows, "network": network, "hardware": hardware("cpu"), "versions": versions()}
     given.out.mkdir(parents=True, exist_ok=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from stages.artifacts import BakeOutputs
 from stages.settings import SettingInfo, describe_settings
 from workflows.asset import STAGES
 from workflows.cli.main import enerf
@@ -90,7 +91,7 @@ def hostile_page() -> str:
         "|---|---|",
     ]
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "asset.nerftree"
+        path = BakeOutputs(Path(folder)).asset
         for name, (make, _) in HOSTILE.items():
             path.write_bytes(make())
             try:

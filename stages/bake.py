@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.stage import Job, Stage
+from stages.artifacts import BakeInputs, BakeOutputs, inputs_of, needs_of
 from stages.settings import setting
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from stages.baking.resolution import Choice
     from stages.framing.forward_facing import Forward
     from stages.io.scene import Scene
-
-ASSET = "asset.nerftree"
 
 
 @dataclass(frozen=True)
@@ -146,19 +145,19 @@ def run(job: Job) -> None:
         targets, most,
     )  # fmt: skip
     provenance = {**facts["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": fitted["psnr_after"]}}
-    format.save(tree.with_metadata(provenance=provenance), job.out / ASSET, settings.layout)
-    size = (job.out / ASSET).stat().st_size
+    format.save(tree.with_metadata(provenance=provenance), BakeOutputs(job.out).asset, settings.layout)
+    size = BakeOutputs(job.out).asset.stat().st_size
     report = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index), "bytes": size, "optimisation": fitted}
     report |= {"voxels_along_longest_side": resolution, "resolution_decided_by": choice.why, "max_mib": mib}
-    (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    BakeOutputs(job.out).report.write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def sources_of(job: Job) -> dict[str, str]:
     """SHA-256 of what the asset was made from: the cameras, and the network."""
     from pipeline.hashes import sha256_of
-    from stages.io.field_file import FILE
 
-    return {path.name: sha256_of(path) for path in (job.inputs["poses"] / "scene.json", job.inputs["train"] / FILE)}
+    inputs = inputs_of(BakeInputs, job.inputs)
+    return {path.name: sha256_of(path) for path in (inputs.poses.scene, inputs.train.field)}
 
 
 def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
@@ -372,4 +371,4 @@ def _read_npy(path: Path) -> np.ndarray | None:
         return None
 
 
-STAGE = Stage(name="bake", version=4, settings=BakeSettings, needs=("poses", "train"), run=run)
+STAGE = Stage(name="bake", version=4, settings=BakeSettings, needs=needs_of(BakeInputs), run=run)

@@ -23,6 +23,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import MODELS, Camera
 from pipeline.stage import Job, Stage
+from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, inputs_of, needs_of
 from stages.io.scene import Scene, View
 from stages.lpips_weights import load_lpips
 from stages.settings import setting
@@ -72,12 +73,14 @@ class Truth:
 def run(job: Job) -> None:
     from efficientnerf.asset.tree import NerfTree
 
+    inputs = inputs_of(EvaluateInputs, job.inputs)
+
     def load_field() -> Any:
         from stages.io.field_file import load_renderer
 
-        return load_renderer(job.inputs["train"], job.device)
+        return load_renderer(inputs.train.folder, job.device)
 
-    evaluate(NerfTree.load(job.inputs["bake"] / "asset.nerftree").to(job.device), load_field, job)
+    evaluate(NerfTree.load(inputs.bake.asset).to(job.device), load_field, job)
 
 
 def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
@@ -89,7 +92,7 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
     from stages.io.scene import load
 
     settings: EvaluateSettings = job.settings
-    scene = load(job.inputs["poses"])
+    scene = load(job.inputs[PosesOutputs.stage])
     views, split = held_back(scene)
     if split == "train":
         job.warn("no view was held back from training: the figures below are of views that training saw")
@@ -116,7 +119,7 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
         figures.append(json.loads(done.read_text(encoding="utf-8")))
     job.progress(len(views), len(views))
     metrics = summary(figures, split=split, stride=stride, background=rest if behind_of(scene) is None else None, perceptual=tuple(perceptual))
-    _write_json(metrics, job.out / "metrics.json")
+    _write_json(metrics, EvaluateOutputs(job.out).metrics)
     _write_sheet(metrics, sorted(drawn), job)
 
 
@@ -203,7 +206,7 @@ def measure(
     """
     from stages.pictures.plots import eight_bits, error_picture
 
-    truth = truth_of(job.inputs["poses"], view, scene.background)
+    truth = truth_of(job.inputs[PosesOutputs.stage], view, scene.background)
     plain = behind_of(scene)
     figures: dict[str, Any] = {"name": view.name, "network": None}
     pictures: list[np.ndarray] = []
@@ -337,7 +340,7 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
         view = metrics["views"][k]
         labels.append([view["name"], f"network {figure(view['network'])}", "error of the network", f"asset {figure(view['asset'])}", "error of the asset"])
     title = f"{metrics['split']} views: network {figure(metrics['network'])}; asset {figure(metrics['asset'])}; errors are white from 0.25"
-    contact_sheet(rows, labels, job.out / "contact_sheet.png", thumbnail=SHEET_SIDE, title=title)
+    contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=SHEET_SIDE, title=title)
 
 
-STAGE = Stage(name="evaluate", version=1, settings=EvaluateSettings, needs=("bake", "train", "poses"), run=run)
+STAGE = Stage(name="evaluate", version=1, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
+from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.settings import setting
 
 if TYPE_CHECKING:
@@ -96,7 +97,8 @@ def run(job: Job) -> None:
     from stages.io.exporters.writing import source_frame
     from stages.pictures.shading import IN_FRONT, draw_sides
 
-    tree = load(job.inputs["bake"] / "asset.nerftree")
+    outputs = MeshOutputs(job.out)
+    tree = load(inputs_of(MeshInputs, job.inputs).bake.asset)
     frame = source_frame(tree.metadata)
     found = mesh_of(tree, job.settings, job.reached)
     job.safe_point()
@@ -104,17 +106,17 @@ def run(job: Job) -> None:
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
     forward = bool(orbit.get("forward_facing", False))
     sides: dict[str, Any] = {"turns": IN_FRONT, "shown": 0.8} if forward else {}
-    Image.fromarray(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides)).save(job.out / "preview.png")
+    Image.fromarray(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides)).save(outputs.preview)
     job.safe_point()
     mesh = in_capture(found, frame)
-    for extension in (".ply", ".glb"):
-        MESH_EXPORTERS[extension](mesh, job.out / f"mesh{extension}", frame)
+    for path in (outputs.ply, outputs.glb):
+        MESH_EXPORTERS[path.suffix](mesh, path, frame)
     report = describe(mesh, frame)
-    (job.out / "report.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    outputs.report.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     if not report["watertight"]:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['crowded_edges']} crowded edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}
     job.say(f"{report['faces']} faces in {report['components']} pieces", **facts)
 
 
-STAGE = Stage(name="mesh", version=1, settings=MeshSettings, needs=("bake",), run=run)
+STAGE = Stage(name="mesh", version=1, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
+from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
 from stages.mesh import orbit_places, remedy
 from stages.settings import setting
 
@@ -52,12 +53,13 @@ def run(job: Job) -> None:
     from stages.io.exporters import POINT_EXPORTERS
     from stages.io.exporters.writing import source_frame
 
-    tree = load(job.inputs["bake"] / "asset.nerftree")
+    tree = load(inputs_of(PointsInputs, job.inputs).bake.asset)
     frame = source_frame(tree.metadata)
     cloud = points_of(tree, job.settings, frame, job.reached)
     job.safe_point()
-    POINT_EXPORTERS[".ply"](cloud, job.out / "points.ply", frame)
+    path = PointsOutputs(job.out).ply
+    POINT_EXPORTERS[path.suffix](cloud, path, frame)
     job.say(f"{len(cloud.positions)} points", points=len(cloud.positions))
 
 
-STAGE = Stage(name="points", version=1, settings=PointsSettings, needs=("bake",), run=run)
+STAGE = Stage(name="points", version=1, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)

@@ -17,6 +17,7 @@ from typing import Any
 from efficientnerf.geometry.cameras import resized
 from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
+from stages.artifacts import PosesOutputs
 from stages.framing.forward_facing import SPACES
 from stages.io import importers
 from stages.io.capture import Capture, Photo, SparsePoints
@@ -112,7 +113,7 @@ def run(job: Job) -> None:
         forward=framed.forward,
     )
     save(scene, job.out)
-    _write_report(job.out / "report.json", capture, scene, framed.facts, notes)
+    _write_report(PosesOutputs(job.out).report, capture, scene, framed.facts, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, job.source)
 

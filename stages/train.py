@@ -22,6 +22,7 @@ import numpy as np
 
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job, Stage
+from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
 from stages.training.budget import MOST, TIMED, Budget
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def run(job: Job) -> None:
 
     _check(job.settings)
     use_all_cores()
-    folder = job.inputs["poses"]
+    folder = inputs_of(TrainInputs, job.inputs).poses.folder
     s = scene.load(folder)
     views = scene.views_of(s, "train")
     job.progress(0, job.settings.iterations, "reading images")
@@ -57,7 +58,7 @@ def run(job: Job) -> None:
     m = model(field_file.space_of(s), settings, s.background, job.device, (near, far))
     _close(m, views, job)
     t = loop.trainer(m, len(views))
-    log = job.work / "log.jsonl"
+    log = job.work / TrainOutputs.log
     spent = _resume(t, job, log)
     budget = Budget(settings, job.work, spent, clock) if settings.time_budget else None
     if budget is not None:
@@ -93,7 +94,7 @@ def run(job: Job) -> None:
         facts = {"loss": loss, "psnr": round(-10 * math.log10(max(loss, 1e-10)), 2), **({} if held_back is None else {"held_back_psnr": held_back})}
         job.progress(min(done.step, goal), goal, "training", **facts, **pace)
         if drawn is not None:
-            _curve([*_lines(log), *map(json.loads, lines)], job.work / "curve.png")
+            _curve([*_lines(log), *map(json.loads, lines)], job.work / TrainOutputs.curve)
         if done.step % settings.checkpoint_every == 0 and not last:
             _checkpoint(t, job, log, lines, seconds)
         try:
@@ -104,7 +105,7 @@ def run(job: Job) -> None:
             raise
         resumed = clock()
     _append(log, lines)
-    field_file.save_model(m, near, far, job.out / field_file.FILE, gains_of(t, views))
+    field_file.save_model(m, near, far, TrainOutputs(job.out).field, gains_of(t, views))
     _report(job, t, spent + clock() - started, held_back)
     _publish_log(log, job)
 
@@ -164,7 +165,7 @@ def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> No
         "finest": reached.finest_resolution,
         "again": _again(reached),
     }
-    (job.out / "report.json").write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    TrainOutputs(job.out).report.write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def _again(reached: TrainSettings) -> str:
@@ -364,20 +365,21 @@ def _curve(lines: list[dict[str, Any]], path: Path) -> None:
 def _publish_log(log: Path, job: Job) -> None:
     import shutil
 
-    shutil.copyfile(log, job.out / "log.jsonl")
-    _curve(_lines(log), job.out / "curve.png")
+    outputs = TrainOutputs(job.out)
+    shutil.copyfile(log, outputs.log)
+    _curve(_lines(log), outputs.curve)
     previews = sorted(job.work.glob("preview_*.png"))
     if previews:
-        (job.out / "previews").mkdir()
+        outputs.previews.mkdir()
         for path in previews:
-            shutil.copyfile(path, job.out / "previews" / path.name)
+            shutil.copyfile(path, outputs.previews / path.name)
 
 
 STAGE = Stage(
     name="train",
     version=2,
     settings=TrainSettings,
-    needs=("poses",),
+    needs=needs_of(TrainInputs),
     run=run,
-    volatile=("log.jsonl", "curve.png", "previews/*", "report.json"),
+    volatile=(TrainOutputs.log, TrainOutputs.curve, f"{TrainOutputs.previews}/*", TrainOutputs.report),
 )

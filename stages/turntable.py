@@ -6,6 +6,7 @@ import shutil
 from dataclasses import dataclass
 
 from pipeline.stage import Job, Stage
+from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of, needs_of
 from stages.settings import setting
 
 
@@ -30,7 +31,8 @@ class TurntableSettings:
 def run(job: Job) -> None:
     from efficientnerf.asset.tree import NerfTree
 
-    draw_turntable(NerfTree.load(job.inputs["bake"] / "asset.nerftree").to(job.device), job)
+    inputs = inputs_of(TurntableInputs, job.inputs)
+    draw_turntable(NerfTree.load(inputs.bake.asset).to(job.device), job)
 
 
 def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # anything with the interface of a NerfTree
@@ -47,9 +49,9 @@ def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # a
 
     written = draw_frames(tree, cameras, job.work / "frames", options, each, reuse=True)
     job.say("encoding the video")
-    encode_frames([path for path in written if path.suffix == ".png"], job.out / "turntable.mp4", options, job.safe_point)
+    encode_frames([path for path in written if path.suffix == ".png"], TurntableOutputs(job.out).video, options, job.safe_point)
     for path in written:
         shutil.copyfile(path, job.out / path.name)
 
 
-STAGE = Stage(name="turntable", version=2, settings=TurntableSettings, needs=("bake",), run=run)
+STAGE = Stage(name="turntable", version=2, settings=TurntableSettings, needs=needs_of(TurntableInputs), run=run)

@@ -13,6 +13,7 @@ import numpy as np
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.stage import settings_from
+from stages.artifacts import TrainOutputs
 from stages.io.exporters.aside import written_aside
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from efficientnerf.rendering.render import FieldRenderer
     from stages.io.scene import Scene
 
-FILE = "field.safetensors"
 FORMAT = 1
 
 
@@ -98,7 +98,7 @@ def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, n
 
 def load_gains(folder: Path) -> dict[str, np.ndarray]:
     """What `save_model` was given: the factors (3,) of each training view; none where exposure was not learned."""
-    path = folder / FILE
+    path = TrainOutputs(folder).field
     tensors, about = read_tensors(path)
     names = about.get("exposed", [])
     if not names and GAINS not in tensors:
@@ -116,7 +116,7 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     from efficientnerf.model import model, restore
     from efficientnerf.rendering.render import FieldRenderer
 
-    path = folder / FILE
+    path = TrainOutputs(folder).field
     tensors, about = read_tensors(path)
     try:
         background = about["background"]

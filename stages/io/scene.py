@@ -23,6 +23,7 @@ from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.geometry.ndc import Ndc
 from pipeline.errors import BadInput
 from pipeline.files import Unreadable, read_json
+from stages.artifacts import PosesOutputs
 from stages.framing.forward_facing import SPACES, Forward
 from stages.io.capture import SparsePoints
 
@@ -157,12 +158,12 @@ def save(scene: Scene, folder: Path) -> None:
         "forward": None if scene.forward is None else _forward_to_json(scene.forward),
         "views": views,
     }
-    (folder / "scene.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    PosesOutputs(folder).scene.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def load(folder: Path) -> Scene:
     """Read folder/scene.json, checked; BadInput names what is wrong with it."""
-    path = folder / "scene.json"
+    path = PosesOutputs(folder).scene
     document = _Reader(_read_json(path), str(path))
     version = document.integer("format")  # also refuses what is not an object
     if not 1 <= version <= FORMAT:
@@ -244,7 +245,7 @@ def save_points(points: SparsePoints, folder: Path) -> None:
         "observer_counts": counts,
         "observers": np.array([view for seen in points.observers for view in seen], np.int64),
     }
-    save_file(tensors, str(folder / "points.safetensors"))
+    save_file(tensors, str(PosesOutputs(folder).points))
 
 
 def read_points(folder: Path) -> SparsePoints:
@@ -252,7 +253,7 @@ def read_points(folder: Path) -> SparsePoints:
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
-    path = folder / "points.safetensors"
+    path = PosesOutputs(folder).points
     try:
         tensors = load_file(str(path))
         ends = np.cumsum(tensors["observer_counts"])
@@ -305,7 +306,7 @@ def describe(folder: Path) -> dict[str, Any]:
 
 
 def _report_warnings(folder: Path) -> list[str]:
-    path = folder / "report.json"
+    path = PosesOutputs(folder).report
     report = _read_json(path) if path.is_file() else {}
     found = report.get("warnings", []) if isinstance(report, dict) else []
     return [str(sentence) for sentence in found]

@@ -12,6 +12,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
+from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo
 from stages.io.importers.lenses import read_header, same_aspect
 from stages.io.photo import UnreadableImage, working_size, write_png
@@ -122,7 +123,7 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alph
         usable = opaque if usable is None else usable & opaque
         pixels = pixels[..., :3]
     verbatim = found.verbatim and size == (width, height) and (keep_alpha or not has_alpha)
-    path = folder / "images" / relative
+    path = PosesOutputs(folder).images / relative
     path = path if verbatim else path.with_name(path.stem + ".png")
     path.parent.mkdir(parents=True, exist_ok=True)
     if verbatim:
@@ -131,7 +132,7 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alph
         write_png(path, pixels)
     mask = None
     if usable is not None and not usable.all():
-        mask = folder / "masks" / PurePosixPath(relative).with_suffix(".png")
+        mask = PosesOutputs(folder).masks / PurePosixPath(relative).with_suffix(".png")
         mask.parent.mkdir(parents=True, exist_ok=True)
         write_png(mask, np.where(usable, np.uint8(255), np.uint8(0)))
         if not usable.any():

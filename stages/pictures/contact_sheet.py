@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.artifacts import PosesOutputs
 from stages.io.scene import SPLITS, Scene
 
 THUMBNAIL = 144  # px, longest side
@@ -18,7 +19,7 @@ COLOURS = {"train": (70, 130, 180), "val": (218, 165, 32), "test": (60, 160, 75)
 
 
 def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str, str]], source: Path) -> None:
-    """Write folder/contact_sheet.png: thumbnails framed in the colour of their split, names below, the rejected ones crossed out last."""
+    """Write the contact sheet of the folder of a scene: thumbnails framed in the colour of their split, names below, the rejected ones crossed out last."""
     from stages.pictures.plots import contact_sheet
 
     entries: list[tuple[Path | None, str, str]] = [(folder / view.image, view.name, view.split) for view in scene.views]
@@ -30,7 +31,7 @@ def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str
     contact_sheet(
         [[_framed(path, split) for path, _, split in row] for row in rows],
         [[f"{name} {split}" for _, name, split in row] for row in rows],
-        folder / "contact_sheet.png",
+        PosesOutputs(folder).contact_sheet,
         thumbnail=THUMBNAIL + 2 * FRAME,
         title=title + (f" (every {every}th shown)" if every > 1 else ""),
     )

@@ -19,10 +19,11 @@ from efficientnerf.rendering.compositing import activate
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
 from stages import bake, train
-from stages.bake import ASSET, BakeSettings
+from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
+from stages.bake import BakeSettings
 from stages.baking import memory, refinement, resolution
 from stages.evaluate import truth_of
-from stages.io.field_file import FILE, load_renderer, save_model
+from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
@@ -46,7 +47,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def run(made: Job) -> str:
     bake.run(made)
-    return hashlib.sha256((made.out / ASSET).read_bytes() + (made.out / "report.json").read_bytes()).hexdigest()
+    return hashlib.sha256((made.out / BakeOutputs.asset).read_bytes() + (made.out / "report.json").read_bytes()).hexdigest()
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +108,7 @@ def test_damaged_scratch_is_made_anew(inputs: dict[str, Path], tmp_path: Path, u
 
 def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tuple[str, Job, int]) -> None:
     made = undisturbed[1]
-    tree = NerfTree.load(made.out / ASSET)
+    tree = NerfTree.load(made.out / BakeOutputs.asset)
     about = tree.metadata
     assert about["world_from_capture"] == {"scale": SIMILARITY.scale, "rotation": SIMILARITY.rotation.tolist(), "translation": SIMILARITY.translation.tolist()}
     assert about["orbit"] == {**dataclasses.asdict(ORBIT), "centre": list(ORBIT.centre)}
@@ -116,8 +117,11 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
     assert about["provenance"]["kind"] == "ball"
     assert about["provenance"]["training_views"] == 7
     assert about["provenance"]["iterations"] == 30
-    field = hashlib.sha256((inputs["train"] / FILE).read_bytes()).hexdigest()
-    assert about["provenance"]["sources"] == {"scene.json": hashlib.sha256((inputs["poses"] / "scene.json").read_bytes()).hexdigest(), FILE: field}
+    field = hashlib.sha256((inputs["train"] / TrainOutputs.field).read_bytes()).hexdigest()
+    assert about["provenance"]["sources"] == {
+        PosesOutputs.scene: hashlib.sha256(PosesOutputs(inputs["poses"]).scene.read_bytes()).hexdigest(),
+        TrainOutputs.field: field,
+    }
     assert 5 < about["provenance"]["metrics"]["training_psnr"] <= 100
     assert tree.background == (1.0, 1.0, 1.0)
     assert tree.resolution == (24, 24, 24)
@@ -135,7 +139,7 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
         "max_mib": 24,
         "voxels": len(tree.density_values),
         "bricks": len(tree.voxel_index),
-        "bytes": (made.out / ASSET).stat().st_size,
+        "bytes": (made.out / BakeOutputs.asset).stat().st_size,
     }
 
 
@@ -147,8 +151,8 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
     field = load_renderer(inputs["train"]).render(view.camera).colour
     made = job(tmp_path, dataclasses.replace(QUICK, optimise=0), **inputs)
     run(made)
-    raw = NerfTree.load(made.out / ASSET).render(view.camera, background=white).colour
-    fitted = NerfTree.load(undisturbed[1].out / ASSET).render(view.camera, background=white).colour
+    raw = NerfTree.load(made.out / BakeOutputs.asset).render(view.camera, background=white).colour
+    fitted = NerfTree.load(undisturbed[1].out / BakeOutputs.asset).render(view.camera, background=white).colour
     truth = truth_of(inputs["poses"], view, white).colour
     assert np.sqrt(((field - raw) ** 2).mean()) < 0.08
     assert ((fitted - truth) ** 2).mean() < 0.5 * ((raw - truth) ** 2).mean()
@@ -177,7 +181,7 @@ def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None
     m = load_renderer(inputs["train"]).model
     m.voxels.values.fill_(-1.0)
     (tmp_path / "train").mkdir()
-    save_model(m, 1.0, 5.0, tmp_path / "train" / FILE)
+    save_model(m, 1.0, 5.0, tmp_path / "train" / TrainOutputs.field)
     with pytest.raises(StageFailed, match=r"the trained field is empty.*Train longer, or check the box"):
         run(job(tmp_path, QUICK, poses=inputs["poses"], train=tmp_path / "train"))
 
@@ -226,9 +230,9 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
         made = job(tmp_path / str(most), settings, **inputs)
         made._report = told.append
         run(made)
-        sizes[most] = (made.out / ASSET).stat().st_size
+        sizes[most] = (made.out / BakeOutputs.asset).stat().st_size
         assert any("bake.max_mib" in event.get("text", "") for event in told) == (most == 1)
-        assert format.describe(made.out / ASSET)["layout"] == layout
+        assert format.describe(made.out / BakeOutputs.asset)["layout"] == layout
     assert sizes[1] <= 2**20
     assert sizes[64] > sizes[1] > 2**16
 
@@ -240,7 +244,7 @@ def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: 
     near = dataclasses.replace(QUICK, resolution=0, lookup="nearest", layout="sparse", optimise=0)
     made = job(tmp_path / "raw", near, **given)
     run(made)
-    tree = NerfTree.load(made.out / ASSET)
+    tree = NerfTree.load(made.out / BakeOutputs.asset)
     assert tree.lookup == "nearest"
     assert tree.resolution == (20, 20, 20)  # train.discretise
     m = load_renderer(given["train"]).model
@@ -253,7 +257,7 @@ def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: 
     np.testing.assert_allclose(tree.density_values[lit], np.minimum(said[lit], 65000), rtol=2e-3)
     fitted = job(tmp_path / "fitted", dataclasses.replace(near, optimise=12), **given)
     run(fitted)
-    assert NerfTree.load(fitted.out / ASSET).lookup == "nearest"
+    assert NerfTree.load(fitted.out / BakeOutputs.asset).lookup == "nearest"
     facts = json.loads((fitted.out / "report.json").read_text())["optimisation"]
     assert facts["psnr_after"] > facts["psnr_before"] > 10
 
@@ -262,7 +266,7 @@ def test_other_voxels_than_those_of_the_training_are_told_of(tmp_path: Path, inp
     m = load_renderer(inputs["train"])
     m = dataclasses.replace(m, model=dataclasses.replace(m.model, settings=dataclasses.replace(m.model.settings, discretise=16)))
     (tmp_path / "train").mkdir()
-    save_model(m.model, m.near, m.far, tmp_path / "train" / FILE)
+    save_model(m.model, m.near, m.far, tmp_path / "train" / TrainOutputs.field)
     given = {"poses": inputs["poses"], "train": tmp_path / "train"}
     events: list[dict[str, Any]] = []
     made = job(tmp_path / "bake", dataclasses.replace(QUICK, resolution=20, lookup="nearest", optimise=0), events=events, **given)
@@ -270,4 +274,4 @@ def test_other_voxels_than_those_of_the_training_are_told_of(tmp_path: Path, inp
     told = [event["text"] for event in events if event["event"] == "warning"]
     assert len(told) == 1
     assert "train.discretise=16" in told[0]
-    assert NerfTree.load(made.out / ASSET).resolution == (20, 20, 20)
+    assert NerfTree.load(made.out / BakeOutputs.asset).resolution == (20, 20, 20)

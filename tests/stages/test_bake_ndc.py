@@ -14,7 +14,8 @@ from efficientnerf.asset.bake import flattened
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import rays
 from stages import bake, train
-from stages.bake import ASSET, NDC_DEPTH, BakeSettings
+from stages.artifacts import BakeOutputs
+from stages.bake import NDC_DEPTH, BakeSettings
 from stages.baking.refinement import WEIGHED_NDC
 from stages.baking.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
 from stages.framing.forward_facing import forward_of
@@ -51,7 +52,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def baked(folder: Path, inputs: dict[str, Path], told: list[dict[str, Any]] | None = None, **changes: Any) -> NerfTree:
     made = job(folder, BakeSettings(**{**QUICK, **changes}), events=told, **inputs)
     bake.run(made)
-    return NerfTree.load(made.out / ASSET)
+    return NerfTree.load(made.out / BakeOutputs.asset)
 
 
 def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages import train
-from stages.io.field_file import FILE, load_renderer
+from stages.artifacts import TrainOutputs
+from stages.io.field_file import load_renderer
 from stages.training.budget import MOST, TIMED, Budget
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
@@ -49,7 +50,7 @@ def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def digest(made: Job) -> str:
     train.run(made)
-    return hashlib.sha256((made.out / FILE).read_bytes()).hexdigest()
+    return hashlib.sha256((made.out / TrainOutputs.field).read_bytes()).hexdigest()
 
 
 def report(made: Job) -> dict[str, Any]:

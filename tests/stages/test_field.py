@@ -11,7 +11,8 @@ import torch
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import state_of
 from pipeline.errors import CorruptArtifact
-from stages.io.field_file import FILE, GAINS, load_gains, load_renderer, read_tensors, save_model, write_tensors
+from stages.artifacts import TrainOutputs
+from stages.io.field_file import GAINS, load_gains, load_renderer, read_tensors, save_model, write_tensors
 from tests.efficientnerf.balls import pose, untrained
 
 CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3))
@@ -26,7 +27,7 @@ def test_a_saved_field_draws_the_same_picture(tmp_path: Path, field: str, contra
     with torch.no_grad():
         for _, p in m.parameters():
             p.add_(torch.randn(p.shape, generator=torch.Generator().manual_seed(0)) * 0.1)
-    save_model(m, 0.5, 20.0, tmp_path / FILE)
+    save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field)
     again = load_renderer(tmp_path)
     assert (again.near, again.far) == (0.5, 20.0)
     assert again.model.settings == m.settings
@@ -34,14 +35,14 @@ def test_a_saved_field_draws_the_same_picture(tmp_path: Path, field: str, contra
     for name, tensor in state_of(m).items():
         assert torch.equal(tensor, state_of(again.model)[name]), name
     assert np.array_equal(again.render(CAMERA).colour, FieldRenderer(m, 0.5, 20.0).render(CAMERA).colour)
-    before = (tmp_path / FILE).read_bytes()
-    save_model(again.model, 0.5, 20.0, tmp_path / FILE)
-    assert (tmp_path / FILE).read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+    before = (tmp_path / TrainOutputs.field).read_bytes()
+    save_model(again.model, 0.5, 20.0, tmp_path / TrainOutputs.field)
+    assert (tmp_path / TrainOutputs.field).read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == [TrainOutputs.field]
 
 
 def test_damage_is_told(tmp_path: Path) -> None:
-    path = tmp_path / FILE
+    path = tmp_path / TrainOutputs.field
     m = untrained()
     save_model(m, 0.5, 20.0, path)
     data = path.read_bytes()
@@ -54,14 +55,14 @@ def test_damage_is_told(tmp_path: Path) -> None:
         with pytest.raises(CorruptArtifact, match=r"damaged field file.*Train again"):
             load_renderer(tmp_path)
     path.unlink()
-    with pytest.raises(CorruptArtifact, match=f"{FILE}: not a readable field file"):
+    with pytest.raises(CorruptArtifact, match=f"{TrainOutputs.field}: not a readable field file"):
         load_renderer(tmp_path)
 
 
 def test_files_that_are_something_else_are_told(tmp_path: Path) -> None:
     from safetensors.torch import save_file
 
-    path = tmp_path / FILE
+    path = tmp_path / TrainOutputs.field
     save_file({"a": torch.zeros(1)}, str(path))
     with pytest.raises(CorruptArtifact, match="field file of format None; this build reads 1"):
         read_tensors(path)
@@ -74,7 +75,7 @@ def test_files_that_are_something_else_are_told(tmp_path: Path) -> None:
 
 
 def test_tensors_that_do_not_fit_are_named(tmp_path: Path) -> None:
-    path = tmp_path / FILE
+    path = tmp_path / TrainOutputs.field
     save_model(untrained(), 0.5, 20.0, path)
     tensors, about = read_tensors(path)
     write_tensors({name: t for name, t in tensors.items() if name != "sky.sh"}, about, path)
@@ -88,15 +89,15 @@ def test_tensors_that_do_not_fit_are_named(tmp_path: Path) -> None:
 def test_exposures_lie_beside_the_field(tmp_path: Path) -> None:
     m = untrained(contracted=True)
     given = {"images/b.png": np.array([1.1, 1.0, 0.9]), "images/a.png": np.array([0.9, 1.0, 1.1])}
-    save_model(m, 0.5, 20.0, tmp_path / FILE, given)
+    save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field, given)
     found = load_gains(tmp_path)
     assert found.keys() == given.keys()
     for name, gain in given.items():
         np.testing.assert_allclose(found[name], gain, rtol=1e-6)
     assert load_renderer(tmp_path).model.background is None
-    tensors, about = read_tensors(tmp_path / FILE)
-    write_tensors({name: t for name, t in tensors.items() if name != GAINS}, about, tmp_path / FILE)
+    tensors, about = read_tensors(tmp_path / TrainOutputs.field)
+    write_tensors({name: t for name, t in tensors.items() if name != GAINS}, about, tmp_path / TrainOutputs.field)
     with pytest.raises(CorruptArtifact, match=r"exposure\.gains' is None; expected \(2, 3\)"):
         load_gains(tmp_path)
-    save_model(m, 0.5, 20.0, tmp_path / FILE)
+    save_model(m, 0.5, 20.0, tmp_path / TrainOutputs.field)
     assert load_gains(tmp_path) == {}

@@ -16,6 +16,7 @@ from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
 from stages import bake, train
+from stages.artifacts import BakeOutputs
 from stages.framing.view_coverage import cells_below_min_views, has_min_views, spread_order
 from stages.io.field_file import load_renderer, space_of
 from stages.io.scene import Scene, views_of
@@ -136,7 +137,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, obs
         train=trained.out,
     )
     bake.run(made)
-    tree = NerfTree.load(made.out / bake.ASSET)
+    tree = NerfTree.load(made.out / BakeOutputs.asset)
     centre = tree.bounds_min + (voxel_coordinates(tree) + 0.5) * tree.voxel
     few = ~has_min_views(centre, [view.camera for view in views_of(s, "train")], 2)
     assert len(few) > 1000

@@ -13,9 +13,10 @@ import pytest
 from pipeline.errors import Interrupted, UsageError
 from pipeline.stage import Job
 from stages import train
+from stages.artifacts import TrainOutputs
 from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
-from stages.io.field_file import FILE, load_gains, load_renderer
+from stages.io.field_file import load_gains, load_renderer
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -37,7 +38,7 @@ def no_curve(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) ->
 def run(made: Job) -> str:
     """The digest of the field."""
     train.run(made)
-    return hashlib.sha256((made.out / FILE).read_bytes()).hexdigest()
+    return hashlib.sha256((made.out / TrainOutputs.field).read_bytes()).hexdigest()
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Pat
     made = job(tmp_path, settings(**QUICK), poses=scene, events=events)
     assert run(made) == undisturbed  # twice the same
     assert sorted(path.relative_to(made.out).as_posix() for path in made.out.rglob("*") if path.is_file()) == [
-        "curve.png", FILE, "log.jsonl", "previews/preview_000005.png", "previews/preview_000010.png", "report.json",
+        "curve.png", TrainOutputs.field, "log.jsonl", "previews/preview_000005.png", "previews/preview_000010.png", "report.json",
     ]  # fmt: skip
     lines = [json.loads(line) for line in (made.out / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10, 13]
@@ -77,7 +78,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(scene: Path, tmp_path: Path, un
     for _ in calls:
         with pytest.raises(Interrupted):
             run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop))
-        assert not (tmp_path / "out" / FILE).exists()
+        assert not (tmp_path / "out" / TrainOutputs.field).exists()
         assert 1 <= len(checkpoints(job(tmp_path, None))) <= 2
     events: list[dict[str, Any]] = []
     assert run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop, events=events)) == undisturbed

@@ -62,14 +62,15 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, set
 
 def _export_cameras(what: Path, path: Path) -> int:
     from pipeline.errors import BadInput
+    from stages.artifacts import PosesOutputs
     from stages.io import scene
     from stages.io.exporters import cameras
     from workflows.cli.target import is_run
 
-    folder = what / "poses" if is_run(what) else what
-    if not (folder / "scene.json").is_file():
+    poses = PosesOutputs.of_run(what) if is_run(what) else PosesOutputs(what)
+    if not poses.scene.is_file():
         raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
-    found = scene.load(folder)
+    found = scene.load(poses.folder)
     cameras.write(found, path)
     return len(found.views)
 

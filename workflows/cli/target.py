@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.run import NAME
+from stages.artifacts import BakeOutputs
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
-ASSET = "asset.nerftree"
+ASSET = BakeOutputs.asset  # the file's name
 
 
 def is_run(path: Path) -> bool:
@@ -25,7 +26,7 @@ def asset_of(path: Path) -> Path:
     if not path.exists():
         raise BadInput(f"{path}: no such file or folder. Give a run or an asset ({ASSET}).")
     if is_run(path):
-        found = path / "bake" / ASSET
+        found = BakeOutputs.of_run(path).asset
         if not found.is_file():
             raise BadInput(f"{path}: has no asset yet. Make it first: enerf run --out {path} --until bake")
         return found

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput
+from stages.artifacts import BakeOutputs, PosesOutputs
 from workflows.cli.progress import plain, size
 from workflows.cli.target import ASSET, describe_asset, is_run
 
@@ -20,7 +21,7 @@ def describe(path: Path) -> dict[str, Any]:
         return _describe_file(path)
     if is_run(path):
         return _describe_run(path)
-    if (path / "scene.json").is_file():
+    if PosesOutputs(path).scene.is_file():
         from stages.io import scene
 
         return scene.describe(path)
@@ -37,7 +38,7 @@ def _describe_file(path: Path) -> dict[str, Any]:
         return {"what": "asset", "path": str(path), **describe_asset(path)}
     if suffix in MESHES:
         return {"what": "mesh", "path": str(path), "bytes": path.stat().st_size, **_describe_mesh(path)}
-    if path.name == "scene.json":
+    if path.name == PosesOutputs.scene:
         from stages.io import scene
 
         return scene.describe(path.parent)
@@ -65,12 +66,12 @@ def _describe_run(path: Path) -> dict[str, Any]:
         "artifacts": artifacts(run.path),
         "quality": {name: quality[name] for name in ("network", "asset") if name in quality},
     }
-    if (path / "poses" / "scene.json").is_file():
+    if PosesOutputs.of_run(path).scene.is_file():
         from stages.io import scene
 
-        found["scene"] = scene.describe(path / "poses")
+        found["scene"] = scene.describe(PosesOutputs.of_run(path).folder)
     if "asset" in found["artifacts"]:
-        found["asset"] = describe_asset(path / "bake" / ASSET)
+        found["asset"] = describe_asset(BakeOutputs.of_run(path).asset)
     return found
 
 

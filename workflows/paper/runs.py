@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stages.artifacts import BakeOutputs, TrainOutputs
 from workflows.paper.result import Request
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def measured(request: Request, scene: Path, row: Row) -> Figures:
     outcomes = run_stages(run, stages, device=request.device, report=request.report)
     request.say(f"{scene.name}, {row.name}: measuring")
     quality = _quality(run, str(outcomes[1].digest), settings, request.device)
-    lines = [json.loads(line) for line in (run.folder("train") / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+    lines = [json.loads(line) for line in TrainOutputs.of_run(run.path).log.read_text(encoding="utf-8").splitlines()]
     return Figures(
         **{name: quality[name] for name in ("psnr", "ssim", "valid", "pivotal")}, **_pace(lines),
         tree=_tree_figures(run, settings["evaluate"]["views"], request.device) if row.bakes else None,
@@ -254,7 +255,7 @@ def _tree_figures(run: Run, wanted: int, device: str) -> dict[str, Any]:
     from stages.evaluate import held_back, spread, truth_of
     from stages.io import scene
 
-    tree = NerfTree.load(run.folder("bake") / "asset.nerftree").to(device)
+    tree = NerfTree.load(BakeOutputs.of_run(run.path).asset).to(device)
     s = scene.load(run.folder("poses"))
     views, _ = held_back(s)
     drawn = [views[k] for k in spread(len(views), wanted)]
@@ -266,7 +267,7 @@ def _tree_figures(run: Run, wanted: int, device: str) -> dict[str, Any]:
         truth = truth_of(run.folder("poses"), view, s.background).colour
         decibels.append(psnr(np.clip(picture, 0, 1), truth))
         similarities.append(ssim(np.clip(picture, 0, 1), truth))
-    size = (run.folder("bake") / "asset.nerftree").stat().st_size
+    size = BakeOutputs.of_run(run.path).asset.stat().st_size
     camera = drawn[0].camera
     return {
         "psnr": float(np.mean(decibels)),

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.progress import duration, size
 from workflows.report.summary import metrics, quality_in_words
 
@@ -21,14 +22,17 @@ if TYPE_CHECKING:
     from pipeline.run import Run
 
 NAME = "report.html"
+RUN = Path()  # names are relative to the page
+POSES, TRAIN, BAKE, EVALUATE = PosesOutputs.of_run(RUN), TrainOutputs.of_run(RUN), BakeOutputs.of_run(RUN), EvaluateOutputs.of_run(RUN)
+TURNTABLE, MESH, POINTS = TurntableOutputs.of_run(RUN), MeshOutputs.of_run(RUN), PointsOutputs.of_run(RUN)
 DOWNLOADS = (
-    ("bake/asset.nerftree", "the baked asset"),
-    ("turntable/turntable.mp4", "turntable, H.264"),
-    ("mesh/mesh.glb", "mesh, y up"),
-    ("mesh/mesh.ply", "mesh, the capture's frame"),
-    ("points/points.ply", "point cloud"),
-    ("poses/scene.json", "cameras and splits"),
-    ("evaluate/metrics.json", "all figures"),
+    (BAKE.asset, "the baked asset"),
+    (TURNTABLE.video, "turntable, H.264"),
+    (MESH.glb, "mesh, y up"),
+    (MESH.ply, "mesh, the capture's frame"),
+    (POINTS.ply, "point cloud"),
+    (POSES.scene, "cameras and splits"),
+    (EVALUATE.metrics, "all figures"),
 )
 STYLE = """
 :root { color-scheme: light dark; font: 15px/1.5 system-ui, sans-serif }
@@ -65,11 +69,11 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         f'<p class="big">{_text(quality_in_words(found) or "not evaluated yet")}</p>',
         _looks(folder),
         _files(folder),
-        _section("Held-back views", _picture(folder, "evaluate/contact_sheet.png", "Truth, render and error") + _views(found)),
-        _section("Asset", _facts(folder, "bake/report.json")),
-        _section("Mesh", _picture(folder, "mesh/preview.png", "The mesh, coloured and plain") + _facts(folder, "mesh/report.json")),
-        _section("Training", _picture(folder, "train/curve.png", "PSNR over steps") + _row(folder, "train/previews", "Held-back view, truth left")),
-        _section("Cameras", _cameras(folder) + _picture(folder, "poses/contact_sheet.png", "The photographs and what became of them")),
+        _section("Held-back views", _picture(folder, EVALUATE.contact_sheet, "Truth, render and error") + _views(found)),
+        _section("Asset", _facts(folder, BAKE.report)),
+        _section("Mesh", _picture(folder, MESH.preview, "The mesh, coloured and plain") + _facts(folder, MESH.report)),
+        _section("Training", _picture(folder, TRAIN.curve, "PSNR over steps") + _row(folder, TRAIN.previews, "Held-back view, truth left")),
+        _section("Cameras", _cameras(folder) + _picture(folder, POSES.contact_sheet, "The photographs and what became of them")),
         _section("Stages", _stages(decisions)),
         _section("Settings", _settings(run.settings)),
         _section("Made with", _versions(decisions)),
@@ -96,26 +100,31 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Any]], numbers: frozense
     return f"<table><tr>{cells('th', head)}</tr>" + "".join(f"<tr>{cells('td', row)}</tr>" for row in rows) + "</table>"
 
 
-def _picture(folder: Path, name: str, caption: str) -> str:
-    return f'<p><img src="{quote(name)}" alt="{_text(caption)}" title="{_text(caption)}"></p>' if (folder / name).is_file() else ""
+def _link(name: Path) -> str:
+    return quote(name.as_posix())
 
 
-def _row(folder: Path, name: str, caption: str) -> str:
+def _picture(folder: Path, name: Path, caption: str) -> str:
+    return f'<p><img src="{_link(name)}" alt="{_text(caption)}" title="{_text(caption)}"></p>' if (folder / name).is_file() else ""
+
+
+def _row(folder: Path, name: Path, caption: str) -> str:
     pictures = sorted((folder / name).glob("*.png"))
-    shown = "".join(f'<img src="{quote(f"{name}/{each.name}")}" alt="{_text(each.stem)}" title="{_text(each.stem)}">' for each in pictures)
+    shown = "".join(f'<img src="{_link(name / each.name)}" alt="{_text(each.stem)}" title="{_text(each.stem)}">' for each in pictures)
     return f'<p>{_text(caption)}</p><div class="row">{shown}</div>' if shown else ""
 
 
 def _looks(folder: Path) -> str:
-    if not (folder / "turntable/turntable.mp4").is_file():
+    if not (folder / TURNTABLE.video).is_file():
         return ""
-    return '<p><video src="turntable/turntable.mp4" poster="turntable/frame_0000.png" controls loop muted autoplay playsinline></video></p>'
+    return f'<p><video src="{_link(TURNTABLE.video)}" poster="{_link(TURNTABLE.poster)}" controls loop muted autoplay playsinline></video></p>'
 
 
 def _files(folder: Path) -> str:
     there = [(name, what, (folder / name).stat().st_size) for name, what in DOWNLOADS if (folder / name).is_file()]
     rows = "".join(
-        f'<tr><td><a href="{quote(name)}">{_text(name)}</a></td><td>{_text(what)}</td><td class=n>{size(count)}</td></tr>' for name, what, count in there
+        f'<tr><td><a href="{_link(name)}">{_text(name.as_posix())}</a></td><td>{_text(what)}</td><td class=n>{size(count)}</td></tr>'
+        for name, what, count in there
     )
     return f"<h2>Files</h2>\n<table>{rows}</table>" if rows else ""
 
@@ -138,7 +147,7 @@ def _json(path: Path) -> Any:
 
 
 def _cameras(folder: Path) -> str:
-    report = _json(folder / "poses/report.json")
+    report = _json(folder / POSES.report)
     if not isinstance(report, dict):
         return ""
     registered, rejected = report.get("registered") or [], report.get("rejected") or []
@@ -172,12 +181,12 @@ def _views(found: dict[str, Any] | None) -> str:
     return f"<details><summary>{len(rows)} views, each</summary>{_table(head, rows, frozenset({1, 2, 3, 4}))}</details>"
 
 
-def _facts(folder: Path, name: str) -> str:
+def _facts(folder: Path, name: Path) -> str:
     found = _json(folder / name)
     if not isinstance(found, dict):
         return ""
     plain = [(key.replace("_", " "), value) for key, value in found.items() if isinstance(value, (str, int, float, bool))]
-    return f"<details><summary>{_text(name)}</summary>{_table(('', ''), plain, frozenset({1}))}</details>"
+    return f"<details><summary>{_text(name.as_posix())}</summary>{_table(('', ''), plain, frozenset({1}))}</details>"
 
 
 def _settings(settings: dict[str, dict[str, Any]]) -> str:

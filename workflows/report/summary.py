@@ -9,19 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.runner import Outcome
+from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.progress import duration, size
 
+RUN = Path()
 # What people look for in a run, and where it lies.
 ARTIFACTS = {
-    "scene": "poses/scene.json",
-    "field": "train/field.safetensors",
-    "asset": "bake/asset.nerftree",
-    "metrics": "evaluate/metrics.json",
-    "turntable": "turntable/turntable.mp4",
-    "mesh_glb": "mesh/mesh.glb",
-    "mesh_ply": "mesh/mesh.ply",
-    "points": "points/points.ply",
-    "report": "report.html",
+    "scene": PosesOutputs.of_run(RUN).scene,
+    "field": TrainOutputs.of_run(RUN).field,
+    "asset": BakeOutputs.of_run(RUN).asset,
+    "metrics": EvaluateOutputs.of_run(RUN).metrics,
+    "turntable": TurntableOutputs.of_run(RUN).video,
+    "mesh_glb": MeshOutputs.of_run(RUN).glb,
+    "mesh_ply": MeshOutputs.of_run(RUN).ply,
+    "points": PointsOutputs.of_run(RUN).ply,
+    "report": RUN / "report.html",
 }
 TITLES = {"asset": "asset", "turntable": "turntable", "mesh_glb": "mesh", "mesh_ply": "mesh", "points": "points", "report": "report"}
 
@@ -34,7 +36,7 @@ def artifacts(run: Path) -> dict[str, str]:
 def metrics(run: Path) -> dict[str, Any] | None:
     """RUN/evaluate/metrics.json, or None where there is none, or none that can be read."""
     try:
-        found = json.loads((run / ARTIFACTS["metrics"]).read_text(encoding="utf-8"))
+        found = json.loads(EvaluateOutputs.of_run(run).metrics.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None

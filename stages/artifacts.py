@@ -1,0 +1,156 @@
+"""The files of each stage's artifact: every file name stands here, once.
+
+A stage writes `XOutputs(job.out)`, reads `inputs_of(XInputs, job.inputs)` and needs `needs_of(XInputs)`; a workflow reads `XOutputs.of_run(run)`.
+A new stage states its pair in its own module, or here if an earlier stage or `stages.io` has to know its files. The poses stage reads the source alone.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import ClassVar, Self, TypeVar, overload
+
+T = TypeVar("T")
+
+
+class Name:
+    """A file or a folder of an artifact: of an instance of Outputs its path, of the class its name relative to the artifact's folder."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, outputs: None, owner: type) -> str: ...
+    @overload
+    def __get__(self, outputs: Outputs, owner: type) -> Path: ...
+    def __get__(self, outputs: Outputs | None, owner: type) -> str | Path:
+        return self.name if outputs is None else outputs.folder / self.name
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a stage leaves in a folder.
+
+    stage  its name, which is also that of its folder in a run
+    """
+
+    folder: Path
+    stage: ClassVar[str]
+
+    @classmethod
+    def of_run(cls, run: Path) -> Self:
+        """Those of the stage in the folder of a run."""
+        return cls(run / cls.stage)
+
+
+class PosesOutputs(Outputs):
+    """The scene: cameras, working images, sparse points."""
+
+    stage = "poses"
+    scene = Name("scene.json")  # stages.io.scene
+    images = Name("images")  # working images, below it at any depth
+    masks = Name("masks")  # 0/255 PNG, 255 = use
+    points = Name("points.safetensors")  # sparse points in the training frame, where there are any
+    report = Name("report.json")  # images used and rejected, framing, warnings
+    contact_sheet = Name("contact_sheet.png")
+
+
+class TrainOutputs(Outputs):
+    """The trained field."""
+
+    stage = "train"
+    field = Name("field.safetensors")  # stages.io.field_file
+    report = Name("report.json")  # steps, seconds, and the settings that give the same field again
+    log = Name("log.jsonl")  # a line every few steps
+    curve = Name("curve.png")  # PSNR over steps
+    previews = Name("previews")  # renders of a validation view
+
+
+class BakeOutputs(Outputs):
+    """The baked asset."""
+
+    stage = "bake"
+    asset = Name("asset.nerftree")  # efficientnerf/asset/FORMAT.md
+    report = Name("report.json")  # resolution, voxels, bytes, PSNR before and after the refinement
+
+
+class EvaluateOutputs(Outputs):
+    """The metrics."""
+
+    stage = "evaluate"
+    metrics = Name("metrics.json")  # PSNR, SSIM, LPIPS: means, and of each view
+    contact_sheet = Name("contact_sheet.png")
+
+
+class TurntableOutputs(Outputs):
+    """Frames and a video."""
+
+    stage = "turntable"
+    video = Name("turntable.mp4")
+    poster = Name("frame_0000.png")  # the first frame
+
+
+class MeshOutputs(Outputs):
+    """The surface as a mesh."""
+
+    stage = "mesh"
+    ply = Name("mesh.ply")  # the capture's frame
+    glb = Name("mesh.glb")  # y up
+    preview = Name("preview.png")
+    report = Name("report.json")  # counts, topology, bounds, area, volume
+
+
+class PointsOutputs(Outputs):
+    """The surface as a point cloud."""
+
+    stage = "points"
+    ply = Name("points.ply")  # the capture's frame
+
+
+@dataclass(frozen=True)
+class TrainInputs:
+    poses: PosesOutputs
+
+
+@dataclass(frozen=True)
+class BakeInputs:
+    poses: PosesOutputs
+    train: TrainOutputs
+
+
+@dataclass(frozen=True)
+class EvaluateInputs:
+    bake: BakeOutputs
+    train: TrainOutputs
+    poses: PosesOutputs
+
+
+@dataclass(frozen=True)
+class TurntableInputs:
+    bake: BakeOutputs
+
+
+@dataclass(frozen=True)
+class MeshInputs:
+    bake: BakeOutputs
+
+
+@dataclass(frozen=True)
+class PointsInputs:
+    bake: BakeOutputs
+
+
+def inputs_of(kind: type[T], folders: Mapping[str, Path]) -> T:
+    """The inputs of a stage: a dataclass whose fields are named as the stages it needs and typed by their Outputs.
+
+    folders  stage -> folder of its artifact, as `Job.inputs` holds them
+    """
+    outputs = typing.get_type_hints(kind)
+    return kind(**{need: outputs[need](folders[need]) for need in needs_of(kind)})
+
+
+def needs_of(kind: type) -> tuple[str, ...]:
+    """The names of the stages whose outputs a dataclass of inputs holds."""
+    return tuple(field.name for field in fields(kind))
