@@ -1,9 +1,9 @@
-"""Time and memory that baking takes, against the voxels that come out of it: the same field at several resolutions.
+"""Time and memory of baking over the number of voxels: the same field at several resolutions.
 
     python benchmarks/baking.py RUN [--resolutions 96,144,192] [--json benchmarks/results/baking.json] [--set STAGE.NAME=VALUE]
 
-RUN has to be trained; it is not changed. Straight lines through the figures tell what is fixed (starting, looking at the training pixels) and
-what each million of occupied voxels adds; the cells of the grid stand beside them, for comparison.
+RUN has to be trained; it is not changed. Linear fits separate what is fixed (starting, rendering the training pixels) from what each million voxels
+adds. The number of grid cells is reported too.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from workflows.paper.document import hardware, versions
 
 
 def row_of(run: Path, resolution: int, settings: dict[str, str]) -> dict[str, Any]:
-    """Bake at a resolution, and say what it took."""
+    """Bake at a resolution; its figures."""
     took = made(run, "bake", {"bake.max_mib": 4096, **settings, "bake.resolution": resolution})
     report = read_json(BakeOutputs.of_run(run).report)
     cells, voxels = math.prod(report["resolution"]), report["voxels"]
-    print(f"{resolution:5}: {voxels:11,} voxels of {cells:13,} cells: {took['seconds']:.1f} s, {took['cpu_seconds']:.1f} s of all cores, "
+    print(f"{resolution:5}: {voxels:11,} voxels of {cells:13,} cells: {took['seconds']:.1f} s, {took['cpu_seconds']:.1f} s of processor time, "
           f"{took['peak_mib']:.0f} MiB", flush=True)  # fmt: skip
     return {"resolution": report["resolution"], "cells": cells, "voxels": voxels, **took}
 

@@ -1,9 +1,9 @@
-"""Run the whole pipeline on some sources with the default settings and write down seconds and quality.
+"""Run the pipeline on some sources with default settings and write seconds and quality.
 
     python benchmarks/end_to_end.py SOURCE... --runs FOLDER [--json FILE]
 
-Each source gets a run of its own, FOLDER/<name of the source>; one that stands already is only read, with the seconds that its stages took when they
-were made. Beside the figures stand the machine and the versions, and of runs made here the load, for seconds mean nothing without them.
+Each source has a run of its own, FOLDER/<name of the source>. A run that exists is only read, with the seconds that its stages took. The machine, the
+versions and, for runs made here, the load average are written too.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ def row_of(source: Path, run: Path) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="+", type=Path)
-    parser.add_argument("--runs", type=Path, required=True, help="where the runs lie")
+    parser.add_argument("--runs", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--json", type=Path, help="where to write the table")
     arguments = parser.parse_args()
     rows = []
     for source in arguments.sources:
-        before, stood = os.getloadavg(), (arguments.runs / source.name).exists()
+        before, existed = os.getloadavg(), (arguments.runs / source.name).exists()
         row = row_of(source, arguments.runs / source.name)
-        if not stood:
+        if not existed:
             row["load"] = {"before": before, "after": os.getloadavg()}
         rows.append(row)
         total = sum(row["seconds"].values())

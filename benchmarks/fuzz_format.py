@@ -1,13 +1,13 @@
-"""Hostile asset files by the hundred thousand: sound files of every layout, changed at random, must be read or refused, and nothing else.
+"""Fuzzing of the asset format: valid files of every layout, changed at random, must be read or refused.
 
     python benchmarks/fuzz_format.py [--inputs 100000] [--seed 0] [--json FILE]
 
-Four ways of changing: bytes anywhere; bytes of the header; values in the JSON of the header and of the metadata, chosen so that they fit or nearly do;
-and bytes of a tensor with its digest put right, so that what lies behind the digests is reached. What is read is drawn and saved again.
+Four kinds of mutation: bytes anywhere; bytes of the header; JSON values of the header and the metadata, valid or nearly so; bytes of a tensor with
+its digest recomputed, so that the checks after the digests are reached. Files that are read are rendered and saved again.
 
-A child process takes each batch with its address space limited to what it had after its imports and 1 GiB; the file at work is on disk before it is
-opened, so that an input that kills the child is known. Counted as failures: any exception but FormatError, a child that dies, an input that takes
-more than ten seconds. The same seed gives the same inputs.
+A child process runs each batch, its address space limited to 1 GiB more than after its imports. Each input is written to disk before it is opened, so
+that an input that kills the child is known. Failures are: any exception but FormatError, a child that dies, an input that takes more than ten
+seconds. The same seed gives the same inputs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ import numpy as np
 
 HERE = Path(__file__).resolve().parent
 GOLDEN = HERE.parent / "tests" / "data" / "golden"
-ROOM = 2**30  # bytes of address space beyond what the imports took
+EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
 SLOW = 10  # seconds
 BATCH = 20000
 NUMBERS = [0, 1, -1, 2, 3, 7, 8, 16, 17, 63, 64, 65, 255, 256, 257, 2**16, 2**31, 2**32, 2**53, 2**63, 2**64, 10**30, 0.5, -0.0, 1e-30, 1e30, 1e300, 1e-320]
@@ -49,7 +49,7 @@ def number(rng: Rng, below: int) -> int:
 
 
 def header_of(data: bytes) -> tuple[dict[str, Any], dict[str, Any], bytes]:
-    """The header's entries, the metadata and the data of a sound file."""
+    """The header's entries, the metadata and the data of a valid file."""
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
     return header, json.loads(header.pop("__metadata__")["nerftree"]), data[8 + length :]
@@ -88,7 +88,7 @@ def with_bytes(rng: Rng, data: bytes, begin: int, end: int) -> bytes:
 
 
 def value(rng: Rng, depth: int = 0) -> Any:
-    """Any JSON value, of the kinds that readers stumble over."""
+    """Any JSON value, of kinds that break readers."""
     kind = number(rng, 8 if depth < 3 else 5)
     if kind == 0:
         return [None, True, False][number(rng, 3)]
@@ -142,7 +142,7 @@ def with_tensor(rng: Rng, data: bytes) -> bytes:
 
 
 def changed(rng: Rng, seeds: list[bytes]) -> tuple[str, bytes]:
-    """The way that was taken, and the file."""
+    """The kind of mutation, and the file."""
     data = seeds[number(rng, len(seeds))]
     kind = number(rng, 4)
     if kind == 0:
@@ -158,20 +158,20 @@ def changed(rng: Rng, seeds: list[bytes]) -> tuple[str, bytes]:
 
 
 def try_file(path: Path) -> str | None:
-    """None if the file is read, and can be drawn and saved; else what it is refused for. Anything else is raised."""
+    """None if the file is read, rendered and saved; else the reason why it is refused. Anything else is raised."""
     from efficientnerf.asset.format import FormatError, describe, load, serialize
 
-    said = None
+    refusal = None
     try:
         describe(path)
     except FormatError as error:
-        said = str(error)
+        refusal = str(error)
     try:
         tree = load(path)
     except FormatError as error:
         return str(error)
-    if said is not None:
-        raise AssertionError(f"read, but not described: {said}")
+    if refusal is not None:
+        raise AssertionError(f"read, but not described: {refusal}")
     if tree.degree <= 2 and max(tree.resolution) <= 64:
         centre = (tree.bounds_min + tree.bounds_max) / 2
         with np.errstate(all="ignore"):
@@ -181,7 +181,7 @@ def try_file(path: Path) -> str | None:
 
 
 def rule(message: str) -> str:
-    """The message without what is of this file, so that equal refusals count as one."""
+    """The message without what is specific to this file, so that equal refusals count as one."""
     return re.sub(r"'[^']*'|SHA-256.*|[0-9]+|\(.*\)", "*", message.partition(": ")[2])[:60]
 
 
@@ -204,16 +204,16 @@ def batch(seed: int, first: int, count: int, folder: Path, report: Callable[[dic
         begin = time.process_time()
         signal.alarm(SLOW)
         try:
-            said = try_file(path)
+            refusal = try_file(path)
         except Exception as error:
             failures.append({"index": index, "kind": kind, "error": f"{type(error).__name__}: {error}"[:300]})
-            said = "failed"
+            refusal = "failed"
         signal.alarm(0)
         slowest = max(slowest, time.process_time() - begin)
         kinds[kind] += 1
-        read += said is None
-        if said is not None:
-            refusals[rule(said)] += 1
+        read += refusal is None
+        if refusal is not None:
+            refusals[rule(refusal)] += 1
     report({"inputs": count, "kinds": dict(kinds), "read": read, "refusals": dict(refusals), "slowest_s": slowest, "failures": failures,
             "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024})  # fmt: skip
 
@@ -228,7 +228,7 @@ def child(seed: int, first: int, count: int, folder: Path) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     if pages:
-        limit = pages * resource.getpagesize() + ROOM
+        limit = pages * resource.getpagesize() + EXTRA_MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     batch(seed, first, count, folder, lambda found: print(json.dumps({**found, "rss_before_mib": before}), flush=True))
 
@@ -268,7 +268,7 @@ def main() -> int:
         "read": sum(part["read"] for part in found), "refused": sum(refusals.values()),
         "failures": failures, "slowest_s": round(max((part["slowest_s"] for part in found), default=0), 3),
         "peak_rss_mib": max((part["peak_rss_mib"] for part in found), default=0), "rss_before_mib": max((part["rss_before_mib"] for part in found), default=0),
-        "room_mib": ROOM // 2**20, "seconds": round(time.time() - begin), "python": platform.python_version(), "numpy": np.__version__,
+        "room_mib": EXTRA_MEMORY // 2**20, "seconds": round(time.time() - begin), "python": platform.python_version(), "numpy": np.__version__,
         "most_common_refusals": dict(refusals.most_common(40)),
     }  # fmt: skip
     given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -1,11 +1,11 @@
-"""A CUDA device at work: tests, kernels, pictures, training steps, a bake and the whole pipeline, written to benchmarks/results/gpu.json after each part.
+"""Benchmarks on a CUDA device: tests, kernels, renders, training steps, a bake and the pipeline, written to benchmarks/results/gpu.json after each part.
 
-    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,pictures,training,asset,pipeline,paper] [--seconds 570] [--preset standard] [--asset FILE]
+    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,renders,training,asset,pipeline,paper] [--seconds 570] [--preset standard] [--asset FILE]
                              [--json FILE]
 
-Says so and does nothing where torch has no CUDA device. Each part runs in a process of its own, for what goes wrong on a device may take all that comes
-after with it; what has not ended after its share of --seconds is stopped and noted as such. All but the pipeline need torch, triton, numba, scipy and
-safetensors alone (the tests pytest, too): no pycolmap, and nothing of this project need be installed.
+Prints a line and ends where torch has no CUDA device. Each part runs in a process of its own, because an error on a device can break what follows it;
+a part that has not ended after its share of --seconds is stopped and recorded as such. All but the pipeline need torch, triton, numba, scipy and
+safetensors alone (the tests pytest too): neither pycolmap nor this project has to be installed.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
-# Seconds at most. Most of the tests' time goes into building kernels.
-PARTS = {"tests": 200.0, "kernels": 60.0, "pictures": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
+# Seconds at most. Most of the tests' time is compilation of kernels.
+PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
 TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
 TESTS = ["tests/efficientnerf", "--ignore=tests/efficientnerf/test_cuda_builds.py", "-k", "cuda or late or device or gpu"]
 PIPELINE = [
@@ -35,7 +35,7 @@ PIPELINE = [
 
 
 def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[str, Any]:
-    """The summary of `enerf run`, and what it said last of its training."""
+    """The summary of `enerf run`, and the last progress of its training."""
     needed = PIPELINE if list(source.glob("transforms*.json")) else [*PIPELINE, "pycolmap"]
     missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
@@ -62,20 +62,20 @@ def run(source: Path, folder: Path, options: list[str], seconds: float) -> dict[
 
 
 def tests(seconds: float) -> dict[str, Any]:
-    """How the tests of the kernels went on the device, and what pytest said last."""
+    """Result of the kernels' tests on the device, and the last line of pytest."""
     if importlib.util.find_spec("pytest") is None:
         return {"left_out": "not installed here: pytest"}
-    # Other versions of the libraries than those of this project may warn of things to come.
+    # Other versions of the libraries may warn of deprecations.
     command = [sys.executable, "-m", "pytest", "-q", "-W", "default", "-p", "no:cacheprovider", "--continue-on-collection-errors", *TESTS]
     if importlib.util.find_spec("xdist") is not None:
         command += ["-n", str(min(8, os.cpu_count() or 1))]
-    with tempfile.TemporaryFile("w+") as said:
+    with tempfile.TemporaryFile("w+") as output:
         try:
-            code: int | None = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, cwd=ROOT, timeout=seconds, check=False).returncode
+            code: int | None = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT, timeout=seconds, check=False).returncode
         except subprocess.TimeoutExpired:
             code = None
-        said.seek(0)
-        lines = said.read().splitlines()
+        output.seek(0)
+        lines = output.read().splitlines()
     failed = [line for line in lines if line.startswith(("FAILED", "ERROR", "E   "))]
     return {"exit_code": code, **({} if code == 0 else {"failed": failed[:80]}), "last": lines[-1] if lines else ""}
 
@@ -94,7 +94,7 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
 
     if part == "kernels":
         return {"copy_gb_per_second": round(gpu_kernels.copy_rate("cuda", 2048, 10)), **gpu_kernels.kernel_rates("cuda", 2**16, 19, 20)}
-    if part == "pictures":
+    if part == "renders":
         from efficientnerf.asset.tree import NerfTree
 
         tree = NerfTree.load(given.asset) if given.asset else gpu_kernels.shell(384)
@@ -102,26 +102,29 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
     if part == "paper":
         return gpu_kernels.paper_rates("cuda", 300, 400, 40)
     if part == "asset":
-        return gpu_asset.asset_rates("cuda", steps=2000, side=400, views=60, resolution=256, pixels=1_000_000, fit_steps=160, rays=32768, samples=2**18)
-    return gpu_kernels.training_rates("cuda", 1500, 400, 40, samples=2**18, rays=2**16, levels=16, log2_table=19, finest=2048)
+        return gpu_asset.asset_rates(
+            "cuda", steps=2000, side=400, views=60, resolution=256, pixels=1_000_000, refine_steps=160, rays=32768, sample_batch_size=2**18
+        )
+    settings = {"sample_batch_size": 2**18, "max_rays_per_batch": 2**16, "num_levels": 16, "log2_hashmap_size": 19, "finest_resolution": 2048}
+    return gpu_kernels.training_rates("cuda", 1500, 400, 40, **settings)
 
 
-def apart(part: str, seconds: float) -> dict[str, Any]:
-    """The figures of one part from a process of its own, which is given the same words."""
+def in_child(part: str, seconds: float) -> dict[str, Any]:
+    """The figures of one part, from a child process with the same arguments."""
     with tempfile.TemporaryDirectory(prefix="gpu-") as folder:
         figures = Path(folder) / "figures.json"
         command = [sys.executable, __file__, *sys.argv[1:], "--only", part, "--seconds", str(max(1.0, seconds - 10)), "--json", str(figures)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
         begun = time.monotonic()
-        with tempfile.TemporaryFile("w+") as said:
+        with tempfile.TemporaryFile("w+") as output:
             try:
-                code = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, env=environment, timeout=seconds, check=False).returncode
+                code = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, env=environment, timeout=seconds, check=False).returncode
             except subprocess.TimeoutExpired:
                 return {"stopped_after_seconds": round(seconds)}
-            said.seek(0)
-            words = said.read()
+            output.seek(0)
+            text = output.read()
         if code != 0 or not figures.exists():
-            return {"error": words[-3000:] or f"exit code {code}"}
+            return {"error": text[-3000:] or f"exit code {code}"}
         return {**json.loads(figures.read_text(encoding="utf-8")), "seconds_in_all": round(time.monotonic() - begun, 1)}
 
 
@@ -132,7 +135,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=570.0)
     parser.add_argument("--preset", default="standard")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="STAGE.NAME=VALUE")
-    parser.add_argument("--asset", type=Path, help="draw this tree instead of a made-up one")
+    parser.add_argument("--asset", type=Path, help="render this asset instead of a synthetic one")
     parser.add_argument("--json", type=Path, default=HERE / "results" / "gpu.json")
     parser.add_argument("--only", help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -158,7 +161,7 @@ def main() -> int:
     failed = False
     for part in wanted:
         left = min(PARTS[part], given.seconds - (time.monotonic() - started))
-        result[part] = apart(part, left) if left > 15 else {"left_out": f"{given.seconds:g} s were over"}
+        result[part] = in_child(part, left) if left > 15 else {"left_out": f"{given.seconds:g} s were over"}
         failed |= "error" in result[part] or result[part].get("exit_code", 0) != 0
         given.json.parent.mkdir(parents=True, exist_ok=True)
         given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

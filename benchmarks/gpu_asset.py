@@ -1,6 +1,6 @@
-"""What benchmarks/gpu.py measures of a whole asset on a made-up scene: training, baking, fitting, pictures; the method alone, without files.
+"""The part *asset* of benchmarks/gpu.py on a synthetic scene: training, bake, refinement, renders; the method alone, without files.
 
-Sizes are arguments, so that the code can be tried without a device.
+Sizes are arguments, so that the code runs without a device too.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 class Clock:
-    """Seconds of one thing after the other, what the device still has to do included."""
+    """Seconds of consecutive parts, pending work of the device included."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -45,10 +45,12 @@ class Clock:
         self.seconds[name], self.last = round(now - self.last, 3), now
 
 
-def asset_rates(device: str, *, steps: int, side: int, views: int, resolution: int, pixels: int, fit_steps: int, rays: int, **settings: Any) -> dict[str, Any]:
-    """Seconds of each part, the fit's steps a second and the lines in which it waited for the device, and decibels on a view that was not trained on."""
+def asset_rates(
+    device: str, *, steps: int, side: int, views: int, resolution: int, pixels: int, refine_steps: int, rays: int, **settings: Any
+) -> dict[str, Any]:
+    """Seconds of each part, refinement steps a second, the lines that waited for the device, and PSNR of a test view."""
     cameras = orbit(side, views + 1)
-    held, scene = cameras.pop(views // 2), ball(cameras)
+    test_camera, scene = cameras.pop(views // 2), ball(cameras)
     clock = Clock(device)
     m = model(Space(BOUNDS, False), TrainSettings(iterations=steps, **settings), WHITE, device)
     for _ in train(trainer(m), scene):
@@ -58,15 +60,15 @@ def asset_rates(device: str, *, steps: int, side: int, views: int, resolution: i
     clock.lap("bake")
     targets = Targets(scene, WHITE).to(device)
     o = refinement.optimiser(tree, refinement.OPAQUE)
-    told: dict[str, Any] = {"steps": fit_steps, "rays": rays, "density_rate": 0.3, "colour_rate": 0.03, "final": 0.3, "seed": 0}
-    for _ in refinement.optimise(o, targets, until=fit_steps // 4, **told):
+    options: dict[str, Any] = {"steps": refine_steps, "rays": rays, "density_rate": 0.3, "colour_rate": 0.03, "final": 0.3, "seed": 0}
+    for _ in refinement.optimise(o, targets, until=refine_steps // 4, **options):
         pass
-    clock.lap("fit_begins")
-    for _ in refinement.optimise(o, targets, until=fit_steps, **told):
+    clock.lap("refine_first_quarter")
+    for _ in refinement.optimise(o, targets, until=refine_steps, **options):
         pass
-    clock.lap("fit")
-    pace = (fit_steps - fit_steps // 4) / clock.seconds["fit"]
-    waits = waits_of(o, targets, device, {**told, "steps": fit_steps + 32, "until": fit_steps + 32})
+    clock.lap("refine")
+    steps_per_second = (refine_steps - refine_steps // 4) / clock.seconds["refine"]
+    waits = waits_of(o, targets, device, {**options, "steps": refine_steps + 32, "until": refine_steps + 32})
     clock.lap("waits")
     weights = refinement.greatest_weights(o.result(), targets, pixels, 0)
     clock.lap("weights")
@@ -74,14 +76,14 @@ def asset_rates(device: str, *, steps: int, side: int, views: int, resolution: i
     clock.lap("errors")
     return {
         "seconds": clock.seconds, "voxels": len(tree.density_values), "voxels_that_show": int((weights > 1e-3).sum()),
-        "fit_steps_per_second": round(pace, 1), "fit_waits_in_32_steps": waits, "fit_on": "device" if targets.on_device else "host",
-        "training_psnr": {"baked": decibels(errors[0]), "fitted": decibels(errors[1])},
-        "held_back_psnr": held_back(m, [tree, o.result()], held, device),
+        "refine_steps_per_second": round(steps_per_second, 1), "refine_waits_in_32_steps": waits, "refine_on": "device" if targets.on_device else "host",
+        "training_psnr": {"baked": decibels(errors[0]), "refined": decibels(errors[1])},
+        "test_psnr": test_view_psnr(m, [tree, o.result()], test_camera, device),
     }  # fmt: skip
 
 
 def baked(m: Model, scene: Pixels, resolution: int, pixels: int) -> NerfTree:
-    """The network's values in all voxels that it shows."""
+    """The asset of the network, before refinement."""
     shape, voxel = bake.grid_of(BOUNDS, resolution, 4)
     seen = bake.visible_voxels(m, scene, shape, voxel, BOUNDS[0], 4, pixels, lambda done, total: None)
     indices = bake.chosen_voxels(seen, shape, 4, 1e-3, 1)
@@ -90,9 +92,9 @@ def baked(m: Model, scene: Pixels, resolution: int, pixels: int) -> NerfTree:
     return tree_from_voxels(shape, voxel, BOUNDS[0], indices, density, sh, background=WHITE)
 
 
-def waits_of(o: refinement.Optimiser, targets: Targets, device: str, told: dict[str, Any]) -> dict[str, int]:
-    """Lines that waited for the device in more steps, the first left out, which waits by design."""
-    running = refinement.optimise(o, targets, **told)
+def waits_of(o: refinement.Optimiser, targets: Targets, device: str, options: dict[str, Any]) -> dict[str, int]:
+    """Lines that waited for the device in further steps; the first is left out, which waits by design."""
+    running = refinement.optimise(o, targets, **options)
     next(running)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -105,13 +107,13 @@ def waits_of(o: refinement.Optimiser, targets: Targets, device: str, told: dict[
     return dict(Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)))
 
 
-def held_back(m: Model, trees: list[NerfTree], camera: Camera, device: str) -> dict[str, float]:
+def test_view_psnr(m: Model, trees: list[NerfTree], camera: Camera, device: str) -> dict[str, float]:
     rgba = ball([camera]).images.reshape(camera.height, camera.width, 4) / 255
     truth = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
-    pictures = {"network": FieldRenderer(m, 1.5, 4.5).render(camera).colour}
-    for name, tree in zip(("baked", "fitted"), trees, strict=True):
-        pictures[name] = tree.to(device).render(camera, background=WHITE).colour
-    return {name: decibels(float(((colour - truth) ** 2).mean())) for name, colour in pictures.items()}
+    renders = {"network": FieldRenderer(m, 1.5, 4.5).render(camera).colour}
+    for name, tree in zip(("baked", "refined"), trees, strict=True):
+        renders[name] = tree.to(device).render(camera, background=WHITE).colour
+    return {name: decibels(float(((colour - truth) ** 2).mean())) for name, colour in renders.items()}
 
 
 def decibels(error: float) -> float:

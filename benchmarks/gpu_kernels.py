@@ -1,4 +1,4 @@
-"""What benchmarks/gpu.py measures of single kernels, pictures and training steps. Sizes are arguments, so that the code can be tried without a device."""
+"""The parts *kernels*, *renders*, *training* and *paper* of benchmarks/gpu.py. Sizes are arguments, so that the code runs without a device too."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def copy_rate(device: str, mebibytes: int, repeats: int) -> float:
 
 
 def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Each kernel of a step at the sizes of a bundle of `rays_` rays: milliseconds, samples a second, and the bytes that it cannot avoid over that time."""
+    """Each kernel of a step at the sizes of a bundle of `rays_` rays: milliseconds, samples a second, and bytes moved at least over that time."""
     from efficientnerf.backends.triton import compositing, hash_grid, sampling
     from efficientnerf.rendering.harmonics import basis
 
@@ -61,10 +61,10 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     side = m.voxels.side
     centre = (torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1) + 0.5) / side * 2 - 1
     voxels = ((centre.norm(dim=-1) - 0.7).abs() < 0.08).float().to(device)  # a shell
-    away = torch.nn.functional.normalize(torch.randn(rays_, 3, generator=generator), dim=-1)
+    outward = torch.nn.functional.normalize(torch.randn(rays_, 3, generator=generator), dim=-1)
     target = torch.rand(rays_, 3, generator=generator) * 1.6 - 0.8
-    directions = torch.nn.functional.normalize(target - 3 * away, dim=-1).to(device)
-    origins = (3 * away).to(device)
+    directions = torch.nn.functional.normalize(target - 3 * outward, dim=-1).to(device)
+    origins = (3 * outward).to(device)
     near, far, offset = (torch.full((rays_,), x, device=device) for x in (1.0, 6.0, 0.5))
     march = (m.space, origins, directions, near, far, offset, m.step, m.slots, voxels, 0.5)
     coarse = sampling.valid_samples(*march)
@@ -77,23 +77,23 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     table, levels = field.table, len(field.sides)
     encode = lambda: hash_grid.Encode.apply(fine.point, table, field.sides, field.dense, field.starts, int(field.mask))  # noqa: E731
     features = encode()
-    pull = torch.randn(features.shape, generator=generator).to(device)
+    grad_features = torch.randn(features.shape, generator=generator).to(device)
     raw = torch.randn(samples, 28, generator=generator).to(device).requires_grad_()
-    harmonics, behind = basis(directions, 2), torch.ones(rays_, 3, device=device)
-    composite = lambda: compositing.composite(raw, fine.length, fine.first, harmonics, behind, "exp")  # noqa: E731
+    harmonics, background = basis(directions, 2), torch.ones(rays_, 3, device=device)
+    composite = lambda: compositing.composite(raw, fine.length, fine.first, harmonics, background, "exp")  # noqa: E731
     colour = composite().colour
     grad, first, second = (torch.randn(table.shape, generator=generator).to(device) for _ in range(3))
     grad[torch.rand(len(table), generator=generator).to(device) < 0.5] = 0
     second = second.abs()
     value = table.detach().clone()
     corner = 8 * levels * 8.0  # bytes of the table that a sample reads, two features of 4 bytes at 8 corners of each level
-    room = math.ceil(1.3 * count / 4096) * 4096
+    capacity = math.ceil(1.3 * count / 4096) * 4096
     jobs: list[tuple[str, Callable[[], Any], int, float]] = [
-        ("march", lambda: sampling.valid_samples(*march, capacity=room), count, 32.0),
+        ("march", lambda: sampling.valid_samples(*march, capacity=capacity), count, 32.0),
         ("pivots", lambda: sampling.pivots(weight, coarse.first, 1e-4, 8), count, 5.0),
-        ("pivotal_samples", lambda: sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2, 2 * room), samples, 32.0),
+        ("pivotal_samples", lambda: sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2, 2 * capacity), samples, 32.0),
         ("encode", encode, samples, 12 + corner + 8 * levels),
-        ("encode_backward", lambda: torch.autograd.grad(features, table, pull, retain_graph=True), samples, 12 + 2 * corner + 8 * levels),
+        ("encode_backward", lambda: torch.autograd.grad(features, table, grad_features, retain_graph=True), samples, 12 + 2 * corner + 8 * levels),
         ("composite", composite, samples, 28 * 4 + 4 + 16.0),
         ("composite_backward", lambda: torch.autograd.grad(colour.sum(), raw, retain_graph=True), samples, 2 * 28 * 4 + 4 + 16.0),
         ("adam", lambda: hash_grid.adam(value, grad, first, second, 0.01, 0.9, 0.99, 0.5, 0.5, 1e-15, skip_zeros=True), table.numel(), 4 + 24 / 2.0),
@@ -106,7 +106,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
 
 
 def shell(resolution: int) -> NerfTree:
-    """A bumpy shell with soft edges, degree 2: about as many voxels as an object of that size has."""
+    """A bumpy shell with soft edges, degree 2, with about as many voxels as an object of that size."""
     side = resolution // 4 * 4
     kept = []
     for x in range(side):
@@ -135,30 +135,30 @@ def orbit(side: int, frames: int) -> list[Camera]:
 
 
 def frame_rates(device: str, tree: NerfTree, side: int, repeats: int, variants: list[tuple[tuple[int, int], int]]) -> dict[str, Any]:
-    """Milliseconds of a picture of side x side pixels, mean over an orbit, for tiles of pixels and warps to a program; and how far it is from the CPU's."""
+    """Milliseconds of a render of side x side pixels, mean over an orbit, for tile sizes and warps per program; and its difference from the CPU's."""
     from efficientnerf.backends.triton import tree as cuda_tree
 
-    sent = cuda_tree.device_tree(tree, device)
+    on_device = cuda_tree.device_tree(tree, device)
     cameras = orbit(side, 8)
-    row = sent.sh.shape[1]
+    row = on_device.sh.shape[1]
     usual = (cuda_tree.TILE, cuda_tree.WARPS[row])
     timed = []
     for tile, warps in [usual, *variants]:
         cuda_tree.TILE = tile
         cuda_tree.WARPS[row] = warps
-        took = milliseconds(lambda: [cuda_tree.draw(sent, camera, background=(1.0, 1.0, 1.0)) for camera in cameras], device, repeats) / len(cameras)
+        took = milliseconds(lambda: [cuda_tree.draw(on_device, camera, background=(1.0, 1.0, 1.0)) for camera in cameras], device, repeats) / len(cameras)
         timed.append({"tile": list(tile), "warps": warps, "ms": round(took, 4), "frames_per_second": round(1e3 / took, 1)})
     cuda_tree.TILE, cuda_tree.WARPS[row] = usual
-    ours = cuda_tree.draw(sent, cameras[0]).colour.cpu().numpy()
+    ours = cuda_tree.draw(on_device, cameras[0]).colour.cpu().numpy()
     off = np.abs(ours - tree.render(cameras[0]).colour).max(axis=-1)
     return {
-        "pixels": [side, side], "voxels": len(tree.density_values), "bytes_on_device": sent.bytes, "runs": timed,
+        "pixels": [side, side], "voxels": len(tree.density_values), "bytes_on_device": on_device.bytes, "runs": timed,
         "difference_from_cpu": {"mean": float(off.mean()), "share_above_1e-3": float((off > 1e-3).mean()), "largest": float(off.max())},
     }  # fmt: skip
 
 
 def ball(cameras: list[Camera]) -> Pixels:
-    """Pictures of a chequered ball, transparent round it."""
+    """Images of a chequered ball with alpha."""
     images = []
     for camera in cameras:
         origins, directions = rays(camera)
@@ -173,7 +173,7 @@ def ball(cameras: list[Camera]) -> Pixels:
 
 
 def training_rates(device: str, steps: int, side: int, views: int, **settings: Any) -> dict[str, Any]:
-    """Steps and samples a second on the ball, the second half of the steps timed; and which lines still waited for the device in 32 steps more."""
+    """Steps and samples a second on the ball, the second half of the steps timed; and which lines waited for the device in 32 further steps."""
     from efficientnerf.training.loop import train, trainer
 
     s = TrainSettings(**{**settings, "iterations": steps + 32})
@@ -209,7 +209,7 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
 
 
 def paper_rates(device: str, steps: int, side: int, views: int, **changes: Any) -> dict[str, Any]:
-    """`training_rates` of the rows of table 5, and of uniform sampling, with the settings of the preset paper-n4, a short warm-up apart."""
+    """`training_rates` of the rows of table 5, and of uniform sampling, with the settings of the preset paper-n4 but for a short warm-up."""
     from workflows.paper.tables import IMPORTANCE, LARGE, NERF
 
     rows: dict[str, dict[str, Any]] = {
@@ -218,5 +218,5 @@ def paper_rates(device: str, steps: int, side: int, views: int, **changes: Any) 
     }  # fmt: skip
     path = Path(__file__).resolve().parents[1] / "workflows" / "presets" / "paper-n4.toml"
     preset = tomllib.loads(path.read_text(encoding="utf-8"))["train"]
-    short = {"warm_up": steps // 4, "crop_steps": 0, "voxel_beta": 0.5}  # so many steps prune little with the paper's 0.1
+    short = {"occupancy_warmup_steps": steps // 4, "precrop_steps": 0, "occupancy_beta": 0.5}  # with the paper's 0.1 so few steps prune little
     return {name: training_rates(device, steps, side, views, **{**preset, **short, **row, **changes}) for name, row in rows.items()}

@@ -1,10 +1,10 @@
-"""Samples per second of each CPU kernel of the hash field's training step, beside what the machine can load, gather and multiply.
+"""Samples per second of each CPU kernel of the hash field's training step, and what the machine can copy, gather and multiply.
 
     python benchmarks/kernels.py [--json FILE] [--seconds 1.0] [--threads 1,2]
 
 Each kernel is timed alone, on the sizes of a step of the default preset in its steady state, with one thread and with all; each figure is the best of
-many repetitions within `--seconds`. The floor of a kernel is the larger of two times: what it must move over the measured bandwidth, and what it must
-multiply over the measured rate. Each number of threads is measured in a process of its own, for some libraries read it once.
+many repetitions within `--seconds`. The floor of a kernel is the larger of two times: the bytes it must move over the measured bandwidth, and the
+products it must compute over the measured rate. Each number of threads is measured in a process of its own, because some libraries read the number once.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def best(work: Callable[[], object], seconds: float) -> float:
 
 
 def machine(seconds: float) -> dict[str, float]:
-    """Rates that nothing here can beat: copying, gathering 8-byte entries of a table of 1 MiB and of 12, products of matrices."""
+    """Upper bounds: copying, gathering 8-byte entries of a table of 1 MiB and of 12, products of matrices."""
     import numba
     import numpy as np
     import torch
@@ -73,7 +73,7 @@ def machine(seconds: float) -> dict[str, float]:
 
 
 def row(samples: int, seconds: float, moved: float, operations: float = 0.0) -> dict[str, Any]:
-    """What one call comes to: samples, seconds, bytes that must be moved at least, multiplications and additions."""
+    """Figures of one call: samples, seconds, bytes that must be moved at least, multiplications and additions."""
     return {"samples": samples, "seconds": seconds, "bytes": moved, "operations": operations}
 
 
@@ -91,7 +91,7 @@ def default_field() -> Any:
 
     s = TrainSettings()
     return HashField(
-        levels=s.levels, log2_table=LOG2_TABLE, coarsest=16, finest=FINEST, hidden=s.hidden, layers=s.layers, degree=s.degree,
+        levels=s.num_levels, log2_table=LOG2_TABLE, coarsest=16, finest=FINEST, hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree,
         initial_density=s.initial_density, generator=torch.Generator().manual_seed(0), precision=s.precision,
     )  # fmt: skip
 
@@ -106,35 +106,35 @@ def field_kernels(seconds: float) -> dict[str, Any]:
     from efficientnerf.fields.hash import FEATURES
 
     field, rng = default_field(), np.random.default_rng(0)
-    # Samples lie one behind the other on rays that end on a sphere, as those of a trained scene do.
+    # Samples follow each other on rays that end on a sphere, as in a trained scene.
     count = RAYS * PER_RAY
     surface = rng.normal(size=(RAYS, 1, 3))
     surface *= 0.3 / np.linalg.norm(surface, axis=2, keepdims=True)
     points = torch.from_numpy((0.5 + surface * (1 + 0.01 * np.arange(PER_RAY)[:, None])).reshape(-1, 3).astype(np.float32))
     across = points.t().contiguous().numpy()
     features = np.empty((FEATURES * len(field.sides), count), np.float32)
-    pull = rng.normal(size=features.shape).astype(np.float32)
+    grad_features = rng.normal(size=features.shape).astype(np.float32)
     table_grad = np.zeros_like(field.table.detach().numpy())
     levels = (field.sides, field.dense, field.starts, field.mask)
     corners = count * len(field.sides) * 8
-    forth = best(lambda: hash_grid.encode(across, field.table.detach().numpy(), *levels, features), seconds)
-    back = best(lambda: hash_grid.encode_backward(across, pull, *levels, table_grad), seconds)
+    encode = best(lambda: hash_grid.encode(across, field.table.detach().numpy(), *levels, features), seconds)
+    encode_back = best(lambda: hash_grid.encode_backward(across, grad_features, *levels, table_grad), seconds)
 
     wide = 2 if has_bfloat16("cpu") and field.precision != "float32" else 4
     weights = [weight.detach().numpy() for weight in field.weights]
     products, activations = 2 * count * sum(w.size for w in weights), wide * count * sum(len(w) for w in weights[:-1])
-    out, towards = np.empty((count, len(weights[-1])), np.float32), rng.normal(size=(count, len(weights[-1]))).astype(np.float32)
+    out, grad_out = np.empty((count, len(weights[-1])), np.float32), rng.normal(size=(count, len(weights[-1]))).astype(np.float32)
     prepared = mlp.prepared(weights, bfloat16=wide == 2)
     kept = mlp.forward(features, prepared, 0.0, out, keep=True)
-    through = best(lambda: mlp.forward(features, prepared, 0.0, out, keep=True), seconds)
-    again = best(lambda: mlp.backward(towards, features, prepared, kept, [w.shape for w in weights]), seconds)
-    both = best(lambda: field(points).backward(torch.from_numpy(towards)), seconds)
+    network = best(lambda: mlp.forward(features, prepared, 0.0, out, keep=True), seconds)
+    network_back = best(lambda: mlp.backward(grad_out, features, prepared, kept, [w.shape for w in weights]), seconds)
+    both = best(lambda: field(points).backward(torch.from_numpy(grad_out)), seconds)
     ends = features.nbytes + out.nbytes
     return {
-        "encode": row(count, forth, corners * 8 + features.nbytes, corners * 4),
-        "encode backward": row(count, back, corners * 16 + features.nbytes, corners * 4),
-        "network": row(count, through, ends + activations, products),
-        "network backward": row(count, again, ends + features.nbytes + activations, 2.0 * products),
+        "encode": row(count, encode, corners * 8 + features.nbytes, corners * 4),
+        "encode backward": row(count, encode_back, corners * 16 + features.nbytes, corners * 4),
+        "network": row(count, network, ends + activations, products),
+        "network backward": row(count, network_back, ends + features.nbytes + activations, 2.0 * products),
         "field, forward and backward": row(count, both, corners * 24 + 2 * ends + 2 * features.nbytes + 2 * activations, 3.0 * products),
     }
 
@@ -151,14 +151,14 @@ def compositing_kernels(seconds: float) -> dict[str, Any]:
     raw, length, first = torch.randn(count, 1 + 3 * harmonics_count(degree)), torch.full((count,), 0.02), torch.arange(0, count + 1, PER_RAY)
     harmonics = basis(torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1), degree)
     packed = [t.numpy() for t in (raw, length, first, harmonics, torch.rand(RAYS, 3))]
-    colour, opacity, spread = np.empty((RAYS, 3), np.float32), np.empty(RAYS, np.float32), np.empty(RAYS, np.float32)
-    seen = np.empty(count, np.float32), np.empty((count, 3), np.float32)  # weights and colours of samples
-    grad_raw, grad_behind, ones = np.empty(raw.shape, np.float32), np.empty((RAYS, 3), np.float32), np.ones(count, np.float32)
-    forth = best(lambda: rays.composite(*packed, True, colour, opacity, spread, *seen), seconds)
-    back = best(lambda: rays.composite_backward(*packed, True, *seen, colour, opacity, spread, ones, grad_raw, grad_behind), seconds)
+    colour, opacity, distortion = np.empty((RAYS, 3), np.float32), np.empty(RAYS, np.float32), np.empty(RAYS, np.float32)
+    outputs = np.empty(count, np.float32), np.empty((count, 3), np.float32)  # weights and colours of samples
+    grad_raw, grad_background, ones = np.empty(raw.shape, np.float32), np.empty((RAYS, 3), np.float32), np.ones(count, np.float32)
+    forward = best(lambda: rays.composite(*packed, True, colour, opacity, distortion, *outputs), seconds)
+    backward = best(lambda: rays.composite_backward(*packed, True, *outputs, colour, opacity, distortion, ones, grad_raw, grad_background), seconds)
     return {
-        "composite": row(count, forth, packed[0].nbytes + 16 * count),
-        "composite backward": row(count, back, 2 * packed[0].nbytes + 16 * count),
+        "composite": row(count, forward, packed[0].nbytes + 16 * count),
+        "composite backward": row(count, backward, 2 * packed[0].nbytes + 16 * count),
     }
 
 
@@ -172,10 +172,10 @@ def march_kernel(seconds: float) -> dict[str, Any]:
     from efficientnerf.training.settings import COARSE_SAMPLES, TrainSettings
 
     s = TrainSettings()
-    side = s.voxels or 128
+    side = s.occupancy_resolution or 128
     axis = (torch.arange(side) + 0.5) / side * 2 - 1
-    away = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
-    voxels = ((away - 0.6).abs() < 0.04).float()
+    distance = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
+    voxels = ((distance - 0.6).abs() < 0.04).float()
     origins = torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1) * 4
     directions = torch.nn.functional.normalize(torch.rand(RAYS, 3) - 0.5 - origins, dim=1)
     near, far, offset = torch.full((RAYS,), 2.0), torch.full((RAYS,), 6.0), torch.rand(RAYS)
@@ -187,7 +187,7 @@ def march_kernel(seconds: float) -> dict[str, Any]:
 
 
 def adam_kernel(seconds: float) -> dict[str, Any]:
-    """A step on the table of which two thirds of the entries have a gradient, which it clears: the time to fill it again is taken off."""
+    """A step on the table of which two thirds of the entries have a gradient, which it clears; the time to fill it again is subtracted."""
     import numpy as np
 
     from efficientnerf.backends.numba import adam as cpu_adam

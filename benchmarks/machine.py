@@ -1,4 +1,4 @@
-"""What the benchmarks say of the machine."""
+"""The machine, for the benchmarks' results."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Peak memory and time of each stage for many large photographs: 100 of 12 megapixels unless told otherwise, drawn here, with known cameras.
+"""Peak memory and time of each stage for many large images: by default 100 of 12 megapixels, rendered here, with known cameras.
 
     python benchmarks/memory.py [--count 100] [--width 4000] [--set train.iterations=300] [--json FILE] [--keep FOLDER]
 
 The scene is a patterned ball over a patterned floor under a plain sky, written as JPEGs and a transforms.json. It is trained at full size
-(`poses.max_image_size` is the width), for a few hundred steps, and baked with a few steps of fitting: quality is not the matter here.
+(`poses.max_image_size` is the width), for a few hundred steps, and baked with a few refinement steps: quality is not measured.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from stage_runs import cost_of
 
-DRAWN = 4  # pixels a side of a photograph for each that is computed; noise fills in between
+UPSAMPLED = 4  # pixels a side of an image for each that is computed; noise is added
 
 
 def pose(angle: float, height: float) -> np.ndarray:
@@ -34,8 +34,8 @@ def pose(angle: float, height: float) -> np.ndarray:
     return out
 
 
-def drawing(world_from_camera: np.ndarray, width: int, height: int, focal: float) -> np.ndarray:
-    """(H, W, 3) uint8: what a pinhole camera sees of a ball of radius 1 that stands on a floor."""
+def image_of(world_from_camera: np.ndarray, width: int, height: int, focal: float) -> np.ndarray:
+    """(H, W, 3) uint8: a pinhole camera's image of a ball of radius 1 on a floor."""
     y, x = np.mgrid[0:height, 0:width]
     local = np.stack([(x + 0.5 - width / 2) / focal, -(y + 0.5 - height / 2) / focal, -np.ones(x.shape)], axis=-1)
     d = local @ world_from_camera[:3, :3].T
@@ -54,7 +54,7 @@ def drawing(world_from_camera: np.ndarray, width: int, height: int, focal: float
     return (255 * np.clip(colour, 0, 1)).astype(np.uint8)
 
 
-def draw(folder: Path, count: int, width: int) -> None:
+def write_images(folder: Path, count: int, width: int) -> None:
     """The photographs and their transforms.json."""
     from PIL import Image
 
@@ -62,7 +62,7 @@ def draw(folder: Path, count: int, width: int) -> None:
     frames = []
     for n in range(count):
         camera = pose(2.399963 * n, 0.6 + 2.4 * n / count)  # turned by the golden angle
-        small = drawing(camera, width // DRAWN, height // DRAWN, 0.9 * width / DRAWN)
+        small = image_of(camera, width // UPSAMPLED, height // UPSAMPLED, 0.9 * width / UPSAMPLED)
         image = np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC), np.int16)
         noisy = np.clip(image + rng.integers(-6, 7, image.shape, np.int16), 0, 255).astype(np.uint8)
         Image.fromarray(noisy).save(folder / f"{n:04d}.jpg", quality=92)
@@ -80,7 +80,7 @@ def measured(photographs: Path, run: Path, sets: list[str]) -> dict[str, dict[st
         for text in sets if stage == "poses" else []:
             command += ["--set", text]
         rows[stage] = cost_of(command)
-        print(f"{stage:8}{rows[stage]['seconds']:8.0f} s{rows[stage]['cpu_seconds']:8.0f} s of the processor{rows[stage]['peak_mib']:8.0f} MiB", flush=True)
+        print(f"{stage:8}{rows[stage]['seconds']:8.0f} s{rows[stage]['cpu_seconds']:8.0f} s cpu{rows[stage]['peak_mib']:8.0f} MiB", flush=True)
     return rows
 
 
@@ -97,7 +97,7 @@ def main() -> None:
         folder = arguments.keep or Path(temporary)
         (folder / "photographs").mkdir(parents=True, exist_ok=True)
         load = os.getloadavg()
-        draw(folder / "photographs", arguments.count, arguments.width)
+        write_images(folder / "photographs", arguments.count, arguments.width)
         rows = measured(folder / "photographs", folder / "run", sets)
     if arguments.json is not None:
         report: dict[str, Any] = {

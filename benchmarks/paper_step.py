@@ -1,11 +1,11 @@
-"""Seconds of a training step of `paper-n4` in its steady state, and how close that comes to what the machine can multiply.
+"""Seconds of a training step of `paper-n4` in its steady state, and its share of the machine's matrix-product rate.
 
     python benchmarks/paper_step.py [--json FILE] [--steps 12] [--threads N]
 
-The networks, the 384^3 density voxels, the batch of 1024 rays and Adam are those of the preset. How many samples a ray has depends on how long a
-scene has been trained, so that it is set here: the voxels are filled so that about 6 intervals of a ray are valid, and every one is made pivotal, with
-5 fine samples each. Nothing else is left out of a step: choosing pixels, rays, both networks forward and backward, compositing, Adam, the
-update of the voxels.
+The networks, the 384^3 density voxels, the batch of 1024 rays and Adam are those of the preset. The number of samples on a ray depends on how long a
+scene has been trained, so it is set here: density voxels are filled so that about 6 intervals of a ray are valid, and all are pivotal, with 5 fine
+samples each. Everything else of a step is included: drawing pixels, rays, both networks forward and backward, compositing, Adam, the occupancy
+update.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ VALID, SIDE, VIEWS = 6.1, 200, 20  # a little more than 6, for it varies from st
 
 
 def settings() -> Any:
-    """Those of the preset; samples are pivotal whatever their weight, and rays are not looked at whole."""
+    """Those of the preset; samples are pivotal whatever their weight, and no ray is sampled without pruning."""
     import dataclasses
 
     from workflows import asset
@@ -32,15 +32,16 @@ def settings() -> Any:
 
     resolved = Settings({stage.name: stage.settings for stage in asset.STAGES})
     resolved.put_table(read_preset("paper-n4").table, "paper-n4")
-    return dataclasses.replace(resolved.resolved()["train"], warm_up=0, crop_steps=0, pivotal_weight=0.0, max_pivots=4096, refresh_rays=0.0, voxel_beta=0.0)
+    return dataclasses.replace(resolved.resolved()["train"], occupancy_warmup_steps=0, precrop_steps=0, pivotal_threshold=0.0, max_pivots=4096,
+                               occupancy_update_ray_fraction=0.0, occupancy_beta=0.0)  # fmt: skip
 
 
 def views() -> Any:
-    """Pixels of some cameras round the box, whose colours are noise."""
+    """Pixels of cameras round the box, with random colours."""
     import numpy as np
 
     from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.training.loop import Pixels
+    from efficientnerf.training.pixels import Pixels
 
     rng = np.random.default_rng(0)
     cameras, images = [], []
@@ -56,7 +57,7 @@ def views() -> Any:
 
 
 def trainer_of(pixels: Any) -> Any:
-    """A trainer whose voxels hold a shell, as thick as gives VALID valid samples a ray."""
+    """A trainer whose density voxels hold a shell, thick enough for VALID valid samples a ray."""
     import numpy as np
     import torch
 
@@ -66,16 +67,16 @@ def trainer_of(pixels: Any) -> Any:
 
     m = model(Space(np.array([[-1.0] * 3, [1.0] * 3]), False), settings(), (1.0, 1.0, 1.0), "cpu", (2.0, 6.0))
     axis = (torch.arange(m.voxels.side) + 0.5) / m.voxels.side * 2 - 1
-    away = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
+    distance = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
     low, high = 0.0, 0.7
     shell = torch.empty_like(m.voxels.values)
     for _ in range(9):
         middle = (low + high) / 2
-        shell.copy_(torch.where((away < 0.8) & (away > 0.8 - middle), 1.0, -1.0))
+        shell.copy_(torch.where((distance < 0.8) & (distance > 0.8 - middle), 1.0, -1.0))
         m.voxels.values.copy_(shell)
         done = next(iter(train(trainer(m), pixels)))
         low, high = (middle, high) if done.valid / done.rays < VALID else (low, middle)
-    m.voxels.values.copy_(torch.where((away < 0.8) & (away > 0.8 - high), 1.0, -1.0))
+    m.voxels.values.copy_(torch.where((distance < 0.8) & (distance > 0.8 - high), 1.0, -1.0))
     return trainer(m)
 
 
@@ -121,7 +122,7 @@ def measure(steps: int) -> dict[str, Any]:
         valid.append(done.valid)
         fine.append(done.fine)
     rays = m.settings.max_rays_per_batch
-    # Forward, and backward with respect to weights and to inputs; the first layer has no gradient with respect to its input.
+    # Forward, and backward for weights and for inputs; the first layer has no gradient for its input.
     flop = sum(2 * n * (3 * products(field) - field.weights[0].numel()) for n, field in ((statistics.mean(valid), m.coarse), (statistics.mean(fine), m.fine)))
     median = statistics.median(seconds)
     return {

@@ -1,9 +1,9 @@
-"""How exactly, and how fast, cameras are found from the sample photographs.
+"""Accuracy and speed of finding cameras from the sample photographs.
 
     python benchmarks/poses.py [--photographs FOLDER] [--truth FILE.json] [--out RESULT.json]
 
 Prints and saves: photographs registered, RMS and largest error of the camera centres after a similarity alignment, in per cent of
-their mean distance to the centroid, the lens, seconds, processor seconds and the load of the machine before and after.
+their mean distance to the centroid, the camera model, seconds, processor seconds and the load average before and after.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""How fast a baked asset is drawn on the CPU, and what bounds it: written to benchmarks/results/render_cpu.json.
+"""Speed of rendering an asset on the CPU, and what bounds it: written to benchmarks/results/render_cpu.json.
 
     python benchmarks/render.py ASSET [--width 800 --height 800] [--frames 24] [--threads N] [--json FILE]
 
-Cameras stand on the asset's orbit, evenly round it. Beside frames a second stand samples and colours a ray, the bytes that they read, and the
-bandwidth that the machine's memory was measured to have, so that it can be told what is near its limit. Seconds mean nothing on a busy machine:
-the load average is written down too.
+Cameras are spread evenly on the asset's orbit. Besides frames a second: samples and colours of a ray, the bytes that they read, the measured
+bandwidth of the memory, and the load average.
 """
 
 from __future__ import annotations
@@ -20,15 +19,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from machine import processor
+
 HERE = Path(__file__).resolve().parent
 TRIAD_BYTES = 512 * 2**20  # far more than any cache holds
-
-
-def processor() -> str:
-    """The processor's name, as the system tells it."""
-    info = Path("/proc/cpuinfo")
-    names = [line.split(":", 1)[1].strip() for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")] if info.exists() else []
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def bandwidth() -> dict[str, float]:
@@ -70,7 +64,7 @@ def cameras(tree: Any, width: int, height: int, count: int, fov: float) -> list[
 
 
 def measure(tree: Any, views: list[Any], supersample: int) -> dict[str, Any]:
-    """Seconds of each picture, after one that compiles and packs; `processor_ms` is what all cores together spend on one."""
+    """Times of each render, after one that compiles and packs; `processor_ms` is the time of all cores together for one."""
     first = _seconds(lambda: tree.render(views[0], supersample=supersample))
     spent = time.process_time()
     took = [_seconds(lambda view=view: tree.render(view, supersample=supersample)) for view in views]
@@ -80,7 +74,7 @@ def measure(tree: Any, views: list[Any], supersample: int) -> dict[str, Any]:
     rays = views[0].width * views[0].height * supersample**2
     mean = sum(best) / len(best)
     return {
-        "first_picture_s": round(first, 3),
+        "first_render_s": round(first, 3),
         "mean_ms": round(mean * 1e3, 2),
         "slowest_ms": round(max(best) * 1e3, 2),
         "all_passes_mean_ms": round((sum(took) + sum(again)) / (2 * len(views)) * 1e3, 2),
@@ -91,7 +85,7 @@ def measure(tree: Any, views: list[Any], supersample: int) -> dict[str, Any]:
 
 
 def counts(tree: Any, views: list[Any]) -> dict[str, float]:
-    """Means over the rays of some pictures: what the kernel looks up, and the bytes that it asks for, most of which lie in caches."""
+    """Means over the rays of some renders: what the kernel looks up, and the bytes that it reads, most of them from caches."""
     import numpy as np
 
     from efficientnerf.backends.numba.tree.rendering import picture_work
@@ -99,28 +93,28 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
     work = np.concatenate([picture_work(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
     cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
     # A cell is 4 bytes; a tested sample reads one density; an interpolated one the four numbers of eight voxels, colours among them.
-    asked = 4 * cells + 4 * tested + 8 * 16 * mixed
+    read = 4 * cells + 4 * tested + 8 * 16 * mixed
     return {
         "cells_per_ray": round(cells, 3),
         "samples_per_ray": round(tested, 3),
         "samples_with_density_per_ray": round(mixed, 3),
         "colours_per_ray": round(colours, 3),
-        "bytes_per_ray": round(asked, 1),
+        "bytes_per_ray": round(read, 1),
         "rays_that_hit": round(float((work[:, 3] > 0).mean()), 4),
     }
 
 
 def memory(tree: Any, view: Any) -> dict[str, float]:
-    """Bytes of all that lies in memory while a picture is drawn: the tree, what is packed of it, the threads' blocks, and the picture."""
+    """Bytes in memory while rendering: the tree, its packed form, the threads' blocks, and the framebuffer."""
     from efficientnerf.backends.numba.tree.rendering import pool_bytes
 
     values = vars(tree) | vars(tree.harmonics) if hasattr(tree.harmonics, "__dict__") else vars(tree)
     own = sum(part.nbytes for part in values.values() if hasattr(part, "nbytes") and not isinstance(part, tuple))
-    picture = tree.render(view)
-    drawn = sum(part.nbytes for part in vars(picture).values())
-    total = own + tree.packed.nbytes + pool_bytes(tree) + drawn
+    rendering = tree.render(view)
+    framebuffer = sum(part.nbytes for part in vars(rendering).values())
+    total = own + tree.packed.nbytes + pool_bytes(tree) + framebuffer
     each = round(total / max(1, len(tree.density_values)), 1)
-    return {"tree": own, "packed": tree.packed.nbytes, "blocks": pool_bytes(tree), "picture": drawn, "total": total, "bytes_per_voxel": each}
+    return {"tree": own, "packed": tree.packed.nbytes, "blocks": pool_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
 
 
 def main() -> int:
@@ -158,7 +152,7 @@ def main() -> int:
             "sh_degree": tree.degree,
             "load_s": round(loading, 3),
         },
-        "picture": {"width": given.width, "height": given.height, "supersample": given.supersample, "frames": given.frames},
+        "image": {"width": given.width, "height": given.height, "supersample": given.supersample, "frames": given.frames},
         "speed": measure(tree, views, given.supersample),
         "work": counts(tree, views),
         "memory": memory(tree, views[0]),
@@ -172,8 +166,7 @@ def main() -> int:
         },
         "versions": {name: version(name) for name in ("numba", "numpy", "llvmlite")} | {"python": platform.python_version()},
     }
-    asked = result["work"]["bytes_per_ray"] * result["speed"]["rays_per_s"] / 1e9
-    result["speed"]["asked_gb_per_s"] = round(asked, 1)
+    result["speed"]["read_gb_per_s"] = round(result["work"]["bytes_per_ray"] * result["speed"]["rays_per_s"] / 1e9, 1)
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(result, indent=1))

@@ -1,9 +1,9 @@
-"""How good an asset is at what size: a run's field baked to several budgets, its pictures measured on the held-back views.
+"""Quality of an asset over its size: a run's field baked to several budgets, evaluated on test views.
 
     python benchmarks/size_quality.py RUN [--sizes 8,16,32,64,128] [--out benchmarks/results] [--set STAGE.NAME=VALUE]
 
-RUN has to be trained; it is not changed. Each budget (bake.max_mib) is baked and evaluated in a copy beside it by the stages themselves, with the run's other
-settings. Writes size_quality_NAME.json, .md and .png; the network's PSNR, of one view drawn by the evaluate stage, stands beside.
+RUN has to be trained; it is not changed. Each budget (bake.max_mib) is baked and evaluated in a copy beside it by the stages themselves, with the
+run's other settings. Writes size_quality_NAME.json, .md and .png; the network's PSNR is of the views that the evaluate stage rendered.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from workflows.paper.document import hardware, versions
 
 
 def row_of(run: Path, size: int, settings: dict[str, str]) -> dict[str, Any]:
-    """Bake to at most `size` MiB, evaluate, and read what came of it."""
+    """Bake to at most `size` MiB, evaluate, and read the figures."""
     took = made(run, "bake", {**settings, "bake.max_mib": size})
     made(run, "evaluate", {"evaluate.field_views": 1})
     report, metrics = read_json(BakeOutputs.of_run(run).report), read_json(EvaluateOutputs.of_run(run).metrics)
@@ -47,7 +47,7 @@ def in_markdown(name: str, rows: list[dict[str, Any]], network: float | None) ->
         grid = " x ".join(str(n) for n in row["resolution"])
         figures = f"{row['psnr']:.2f} | {row['ssim']:.4f} | {row['baking']['seconds']:.0f}"
         lines.append(f"| {row['max_mib']} | {row['mib']:.1f} | {row['voxels']:,} | {grid} | {figures} |")
-    lines += ["", f"PSNR over {rows[0]['views']} held-back views at full working size." + (f" The network: {network:.2f} dB." if network else "")]
+    lines += ["", f"PSNR over {rows[0]['views']} test views at full working size." + (f" The network: {network:.2f} dB." if network else "")]
     return "\n".join(lines) + "\n"
 
 
@@ -63,7 +63,7 @@ def plot(path: Path, rows: list[dict[str, Any]], network: float | None, name: st
         axes.axhline(network, color="grey", linestyle="--", label="network")
     axes.set_xscale("log", base=2)
     axes.set_xticks([row["max_mib"] for row in rows], [str(row["max_mib"]) for row in rows])
-    axes.set(xlabel="asset file / MiB", ylabel="PSNR of held-back views / dB", title=name)
+    axes.set(xlabel="asset file / MiB", ylabel="PSNR of test views / dB", title=name)
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, metadata={"Software": None})
@@ -83,7 +83,7 @@ def main() -> None:
         for size in sorted(int(word) for word in given.sizes.split(",")):
             rows.append(row_of(work, size, settings))
             print(f"{size:5} MiB: {rows[-1]['mib']:.1f} MiB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
-        measured = EvaluateOutputs.of_run(given.run).metrics  # of more views than one, where the run has been evaluated
+        measured = EvaluateOutputs.of_run(given.run).metrics  # of more than one view, where the run has been evaluated
         network = read_json(measured if measured.exists() else EvaluateOutputs.of_run(work).metrics)["network"]
     name = given.run.resolve().name
     document = {"run": name, "settings": settings, "rows": rows, "network": network, "hardware": hardware("cpu"), "versions": versions()}

@@ -1,4 +1,4 @@
-"""For benchmarks: a run's first stages, with later ones made again under other settings, timed, and their memory measured."""
+"""Copies of runs whose later stages are run again with other settings; time and memory of each."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 LATER = ("bake", "evaluate", "turntable", "mesh", "points")
-OWN = (".lock", ".work", ".cache")  # a lock belongs to a file, whichever name it is opened by
+OWN = (".lock", ".work", ".cache")  # a lock belongs to the file, not to its name
 
 
 def linked_copy(run: Path, copy: Path) -> Path:
@@ -28,7 +28,7 @@ def linked_copy(run: Path, copy: Path) -> Path:
     if not (run / "train").is_dir():
         raise SystemExit(f"{run}: holds no trained field (train/). Run: enerf run SOURCE --out {run} --until train")
     shutil.copytree(run, copy, copy_function=link, ignore=lambda folder, names: [n for n in names if Path(folder) == run and n in (*LATER, *OWN)])
-    settings = copy / "run.json"  # is written again with other settings: not the link
+    settings = copy / "run.json"  # is written again with other settings, so not a link
     text = settings.read_bytes()
     settings.unlink()
     settings.write_bytes(text)
@@ -36,7 +36,7 @@ def linked_copy(run: Path, copy: Path) -> Path:
 
 
 def made(run: Path, stage: str, settings: dict[str, Any]) -> dict[str, float]:
-    """Make a stage whatever stands: `seconds` by the clock, `cpu_seconds` of all threads and `peak_mib` of resident memory, of the whole command."""
+    """Run a stage again: `seconds` by the clock, `cpu_seconds` of all threads and `peak_mib` of resident memory, of the whole command."""
     command = [sys.executable, "-m", "workflows.cli.main", "stage", stage, str(run), "--force", "--quiet"]
     for name, value in settings.items():
         command += ["--set", f"{name}={value}"]

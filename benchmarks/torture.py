@@ -2,15 +2,15 @@
 
     python benchmarks/torture.py [--kills 30] [--images 12] [--json FILE]
 
-Each round is a run folder of its own: it is killed in one stage after the other, each kill followed by `enerf run` again, until it is done; then
-the digests of all its artifacts are compared. On top of the moments that come by time:
+Each round has a run folder of its own. It is killed in one stage after the other, each kill followed by `enerf run`, until it is done; then the
+digests of all its artifacts are compared. Besides moments at random times:
 
     matching  while pairs of photographs are matched
     mp4       while the video is being written
     swap      while a new artifact takes the place of an older one: between the two renames, and after them
     publish   after an artifact was sealed, before it was renamed into the run
 
-The last two are reached by a child process that kills itself after a certain rename; the program that runs is otherwise the same.
+The last two are reached by a child process that kills itself after a certain rename.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ sys.exit(main(sys.argv[3:]))
 
 @dataclass
 class Kill:
-    """One kill: what was aimed at, and where it hit."""
+    """One kill: the moment that was intended, and the moment it hit."""
 
     round: int
     aim: str
@@ -74,7 +74,7 @@ class Kill:
 
 @dataclass
 class Child:
-    """A running `enerf run --json` and what it has said so far."""
+    """A running `enerf run --json` and its events so far."""
 
     process: subprocess.Popen[str]
     events: list[dict[str, Any]] = field(default_factory=list)

@@ -2,10 +2,9 @@
 
     python benchmarks/train.py SOURCE --runs FOLDER [--presets preview,standard,paper-n4] [--minutes 4] [--slice 20] [--json FILE] [--plot FILE]
 
-The presets take turns of `--slice` seconds, so that whatever else the machine does falls on all of them alike; each trains for `--minutes` in all, and is
-stopped there whatever its schedule says. Time is that of the training steps alone, by wall clock and by processor; pictures of held-back views are drawn
-between the turns and counted for nothing. A preset whose batch is too large for the machine simply gets fewer steps done: that is what is measured. With
-`--whole` the length of the schedule of each preset becomes what fits into the time, as with `enerf run --budget`.
+The presets take turns of `--slice` seconds, so that other load of the machine affects all of them; each trains for `--minutes` in all, wherever its
+schedule ends. Time is that of the training steps alone, wall clock and processor; test views are rendered between the turns and not counted. With
+`--whole` the schedule of each preset is as long as fits into the time, as with `enerf run --budget`.
 """
 
 from __future__ import annotations
@@ -81,10 +80,10 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     pixels = pixels_of(poses, views)
     settings = with_auto_sizes(settings, s, len(pixels))
     near, far = min(view.near for view in s.views), max(view.far for view in s.views)
-    if settings.far > 0:
+    if settings.far_plane > 0:
         near, far = stated_range(s, settings)
         pixels.near[:], pixels.far[:] = near, far
-    hold = settings.warm_up + TIMED
+    hold = settings.occupancy_warmup_steps + TIMED
     if whole:
         settings = dataclasses.replace(settings, iterations=MOST, rate_hold=hold)
     m = model(space_of(s), settings, s.background, "cpu", (near, far))
@@ -93,7 +92,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
 
     def plan(step: int, wall: float) -> Any:
         """As `stages.training.budget` does, by the time of this contender alone."""
-        if not warmed and step >= settings.warm_up:
+        if not warmed and step >= settings.occupancy_warmup_steps:
             warmed.append((step, wall))
         if step < hold:
             return None
@@ -103,8 +102,8 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     return Contender(preset, t, iter(train(t, pixels, anchors_of(poses, s))), FieldRenderer(m, near, far), plan if whole else None)
 
 
-def held_back(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
-    """Cameras, their true pictures, and by how much they are thinned."""
+def test_views(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
+    """Cameras, their images, and by how much both are subsampled."""
     from stages.evaluate import thinned, thinned_camera, truth_of
     from stages.io import scene
 
@@ -136,7 +135,7 @@ def plot(report: dict[str, Any], path: Path) -> None:
     axes = figure.add_subplot()
     for (name, row), colour in zip(report["presets"].items(), COLOURS, strict=False):
         axes.plot([p[0] for p in row["points"]], [p[3] for p in row["points"]], label=f"{name}, {row['steps']} steps", color=colour, marker=".")
-    axes.set(xlabel="seconds of training", ylabel="PSNR over held-back views / dB")
+    axes.set(xlabel="seconds of training", ylabel="PSNR over test views / dB")
     axes.set_title(f"{report['source']}, {report['processor']}, {report['threads']} threads")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
@@ -146,13 +145,13 @@ def plot(report: dict[str, Any], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", type=Path)
-    parser.add_argument("--runs", type=Path, required=True, help="where the run with the cameras lies, or is made")
+    parser.add_argument("--runs", type=Path, required=True, help="folder of the run with the cameras; made if it is not there")
     parser.add_argument("--presets", default="preview,standard,paper-n4")
     parser.add_argument("--minutes", type=float, default=4.0, help="of training, for each preset")
     parser.add_argument("--slice", type=float, default=20.0, help="seconds of a turn")
     parser.add_argument("--whole", action="store_true", help="fit each schedule into the time")
-    parser.add_argument("--views", type=int, default=4, help="held-back views that are drawn")
-    parser.add_argument("--side", type=int, default=200, help="longest side at which they are drawn, pixels at most")
+    parser.add_argument("--views", type=int, default=4, help="test views that are rendered")
+    parser.add_argument("--side", type=int, default=200, help="their longest side, pixels at most")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
@@ -163,7 +162,7 @@ def main() -> None:
 
     use_all_cores()
     poses, seconds, load = run / "poses", 60 * arguments.minutes, os.getloadavg()
-    views = held_back(poses, arguments.views, arguments.side)
+    views = test_views(poses, arguments.views, arguments.side)
     field_of = [contender(preset, poses, seconds, arguments.whole) for preset in arguments.presets.split(",")]
     for each in field_of:
         each.turn(0.0)
