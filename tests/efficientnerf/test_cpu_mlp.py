@@ -174,7 +174,7 @@ def test_turning() -> None:
 PROGRAM = """
 import sys
 import numpy as np
-from efficientnerf.kernels import tiles
+from efficientnerf.backends.numba import tiles
 from tests.efficientnerf.test_cpu_mlp import passes, weights_of
 
 assert not tiles.DOTS and tiles.VECTORS == 1
