@@ -70,7 +70,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     coarse = sampling.valid_samples(*march)
     count = len(coarse.start)
     weight = torch.rand(count, generator=generator).to(device)
-    pivotal = sampling.pivots(weight, coarse.first, 1e-4, 8)
+    pivotal = sampling.select_pivots(weight, coarse.first, 1e-4, 8)
     fine = sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2)
     samples = len(fine.start)
     field: Any = m.fine
@@ -90,7 +90,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     capacity = math.ceil(1.3 * count / 4096) * 4096
     jobs: list[tuple[str, Callable[[], Any], int, float]] = [
         ("march", lambda: sampling.valid_samples(*march, capacity=capacity), count, 32.0),
-        ("pivots", lambda: sampling.pivots(weight, coarse.first, 1e-4, 8), count, 5.0),
+        ("pivots", lambda: sampling.select_pivots(weight, coarse.first, 1e-4, 8), count, 5.0),
         ("pivotal_samples", lambda: sampling.pivotal_samples(m.space, origins, directions, offset, coarse, pivotal, 2, 2 * capacity), samples, 32.0),
         ("encode", encode, samples, 12 + corner + 8 * levels),
         ("encode_backward", lambda: torch.autograd.grad(features, table, grad_features, retain_graph=True), samples, 12 + 2 * corner + 8 * levels),

@@ -124,7 +124,7 @@ def field_kernels(seconds: float) -> dict[str, Any]:
     weights = [weight.detach().numpy() for weight in field.weights]
     products, activations = 2 * count * sum(w.size for w in weights), wide * count * sum(len(w) for w in weights[:-1])
     out, grad_out = np.empty((count, len(weights[-1])), np.float32), rng.normal(size=(count, len(weights[-1]))).astype(np.float32)
-    prepared = mlp.prepared(weights, bfloat16=wide == 2)
+    prepared = mlp.pack_weights(weights, bfloat16=wide == 2)
     kept = mlp.forward(features, prepared, 0.0, out, keep=True)
     network = best(lambda: mlp.forward(features, prepared, 0.0, out, keep=True), seconds)
     network_back = best(lambda: mlp.backward(grad_out, features, prepared, kept, [w.shape for w in weights]), seconds)
@@ -143,7 +143,7 @@ def compositing_kernels(seconds: float) -> dict[str, Any]:
     import numpy as np
     import torch
 
-    from efficientnerf.backends.numba import rays
+    from efficientnerf.backends.numba import compositing
     from efficientnerf.rendering.harmonics import basis, harmonics_count
     from efficientnerf.training.settings import TrainSettings
 
@@ -154,8 +154,8 @@ def compositing_kernels(seconds: float) -> dict[str, Any]:
     colour, opacity, distortion = np.empty((RAYS, 3), np.float32), np.empty(RAYS, np.float32), np.empty(RAYS, np.float32)
     outputs = np.empty(count, np.float32), np.empty((count, 3), np.float32)  # weights and colours of samples
     grad_raw, grad_background, ones = np.empty(raw.shape, np.float32), np.empty((RAYS, 3), np.float32), np.ones(count, np.float32)
-    forward = best(lambda: rays.composite(*packed, True, colour, opacity, distortion, *outputs), seconds)
-    backward = best(lambda: rays.composite_backward(*packed, True, *outputs, colour, opacity, distortion, ones, grad_raw, grad_background), seconds)
+    forward = best(lambda: compositing.composite(*packed, True, colour, opacity, distortion, *outputs), seconds)
+    backward = best(lambda: compositing.composite_backward(*packed, True, *outputs, colour, opacity, distortion, ones, grad_raw, grad_background), seconds)
     return {
         "composite": row(count, forward, packed[0].nbytes + 16 * count),
         "composite backward": row(count, backward, 2 * packed[0].nbytes + 16 * count),

@@ -88,9 +88,9 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
     """Means over the rays of some renders: what the kernel looks up, and the bytes that it reads, most of them from caches."""
     import numpy as np
 
-    from efficientnerf.backends.numba.tree.rendering import picture_work
+    from efficientnerf.backends.numba.tree.rendering import image_work
 
-    work = np.concatenate([picture_work(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
+    work = np.concatenate([image_work(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
     cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
     # A cell is 4 bytes; a tested sample reads one density; an interpolated one the four numbers of eight voxels, colours among them.
     read = 4 * cells + 4 * tested + 8 * 16 * mixed
@@ -106,15 +106,15 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
 
 def memory(tree: Any, view: Any) -> dict[str, float]:
     """Bytes in memory while rendering: the tree, its packed form, the threads' blocks, and the framebuffer."""
-    from efficientnerf.backends.numba.tree.rendering import pool_bytes
+    from efficientnerf.backends.numba.tree.rendering import scratch_bytes
 
     values = vars(tree) | vars(tree.harmonics) if hasattr(tree.harmonics, "__dict__") else vars(tree)
     own = sum(part.nbytes for part in values.values() if hasattr(part, "nbytes") and not isinstance(part, tuple))
     rendering = tree.render(view)
     framebuffer = sum(part.nbytes for part in vars(rendering).values())
-    total = own + tree.packed.nbytes + pool_bytes(tree) + framebuffer
+    total = own + tree.packed.nbytes + scratch_bytes(tree) + framebuffer
     each = round(total / max(1, len(tree.density_values)), 1)
-    return {"tree": own, "packed": tree.packed.nbytes, "blocks": pool_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
+    return {"tree": own, "packed": tree.packed.nbytes, "blocks": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
 
 
 def main() -> int:

@@ -236,7 +236,7 @@ def render_rays(
         return _looked_by_voxels(m, rays, directions, offset, behind, coarse, prune=prune, rng=rng, capacity=for_fine, fine_samples=fine_samples)
     coarse_raw, seen = _seen(m, m.coarse, directions, coarse, behind)
     weight = seen.weight.detach()
-    pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_threshold, m.settings.max_pivots)
+    pivotal = dispatch.select_pivots(weight, coarse.first, m.settings.pivotal_threshold, m.settings.max_pivots)
     if m.settings.sampling == "efficient":
         if rng is not None and m.settings.exploration_fraction > 0:
             pivotal = pivotal | _chance(len(pivotal), m.settings.exploration_fraction, rng, pivotal.device)
@@ -256,7 +256,7 @@ def _looked_by_voxels(
     """Pivots by what the density voxels hold, without a coarse field; while nothing is pruned, all intervals, with one sample each."""
     weight = voxel_weights(m.voxels, coarse.point, coarse.length, coarse.first)
     if prune:
-        pivotal = dispatch.pivots(weight, coarse.first, m.settings.pivotal_threshold, m.settings.max_pivots)
+        pivotal = dispatch.select_pivots(weight, coarse.first, m.settings.pivotal_threshold, m.settings.max_pivots)
         if rng is not None and m.settings.exploration_fraction > 0:
             pivotal = pivotal | _chance(len(pivotal), m.settings.exploration_fraction, rng, pivotal.device)
         fine = dispatch.pivotal_samples(m.space, rays.origins, rays.directions, offset, coarse, pivotal, fine_samples, capacity)

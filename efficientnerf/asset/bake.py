@@ -126,13 +126,13 @@ def coarsened(
 ) -> Visible:
     """What was seen of a grid, for one of larger voxels of the same corner: each of these has the greatest weight of the voxels whose centres lie in it.
     Weights that don't exceed `threshold` are left out."""
-    from efficientnerf.backends.numba.voxels import carry
+    from efficientnerf.backends.numba.bricks import resample_weights
 
     row_of = np.full(math.prod(to_shape), -1, np.int32)
     given = seen.cells, seen.greatest, float(np.float32(threshold)), shape, to_shape, voxel / to_voxel, brick, row_of
-    rows = carry(*given, np.zeros((0, brick**3), np.float32), 0)
+    rows = resample_weights(*given, np.zeros((0, brick**3), np.float32), 0)
     greatest = np.zeros((rows, brick**3), np.float32)
-    carry(*given, greatest, rows)
+    resample_weights(*given, greatest, rows)
     cells = np.flatnonzero(row_of >= 0)
     return replace(seen, cells=cells, greatest=greatest[row_of[cells]])
 
@@ -142,7 +142,7 @@ def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, thresh
 
     They are marked in the cells that they reach, so that memory grows with what is found, and neither with the grid nor with the neighbours looked at.
     """
-    from efficientnerf.backends.numba.voxels import listed, mark
+    from efficientnerf.backends.numba.bricks import flat_indices, threshold_and_dilate
 
     threshold = float(np.float32(threshold))
     reached = np.zeros(shape, bool)
@@ -156,9 +156,9 @@ def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, thresh
     row_of = np.full(reached.size, -1, np.int32)
     row_of[cells] = np.arange(len(cells))
     into = np.zeros((len(cells), brick**3), bool)
-    mark(seen.cells, seen.greatest, threshold, shape, brick, dilate, row_of, into)
+    threshold_and_dilate(seen.cells, seen.greatest, threshold, shape, brick, dilate, row_of, into)
     flat = np.empty(np.count_nonzero(into), np.int64)
-    listed(into, cells, shape, brick, flat)
+    flat_indices(into, cells, shape, brick, flat)
     flat.sort()
     index = np.empty((len(flat), 3), np.int32)
     for axis in (2, 1, 0):

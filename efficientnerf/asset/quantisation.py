@@ -102,7 +102,7 @@ def _base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def clustered(vectors: np.ndarray, share: np.ndarray, entries: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Centroids (P, D) float32, halves in value, P <= entries, and the code (n,) of each vector (n, D) float32."""
-    from efficientnerf.backends.numba import clusters
+    from efficientnerf.backends.numba import kmeans
 
     rng = np.random.Generator(np.random.Philox(key=seed))
     sample = _sample(vectors, share, max(SAMPLES, 16 * entries), rng)
@@ -110,7 +110,7 @@ def clustered(vectors: np.ndarray, share: np.ndarray, entries: int, seed: int) -
     for _ in range(ITERATIONS):
         found, distance = _nearest(sample, centroids)
         total, count = np.zeros(centroids.shape), np.zeros(len(centroids), np.int64)
-        clusters.sums(sample, found, total, count)
+        kmeans.sum_clusters(sample, found, total, count)
         moved = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], centroids).astype(np.float32)
         idle = np.flatnonzero(count == 0)
         if len(idle):  # an entry that nothing chose takes the place of what is worst served
@@ -134,7 +134,7 @@ def _sample(vectors: np.ndarray, share: np.ndarray, count: int, rng: np.random.G
 
 def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.ndarray:
     """k-means++: each next centroid a vector drawn in proportion to its squared distance from those before; fewer where none is away."""
-    from efficientnerf.backends.numba import clusters
+    from efficientnerf.backends.numba import kmeans
 
     if not len(sample):
         return np.zeros((0, sample.shape[1]), np.float32)
@@ -144,7 +144,7 @@ def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.nd
     chosen = [few[int(rng.integers(len(few)))]]
     distance = np.full(len(few), np.inf, np.float32)
     for _ in range(entries - 1):
-        clusters.approach(turned, chosen[-1], distance)
+        kmeans.lower_distances(turned, chosen[-1], distance)
         reached = np.cumsum(distance, dtype=np.float64)
         if reached[-1] <= 0:
             break
@@ -154,8 +154,8 @@ def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.nd
 
 def _nearest(vectors: np.ndarray, centroids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Index of the nearest centroid of each vector, and the squared distance to it."""
-    from efficientnerf.backends.numba import clusters
+    from efficientnerf.backends.numba import kmeans
 
     found, distance = np.zeros(len(vectors), np.int32), np.zeros(len(vectors), np.float32)
-    clusters.nearest(np.ascontiguousarray(vectors.T), centroids, found, distance)
+    kmeans.nearest_centroids(np.ascontiguousarray(vectors.T), centroids, found, distance)
     return found, distance

@@ -1,7 +1,7 @@
 """From a raw tree to one that looks like the training images: its values descend on the error of its own pictures.
 
 The structure of the tree stays; what is fitted is the optical thickness of each voxel (by its logarithm, so that it stays positive and matter that
-nobody needs fades away) and its harmonics. The loss of a ray is that of `cpu_tree_grad.Seen`: photographs are compared through what the network puts
+nobody needs fades away) and its harmonics. The loss of a ray is that of `RayTargets`: photographs are compared through what the network puts
 before and behind the box; objects that were cut out are compared over every background at once.
 
 Every random choice of step n is drawn from a generator seeded by (seed, n), as in training; the kernels sum in a fixed order. So the same
@@ -22,7 +22,7 @@ import numpy as np
 
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients
-from efficientnerf.backends.numba.tree.gradients import Grid, Records, Seen
+from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords, TreeGrid
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.pixels import Pixels
 
@@ -34,7 +34,7 @@ OPAQUE = 2.0  # optical thickness of a voxel to begin with at most: networks say
 GREY, MATTE = 0.5, 0.25  # mean of a channel of a background of any colour, and three times the variance: see `Targets`
 WEIGHED_RAYS, MEASURED_RAYS = 2**16, 2**14  # in a bundle; those that are measured leave records
 
-Bundle = tuple[Any, Any, Seen]  # see `Targets.draw`
+Bundle = tuple[Any, Any, RayTargets]  # see `Targets.draw`
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Targets:
 
         return sent_targets(self, device)
 
-    def draw(self, count: int, rng: np.random.Generator, *, declared: bool = False) -> tuple[Any, Any, Seen]:
+    def draw(self, count: int, rng: np.random.Generator, *, declared: bool = False) -> tuple[Any, Any, RayTargets]:
         """Origins (R, 3) and unit directions (R, 3) of `count` random pixels, world frame, and what they should show; arrays, or tensors of the device.
 
         declared  objects are seen on the background of the scene alone
@@ -89,7 +89,7 @@ class Targets:
         at = rng.integers(len(self.chosen), size=count)
         return self.of(self.chosen[at], at, declared=declared)
 
-    def of(self, index: np.ndarray, at: np.ndarray | None, *, declared: bool = False) -> tuple[Any, Any, Seen]:
+    def of(self, index: np.ndarray, at: np.ndarray | None, *, declared: bool = False) -> tuple[Any, Any, RayTargets]:
         """`draw` for pixels `index`; `at` are their places in `chosen`."""
         bundle: tuple[Any, ...] = self.pixels.bundle(index)
         origins, directions, _, _, colour = bundle
@@ -98,7 +98,7 @@ class Targets:
         if self.background is None:
             assert at is not None
             before, behind = self._rows(self.before, at), self._rows(self.behind, at)
-            return origins, directions, Seen(truth - before[:, :3], behind, 1 - before[:, 3], ones, 0.0)
+            return origins, directions, RayTargets(truth - before[:, :3], behind, 1 - before[:, 3], ones, 0.0)
         matted = colour.shape[1] == 4
         anything = (matted or self.infinite) and not declared
         behind = colour[:, :3] * 0
@@ -109,7 +109,7 @@ class Targets:
         if matted:
             opacity = colour[:, 3] * 1
             truth = truth * opacity[:, None] + behind * (1 - opacity[:, None])
-        return origins, directions, Seen(truth * 1, behind, ones, opacity, MATTE if anything else 0.0)
+        return origins, directions, RayTargets(truth * 1, behind, ones, opacity, MATTE if anything else 0.0)
 
     def _rows(self, part: Any, at: np.ndarray) -> Any:
         """Rows `at` of an array, or of a tensor on the pixels' device, in float32."""
@@ -180,8 +180,8 @@ def kept(o: Optimiser, keep: np.ndarray, tree: NerfTree) -> Optimiser:
     return Optimiser(tree, **{name: getattr(o, name)[keep] for name in SQUARES}, step=o.step)
 
 
-def grid_of(tree: NerfTree) -> Grid:
-    return Grid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, gradients.STEP * tree.voxel, tree.lookup == "nearest")
+def grid_of(tree: NerfTree) -> TreeGrid:
+    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, gradients.STEP * tree.voxel, tree.lookup == "nearest")
 
 
 def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -221,7 +221,7 @@ def optimise(
             view_share=view_share,
         )  # fmt: skip
         return
-    grid, records = grid_of(o.tree), Records()
+    grid, records = grid_of(o.tree), SampleRecords()
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
     stamp = np.zeros(len(o.density), np.int32)
     rates = np.full(o.sh.shape[1], colour_rate, np.float32)
@@ -230,9 +230,9 @@ def optimise(
         number = o.step + 1
         origins, directions, seen = targets.draw(rays, randomness(seed, number))
         start, along, bases = in_voxels(o.tree, origins, directions)
-        loss, counts = gradients.look(grid, start, along, bases, o.density, o.sh, seen, records)
+        loss, counts = gradients.forward_backward(grid, start, along, bases, o.density, o.sh, seen, records)
         fall = final ** (number / steps)
-        gradients.descend(
+        gradients.rmsprop_step(
             records, counts, bases, (o.density, o.sh), (by_density, by_sh), (o.square_density, o.square_sh), o.visits, stamp,
             number=number, thickness=o.tree.voxel, density_rate=density_rate * fall, sh_rates=rates * np.float32(fall), decay=DECAY, epsilon=EPSILON,
         )  # fmt: skip
@@ -253,10 +253,10 @@ def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
         from efficientnerf.asset import refinement_device
 
         return refinement_device.total_loss(tree, targets, bundles) / (3 * count)
-    grid, records, sh = grid_of(tree), Records(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
+    grid, records, sh = grid_of(tree), SampleRecords(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
     total = 0.0
     for origins, directions, seen in bundles:
-        loss, _ = gradients.look(grid, *in_voxels(tree, origins, directions), tree.density_values, sh, seen, records)
+        loss, _ = gradients.forward_backward(grid, *in_voxels(tree, origins, directions), tree.density_values, sh, seen, records)
         total += float(loss.sum())
     return total / (3 * count)
 
@@ -272,10 +272,10 @@ def greatest_weights(tree: NerfTree, targets: Targets, count: int, seed: int, lo
         from efficientnerf.asset import refinement_device
 
         return refinement_device.greatest_weights(tree, targets, bundles)
-    grid, greatest = grid_of(tree), np.zeros((gradients.parts(), len(tree.density_values)), np.float32)
+    grid, greatest = grid_of(tree), np.zeros((gradients.contribution_parts(), len(tree.density_values)), np.float32)
     for origins, directions, seen in bundles:
         start, along, _ = in_voxels(tree, origins, directions)
-        gradients.greatest(grid, start, along, tree.density_values, seen.gain, greatest)
+        gradients.max_contributions(grid, start, along, tree.density_values, seen.transmittance, greatest)
     return greatest.max(axis=0)
 
 

@@ -123,5 +123,5 @@ def greatest_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]
     grid, density, _ = values_of(tree, targets.pixels.device)
     greatest = torch.zeros_like(density)
     for origins, directions, seen in bundles:
-        tree_gradients.weigh(grid, rays_in_voxels(tree, origins, directions), density, seen.gain.contiguous(), greatest)
+        tree_gradients.weigh(grid, rays_in_voxels(tree, origins, directions), density, seen.transmittance.contiguous(), greatest)
     return greatest.cpu().numpy()

@@ -183,9 +183,9 @@ class NerfTree:
             return Rendering(*tree_rays(self, origins, directions, None, eye, columns))
         from efficientnerf.backends.numba import ndc as cpu_ndc
 
-        rays = cpu_ndc.rays(self.ndc, origins, directions)
+        rays = cpu_ndc.warp_rays(self.ndc, origins, directions)
         colour, opacity, along, normal = tree_rays(self, rays.origins, rays.directions, np.asarray(directions), eye, columns)
-        return Rendering(colour, opacity, *cpu_ndc.hits(self.ndc, rays, along, normal))
+        return Rendering(colour, opacity, *cpu_ndc.unwarp_hits(self.ndc, rays, along, normal))
 
     def frame_rays(self, origins: Any, directions: Any) -> WarpedRays:
         """World rays (R, 3), unit directions, as rays of the tree's frame: what anything that walks the grid itself has to do first.

@@ -69,7 +69,7 @@ def valid_samples(
     _refuse(capacity)
     if not _fast(origins, directions, near, far, offset, voxels):
         return samples.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, whole=whole)
-    from efficientnerf.backends.numba import rays as cpu
+    from efficientnerf.backends.numba import sampling as cpu
 
     *packed, tried = cpu.valid_samples(
         _array(origins), _array(directions), _array(near), _array(far), _array(offset), *_box(space), step, slots, _array(voxels), threshold, whole
@@ -83,24 +83,24 @@ def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activat
     False where there is no kernel for it."""
     if not _fast(values, point, raw):
         return False
-    from efficientnerf.backends.numba import voxels as cpu_voxels
+    from efficientnerf.backends.numba import occupancy as cpu
 
-    cpu_voxels.update_occupancy_maximum(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
+    cpu.update_occupancy(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
     return True
 
 
-def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
-    """See `efficientnerf.sampling.samples.pivots`."""
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+    """See `efficientnerf.sampling.samples.select_pivots`."""
     if on_device(weight):
         from efficientnerf.backends.triton import sampling as cuda_sampling
 
-        return cuda_sampling.pivots(weight, first, threshold, most)
+        return cuda_sampling.select_pivots(weight, first, threshold, most)
     if not _fast(weight):
-        return samples.pivots(weight, first, threshold, most)
-    from efficientnerf.backends.numba import rays as cpu
+        return samples.select_pivots(weight, first, threshold, most)
+    from efficientnerf.backends.numba import sampling as cpu
 
     out = torch.empty(len(weight), dtype=torch.bool)
-    cpu.pivots(_array(weight), _array(first), np.float32(threshold), most, out.numpy())
+    cpu.select_pivots(_array(weight), _array(first), np.float32(threshold), most, out.numpy())
     return out
 
 
@@ -115,7 +115,7 @@ def pivotal_samples(
     _refuse(capacity)
     if not _fast(origins, directions, offset, coarse.start):
         return samples.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
-    from efficientnerf.backends.numba import rays as cpu
+    from efficientnerf.backends.numba import sampling as cpu
 
     fine = cpu.pivotal_samples(
         _array(origins), _array(directions), _array(offset), *_box(space),
@@ -162,7 +162,7 @@ def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, bac
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, exponential: bool) -> tuple[Tensor, ...]:
-        from efficientnerf.backends.numba import rays as cpu
+        from efficientnerf.backends.numba import compositing as cpu
 
         rays = len(first) - 1
         colour, opacity, distortion = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays)
@@ -178,7 +178,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        from efficientnerf.backends.numba import rays as cpu
+        from efficientnerf.backends.numba import compositing as cpu
 
         raw, length, first, harmonics, background, weight, rgb = ctx.saved_tensors
         grad_raw, grad_background = torch.empty(raw.shape), torch.empty(background.shape)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from efficientnerf.backends.dispatch import on_device
-from efficientnerf.backends.numba.rays import PRIME_Y, PRIME_Z
+from efficientnerf.backends.numba.hash_grid import PRIME_Y, PRIME_Z
 from efficientnerf.backends.torch.linear_chain import precision_of
 from efficientnerf.rendering.harmonics import harmonics_count
 
@@ -94,7 +94,7 @@ def _encoded(points: Tensor, table: Tensor, field: HashField) -> tuple[Tensor, T
     from efficientnerf.backends.numba import hash_grid
 
     turned, out = torch.empty(3, len(points)), torch.empty(FEATURES * len(field.sides), len(points))
-    hash_grid.across(points.detach().contiguous().numpy(), turned.numpy())
+    hash_grid.transpose_points(points.detach().contiguous().numpy(), turned.numpy())
     hash_grid.encode(turned.numpy(), table.detach().numpy(), field.sides, field.dense, field.starts, field.mask, out.numpy())
     return turned, out
 
@@ -135,7 +135,7 @@ class _Network(torch.autograd.Function):
         from efficientnerf.backends.numba import mlp
 
         at, features = _encoded(points, table, field)
-        prepared = mlp.prepared([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
+        prepared = mlp.pack_weights([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
         out = torch.empty(len(points), len(weights[-1]))
         kept = mlp.forward(features.numpy(), prepared, field.log_initial_density, out.numpy(), keep=any(ctx.needs_input_grad))
         if any(ctx.needs_input_grad):

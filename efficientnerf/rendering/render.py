@@ -30,7 +30,7 @@ FIELD_RAYS_PER_BLOCK = 8192
 def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
     """See `NerfTree.render`."""
     from efficientnerf.asset.tree import Rendering
-    from efficientnerf.backends.numba.tree.rendering import render_picture
+    from efficientnerf.backends.numba.tree.rendering import render_image
 
     if supersample < 1:
         raise ValueError(f"supersample {supersample}: expected at least 1")
@@ -43,7 +43,7 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
         return Rendering(*(part.cpu().numpy() for part in draw(tree.on_device, camera, background=background, supersample=supersample)))
     if tree.ndc is not None or tree.lookup == "nearest":
         return _render_by_rays(tree, camera, behind, supersample)
-    return Rendering(*render_picture(tree, camera, supersample, behind, normals=True, rays_per_band=RAYS_PER_BAND))
+    return Rendering(*render_image(tree, camera, supersample, behind, normals=True, rays_per_band=RAYS_PER_BAND))
 
 
 def _rays_as_they_are(tree: NerfTree, camera: Camera, behind: np.ndarray) -> Rendering:

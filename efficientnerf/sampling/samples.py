@@ -101,7 +101,7 @@ def valid_samples(
     return Samples(first, start, extent, length, point, tried)
 
 
-def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
     """Which coarse samples are pivotal: (N,) bool, those with a weight above `threshold`, the `most` heaviest of a ray.
 
     The cap bounds the work where a field is still fog. The lowest weights are dropped, in training and in rendering alike; among equals the

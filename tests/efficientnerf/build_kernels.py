@@ -77,7 +77,7 @@ def training_step() -> None:
         space = Space(np.array([[-1.0] * 3, [1.0] * 3]), contracted)
         rays = (torch.zeros(8, 3), torch.ones(8, 3), torch.zeros(8), torch.ones(8), torch.zeros(8))
         found = sampling.valid_samples(space, *rays, 0.1, 4, torch.ones(4, 4, 4), 0.0, capacity=32)
-        pivotal = sampling.pivots(found.start, found.first, 0.1, 4)
+        pivotal = sampling.select_pivots(found.start, found.first, 0.1, 4)
         sampling.pivotal_samples(space, rays[0], rays[1], rays[4], found, pivotal, 2, capacity=64)
     for terms in (1, 9, 25):
         for activation in ("exp", "softplus"):

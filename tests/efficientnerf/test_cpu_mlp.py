@@ -57,7 +57,7 @@ def expected(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, 
 
 
 def passes(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, bfloat16: bool, offset: float = 0.0) -> list[np.ndarray]:
-    prepared = mlp.prepared(weights, bfloat16)
+    prepared = mlp.pack_weights(weights, bfloat16)
     out = np.full((features.shape[1], len(weights[-1])), np.nan, np.float32)
     kept = mlp.forward(features, prepared, offset, out, keep=True)
     pull, of_weights = mlp.backward(grad, features, prepared, kept, [w.shape for w in weights])
@@ -88,7 +88,7 @@ def test_nothing_beside_the_outputs_is_written_and_none_left_out(bfloat16: bool)
             around = np.full((samples + 2 * outputs + 32, outputs), 7, np.float32)
             out = around[outputs : outputs + samples]
             out[:] = np.nan
-            prepared = mlp.prepared(weights, bfloat16)
+            prepared = mlp.pack_weights(weights, bfloat16)
             assert mlp.forward(features, prepared, 0.5, out, keep=False).size == 0
             assert (around[:outputs] == 7).all()
             assert (around[outputs + samples :] == 7).all()

@@ -116,10 +116,10 @@ def test_pivots_are_those_of_torch(most: int) -> None:
     counts = [0, 4, 12, 1, 7, 0, 30, 0]
     weight = torch.from_numpy(np.round(rng.random(sum(counts)), 1).astype(np.float32))  # many equals
     first = torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]))
-    expected = sampling.pivots(weight, first, float(np.float32(0.3)), most)
-    assert torch.equal(cuda.pivots(weight.to(DEVICE), first.to(DEVICE), float(np.float32(0.3)), most).cpu(), expected)
+    expected = sampling.select_pivots(weight, first, float(np.float32(0.3)), most)
+    assert torch.equal(cuda.select_pivots(weight.to(DEVICE), first.to(DEVICE), float(np.float32(0.3)), most).cpu(), expected)
     padded = torch.cat([weight, torch.ones(9)]).to(DEVICE)  # heavy, but of no ray
-    ours = cuda.pivots(padded, first.to(DEVICE), float(np.float32(0.3)), most).cpu()
+    ours = cuda.select_pivots(padded, first.to(DEVICE), float(np.float32(0.3)), most).cpu()
     assert torch.equal(ours, torch.cat([expected, torch.zeros(9, dtype=torch.bool)]))
 
 
@@ -133,7 +133,7 @@ def test_no_rays_no_slots_and_no_samples_are_fine() -> None:
     rays, space = there(make_rays("outside")), Space(BOUNDS, False)
     empty = cuda.valid_samples(space, *rays, STEP, 0, voxels, 0.4)
     assert not empty.first.any()
-    assert cuda.pivots(empty.start, empty.first, 0.1, 3).shape == (0,)
+    assert cuda.select_pivots(empty.start, empty.first, 0.1, 3).shape == (0,)
     fine = cuda.pivotal_samples(space, rays.origins, rays.directions, rays.offset, empty, torch.zeros(0, dtype=torch.bool, device=DEVICE), 2)
     assert not fine.first.any()
     assert fine.point.shape == (0, 3)

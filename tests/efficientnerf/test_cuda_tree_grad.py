@@ -12,7 +12,7 @@ import torch
 from efficientnerf.asset import refinement
 from efficientnerf.asset.refinement import Targets, error, greatest_weights, optimise, optimiser
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.gradients import Seen
+from efficientnerf.backends.numba.tree.gradients import RayTargets
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.pixels import Pixels
@@ -26,11 +26,11 @@ kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
 device = pytest.importorskip("efficientnerf.asset.refinement_device")
 
 
-def there(seen: Seen) -> Seen:
-    return Seen(*(torch.from_numpy(np.asarray(part, np.float32)).to(DEVICE) for part in seen[:4]), seen.matte)
+def there(seen: RayTargets) -> RayTargets:
+    return RayTargets(*(torch.from_numpy(np.asarray(part, np.float32)).to(DEVICE) for part in seen[:4]), seen.opacity_weight)
 
 
-def gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: Seen) -> tuple[np.ndarray, ...]:
+def gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets) -> tuple[np.ndarray, ...]:
     """Loss of each ray, and the gradients of their sum by density and harmonics."""
     rays = device.rays_in_voxels(tree, *(torch.from_numpy(a).to(DEVICE) for a in (origins, directions)))
     grid, density, sh = device.values_of(tree, torch.device(DEVICE))
@@ -70,7 +70,7 @@ def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
     seen = seen_at_random(120, 0.3, np.float32)
     _, by_density, by_sh = gradients(tree, origins, directions, seen)
     order = np.random.default_rng(0).permutation(120)
-    again = gradients(tree, origins[order], directions[order], Seen(*(part[order] for part in seen[:4]), seen.matte))
+    again = gradients(tree, origins[order], directions[order], RayTargets(*(part[order] for part in seen[:4]), seen.opacity_weight))
     assert np.array_equal(by_density, again[1])
     assert np.array_equal(by_sh, again[2])
 
@@ -85,7 +85,7 @@ def test_sums_of_the_most_rays_cannot_overflow() -> None:
     middle = (tree.bounds_min + tree.bounds_max) / 2
     origins = np.tile(middle - [0, 0, 2.0], (count, 1))
     directions = np.tile([0.0, 0, 1], (count, 1))
-    seen = Seen(np.full((count, 3), -1.0), np.ones((count, 3)), np.ones(count), np.ones(count), 0.25)
+    seen = RayTargets(np.full((count, 3), -1.0), np.ones((count, 3)), np.ones(count), np.ones(count), 0.25)
     _, by_density, _ = gradients(tree, origins, directions, seen)
     per_ray = by_density[0] / tree.voxel / count
     assert -25 < per_ray < -4
@@ -180,7 +180,7 @@ def test_targets_on_the_device_say_the_same(kind: str) -> None:
     for ours, theirs in zip((*same[1][:2], *same[1][2][:4]), (*same[0][:2], *same[0][2][:4]), strict=True):
         np.testing.assert_allclose(ours.cpu().numpy(), theirs, atol=2e-6)
         assert theirs.dtype == np.float32
-    assert same[0][2].matte == same[1][2].matte
+    assert same[0][2].opacity_weight == same[1][2].opacity_weight
 
 
 @pytest.mark.parametrize("stride", [1, 8])

@@ -15,7 +15,7 @@ from efficientnerf.asset.bake import voxel_coordinates, with_voxels
 from efficientnerf.asset.refinement import Targets, error, greatest_weights, grid_of, in_voxels, optimise, optimiser
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
-from efficientnerf.backends.numba.tree.gradients import Records, Seen
+from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
 from efficientnerf.rendering.render import render_tree_reference
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
@@ -23,19 +23,19 @@ from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 TREES = [(1, 0), (3, 1), (4, 2), (2, 3)]
 
 
-def seen_at_random(count: int, matte: float, dtype: Any = np.float64) -> Seen:
+def seen_at_random(count: int, matte: float, dtype: Any = np.float64) -> RayTargets:
     rng = np.random.default_rng(5)
     shapes: tuple[Any, ...] = ((count, 3), (count, 3), count, count)
-    return Seen(*(rng.random(shape).astype(dtype) for shape in shapes), matte)
+    return RayTargets(*(rng.random(shape).astype(dtype) for shape in shapes), matte)
 
 
-def loss_by_torch(colour: torch.Tensor, opacity: torch.Tensor, seen: Seen) -> torch.Tensor:
-    truth, behind, gain, matte = (torch.from_numpy(a).double() for a in (seen.colour, seen.behind, seen.gain, seen.opacity))
+def loss_by_torch(colour: torch.Tensor, opacity: torch.Tensor, seen: RayTargets) -> torch.Tensor:
+    truth, behind, gain, matte = (torch.from_numpy(a).double() for a in (seen.colour, seen.background, seen.transmittance, seen.opacity))
     off = gain[:, None] * (colour + (1 - opacity)[:, None] * behind) - truth
-    return (off**2).sum(dim=1) + seen.matte * (opacity - matte) ** 2
+    return (off**2).sum(dim=1) + seen.opacity_weight * (opacity - matte) ** 2
 
 
-def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: Seen) -> tuple[np.ndarray, ...]:
+def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets) -> tuple[np.ndarray, ...]:
     """What `gradients` gives, by torch's reference in float64."""
     density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
     loss = loss_by_torch(*render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
@@ -45,14 +45,16 @@ def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.nd
     return loss.detach().numpy(), density.grad.numpy(), sh.grad.numpy()
 
 
-def gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: Seen, dtype: Any = np.float64, stop: float = 0.0) -> tuple[np.ndarray, ...]:
+def gradients(
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets, dtype: Any = np.float64, stop: float = 0.0
+) -> tuple[np.ndarray, ...]:
     """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels."""
     start, along, bases = in_voxels(tree, origins, directions)
     density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
-    records = Records(dtype)
-    loss, counts = kernels.look(grid_of(tree), start, along, bases.astype(dtype), density, sh, seen, records, stop=stop)
+    records = SampleRecords(dtype)
+    loss, counts = kernels.forward_backward(grid_of(tree), start, along, bases.astype(dtype), density, sh, seen, records, stop=stop)
     by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)
-    kernels.gradients(records, counts, bases.astype(dtype), by_density, by_sh)
+    kernels.sum_gradients(records, counts, bases.astype(dtype), by_density, by_sh)
     return loss, by_density, by_sh.reshape(tree.sh.shape)
 
 
@@ -106,7 +108,7 @@ def test_the_pictures_are_those_of_the_renderer() -> None:
     """The loss against black, nothing behind, is the square of the colour that `render_rays` gives."""
     tree = random_tree(2, brick=4, degree=2, share=0.6)
     origins, directions = rays_at(tree, 400)
-    black = Seen(*(np.zeros(shape, np.float32) for shape in ((400, 3), (400, 3))), np.ones(400, np.float32), np.zeros(400, np.float32), 0.0)
+    black = RayTargets(*(np.zeros(shape, np.float32) for shape in ((400, 3), (400, 3))), np.ones(400, np.float32), np.zeros(400, np.float32), 0.0)
     loss = gradients(tree, origins, directions, black, np.float32, kernels.STOP)[0]
     np.testing.assert_allclose(loss, (tree.render_rays(origins, directions).colour ** 2).sum(axis=1), atol=2e-3)
 
@@ -114,15 +116,15 @@ def test_the_pictures_are_those_of_the_renderer() -> None:
 def test_records_grow_until_all_samples_fit() -> None:
     tree = uniform_tree((12, 12, 12), brick=2, sigma=0.05)
     origins, directions = rays_at(tree, 300)
-    records = Records()
+    records = SampleRecords()
     records.room = 7
     start, along, bases = in_voxels(tree, origins, directions)
     o = optimiser(tree)
     seen = seen_at_random(300, 0.0, np.float32)
-    _, counts = kernels.look(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
+    _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
     assert 7 < counts.max() <= records.room
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
-    kernels.gradients(records, counts, bases, by_density, by_sh)
+    kernels.sum_gradients(records, counts, bases, by_density, by_sh)
     expected = gradients(tree, origins, directions, seen, np.float32, kernels.STOP)
     np.testing.assert_array_equal(by_density, expected[1])
 
@@ -194,8 +196,8 @@ def test_any_background_is_the_mean_over_random_ones() -> None:
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - truth) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
     white = targets.of(index, None, declared=True)[2]
-    assert white.matte == 0
-    np.testing.assert_array_equal(white.behind, 1)
+    assert white.opacity_weight == 0
+    np.testing.assert_array_equal(white.background, 1)
 
 
 def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> None:
@@ -211,8 +213,8 @@ def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> No
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - some.images[index] / 255) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
     declared = targets.of(index, None, declared=True)[2]
-    assert declared.matte == 0
-    np.testing.assert_array_equal(declared.behind, 0.5)
+    assert declared.opacity_weight == 0
+    np.testing.assert_array_equal(declared.background, 0.5)
 
 
 def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
@@ -281,7 +283,7 @@ def test_greatest_weights_are_those_of_a_march_by_hand_in_any_number_of_parts() 
     for parts in (1, 3):
         into = np.zeros((parts, len(tree.density_values)), np.float32)
         for half in (slice(0, 25), slice(25, 40)):  # what is known is raised
-            kernels.greatest(grid_of(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
+            kernels.max_contributions(grid_of(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
         found.append(into.max(axis=0))
     np.testing.assert_array_equal(*found)
     np.testing.assert_allclose(found[0], weights_by_hand(tree, origins, directions, gain), atol=1e-5)
@@ -290,7 +292,7 @@ def test_greatest_weights_are_those_of_a_march_by_hand_in_any_number_of_parts() 
 
 def test_steps_are_those_of_the_formula() -> None:
     tree = random_tree(4, brick=2, degree=1)
-    o, records = optimiser(tree), Records()
+    o, records = optimiser(tree), SampleRecords()
     sums, stamp = (np.zeros_like(o.density), np.zeros_like(o.sh)), np.zeros(len(o.density), np.int32)
     rates = np.linspace(0.01, 0.02, o.sh.shape[1]).astype(np.float32)
     density, sh = o.density.astype(np.float64), o.sh.astype(np.float64)
@@ -300,15 +302,15 @@ def test_steps_are_those_of_the_formula() -> None:
         seen = seen_at_random(100, 0.2, np.float32)
         start, along, bases = in_voxels(tree, origins, directions)
         _, by_density, by_sh = gradients(o.result(), origins, directions, seen, np.float32, kernels.STOP)
-        _, counts = kernels.look(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
-        kernels.descend(
+        _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
+        kernels.rmsprop_step(
             records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp,
             number=number, thickness=tree.voxel, density_rate=0.1, sh_rates=rates, decay=0.9, epsilon=1e-12,
         )  # fmt: skip
         named = np.unique(records.index[np.concatenate([np.arange(c) + b * records.room for b, c in enumerate(counts)])])
         met = np.isin(np.arange(len(density)), named)
         visits += met
-        slope, flat = by_density * np.maximum(density, kernels.LEAST / tree.voxel), by_sh.reshape(sh.shape)
+        slope, flat = by_density * np.maximum(density, kernels.MIN_THICKNESS / tree.voxel), by_sh.reshape(sh.shape)
         square_density = np.where(met, 0.9 * square_density + 0.1 * slope**2, square_density)
         square_sh = np.where(met, 0.9 * square_sh + 0.1 * (flat**2).mean(axis=1), square_sh)
         right = np.maximum(1 - 0.9**visits, 1e-30)

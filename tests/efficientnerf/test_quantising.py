@@ -12,7 +12,7 @@ from efficientnerf.asset.format import WRITERS, describe, load, save, serialize
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.quantisation import ENTRIES, clustered, compacted, quantised_density, quantised_harmonics
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
-from efficientnerf.backends.numba import clusters
+from efficientnerf.backends.numba import kmeans
 from tests.efficientnerf.trees import LOW, random_tree, rays_at
 
 
@@ -42,17 +42,17 @@ def test_the_nearest_is_the_nearest(count: int, size: int, entries: int) -> None
     rng = np.random.default_rng(count)
     vectors, centroids = rng.normal(size=(count, size)).astype(np.float32), rng.normal(size=(entries, size)).astype(np.float32)
     found, distance = np.zeros(count, np.int32), np.zeros(count, np.float32)
-    clusters.nearest(np.ascontiguousarray(vectors.T), centroids, found, distance)
+    kmeans.nearest_centroids(np.ascontiguousarray(vectors.T), centroids, found, distance)
     squared = ((vectors[:, None].astype(np.float64) - centroids) ** 2).sum(2)
     assert np.array_equal(found, squared.argmin(1))
     np.testing.assert_allclose(distance, squared.min(1), rtol=1e-5, atol=1e-6)
     total, number = np.zeros((entries, size)), np.zeros(entries, np.int64)
-    clusters.sums(vectors, found, total, number)
+    kmeans.sum_clusters(vectors, found, total, number)
     for p in range(entries):
         assert number[p] == (found == p).sum()
         np.testing.assert_allclose(total[p], vectors[found == p].sum(0, dtype=np.float64), atol=1e-9)
     approached = np.full(count, 1.0, np.float32)
-    clusters.approach(np.ascontiguousarray(vectors.T), centroids[0], approached)
+    kmeans.lower_distances(np.ascontiguousarray(vectors.T), centroids[0], approached)
     np.testing.assert_allclose(approached, np.minimum(squared[:, 0], 1), rtol=1e-5, atol=1e-6)
 
 

@@ -268,11 +268,11 @@ def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytes
 
 
 def test_the_work_of_a_picture_is_counted() -> None:
-    from efficientnerf.backends.numba.tree.rendering import picture_work
+    from efficientnerf.backends.numba.tree.rendering import image_work
 
     tree = uniform_tree(sigma=0.5)
     camera = camera_of(tree)
-    cells, tested, mixed, colours = np.moveaxis(picture_work(tree, camera), -1, 0)
+    cells, tested, mixed, colours = np.moveaxis(image_work(tree, camera), -1, 0)
     seen = tree.render(camera).opacity > 0
     assert ((mixed > 0) == seen).all()
     assert (tested >= mixed).all()

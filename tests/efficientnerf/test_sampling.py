@@ -172,7 +172,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     assert reach.min() > reference.FARTHEST
 
 
-@pytest.mark.parametrize("choose", [samples.pivots, dispatch.pivots], ids=["torch", "kernel"])
+@pytest.mark.parametrize("choose", [samples.select_pivots, dispatch.select_pivots], ids=["torch", "kernel"])
 @pytest.mark.parametrize("most", [1, 3, 5, 100])
 def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[..., torch.Tensor], most: int) -> None:
     rng = np.random.default_rng(3)

@@ -14,10 +14,10 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from efficientnerf.backends.numba.rays import PRIME_Y, PRIME_Z
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.table_entries import LINE, add_to_entries, interpolated_entry, touch
 
+PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Mueller et al. 2022, section 3
 BLOCK = 128  # samples whose places and weights are computed together
 TURNED = 4096  # points of a task
 LINES_TOUCHED = 4  # by a sample in a level, about: neighbours along x are mostly in one cache line
@@ -62,7 +62,7 @@ def _load_level(entries, side, dense, start, mask, samples):  # type: ignore[no-
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def across(points, out):  # type: ignore[no-untyped-def]
+def transpose_points(points, out):  # type: ignore[no-untyped-def]
     """Points (N, 3) as (3, N)."""
     count = len(points)
     for task in numba.prange((count + TURNED - 1) // TURNED):

@@ -57,7 +57,7 @@ def _put_weight(weight, per, forward, back):  # type: ignore[no-untyped-def]
     pairs_of_rows(pointer(turned), 0, forward.shape[1], forward.shape[1], pointer(forward), len(forward), forward.shape[1])
 
 
-def prepared(weights: list[np.ndarray], bfloat16: bool) -> Weights:
+def pack_weights(weights: list[np.ndarray], bfloat16: bool) -> Weights:
     """Weights (O, I) float32 of all layers, of which there are two at least."""
     word, per = (np.int32, 2) if bfloat16 else (np.float32, 1)
     inputs, hidden, outputs = weights[0].shape[1], len(weights[0]), len(weights[-1])

@@ -14,7 +14,7 @@ BLOCK = 4096  # rays of a task
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _rays(origins, directions, turn, place, a, b, near, beyond, start, along, begin, pace, bend):  # type: ignore[no-untyped-def]
+def _warp_rays(origins, directions, turn, place, a, b, near, beyond, start, along, begin, pace, bend):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(origins), block * BLOCK + BLOCK)):
             px, py, pz = origins[n, 0] - place[0], origins[n, 1] - place[1], origins[n, 2] - place[2]
@@ -41,19 +41,19 @@ def _rays(origins, directions, turn, place, a, b, near, beyond, start, along, be
             pace[n] = g
 
 
-def rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> WarpedRays:
+def warp_rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> WarpedRays:
     """`Ndc.rays` of float64 arrays."""
     count = len(origins)
     start, along = np.empty((count, 3)), np.empty((count, 3))
     begin, pace, bend = np.empty(count), np.empty(count), np.empty(count)
     pose = np.ascontiguousarray(ndc.world_from_camera, np.float64)
     given = (np.ascontiguousarray(part, np.float64) for part in (origins, directions, pose[:3, :3], pose[:3, 3]))
-    _rays(*given, *ndc.slopes, ndc.near, BEYOND, start, along, begin, pace, bend)
+    _warp_rays(*given, *ndc.slopes, ndc.near, BEYOND, start, along, begin, pace, bend)
     return WarpedRays(start, along, begin, pace, bend)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _hits(start, along, begin, pace, bend, distance, normal, turn, a, b, near, out_distance, out_normal):  # type: ignore[no-untyped-def]
+def _unwarp_hits(start, along, begin, pace, bend, distance, normal, turn, a, b, near, out_distance, out_normal):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(start) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(start), block * BLOCK + BLOCK)):
             s = np.float64(distance[n])
@@ -74,13 +74,13 @@ def _hits(start, along, begin, pace, bend, distance, normal, turn, a, b, near, o
                     out_normal[n, k] = (turn[k, 0] * nx + turn[k, 1] * ny + turn[k, 2] * nz) / length
 
 
-def hits(ndc: Ndc, warped: WarpedRays, distance: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Hits on rays of `rays` in the world: distances (R,) float32, `world_distance`, and normals (R, 3) float32, `Ndc.world_normals`.
+def unwarp_hits(ndc: Ndc, warped: WarpedRays, distance: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Hits on rays of `warp_rays` in the world: distances (R,) float32, `world_distance`, and normals (R, 3) float32, `Ndc.world_normals`.
 
     distance  (R,)   float32 along the warped rays; infinity where nothing is hit
     normal    (R, 3) float32 in normalised device coordinates
     """
     out = np.empty(len(distance), np.float32), np.empty((len(distance), 3), np.float32)
     turn = np.ascontiguousarray(ndc.world_from_camera[:3, :3], np.float64)
-    _hits(*warped, np.ascontiguousarray(distance), np.ascontiguousarray(normal), turn, *ndc.slopes, ndc.near, *out)
+    _unwarp_hits(*warped, np.ascontiguousarray(distance), np.ascontiguousarray(normal), turn, *ndc.slopes, ndc.near, *out)
     return out

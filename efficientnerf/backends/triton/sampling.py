@@ -189,8 +189,8 @@ def _pivots(weight, first, out, rays, samples, threshold, most, BITS: tl.constex
     tl.store(out + n, (chosen & (rank < most)).to(tl.int8), live)
 
 
-def pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
-    """See `efficientnerf.sampling.samples.pivots`; padding is never pivotal."""
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+    """See `efficientnerf.sampling.samples.select_pivots`; padding is never pivotal."""
     weight, rays, samples = weight.detach().contiguous(), len(first) - 1, len(weight)
     out = torch.zeros(samples, dtype=torch.bool, device=weight.device)
     if rays and samples:

@@ -20,7 +20,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from efficientnerf.backends.numba.tree.gradients import GREATEST, LEAST, Seen
+from efficientnerf.backends.numba.tree.gradients import MAX_THICKNESS, MIN_THICKNESS, RayTargets
 from efficientnerf.backends.triton.hash_grid import INTERPRETED
 from efficientnerf.backends.triton.tree import laid_out
 from efficientnerf.backends.triton.tree_walk import STEP, STOP, at_corner, coefficients, entry, goes_on, harmonics_along, sample, shade, share, vectors
@@ -207,7 +207,7 @@ def _descend(  # type: ignore[no-untyped-def]
     voxels, number, a_one, voxel, density_rate, colour_rate, view_share, decay, log_decay, epsilon, least, greatest, most_visits,
     WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`efficientnerf.backends.numba.tree.gradients.descend` from gradients in whole numbers, `a_one` each."""
+    """`efficientnerf.backends.numba.tree.gradients.rmsprop_step` from gradients in whole numbers, `a_one` each."""
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     met = tl.load(stamp + v, v < voxels, other=-1) == number
     if tl.max(met.to(tl.int32), 0) > 0:
@@ -250,13 +250,13 @@ def look(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor) -> tuple[Tensor
     return colour, rest
 
 
-def loss_of(colour: Tensor, rest: Tensor, seen: Seen) -> tuple[Tensor, Tensor, Tensor]:
-    """Loss (R,) of rays, see `Seen`, and its gradients by their colour (R, 3) and opacity (R,)."""
-    error = seen.gain[:, None] * (colour + rest[:, None] * seen.behind) - seen.colour
+def loss_of(colour: Tensor, rest: Tensor, seen: RayTargets) -> tuple[Tensor, Tensor, Tensor]:
+    """Loss (R,) of rays, see `RayTargets`, and its gradients by their colour (R, 3) and opacity (R,)."""
+    error = seen.transmittance[:, None] * (colour + rest[:, None] * seen.background) - seen.colour
     missing = 1 - rest - seen.opacity
-    by_colour = 2 * error * seen.gain[:, None]
-    by_opacity = 2 * seen.matte * missing - (by_colour * seen.behind).sum(dim=1)
-    return (error * error).sum(dim=1) + seen.matte * missing * missing, by_colour, by_opacity
+    by_colour = 2 * error * seen.transmittance[:, None]
+    by_opacity = 2 * seen.opacity_weight * missing - (by_colour * seen.background).sum(dim=1)
+    return (error * error).sum(dim=1) + seen.opacity_weight * missing * missing, by_colour, by_opacity
 
 
 def pull(
@@ -290,10 +290,10 @@ def descend(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], squares: tuple[Tensor, Tensor], visits: Tensor, stamp: Tensor, *,
     number: int, rays: int, density_rate: float, colour_rate: float, view_share: float, decay: float, epsilon: float,
 ) -> None:  # fmt: skip
-    """A step of RMSprop for the voxels that the last `pull`, of so many rays, met; see `efficientnerf.backends.numba.tree.gradients.descend`."""
+    """A step of RMSprop for the voxels that the last `pull`, of so many rays, met; see `efficientnerf.backends.numba.tree.gradients.rmsprop_step`."""
     voxels = len(visits)
     _descend[(max(1, triton.cdiv(voxels, VOXELS)),)](
         *values, *sums, *squares, visits, stamp, voxels, number, 1 / resolution(rays), float(g.voxel), density_rate, colour_rate, float(view_share),
         decay, math.log(decay),
-        epsilon, LEAST, GREATEST, MOST_VISITS, WIDTH=3 * g.terms, ROW=g.row, BLOCK=VOXELS, num_warps=4,
+        epsilon, MIN_THICKNESS, MAX_THICKNESS, MOST_VISITS, WIDTH=3 * g.terms, ROW=g.row, BLOCK=VOXELS, num_warps=4,
     )  # fmt: skip

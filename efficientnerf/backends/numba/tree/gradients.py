@@ -20,7 +20,7 @@ from efficientnerf.backends.numba.tree.march import STEP, STOP
 from efficientnerf.backends.numba.tree.rendering import stored_voxel
 
 BLOCK = 128  # rays per task
-LEAST, GREATEST = 1e-7, 150.0  # optical thickness of a voxel: nothing that shows, and beyond opaque
+MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: nothing that shows, and beyond opaque
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -132,25 +132,25 @@ def _shade(index, frac, sh, basis, mixed, rgb):  # type: ignore[no-untyped-def]
 Arrays = tuple[np.ndarray, ...]
 
 
-class Seen(NamedTuple):
-    """What rays are to look like. With c and a the premultiplied colour and the opacity of a ray in the tree, the loss of the ray is
+class RayTargets(NamedTuple):
+    """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
 
-        sum over channels of (gain (c + (1 - a) behind) - colour)^2  +  matte (a - opacity)^2
+        sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
 
-    colour   (R, 3) of the photograph, less what lies before the box
-    behind   (R, 3) beyond the box
-    gain     (R,)   light that reaches the box
-    opacity  (R,)   of the photograph
-    matte    weight of the opacity's error
+    colour          (R, 3) of the photograph, less the colour of what lies in front of the box
+    background      (R, 3) colour of what lies behind the box
+    transmittance   (R,)   of what lies in front of the box
+    opacity         (R,)   of the photograph
+    opacity_weight  of the opacity's error
 
     Arrays, or tensors of a device (`efficientnerf.backends.triton.tree_gradients`).
     """
 
     colour: Any
-    behind: Any
-    gain: Any
+    background: Any
+    transmittance: Any
     opacity: Any
-    matte: float
+    opacity_weight: float
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -281,12 +281,12 @@ def _descend(  # type: ignore[no-untyped-def]
             visits[v] = min(visits[v] + 1, 60000)
             right = 1 / (1 - decay ** float(visits[v]))
             # Of the logarithm of the optical thickness; where there is none a little is taken, so that matter may come.
-            depth = max(density[v] * thickness, LEAST)
+            depth = max(density[v] * thickness, MIN_THICKNESS)
             slope = by_density[v] / thickness * depth
             by_density[v] = 0
             square_density[v] = decay * square_density[v] + (1 - decay) * slope * slope
             change = rate_density * slope / (np.sqrt(square_density[v] * right) + epsilon)
-            density[v] = min(max(depth * np.exp(-change), LEAST), GREATEST) / thickness
+            density[v] = min(max(depth * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / thickness
             grown, values, mean = by_sh[v], sh[v], 0.0
             for j in range(terms):
                 mean += grown[j] * grown[j]
@@ -297,7 +297,7 @@ def _descend(  # type: ignore[no-untyped-def]
                 grown[j] = 0
 
 
-class Records:
+class SampleRecords:
     """Room for what samples leave behind, grown where a bundle of rays needs more of it; used again and again."""
 
     def __init__(self, dtype: type = np.float32) -> None:
@@ -323,7 +323,7 @@ class Records:
         return self.index, self.frac, self.gradient, self.ray_of
 
 
-class Grid(NamedTuple):
+class TreeGrid(NamedTuple):
     """Where the voxels of a tree lie; see `NerfTree`. `length` of half a voxel, world units; `nearest` if the tree is not interpolated."""
 
     brick: int
@@ -344,14 +344,14 @@ def slabs() -> int:
     return 2 * numba.get_num_threads()
 
 
-def parts() -> int:
-    """Into how many shares the rays of `greatest` are dealt; each has a copy of what is found."""
+def contribution_parts() -> int:
+    """Into how many shares the rays of `max_contributions` are dealt; each has a copy of what is found."""
     return min(16, numba.get_num_threads())
 
 
-def look(
-    grid: Grid, origins: np.ndarray, directions: np.ndarray, bases: np.ndarray, density: np.ndarray, sh: np.ndarray, seen: Seen, records: Records, *,
-    stop: float = STOP,
+def forward_backward(
+    grid: TreeGrid, origins: np.ndarray, directions: np.ndarray, bases: np.ndarray, density: np.ndarray, sh: np.ndarray, targets: RayTargets,
+    records: SampleRecords, *, stop: float = STOP,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Loss (R,) of rays in voxel coordinates; `records` then holds their samples, and the returned counts how many there are in each block.
 
@@ -365,19 +365,21 @@ def look(
     while True:
         _look(
             origins, directions, bases, grid.brick, grid.brick_index, grid.voxel_index, density, sh, grid.leap, grid.length, grid.nearest, stop, grid.most,
-            seen.colour, seen.behind, seen.gain, seen.opacity, seen.matte, records.room, *records.arrays, counts, loss,
+            targets.colour, targets.background, targets.transmittance, targets.opacity, targets.opacity_weight, records.room, *records.arrays, counts, loss,
         )  # fmt: skip
         if not len(counts) or counts.max() <= records.room:
             return loss, counts
         records.hold(len(counts), int(1.25 * counts.max()))
 
 
-def gradients(records: Records, counts: np.ndarray, bases: np.ndarray, by_density: np.ndarray, by_sh: np.ndarray) -> None:
-    """Add the gradients of the summed loss of `look`'s rays by density (N,) and by sh (N, 3 K)."""
+def sum_gradients(records: SampleRecords, counts: np.ndarray, bases: np.ndarray, by_density: np.ndarray, by_sh: np.ndarray) -> None:
+    """Add the gradients of the summed loss of `forward_backward`'s rays by density (N,) and by sh (N, 3 K)."""
     _sum(slabs(), records.room, *records.arrays, counts, bases, by_density, by_sh)
 
 
-def greatest(grid: Grid, origins: np.ndarray, directions: np.ndarray, density: np.ndarray, gain: np.ndarray, into: np.ndarray, *, stop: float = STOP) -> None:
+def max_contributions(
+    grid: TreeGrid, origins: np.ndarray, directions: np.ndarray, density: np.ndarray, gain: np.ndarray, into: np.ndarray, *, stop: float = STOP
+) -> None:
     """Raise `into` to the greatest contributions of voxels to the pixels of rays in voxel coordinates, through what interpolation leaves of them.
 
     origins, directions  (R, 3) float64
@@ -390,11 +392,11 @@ def greatest(grid: Grid, origins: np.ndarray, directions: np.ndarray, density: n
     )  # fmt: skip
 
 
-def descend(
-    records: Records, counts: np.ndarray, bases: np.ndarray, values: Arrays, sums: Arrays, squares: Arrays, visits: np.ndarray, stamp: np.ndarray, *,
+def rmsprop_step(
+    records: SampleRecords, counts: np.ndarray, bases: np.ndarray, values: Arrays, sums: Arrays, squares: Arrays, visits: np.ndarray, stamp: np.ndarray, *,
     number: int, thickness: float, density_rate: float, sh_rates: np.ndarray, decay: float, epsilon: float,
 ) -> None:  # fmt: skip
-    """A step of RMSprop for the voxels that the last `look` met (the others are left alone), corrected for how often a voxel was met.
+    """A step of RMSprop for the voxels that the last `forward_backward` met (the others are left alone), corrected for how often a voxel was met.
 
         s <- decay s + (1 - decay) g^2        p <- p - rate g / (sqrt(s / (1 - decay^visits)) + epsilon)
 

@@ -217,7 +217,7 @@ def _capacity(tree: NerfTree) -> int:
     return min(max(1, len(tree.voxel_index)), max(LEAST_BLOCKS, POOL_BYTES // (16 * (tree.brick + 2) ** 3)))
 
 
-def pool_bytes(tree: NerfTree) -> int:
+def scratch_bytes(tree: NerfTree) -> int:
     """What painted voxels and the threads' pools take while a picture is drawn."""
     each = 4 * len(tree.voxel_index) + (_capacity(tree) + 1) * (16 * (tree.brick + 2) ** 3 + 5)
     return 16 * (len(tree.density_values) + 1) + numba.get_num_threads() * each
@@ -307,7 +307,7 @@ def _shot(tree: NerfTree, camera: Camera, supersample: int, top: int, low: int) 
     )
 
 
-def render_picture(
+def render_image(
     tree: NerfTree, camera: Camera, supersample: int, behind: np.ndarray, *, normals: bool, rays_per_band: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Colour (H, W, 3) over `behind`, opacity (H, W), depth (H, W) along the view axis, normal (H, W, 3) of a camera's pixels.
@@ -336,7 +336,7 @@ def render_picture(
     return picture
 
 
-def picture_work(tree: NerfTree, camera: Camera) -> np.ndarray:
+def image_work(tree: NerfTree, camera: Camera) -> np.ndarray:
     """What each pixel's ray takes: cells looked at, samples tested, samples interpolated, colours looked up; (H, W, 4) int32."""
     work = np.zeros((camera.height, camera.width, 4), np.int32)
     out = _pixels(camera.height, camera.width, normals=False)

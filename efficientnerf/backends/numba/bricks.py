@@ -1,7 +1,6 @@
-"""Voxels on the CPU (numba): what samples say of them, growing sets of them, and carrying weights over to a coarser grid. Tens of millions
-of voxels a second on a core.
+"""Sets of voxels on the CPU (numba): selection and dilation by weight, and weights resampled to a coarser grid.
 
-B cells that have room for their voxels, N voxels.
+B coarse cells with a row of brick^3 voxels each, N voxels.
 """
 
 from __future__ import annotations
@@ -9,13 +8,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from efficientnerf.backends.numba.rays import density_of
-
-TOLD = 1024  # samples of a task
-
 
 @numba.njit(cache=True, error_model="numpy")
-def mark(
+def threshold_and_dilate(
     cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], brick: int, grown: int, row_of: np.ndarray, into: np.ndarray
 ) -> None:
     """Set `into` for each voxel whose weight exceeds `threshold`, and for those up to `grown` away along each axis, inside the grid.
@@ -38,7 +33,7 @@ def mark(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def listed(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int], brick: int, flat: np.ndarray) -> None:
+def flat_indices(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int], brick: int, flat: np.ndarray) -> None:
     """Flat numbers in the grid (x slowest) of the voxels set in `into` (B, brick^3) bool, whose rows are the flat `cells`, to `flat` (N,)."""
     n = 0
     for row in range(len(cells)):
@@ -52,8 +47,10 @@ def listed(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int], bri
 
 
 @numba.njit(cache=True, error_model="numpy")
-def carry(cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], to_shape: tuple[int, int, int], ratio: float, brick: int,
-          row_of: np.ndarray, into: np.ndarray, rows: int) -> int:  # fmt: skip
+def resample_weights(
+    cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], to_shape: tuple[int, int, int], ratio: float, brick: int,
+    row_of: np.ndarray, into: np.ndarray, rows: int,
+) -> int:  # fmt: skip
     """Raise `into` to the weights above `threshold` of the finer voxels whose centres lie in each coarser one; returns how many rows are in use.
 
     ratio   side of a finer voxel over that of a coarser one
@@ -79,24 +76,3 @@ def carry(cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tupl
                 at = (x % brick * brick + y % brick) * brick + z % brick
                 into[to, at] = max(into[to, at], weight)
     return rows
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def update_occupancy_maximum(point, raw, exponential, values):  # type: ignore[no-untyped-def]
-    """Raise `values` (D, D, D) to the density of samples at `point` (N, 3) in grid coordinates, which is `raw` (N,) activated; closed voxels stay closed.
-
-    All cores find voxels and densities, then one takes the largest.
-    """
-    side, count = values.shape[0], len(raw)
-    cell, density = np.empty(count, np.int32), np.empty(count, np.float32)
-    for block in numba.prange((count + TOLD - 1) // TOLD):
-        for n in range(block * TOLD, min(count, (block + 1) * TOLD)):
-            i = min(max(int(point[n, 0] * side), 0), side - 1)
-            j = min(max(int(point[n, 1] * side), 0), side - 1)
-            k = min(max(int(point[n, 2] * side), 0), side - 1)
-            cell[n], density[n] = (i * side + j) * side + k, density_of(raw[n], exponential)[0]
-    flat = values.reshape(-1)
-    for n in range(count):
-        old = flat[cell[n]]
-        if density[n] > old and old != -np.inf:
-            flat[cell[n]] = density[n]

@@ -14,7 +14,7 @@ LANES = 64
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def nearest(vectors_t, centroids, found, distance):  # type: ignore[no-untyped-def]
+def nearest_centroids(vectors_t, centroids, found, distance):  # type: ignore[no-untyped-def]
     """Index of the nearest centroid of each vector, the first of equals, and the squared distance to it.
 
     vectors_t  (D, n) float32, transposed: the inner loops run over neighbouring vectors, and are a processor's vectors
@@ -46,7 +46,7 @@ def nearest(vectors_t, centroids, found, distance):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sums(vectors, found, total, count):  # type: ignore[no-untyped-def]
+def sum_clusters(vectors, found, total, count):  # type: ignore[no-untyped-def]
     """Adds each vector to the sum of its cluster, in order: total (P, D) float64, count (P,) int64."""
     for n in range(vectors.shape[0]):
         count[found[n]] += 1
@@ -55,7 +55,7 @@ def sums(vectors, found, total, count):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def approach(vectors_t, centroid, distance):  # type: ignore[no-untyped-def]
+def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-def]
     """Lowers distance (n,) to the squared distance from `centroid` (D,) to each of vectors_t (D, n) where that is less."""
     size, count = vectors_t.shape
     for block in numba.prange((count + 16 * LANES - 1) // (16 * LANES)):
