@@ -1,6 +1,7 @@
-"""The few operations on files that everything else is made of: durable writes, bounded reads, canonical JSON, safe names.
+"""The few operations on files that everything else is made of: atomic writes, bounded reads, canonical JSON, safe names.
 
-What must survive a kill or a power cut goes through these functions and no others, so that tests can cut the power at each of them.
+What must survive a kill or a power cut goes through these functions and no others, so that tests can cut the power at each of them. `atomic` is the
+one writer of files that appear whole or not at all.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,7 +22,7 @@ MAX_JSON = 64 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
 
 
 class Unreadable(ValueError):
-    """A JSON file that is too large, cut off or no JSON; the text says which."""
+    """A JSON file that is too large, cut off or not valid; the text says which."""
 
 
 def canonical_json(value: Any) -> bytes:
@@ -28,9 +30,9 @@ def canonical_json(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii")
 
 
-def pretty_json(value: Any) -> bytes:
+def pretty_json(value: Any, *, sort_keys: bool = True, default: Callable[[Any], Any] | None = None) -> bytes:
     """For files that people look into."""
-    return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
+    return json.dumps(value, indent=1, sort_keys=sort_keys, ensure_ascii=True, allow_nan=False, default=default).encode("ascii") + b"\n"
 
 
 def read_json(path: Path, limit: int = MAX_JSON) -> Any:
@@ -50,7 +52,7 @@ def read_json(path: Path, limit: int = MAX_JSON) -> Any:
         return json.loads(data, parse_constant=_refused)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
         text = str(error) if isinstance(error, ValueError) else "nested too deeply"
-        raise Unreadable(f"not JSON ({text.splitlines()[0][:120]})") from None
+        raise Unreadable(f"not valid JSON ({text.splitlines()[0][:120]})") from None
 
 
 def _refused(name: str) -> Any:
@@ -65,15 +67,47 @@ def is_safe_name(name: str) -> bool:
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """The file has either its old content or all of the new, whatever happens meanwhile."""
-    aside = path.with_name(f".{path.name}.tmp")
-    with open(aside, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    rename(aside, path)
-    sync_folder(path.parent)
+@contextmanager
+def atomic(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """A temporary path in the same folder to write to, renamed to `path` when the block ends and removed when it raises.
+
+    durable  sync the file before and the folder after the rename: the file has its old content or all of the new after a power cut, too.
+             Without, only a kill is survived: for scratch that is checked when it is read, or made again
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield temporary
+        if durable:
+            sync_file(temporary)
+        rename(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    if durable:
+        sync_folder(path.parent)
+
+
+def write_atomically(path: Path, data: bytes, *, durable: bool = True) -> None:
+    """See `atomic`."""
+    with atomic(path, durable=durable) as temporary:
+        temporary.write_bytes(data)
+
+
+def is_temporary(name: str, path: str) -> bool:
+    """Whether a file of this name is what a kill left of writing `path`."""
+    return name.startswith(f".{path}.") and name.endswith(".part")
+
+
+def remove_temporaries(path: Path) -> None:
+    """What kills left of writing `path`; only while no other process writes it."""
+    for entry in list(path.parent.iterdir()):
+        if is_temporary(entry.name, path.name):
+            entry.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Any, *, sort_keys: bool = False, default: Callable[[Any], Any] | None = None, durable: bool = True) -> None:
+    """A JSON file that people look into, atomically; see `json.dumps`. Raises ValueError for NaN and infinity."""
+    write_atomically(path, pretty_json(value, sort_keys=sort_keys, default=default), durable=durable)
 
 
 def rename(source: Path, target: Path) -> None:

@@ -29,7 +29,6 @@ from pipeline.lock import HOLDER, LOCK, Holder, holder_of, lock
 NAME = "run.json"
 FORMAT = "enerf-run"
 VERSION = 1
-_OURS = {LOCK, HOLDER, f".{NAME}.tmp", f".{HOLDER}.tmp"}  # what a kill while a run is created may leave behind
 _CHANGEABLE = ("source", "settings", "preset", "seed", "device")
 
 
@@ -75,7 +74,7 @@ class Run:
             return
         if not self.path.is_dir():
             raise BadInput(f"{self.path}: exists and is not a folder. Give a new folder for the run.")
-        found = sorted(entry.name for entry in os.scandir(self.path) if entry.name not in _OURS)
+        found = sorted(entry.name for entry in os.scandir(self.path) if not _is_ours(entry.name))
         if NAME in found:
             raise BadInput(f"{self.path}: is a run already. Go on with it ({self.command()}), or give a new folder.")
         if found:
@@ -140,6 +139,8 @@ class Run:
             return
         with lock(self.path):
             self._holds = 1
+            for name in (NAME, HOLDER):  # what a kill left of writing these
+                files.remove_temporaries(self.path / name)
             try:
                 yield
             finally:
@@ -186,6 +187,11 @@ def cannot_write(path: Path, error: OSError) -> BadInput | DiskFull:
     if is_disk_full(error):
         return disk_full(path, str(path))
     return BadInput(f"{path}: cannot be written ({error.strerror or error}).")
+
+
+def _is_ours(name: str) -> bool:
+    """Whether a kill while a run was created may have left a file of this name."""
+    return name in (LOCK, HOLDER) or files.is_temporary(name, NAME) or files.is_temporary(name, HOLDER)
 
 
 def _absolute(path: Path) -> Path:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.files import atomic
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, inputs_of, needs_of
 from stages.settings import setting
@@ -355,13 +356,8 @@ def _values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray
 
 
 def _write_npy(values: np.ndarray, path: Path) -> None:
-    """Whole or not at all; it need not be on the disk yet, for a lost block is baked again."""
-    import os
-
-    aside = path.with_suffix(".part")
-    with open(aside, "wb") as file:
+    with atomic(path, durable=False) as temporary, open(temporary, "wb") as file:
         np.save(file, values, allow_pickle=False)
-    os.replace(aside, path)
 
 
 def _read_npy(path: Path) -> np.ndarray | None:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import MODELS, Camera
+from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, inputs_of, needs_of
 from stages.io.scene import Scene, View
@@ -115,11 +116,11 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
             measured, pictures = measure(tree, field, scene, view, job, drawn=k in drawn, stride=thinning, perceptual=perceptual)
             if k in drawn:
                 _keep_pictures(pictures, job.work, k)
-            _write_json(measured, done)
+            write_json(done, measured)
         figures.append(json.loads(done.read_text(encoding="utf-8")))
     job.progress(len(views), len(views))
     metrics = summary(figures, split=split, stride=stride, background=rest if behind_of(scene) is None else None, perceptual=tuple(perceptual))
-    _write_json(metrics, EvaluateOutputs(job.out).metrics)
+    write_json(EvaluateOutputs(job.out).metrics, metrics)
     _write_sheet(metrics, sorted(drawn), job)
 
 
@@ -310,15 +311,8 @@ def _clean(image: np.ndarray, job: Job, what: str) -> np.ndarray:
     return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
 
 
-def _write_json(document: dict[str, Any], path: Path) -> None:
-    from stages.io.exporters.aside import written_aside
-
-    with written_aside(path) as aside:
-        aside.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
 def _keep_pictures(pictures: Sequence[np.ndarray], folder: Path, k: int) -> None:
-    from stages.io.exporters.frames import write_png
+    from stages.io.png import write_png
     from stages.pictures.plots import thumbnail_of
 
     for column, picture in enumerate(pictures):
@@ -326,7 +320,7 @@ def _keep_pictures(pictures: Sequence[np.ndarray], folder: Path, k: int) -> None
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
-    from stages.io.exporters.frames import read_png
+    from stages.io.png import read_png
     from stages.pictures.plots import contact_sheet
 
     def figure(found: dict[str, Any]) -> str:

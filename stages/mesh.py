@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.errors import StageFailed
+from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.settings import setting
@@ -90,11 +90,10 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
 
 
 def run(job: Job) -> None:
-    from PIL import Image
-
     from efficientnerf.asset.format import load
     from stages.io.exporters import MESH_EXPORTERS
     from stages.io.exporters.writing import source_frame
+    from stages.io.png import write_png
     from stages.pictures.shading import IN_FRONT, draw_sides
 
     outputs = MeshOutputs(job.out)
@@ -106,13 +105,13 @@ def run(job: Job) -> None:
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
     forward = bool(orbit.get("forward_facing", False))
     sides: dict[str, Any] = {"turns": IN_FRONT, "shown": 0.8} if forward else {}
-    Image.fromarray(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides)).save(outputs.preview)
+    write_png(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides), outputs.preview)
     job.safe_point()
     mesh = in_capture(found, frame)
     for path in (outputs.ply, outputs.glb):
         MESH_EXPORTERS[path.suffix](mesh, path, frame)
     report = describe(mesh, frame)
-    outputs.report.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    write_json(outputs.report, report)
     if not report["watertight"]:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['crowded_edges']} crowded edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}

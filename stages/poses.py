@@ -7,7 +7,6 @@ Undistortion is not needed: every later stage traces the distorted rays of the w
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from typing import Any
 
 from efficientnerf.geometry.cameras import resized
 from pipeline.errors import BadInput
+from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
 from stages.framing.forward_facing import SPACES
@@ -245,4 +245,4 @@ def _write_report(path: Path, capture: Capture, scene: Scene, framing_facts: dic
         "facts": capture.facts,
         "warnings": list(notes),
     }
-    path.write_text(json.dumps(report, indent=1, allow_nan=False, default=str) + "\n", encoding="utf-8")
+    write_json(path, report, default=str)

@@ -340,7 +340,7 @@ def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int
         return None
     from efficientnerf.evaluation.metrics import psnr
     from stages.evaluate import thinned, thinned_camera, truth_of
-    from stages.io.exporters.frames import write_png
+    from stages.io.png import write_png
     from stages.pictures.plots import eight_bits
 
     target = job.work / f"preview_{step:06d}.png"

@@ -8,13 +8,13 @@ steps makes up for what is missing.
 from __future__ import annotations
 
 import math
-import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipeline.files import atomic
 from pipeline.stage import Job
 
 if TYPE_CHECKING:
@@ -139,7 +139,6 @@ def _without_unseen(job: Job, o: Optimiser, targets: Targets, most: int) -> Opti
 
 
 def _checkpoint(job: Job, o: Optimiser, pruned: bool) -> None:
-    """Whole or not at all; it need not be on the disk yet, for what is lost is done again."""
     from safetensors.numpy import save_file
 
     from efficientnerf.asset import bake, refinement
@@ -148,9 +147,8 @@ def _checkpoint(job: Job, o: Optimiser, pruned: bool) -> None:
     tensors = {name: np.ascontiguousarray(getattr(o, name)) for name in refinement.STATE}
     tensors["coordinates"] = bake.voxel_coordinates(o.tree)
     tensors["progress"] = np.array([o.step, pruned], np.int64)
-    aside = job.work / (CHECKPOINT + ".part")
-    save_file(tensors, str(aside))
-    os.replace(aside, job.work / CHECKPOINT)
+    with atomic(job.work / CHECKPOINT, durable=False) as temporary:
+        save_file(tensors, str(temporary))
 
 
 def _restored(job: Job, tree: NerfTree) -> tuple[Optimiser, bool] | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, Similarity, pose_from_opengl
 from pipeline.errors import BadInput
-from pipeline.files import Unreadable, read_json
+from stages.io.json_file import read_json
 from stages.io.scene import Orbit
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
 
     BadInput says what is wrong with the file.
     """
-    document = _read_json(path)
+    document = read_json(path, "Expected a camera path as nerfstudio's viewer exports it.", limit=LARGEST_FILE)
     if not isinstance(document, dict) or not isinstance(document.get("camera_path"), list):
         hint = " It looks like a data set: `enerf run` reads those." if isinstance(document, dict) and "frames" in document else ""
         raise BadInput(f"{path}: no list `camera_path`; expected a camera path as nerfstudio's viewer exports it.{hint}")
@@ -304,15 +304,6 @@ def _shown(value: Any) -> str:
     return "nothing" if value is None else repr(value)[:40]
 
 
-def _read_json(path: Path) -> Any:
-    try:
-        return read_json(path, LARGEST_FILE)
-    except FileNotFoundError as error:
-        raise BadInput(f"{path}: {error.strerror}.") from error
-    except Unreadable as error:
-        raise BadInput(f"{path}: {error}; no camera path.") from error
-
-
 @dataclass(frozen=True)
 class RenderOptions:
     """How a path is drawn.
@@ -344,7 +335,8 @@ def draw_frames(
     reuse     keep frames that are there: only for a folder that nothing but this very request has written
     """
     from stages.io.exporters.exr import write_exr
-    from stages.io.exporters.frames import background_from_text, frame_from_rendering, write_png
+    from stages.io.exporters.frames import background_from_text, frame_from_rendering
+    from stages.io.png import write_png
 
     background, similarity = background_from_text(options.background), similarity_of(tree)
     folder.mkdir(parents=True, exist_ok=True)
@@ -368,8 +360,9 @@ def draw_frames(
 
 def encode_frames(frames: Sequence[Path], path: Path, options: RenderOptions, each: Callable[[], None] | None = None) -> None:
     """The PNGs as an MP4."""
-    from stages.io.exporters.frames import NAMED, over_background, read_png
+    from stages.io.exporters.frames import NAMED, over_background
     from stages.io.exporters.video import write_mp4
+    from stages.io.png import read_png
 
     write_mp4((over_background(read_png(frame), NAMED["white"]) for frame in frames), path, fps=options.fps, crf=options.crf, each=each)
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact, UsageError
+from pipeline.files import write_atomically
 from pipeline.stage import settings_from
 from stages.artifacts import TrainOutputs
-from stages.io.exporters.aside import written_aside
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,8 +34,7 @@ def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path)
     plain = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     text = json.dumps({"format": FORMAT, **about, "sha256": digest_of(plain)}, sort_keys=True)
     data = save(plain, metadata={"field": text})
-    with written_aside(path) as aside:
-        aside.write_bytes(data)
+    write_atomically(path, data)
 
 
 def digest_of(tensors: dict[str, Tensor]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,9 +104,9 @@ def mask_of(path: Path, photo: UprightPhoto) -> np.ndarray:
             mask = np.asarray(image.convert("L"))
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise UnreadableImage(f"{path.name} cannot be read") from error
-    if photo.orientation >= 5 and _same_aspect(mask.shape[::-1], (photo.height, photo.width)):
+    if photo.orientation >= 5 and same_aspect(mask.shape[::-1], (photo.height, photo.width)):
         mask = upright(mask, photo.orientation)  # drawn over the pixels as stored
-    if not _same_aspect(mask.shape, (photo.height, photo.width)):
+    if not same_aspect(mask.shape, (photo.height, photo.width)):
         raise UnreadableImage(f"{path.name} is {mask.shape[1]}x{mask.shape[0]}, the photograph {photo.width}x{photo.height}")
     height, width = photo.rgb.shape[:2]
     rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(int)
@@ -115,8 +114,13 @@ def mask_of(path: Path, photo: UprightPhoto) -> np.ndarray:
     return mask[rows][:, columns] > 0
 
 
-def _same_aspect(shape: tuple[int, ...], other: tuple[int, int]) -> bool:
-    return abs(shape[0] * other[1] - shape[1] * other[0]) <= max(shape[0], shape[1], *other)
+def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Whether two sizes (both (width, height), or both (height, width)) show the same picture: equal aspect within 1 %, or within the rounding of a
+    side by one pixel."""
+    (w, h), (width, height) = size, other
+    if min(w, h, width, height) <= 0:
+        return False
+    return abs(width * h / (w * height) - 1) <= 0.01 or abs(height - h * width / w) <= 1 or abs(width - w * height / h) <= 1
 
 
 def focal_from_exif(details: Any, width: int, height: int) -> float | None:
@@ -179,12 +183,3 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
     pixels = np.ascontiguousarray(pixels)
     return pixels if pixels.shape[1::-1] == size else np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Lossless and appearing by rename; barely compressed, as it is read once and thrown away."""
-    from PIL import Image
-
-    aside = path.with_name(path.name + ".part")
-    Image.fromarray(np.ascontiguousarray(pixels)).save(aside, format="PNG", compress_level=1)
-    os.replace(aside, path)

@@ -11,7 +11,6 @@ Training frame: right-handed, z up, origin at the centre of the box, the largest
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,14 +21,15 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.geometry.ndc import Ndc
 from pipeline.errors import BadInput
-from pipeline.files import Unreadable, read_json
+from pipeline.files import write_json
 from stages.artifacts import PosesOutputs
 from stages.framing.forward_facing import SPACES, Forward
 from stages.io.capture import SparsePoints
+from stages.io.json_file import read_json
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
-LARGEST_FILE = 256 << 20  # bytes of scene.json; a hundred thousand views fit
+AGAIN = "Run the poses stage again."
 
 
 @dataclass(frozen=True)
@@ -158,13 +158,13 @@ def save(scene: Scene, folder: Path) -> None:
         "forward": None if scene.forward is None else _forward_to_json(scene.forward),
         "views": views,
     }
-    PosesOutputs(folder).scene.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(PosesOutputs(folder).scene, document)
 
 
 def load(folder: Path) -> Scene:
     """Read folder/scene.json, checked; BadInput names what is wrong with it."""
     path = PosesOutputs(folder).scene
-    document = _Reader(_read_json(path), str(path))
+    document = _Reader(read_json(path, AGAIN, missing="Run the poses stage first."), str(path))
     version = document.integer("format")  # also refuses what is not an object
     if not 1 <= version <= FORMAT:
         raise BadInput(f"{path}: format version {version}; this build reads 1 to {FORMAT}. Upgrade efficientnerf, or run the poses stage again.")
@@ -307,7 +307,7 @@ def describe(folder: Path) -> dict[str, Any]:
 
 def _report_warnings(folder: Path) -> list[str]:
     path = PosesOutputs(folder).report
-    report = _read_json(path) if path.is_file() else {}
+    report = read_json(path, AGAIN) if path.is_file() else {}
     found = report.get("warnings", []) if isinstance(report, dict) else []
     return [str(sentence) for sentence in found]
 
@@ -385,15 +385,6 @@ def _is_rotation(matrix: np.ndarray) -> bool:
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return read_json(path, LARGEST_FILE)
-    except FileNotFoundError as error:
-        raise BadInput(f"{path}: {error.strerror}. Run the poses stage first.") from error
-    except Unreadable as error:
-        raise BadInput(f"{path}: {error}. Run the poses stage again.") from error
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo
-from stages.io.importers.lenses import read_header, same_aspect
-from stages.io.photo import UnreadableImage, working_size, write_png
+from stages.io.importers.lenses import read_header
+from stages.io.photo import UnreadableImage, same_aspect, working_size
+from stages.io.png import FAST, write_png
 
 OPAQUE = 128  # alpha from which a pixel counts where alpha is used as a mask
 _LOSSY = (".jpg", ".jpeg", ".webp")
@@ -129,12 +130,12 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alph
     if verbatim:
         shutil.copyfile(photo.image, path)
     else:
-        write_png(path, pixels)
+        write_png(pixels, path, compress_level=FAST, durable=False)
     mask = None
     if usable is not None and not usable.all():
         mask = PosesOutputs(folder).masks / PurePosixPath(relative).with_suffix(".png")
         mask.parent.mkdir(parents=True, exist_ok=True)
-        write_png(mask, np.where(usable, np.uint8(255), np.uint8(0)))
+        write_png(np.where(usable, np.uint8(255), np.uint8(0)), mask, compress_level=FAST, durable=False)
         if not usable.any():
             warnings.append(f"{photo.camera.name}: its mask leaves out every pixel.")
     return Written(path.relative_to(folder).as_posix(), None if mask is None else mask.relative_to(folder).as_posix(), *size, tuple(warnings))

@@ -23,7 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from stages.io.photo import UnreadableImage, UprightPhoto, mask_of, upright_photo, write_png
+from pipeline.files import rename, write_atomically, write_json
+from stages.io.photo import UnreadableImage, UprightPhoto, mask_of, upright_photo
+from stages.io.png import FAST, write_png
 
 LAYOUT = 1  # of the work folder; raise it when what is written there changes meaning
 BLOCK = 8  # images to a side of a block of pairs: a block takes a second or three, nothing answers inside one, and each builds its images' indices anew
@@ -109,12 +111,6 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _atomic_text(path: Path, text: str) -> None:
-    aside = path.with_name(path.name + ".part")
-    aside.write_text(text)
-    os.replace(aside, path)
-
-
 def prepare(
     folder: Path,
     names: Sequence[str],
@@ -143,14 +139,14 @@ def prepare(
         remove_database(work)
         for part in ("images", "masks", "copies"):
             (work / part).mkdir(parents=True)
-        _atomic_text(record, text)
+        write_atomically(record, text.encode(), durable=False)
     images: list[WorkImage] = []
     rejected: list[tuple[str, str]] = []
     for index, name in enumerate(sorted(names)):
         safe_point()
         note = work / "copies" / f"{index:05d}.json"
         if not note.is_file():
-            _atomic_text(note, json.dumps(_copy(folder, name, index, max_side, masks.get(name), work)))
+            write_json(note, _copy(folder, name, index, max_side, masks.get(name), work), durable=False)
         copied = json.loads(note.read_text())
         if "reason" in copied:
             rejected.append((name, copied["reason"]))
@@ -181,7 +177,7 @@ def _copy(folder: Path, name: str, index: int, max_side: int, mask_path: Path | 
     except UnreadableImage as error:
         return {"reason": str(error)}
     file = f"{index:05d}.png"
-    write_png(work / "images" / file, photo.rgb)
+    write_png(photo.rgb, work / "images" / file, compress_level=FAST, durable=False)
     mask, remark = photo.opaque, ""
     if mask_path is not None:
         try:
@@ -190,7 +186,7 @@ def _copy(folder: Path, name: str, index: int, max_side: int, mask_path: Path | 
         except UnreadableImage as error:
             remark = f"its mask is not used: {error}"
     if mask is not None:
-        write_png(work / "masks" / f"{file}.png", np.where(mask, np.uint8(255), np.uint8(0)))
+        write_png(np.where(mask, np.uint8(255), np.uint8(0)), work / "masks" / f"{file}.png", compress_level=FAST, durable=False)
     height, width = photo.rgb.shape[:2]
     focal = None if photo.focal is None else float(photo.focal)
     key = f"{photo.width}x{photo.height} {photo.maker} {focal if focal is None else round(focal, 1)}"
@@ -230,7 +226,7 @@ def open_database(work: Path, images: Sequence[WorkImage]) -> bool:
             pycolmap.import_images(aside, work / "images", pycolmap.CameraMode.SINGLE, [image.file], options)
     with contextlib.closing(sqlite3.connect(aside)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    os.replace(aside, database_path(work))
+    rename(aside, database_path(work))
     return False
 
 
@@ -280,7 +276,8 @@ def extract(work: Path, images: Sequence[WorkImage], *, features: int, progress:
         if any((work / "masks").glob("*.png")):
             for image in images:  # COLMAP skips an image whose mask is missing
                 if not (work / "masks" / f"{image.file}.png").exists():
-                    write_png(work / "masks" / f"{image.file}.png", np.full((image.work_height, image.work_width), 255, np.uint8))
+                    everything = np.full((image.work_height, image.work_width), 255, np.uint8)
+                    write_png(everything, work / "masks" / f"{image.file}.png", compress_level=FAST, durable=False)
             reader.mask_path = work / "masks"
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from efficientnerf.training.settings import TrainSettings
-from stages.io.exporters.aside import written_aside
+from pipeline.files import write_json
 
 FILE = "plan.json"
 TIMED = 48  # steps after the warm-up that are timed
@@ -96,8 +96,7 @@ class Budget:
         else:
             self.plan = Plan(iterations, self.plan.rate_hold, (*self.plan.rate_aims, self.plan.iterations, step))
         self.timed = step, now
-        with written_aside(self.work / FILE) as aside:
-            aside.write_text(json.dumps(self.plan._asdict(), sort_keys=True) + "\n", encoding="utf-8")
+        write_json(self.work / FILE, self.plan._asdict())
         return self.planned()
 
     def _due(self, step: int, now: float) -> bool:

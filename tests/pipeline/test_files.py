@@ -22,11 +22,11 @@ def test_names_that_leave_or_are_not_the_only_spelling(name: str) -> None:
     ("data", "message"),
     [
         (b"", "empty"),
-        (b"{", "not JSON"),
-        (b"\xff\xfe", "not JSON"),
+        (b"{", "not valid JSON"),
+        (b"\xff\xfe", "not valid JSON"),
         (b"[NaN]", "NaN"),
         (b"[" * 100_000, "nested too deeply"),
-        (b"1" * 5000, "not JSON"),
+        (b"1" * 5000, "not valid JSON"),
         (b" " * 30000, "larger than"),
     ],
 )

@@ -35,7 +35,7 @@ def test_paths_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_an_empty_folder_will_do_and_so_will_what_a_kill_left(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
-    for name in (".lock", ".lock.json", ".run.json.tmp"):
+    for name in (".lock", ".lock.json", ".run.json.7.part"):
         (tmp_path / "run" / name).write_text("{")
     Run.create(tmp_path / "run")
     assert sorted(os.listdir(tmp_path / "run")) == [".lock", "run.json"]

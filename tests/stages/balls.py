@@ -11,7 +11,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity
 from pipeline.stage import Job
-from stages.io.exporters.frames import write_png
+from stages.io.png import write_png
 from stages.io.scene import Orbit, Scene, View, save
 from tests.efficientnerf import balls
 

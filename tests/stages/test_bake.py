@@ -102,7 +102,7 @@ def test_damaged_scratch_is_made_anew(inputs: dict[str, Path], tmp_path: Path, u
     block = sorted((tmp_path / "work").glob("block_*.npy"))[1]
     block.write_bytes(block.read_bytes()[:-7] if damage is None else damage)
     (tmp_path / "work" / "voxels.npy").write_bytes(b"")
-    (tmp_path / "work" / "block_000000.part").write_bytes(b"half")
+    (tmp_path / "work" / ".block_000000.npy.123.part").write_bytes(b"half")
     assert run(job(tmp_path, QUICK, **inputs)) == digest
 
 

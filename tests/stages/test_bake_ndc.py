@@ -19,8 +19,8 @@ from stages.bake import NDC_DEPTH, BakeSettings
 from stages.baking.refinement import WEIGHED_NDC
 from stages.baking.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
 from stages.framing.forward_facing import forward_of
-from stages.io.exporters.frames import write_png
 from stages.io.field_file import load_renderer
+from stages.io.png import write_png
 from stages.io.scene import Scene, View, load, save
 from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import ORBIT, SIMILARITY, job, poses

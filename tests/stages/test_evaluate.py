@@ -18,7 +18,8 @@ from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages.evaluate import EvaluateSettings, background_stride, evaluate, spread, thickened, thinned, thinned_camera
 from stages.framing.camera_paths import pose_on_sphere
-from stages.io.exporters.frames import frame_from_rendering, write_png
+from stages.io.exporters.frames import frame_from_rendering
+from stages.io.png import write_png
 from stages.io.scene import Orbit, Scene, View, save
 from stages.pictures.plots import eight_bits
 from tests.fakes import WHITE, BallField, BallTree

@@ -16,6 +16,7 @@ from pipeline.errors import BadInput
 from stages.io import importers
 from stages.io.capture import Capture
 from stages.io.importers import llff, transforms
+from stages.io.json_file import read_json
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, WIDTH, Settings
 
@@ -96,14 +97,12 @@ def test_json_that_is_no_data_set(tmp_path: Path, text: str | bytes, word: str) 
     refusal(tmp_path, word, "transforms.json")
 
 
-def test_json_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = captures.nerfstudio(tmp_path / "a")
-    monkeypatch.setattr(transforms, "MOST_FRAMES", 5)
-    refusal(folder, "6 frames; at most 5")
-    from stages.io.importers.source import read_json
-
-    with pytest.raises(BadInput, match="at most"):
-        read_json(folder / "transforms.json", most=100)
+def test_json_is_bounded(tmp_path: Path) -> None:
+    path = captures.nerfstudio(tmp_path / "a") / "transforms.json"
+    with pytest.raises(BadInput, match="6 frames; at most 5"):
+        transforms.read_document(path, most_frames=5)
+    with pytest.raises(BadInput, match="larger than 100 bytes"):
+        read_json(path, "Repair it.", limit=100)
 
 
 MATRICES = {
@@ -293,10 +292,10 @@ def test_poses_bounds_truncated(tmp_path: Path, keep: int) -> None:
     refusal(path.parent, "poses_bounds.npy")
 
 
-def test_poses_bounds_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_poses_bounds_is_bounded(tmp_path: Path) -> None:
     folder = captures.llff(tmp_path / "a")
-    monkeypatch.setattr(llff, "MOST_FRAMES", -30)
-    refusal(folder, "not read")
+    with pytest.raises(BadInput, match="more than -30 poses are not read"):  # its header alone has room for 30
+        llff.read_rows(folder / llff.POSES, most_frames=-30)
 
 
 @pytest.mark.parametrize(("column", "value", "word"), [(4, 95.5, "whole pixels"), (14, 0.0, "focal length 0"), (15, -1.0, "near"), (16, 1.0, "near")])

@@ -14,7 +14,7 @@ import pytest
 from efficientnerf.geometry.cameras import Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError
 from stages.framing.camera_paths import RenderOptions, orbit_of, pose_on_sphere, read_camera_path, render_path, similarity_of, turntable_cameras
-from stages.io.exporters.frames import read_png
+from stages.io.png import read_png
 from tests.fakes import BallTree
 
 ROTATION = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

@@ -17,8 +17,9 @@ from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.rendering.colour import linear_from_srgb, linear_premultiplied, srgb_from_linear, straight_from_premultiplied
 from pipeline.errors import UsageError
 from stages.io.exporters.exr import write_exr
-from stages.io.exporters.frames import background_from_text, frame_from_rendering, over_background, read_png, write_png
+from stages.io.exporters.frames import background_from_text, frame_from_rendering, over_background
 from stages.io.exporters.video import write_mp4
+from stages.io.png import read_png, write_png
 from tests.fakes import BallTree
 
 POSE = np.array([[1.0, 0, 0, 0], [0, 0, 1, -4], [0, -1, 0, 0], [0, 0, 0, 1]])  # looks along +y from y = -4, z up

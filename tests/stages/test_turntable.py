@@ -15,7 +15,7 @@ from efficientnerf.evaluation.metrics import psnr
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages.framing.camera_paths import turntable_cameras
-from stages.io.exporters.frames import read_png
+from stages.io.png import read_png
 from stages.turntable import STAGE, TurntableSettings, draw_turntable
 from tests.fakes import BallTree
 

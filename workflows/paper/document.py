@@ -124,7 +124,6 @@ def versions() -> dict[str, str]:
 
 
 def _write(path: Path, text: str) -> None:
-    from stages.io.exporters.aside import written_aside
+    from pipeline.files import write_atomically
 
-    with written_aside(path) as aside:
-        aside.write_text(text, encoding="utf-8")
+    write_atomically(path, text.encode("utf-8"))

@@ -6,12 +6,11 @@ into the folder of the source images, whose names it uses.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from efficientnerf.geometry.cameras import Camera, opengl_from_pose
-from stages.io.exporters.aside import written_aside
+from pipeline.files import write_json
 from stages.io.scene import SPLITS, Scene, views_of
 
 # nerfstudio knows these; what it does not know is written as the one that contains it.
@@ -37,9 +36,8 @@ def transforms_from_scene(scene: Scene) -> dict[str, Any]:
 
 
 def write(scene: Scene, path: Path) -> None:
-    """Write transforms.json for a scene; the file appears by rename."""
-    with written_aside(path) as aside:
-        aside.write_text(json.dumps(transforms_from_scene(scene), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    """Write transforms.json for a scene, atomically."""
+    write_json(path, transforms_from_scene(scene))
 
 
 def _lens(camera: Camera) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.geometry.cameras import Similarity
-from stages.io.exporters.aside import written_aside
+from pipeline.files import atomic
 
 
 def write_exr(
@@ -40,9 +40,9 @@ def write_exr(
     channels = {"RGBA": _plane(rgba), "depth.Z": _plane(depth / scale)}
     channels |= {f"normal.{axis}": _plane(in_capture[..., k]) for k, axis in enumerate("XYZ")}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with written_aside(path) as aside:
+    with atomic(path) as temporary:
         try:
-            OpenEXR.File(header, channels).write(str(aside))
+            OpenEXR.File(header, channels).write(str(temporary))
         except RuntimeError as error:
             # The library has one exception for everything; a full disk has to be told from the rest.
             for number in (errno.ENOSPC, errno.EDQUOT):

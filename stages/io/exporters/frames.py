@@ -1,13 +1,10 @@
-"""Frames as PNG: 8 bits, sRGB, straight alpha. The same pixels are the same bytes, and a file that is there is whole."""
+"""Frames of a render: 8 bits, sRGB, straight alpha, over a background."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 
 from pipeline.errors import UsageError
-from stages.io.exporters.aside import written_aside
 
 NAMED = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -50,19 +47,3 @@ def over_background(frame: np.ndarray, background: tuple[float, float, float]) -
     values = frame.astype(np.float32) / 255.0
     alpha = values[..., 3:]
     return eight_bits(values[..., :3] * alpha + (1.0 - alpha) * np.asarray(background, np.float32))
-
-
-def write_png(frame: np.ndarray, path: Path) -> None:
-    """Write (H, W, 3) or (H, W, 4) uint8; a kill leaves no half of a file."""
-    from PIL import Image
-
-    with written_aside(path) as aside:
-        Image.fromarray(np.ascontiguousarray(frame)).save(aside, "PNG", compress_level=6)
-
-
-def read_png(path: Path) -> np.ndarray:
-    """(H, W, 3) or (H, W, 4) uint8 of a file that write_png wrote."""
-    from PIL import Image
-
-    with Image.open(path) as image:
-        return np.asarray(image)

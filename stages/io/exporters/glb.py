@@ -20,7 +20,7 @@ import numpy as np
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
 
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_aside
+from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963  # buffer view targets
@@ -52,7 +52,7 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> 
     size = sum(array.nbytes for array in arrays)
     header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(described) + 8 + size)
     parts = [header, struct.pack("<I4s", len(described), b"JSON"), described, struct.pack("<I4s", size, b"BIN\0")]
-    write_aside(path, [*parts, *(array.tobytes() for array in arrays)])
+    write_parts(path, [*parts, *(array.tobytes() for array in arrays)])
 
 
 def _document(arrays: list[np.ndarray], rotation: np.ndarray, frame: SourceFrame) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from efficientnerf.surface.mesh import Mesh
 
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_aside
+from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _ROWS = 50_000  # lines made at a time
 
@@ -17,7 +17,7 @@ _ROWS = 50_000  # lines made at a time
 def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write a mesh in the capture's frame. Raises BadInput."""
     check_mesh(mesh, path)
-    write_aside(path, _text(mesh, frame))
+    write_parts(path, _text(mesh, frame))
 
 
 def _text(mesh: Mesh, frame: SourceFrame) -> Iterator[bytes]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from efficientnerf.surface.mesh import Mesh, PointCloud
 
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_mesh, check_points, write_aside
+from .writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_mesh, check_points, write_parts
 
 _VERTEX = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((name, "u1") for name in ("red", "green", "blue"))])
 _FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])
@@ -21,14 +21,14 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> 
     faces = np.empty(len(mesh.faces), _FACE)
     faces["count"], faces["vertex_indices"] = 3, mesh.faces
     header = _header(len(mesh.vertices), frame) + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    write_aside(path, [header.encode("ascii"), _vertices(mesh.vertices, mesh.normals, mesh.colours), faces.tobytes()])
+    write_parts(path, [header.encode("ascii"), _vertices(mesh.vertices, mesh.normals, mesh.colours), faces.tobytes()])
 
 
 def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write a point cloud in the capture's frame. Raises BadInput."""
     check_points(points, path)
     header = _header(len(points.positions), frame) + "end_header\n"
-    write_aside(path, [header.encode("ascii"), _vertices(points.positions, points.normals, points.colours)])
+    write_parts(path, [header.encode("ascii"), _vertices(points.positions, points.normals, points.colours)])
 
 
 def _header(count: int, frame: SourceFrame) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.io.exporters.aside import written_aside
+from pipeline.files import atomic
 
 
 def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 18, each: Callable[[], None] | None = None) -> int:
@@ -28,7 +28,7 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
     # AVX-512 that look ahead do not even repeat themselves; without them every processor writes the same bytes.
     encoding = {"crf": str(crf), "preset": "medium", "flags": "+bitexact", "x264-params": "cpu-independent=1"}
     options = {"movflags": "+faststart", "fflags": "+bitexact"}
-    with written_aside(path) as aside, av.open(str(aside), "w", format="mp4", container_options=options) as container:
+    with atomic(path) as temporary, av.open(str(temporary), "w", format="mp4", container_options=options) as container:
         stream = container.add_stream("libx264", rate=fps, options=encoding)
         stream.thread_count = 1
         stream.pix_fmt = "yuv420p"

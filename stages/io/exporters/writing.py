@@ -1,4 +1,4 @@
-"""What all exporters share: the frame that a file's numbers are in, the checks before, and writing aside."""
+"""What all exporters share: the frame that a file's numbers are in, the checks before, and writing."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import numpy as np
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Mesh, PointCloud
 from pipeline.errors import BadInput
-from pipeline.files import sync_folder
-from stages.io.exporters.aside import written_aside
+from pipeline.files import atomic
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +74,7 @@ def bytes_from_srgb(colours: np.ndarray) -> np.ndarray:
     return np.round(np.clip(colours, 0, 1) * 255).astype(np.uint8)
 
 
-def write_aside(path: Path, parts: Iterable[bytes | memoryview]) -> None:
-    """Write a file under a name of its own, sync it, then put it in place: `path` holds all of it, or what it held before."""
-    with written_aside(path) as aside, open(aside, "wb") as file:
+def write_parts(path: Path, parts: Iterable[bytes | memoryview]) -> None:
+    """Write a file of parts made one after the other, atomically."""
+    with atomic(path) as temporary, open(temporary, "wb") as file:
         file.writelines(parts)
-    sync_folder(path.parent)

@@ -12,7 +12,7 @@ import numpy as np
 
 from efficientnerf.surface.mesh import PointCloud
 
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_points, write_aside
+from .writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_points, write_parts
 
 _ROWS = 50_000  # lines made at a time
 _LINE = "%.9g %.9g %.9g %d %d %d %.5f %.5f %.5f\n"
@@ -21,7 +21,7 @@ _LINE = "%.9g %.9g %.9g %d %d %d %.5f %.5f %.5f\n"
 def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write a point cloud in the capture's frame. Raises BadInput."""
     check_points(points, path)
-    write_aside(path, _text(np.hstack([points.positions, bytes_from_srgb(points.colours), points.normals])))
+    write_parts(path, _text(np.hstack([points.positions, bytes_from_srgb(points.colours), points.normals])))
 
 
 def _text(rows: np.ndarray) -> Iterator[bytes]:

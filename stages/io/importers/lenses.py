@@ -12,6 +12,7 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, quarter_turned, resized
 from pipeline.errors import BadInput
 from stages.io.importers.source import listed
+from stages.io.photo import same_aspect
 
 _EXIF_ORIENTATION = 0x0112
 _QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}  # clockwise, from the stored pixels to the upright image; the others are mirrored
@@ -144,14 +145,6 @@ def fitted(camera: Camera, header: Header, where: str) -> tuple[Camera, str | No
             "Use the images that the cameras were made for (not cropped ones), or correct w and h."
         )
     return resized(camera, width, height), "resized"
-
-
-def same_aspect(stated: tuple[int, int], actual: tuple[int, int]) -> bool:
-    """Whether two sizes show the same picture: equal aspect within 1 %, or within the rounding of a side by one pixel."""
-    (w, h), (width, height) = stated, actual
-    if min(w, h, width, height) <= 0:
-        return False
-    return abs(width * h / (w * height) - 1) <= 0.01 or abs(height - h * width / w) <= 1 or abs(width - w * height / h) <= 1
 
 
 def fit_warnings(where: str, odd: dict[str, list[str]]) -> list[str]:

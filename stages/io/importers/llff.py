@@ -34,13 +34,13 @@ def image_folders(folder: Path) -> dict[int, Path]:
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The matrix of poses, the images of the folder that is used, and their masks."""
     source = Source(folder, settings.allow_outside)
-    images = _images(source, settings, _row_count(folder / POSES))[0]
+    images = _images(source, settings, len(read_rows(folder / POSES)))[0]
     return [folder / POSES, *images, *masks_of(source, images).values()]
 
 
 def read(folder: Path, settings: ImportSettings) -> Capture:
     """The capture that poses_bounds.npy describes. Raises BadInput."""
-    rows = _rows(folder / POSES)
+    rows = read_rows(folder / POSES)
     source = Source(folder, settings.allow_outside)
     images, factor, warnings = _images(source, settings, len(rows))
     masks = masks_of(source, images)
@@ -85,16 +85,12 @@ def _camera(row: np.ndarray, name: str, where: str) -> Camera:
     return lenses.checked(Camera(name, width, height, "SIMPLE_PINHOLE", (float(focal), width / 2, height / 2), pose), where)
 
 
-def _row_count(path: Path) -> int:
-    return len(_rows(path))
-
-
-def _rows(path: Path) -> np.ndarray:
-    """(N, 17) float64, finite; nothing but plain numbers is read from the file."""
+def read_rows(path: Path, most_frames: int = MOST_FRAMES) -> np.ndarray:
+    """(N, 17) float64, finite, N at most `most_frames`; nothing but plain numbers is read from the file. Raises BadInput."""
     try:
         size = path.stat().st_size
-        if size > 17 * 8 * MOST_FRAMES + 4096:
-            raise BadInput(f"{path}: {size} bytes; more than {MOST_FRAMES} poses are not read.")
+        if size > 17 * 8 * most_frames + 4096:
+            raise BadInput(f"{path}: {size} bytes; more than {most_frames} poses are not read.")
         array = np.load(path, allow_pickle=False, mmap_mode=None)
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error

@@ -7,17 +7,15 @@ source; absolute paths also by their file name alone. What lies outside the sour
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Protocol
+from typing import Protocol
 
 from pipeline.errors import BadInput
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-LARGEST_JSON = 256 << 20  # bytes
 MOST_FRAMES = 100_000
 MOST_FILES = 1_000_000  # entries of a source folder that are looked through
 FEWEST = 3  # images that make a data set
@@ -38,24 +36,6 @@ class ImportSettings(Protocol):
 def listed(names: Sequence[str]) -> str:
     """The first few names, and how many more there are."""
     return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
-
-
-def read_json(path: Path, most: int = LARGEST_JSON) -> Any:
-    """A JSON file of bounded size; NaN and Infinity are refused."""
-
-    def refuse(constant: str) -> float:
-        raise ValueError(f"{constant} is not a number that JSON knows")
-
-    try:
-        size = path.stat().st_size
-        if size > most:
-            raise BadInput(f"{path}: {size >> 20} MiB of JSON; at most {most >> 20} MiB are read.")
-        return json.loads(path.read_bytes().decode("utf-8-sig"), parse_constant=refuse)
-    except OSError as error:
-        raise BadInput(f"{path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise BadInput(f"{path}: not valid JSON ({reason}). Write the data set again, or repair that place.") from error
 
 
 @dataclass(frozen=True)

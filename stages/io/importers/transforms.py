@@ -23,7 +23,8 @@ from efficientnerf.geometry.cameras import MODELS, Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
-from stages.io.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, account_for_missing, account_for_places, read_json
+from stages.io.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, account_for_missing, account_for_places
+from stages.io.json_file import read_json
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 LARGEST_PLY = 1 << 30  # bytes
@@ -72,7 +73,7 @@ def json_files(folder: Path) -> list[Path]:
 
 def dialect(folder: Path) -> str:
     """ "blender", "nerfstudio" or "instant-ngp", by the keys that only one of them has."""
-    document = _document(json_files(folder)[0])
+    document = read_document(json_files(folder)[0])
     frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
     if any(key in document for key in _NERFSTUDIO_KEYS) or any("mask_path" in frame or "depth_file_path" in frame for frame in frames):
         return "nerfstudio"
@@ -86,7 +87,7 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
     source = Source(folder, settings.allow_outside)
     paths: dict[Path, None] = dict.fromkeys(json_files(folder))
     for file in json_files(folder):
-        document = _document(file)
+        document = read_document(file)
         ply = _ply(source, document)
         if ply is not None:
             paths[ply] = None
@@ -114,7 +115,7 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     warnings += account_for_places(where, listing.places, listing.extensions) + lenses.fit_warnings(where, odd) + lens_warnings
     if listing.repeated:
         warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
-    document = _document(json_files(folder)[0])
+    document = read_document(json_files(folder)[0])
     if len({file.name for file in json_files(folder)} & set(SPLIT_FILES)) and (folder / "transforms.json").is_file():
         warnings.append(f"transforms.json is not read: {where} state the same with their splits.")
     points, point_warnings = _points(source, document)
@@ -133,14 +134,15 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     )
 
 
-def _document(file: Path) -> dict[str, Any]:
-    document = read_json(file)
+def read_document(file: Path, most_frames: int = MOST_FRAMES) -> dict[str, Any]:
+    """The document of a transforms.json that lists 1 to `most_frames` frames. Raises BadInput."""
+    document = read_json(file, "Write the data set again, or repair that place.")
     if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
         raise BadInput(f"{file}: no data set: expected an object with a list `frames`. Name the folder of a data set, or choose a format with --as.")
     if not document["frames"]:
         raise BadInput(f"{file}: its list of frames is empty. At least {FEWEST} are needed.")
-    if len(document["frames"]) > MOST_FRAMES:
-        raise BadInput(f"{file}: {len(document['frames'])} frames; at most {MOST_FRAMES} are read.")
+    if len(document["frames"]) > most_frames:
+        raise BadInput(f"{file}: {len(document['frames'])} frames; at most {most_frames} are read.")
     return document
 
 
@@ -149,7 +151,7 @@ def _list_frames(source: Source) -> _Listing:
     seen: set[Path] = set()
     split_files = json_files(source.root)
     for file in split_files:
-        document = _document(file)
+        document = read_document(file)
         split_of_file = SPLIT_FILES.get(file.name) if len(split_files) > 1 else None
         split_of_name = dict(_listed_splits(document, file))
         for index, entry in enumerate(document["frames"]):

@@ -1,0 +1,28 @@
+"""PNG files: the same pixels are the same bytes, and a file that is there is whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.files import atomic
+
+FAST = 1  # compression of what is read once and thrown away
+USUAL = 6
+
+
+def write_png(pixels: np.ndarray, path: Path, *, compress_level: int = USUAL, durable: bool = True) -> None:
+    """Write (H, W), (H, W, 3) or (H, W, 4) uint8; see `pipeline.files.atomic`."""
+    from PIL import Image
+
+    with atomic(path, durable=durable) as temporary:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, "PNG", compress_level=compress_level)
+
+
+def read_png(path: Path) -> np.ndarray:
+    """uint8, in the shape that `write_png` was given."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image)
