@@ -161,7 +161,7 @@ def _source(stage: Stage, run: Run, settings: Any, former: dict[str, str] | None
         what = "the run names no source" if source is None else f"{source} is not there, or empty"
         if former is not None:
             return former, f"{what}; {stage.name} stands as it was made"
-        raise BadInput(f"{stage.name} needs the source: {what}. Name it: {run.command().replace('enerf run', 'enerf run SOURCE')}")
+        raise BadInput(f"{stage.name} needs the source: {what}. Name it: {run.how_to_resume(with_source=True)}")
     base = source if source.is_dir() else source.parent
     prefix, digests = f"source of {stage.name}:", {}
     try:

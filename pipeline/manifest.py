@@ -3,7 +3,7 @@
 request   stage, version, settings, digests of the inputs, digests of the source's files. Its SHA-256 names the work folder
 outputs   name -> SHA-256, size, and whether it depends on the clock (volatile)
 digest    of the names and SHA-256 of the outputs that do not: all that later requests see
-the rest  seconds, peak memory, tool versions: for people, outside of every digest
+the rest  seconds, processor time, peak memory, tool versions: for people, outside of every digest
 checksum  of all of the above, so that a damaged manifest is known as such
 """
 
@@ -87,6 +87,8 @@ class Manifest:
 
     seconds      wall clock of the process that finished it
     peak_memory  bytes, of that process during the stage
+    cpu_seconds  processor time of that process and its children during the stage; 0 where it is not known
+    cores        that the process might use; 0 where it is not known
     resumed      whether it went on from the scratch of an earlier process
     made         seconds since 1970
     """
@@ -98,6 +100,13 @@ class Manifest:
     resumed: bool = False
     made: float = field(default_factory=time.time)
     versions: dict[str, str] = field(default_factory=lambda: dict(tool_versions()))
+    cpu_seconds: float = 0.0
+    cores: int = 0
+
+    @property
+    def cores_busy(self) -> float:
+        """Processor time over wall clock."""
+        return self.cpu_seconds / self.seconds if self.seconds > 0 else 0.0
 
     @property
     def digest(self) -> str:
@@ -118,6 +127,8 @@ class Manifest:
             "digest": self.digest,
             "seconds": self.seconds,
             "peak_memory": self.peak_memory,
+            "cpu_seconds": self.cpu_seconds,
+            "cores": self.cores,
             "resumed": self.resumed,
             "made": self.made,
             "versions": self.versions,
@@ -171,6 +182,8 @@ def _parsed(value: Any) -> Manifest:
         resumed=_typed(value.get("resumed"), bool, "resumed"),
         made=float(_typed(value.get("made"), (int, float), "made")),
         versions={_typed(k, str, "versions"): _typed(v, str, "versions") for k, v in _typed(value.get("versions"), dict, "versions").items()},
+        cpu_seconds=float(_typed(value.get("cpu_seconds", 0.0), (int, float), "cpu_seconds")),  # manifests of 2026 before release 0.1.0 have none
+        cores=_typed(value.get("cores", 0), int, "cores"),
     )
     if value.get("digest") != manifest.digest or value.get("request_digest") != manifest.request.digest:
         raise _Bad("its digests are not those of what it lists")

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import errno
 import os
-import shlex
 import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from pipeline import files
 from pipeline.errors import BadInput, CorruptArtifact, DiskFull
@@ -32,13 +31,31 @@ VERSION = 1
 _CHANGEABLE = ("source", "settings", "preset", "seed", "device")
 
 
+class ResumeText(Protocol):
+    """What messages say of how to go on with a run: a workflow gives the command, the engine knows none.
+
+    until        the last stage to run; None: all
+    only         the one stage to run
+    with_source  whether the source has to be named
+    """
+
+    def __call__(self, run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str: ...
+
+
+def resume_in_words(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+    """The ResumeText of a run that was given none."""
+    what = f"the stage {only}" if only is not None else "the stages" if until is None else f"the stages until {until}"
+    return f"run {what} of {run}" + (" with a source" if with_source else "")
+
+
 @dataclass
 class Run:
     """A run folder and what its run.json says. `Run(path, ...)` alone writes nothing: a plan of a run, for a dry run.
 
-    path      absolute
-    source    absolute, or None
-    settings  stage -> the resolved values of its settings, plain JSON
+    path         absolute
+    source       absolute, or None
+    settings     stage -> the resolved values of its settings, plain JSON
+    resume_text  how to go on with the run, for messages
     """
 
     path: Path
@@ -48,6 +65,7 @@ class Run:
     seed: int | None = None
     device: str | None = None
     created: float = field(default_factory=time.time)
+    resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)
     _holds: int = field(default=0, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -76,12 +94,12 @@ class Run:
             raise BadInput(f"{self.path}: exists and is not a folder. Give a new folder for the run.")
         found = sorted(entry.name for entry in os.scandir(self.path) if not _is_ours(entry.name))
         if NAME in found:
-            raise BadInput(f"{self.path}: is a run already. Go on with it ({self.command()}), or give a new folder.")
+            raise BadInput(f"{self.path}: is a run already. Go on with it ({self.how_to_resume()}), or give a new folder.")
         if found:
             raise BadInput(f"{self.path}: exists and is not a run (no {NAME}; it holds {found[0]!r}). Give a new or an empty folder.")
 
     @classmethod
-    def open(cls, path: Path) -> Run:
+    def open(cls, path: Path, resume_text: ResumeText = resume_in_words) -> Run:
         """Read run.json. Raises BadInput if it is no run or one of a newer format, CorruptArtifact if it is damaged."""
         path = _absolute(path)
         if not path.is_dir():
@@ -92,7 +110,7 @@ class Run:
             raise BadInput(f"{path}: is not a run (it has no {NAME}).") from None
         except files.Unreadable as error:
             raise CorruptArtifact(f"{path / NAME}: {error}. Restore it, or start a new run.", (NAME,)) from None
-        return cls(path, **_checked(path / NAME, value))
+        return cls(path, **_checked(path / NAME, value), resume_text=resume_text)
 
     def update(self, **changes: Any) -> None:
         """Change source, settings (all of them), preset, seed or device, and write run.json if that makes a difference."""
@@ -119,9 +137,9 @@ class Run:
         """The file that remembers digests."""
         return self.path / ".cache" / "hashes.json"
 
-    def command(self) -> str:
-        """What to type to go on with this run."""
-        return f"enerf run --out {shlex.quote(str(self.path))}"
+    def how_to_resume(self, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+        """How to go on with this run; see ResumeText."""
+        return self.resume_text(self.path, until=until, only=only, with_source=with_source)
 
     def holder(self) -> Holder | None:
         """Who is writing the run, for messages; takes no lock."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import shlex
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -137,7 +136,8 @@ class _Runner:
         except (Exception, KeyboardInterrupt) as error:
             self._failed(stage, place, error)
         self.hashes.forget(f"{stage.name}/", {f"{stage.name}/{name}" for name in made.outputs})
-        facts = {"seconds": time.monotonic() - started, "size": made.size, "digest": made.digest, "files": len(made.outputs), "peak_memory": made.peak_memory}
+        facts = {"seconds": time.monotonic() - started, "size": made.size, "digest": made.digest, "files": len(made.outputs)}
+        facts |= {"peak_memory": made.peak_memory, "cpu_seconds": made.cpu_seconds, "cores_busy": made.cores_busy, "cores": made.cores}
         self.emit("stage_done", stage.name, reason=reason, **facts)
         return _outcome(stage, "ran", reason, made)
 
@@ -158,13 +158,13 @@ class _Runner:
         )
         usage = self.execute(stage, job)
         outputs = artifact.outputs_of(place.out, stage, self.hashes)
-        made = Manifest(request, outputs, usage.seconds, usage.peak_memory, resumed)
+        made = Manifest(request, outputs, usage.seconds, usage.peak_memory, resumed, cpu_seconds=usage.cpu_seconds, cores=usage.cores)
         artifact.seal(place.out, made)
         return made
 
     def _runnable(self, stage: Stage, decision: Decision, reason: str) -> Request:
         """The request to run; raises what stands in the way."""
-        until = f"{self.run.command()} --until {stage.name}"
+        until = self.run.how_to_resume(until=stage.name)
         if decision.request is None:
             obstacle = decision.obstacle
             if isinstance(obstacle, CorruptArtifact):
@@ -199,7 +199,7 @@ class _Runner:
 
     def _interrupted(self, error: BaseException, stage: str, only: str | None) -> Interrupted:
         number = error.number if isinstance(error, Interrupted) else signal.SIGINT
-        go_on = self.run.command() if only is None else f"enerf stage {only} {shlex.quote(str(self.run.path))}"
+        go_on = self.run.how_to_resume(only=only)
         during = f" in {stage}" if stage else ""
         told = Interrupted(number, f"interrupted by {signal.Signals(number).name}{during}; what is done is kept. Go on with: {go_on}")
         self.emit("interrupted", stage, text=str(told), resume=go_on, exit_code=told.exit_code)
@@ -243,7 +243,7 @@ def verify(run: Run, stages: Sequence[Stage], report: Report | None = None) -> l
         _emit(report, "message", stage.name, text=f"{stage.name}: {len(made.outputs)} files as they were written", size=made.size)
         outcomes.append(_outcome(stage, "verified", None, made))
     if damaged:
-        raise CorruptArtifact(f"{run.path}: {artifact.listed(damaged)} not as written. Make anew what is damaged: {run.command()}", tuple(damaged))
+        raise CorruptArtifact(f"{run.path}: {artifact.listed(damaged)} not as written. Make anew what is damaged: {run.how_to_resume()}", tuple(damaged))
     return outcomes
 
 
@@ -305,7 +305,7 @@ def _warn_of_stale_needs(run: Run, stages: Sequence[Stage], only: str, report: R
     before = _ancestors(stages, only)
     for decision in survey([stage for stage in stages if stage.name in before], run, hashes=hashes):
         if not decision.fresh:
-            text = f"{decision.stage} is {decision.state} ({decision.reason}); {only} uses what the run has. To bring all up to date: {run.command()}"
+            text = f"{decision.stage} is {decision.state} ({decision.reason}); {only} uses what the run has. To bring all up to date: {run.how_to_resume()}"
             _emit(report, "warning", only, text=text, about=decision.stage, state=decision.state, reason=decision.reason)
 
 

@@ -7,6 +7,7 @@ An executor is a function (Stage, Job) -> Usage. It returns when job.out is comp
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import time
 from dataclasses import dataclass
@@ -16,18 +17,36 @@ from pipeline.stage import Job, Stage
 
 @dataclass(frozen=True)
 class Usage:
-    """What a stage cost: wall clock in seconds, peak resident memory of the process in bytes."""
+    """What a stage cost.
+
+    seconds      wall clock
+    peak_memory  resident memory of the process, bytes
+    cpu_seconds  processor time of the process and of its children that have ended; 0 where it is not known
+    cores        that the process may use; 0 where it is not known
+    """
 
     seconds: float
     peak_memory: int
+    cpu_seconds: float = 0.0
+    cores: int = 0
 
 
 def execute(stage: Stage, job: Job) -> Usage:
     """Run the stage to its end."""
     _reset_peak()
-    started = time.monotonic()
+    started, busy = time.monotonic(), cpu_seconds()
     stage.run(job)
-    return Usage(time.monotonic() - started, peak_memory())
+    return Usage(time.monotonic() - started, peak_memory(), cpu_seconds() - busy, cores())
+
+
+def cpu_seconds() -> float:
+    """User and system time of this process and of its children that have ended."""
+    return sum(os.times()[:4])
+
+
+def cores() -> int:
+    """CPUs that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _reset_peak() -> None:

@@ -133,7 +133,7 @@ def test_a_signal_stops_at_the_next_safe_point_and_the_next_run_goes_on(tmp_path
         time.sleep(0.15)
         process.send_signal(number)
         assert process.stdout is not None
-        assert f"Go on with: enerf run --out {run.path}" in process.stdout.read()
+        assert f"Go on with: run the stages of {run.path}" in process.stdout.read()
         assert process.wait(10) == code
     assert not (run.path / ".lock.json").exists()
     (checkpoint,) = (run.path / ".work" / "count").glob("*/scratch/state.txt")

@@ -17,7 +17,7 @@ A, B, C = ("a" * 64, "b" * 64, "c" * 64)
 
 def example() -> Manifest:
     request = Request("train", 2, {"rate": 0.5, "sizes": [1, 2]}, {"poses": A}, {"0.jpg": B, "gone.jpg": "absent"})
-    return Manifest(request, {"field.bin": Output(A, 10), "log.jsonl": Output(B, 5, True)}, 1.5, 1000, True)
+    return Manifest(request, {"field.bin": Output(A, 10), "log.jsonl": Output(B, 5, True)}, 1.5, 1000, True, cpu_seconds=3.0, cores=4)
 
 
 def write(folder: Path, change: Callable[[dict[str, Any]], Any] = lambda value: None, *, checked: bool = True) -> None:
@@ -35,6 +35,14 @@ def test_there_and_back(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_bytes(made.to_bytes())
     assert read_manifest(tmp_path) == made
     assert made.size == 15
+    assert made.cores_busy == 2.0
+
+
+def test_a_manifest_from_before_processor_time_was_recorded_is_read(tmp_path: Path) -> None:
+    write(tmp_path, lambda value: [value.pop("cpu_seconds"), value.pop("cores")])
+    made = read_manifest(tmp_path)
+    assert (made.cpu_seconds, made.cores, made.cores_busy) == (0.0, 0, 0.0)
+    assert (made.digest, made.request.digest) == (example().digest, example().request.digest)
 
 
 def test_the_digest_sees_names_and_bytes_but_not_what_depends_on_the_clock() -> None:

@@ -30,7 +30,20 @@ def test_paths_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     run = Run.create(Path("run"), Path("photos"))
     assert run.path == tmp_path / "run"
     assert run.source == tmp_path / "photos"
-    assert run.command() == f"enerf run --out {tmp_path}/run"
+    assert run.how_to_resume(until="count") == f"run the stages until count of {tmp_path}/run"
+
+
+def test_messages_name_the_command_that_a_workflow_gives(tmp_path: Path) -> None:
+    def command(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+        return f"make {run.name} {until} {only} {with_source}"
+
+    run = Run.create(tmp_path / "run", resume_text=command)
+    assert run.how_to_resume(until="bake") == "make run bake None False"
+    assert run.how_to_resume(only="bake", with_source=True) == "make run None bake True"
+    assert Run.open(run.path, command).how_to_resume() == "make run None None False"
+    with pytest.raises(BadInput, match=r"Go on with it \(make run None None False\)"):
+        run.check_free()
+    assert Run.open(run.path) == run
 
 
 def test_an_empty_folder_will_do_and_so_will_what_a_kill_left(tmp_path: Path) -> None:

@@ -58,6 +58,8 @@ def test_the_manifest_says_what_made_it(run: Run) -> None:
     assert made.request.inputs == {"list": read_manifest(run.folder("list")).digest}
     assert made.outputs["log.jsonl"].volatile
     assert made.peak_memory > 2**20
+    assert made.cpu_seconds >= 0
+    assert made.cores >= 1
     assert not made.resumed
     assert sorted(read_manifest(run.folder("list")).request.source or {}) == ["0.jpg", "1.jpg", "2.jpg"]
 
@@ -115,7 +117,7 @@ def test_one_stage_alone_says_that_those_before_it_are_stale_and_uses_what_there
 
 
 def test_one_stage_alone_without_what_it_needs(run: Run) -> None:
-    with pytest.raises(BadInput, match=r"count needs list, which this run does not have\. Make it first: enerf run --out .* --until count"):
+    with pytest.raises(BadInput, match=r"count needs list, which this run does not have\. Make it first: run the stages until count of "):
         run_stages(run, STAGES, only="count")
     run_stages(run, STAGES)
     (run.folder("count") / "count.txt").write_text("altered")
@@ -304,10 +306,10 @@ def _count_until(step: int) -> object:
 
 def test_interrupted_and_resumed_gives_the_same_bytes(run: Run, tmp_path: Path) -> None:
     events = Events()
-    with pytest.raises(Interrupted, match="Go on with: enerf run --out ") as caught:
+    with pytest.raises(Interrupted, match="Go on with: run the stages of ") as caught:
         run_stages(run, replaced("count", run=_count_until(3)), report=events)
     assert caught.value.exit_code == 130
-    assert events.named("interrupted")[0]["resume"] == run.command()
+    assert events.named("interrupted")[0]["resume"] == run.how_to_resume()
     assert decide(COUNT, run).reason == "incomplete: cut short; it goes on where it stopped"
     resumed = run_stages(run, STAGES)
     undisturbed = run_stages(make_run(tmp_path / "other"), STAGES)
@@ -325,7 +327,7 @@ def test_an_interruption_that_a_library_wrapped(run: Run, error: BaseException) 
     with pytest.raises(Interrupted) as caught:
         run_stages(run, replaced("count", run=wrapped))
     assert caught.value.exit_code == (143 if isinstance(error, Interrupted) else 130)
-    with pytest.raises(Interrupted, match="enerf stage count "):
+    with pytest.raises(Interrupted, match="run the stage count of "):
         run_stages(run, replaced("count", run=raising(error)), only="count")
 
 
@@ -406,7 +408,7 @@ def test_verify_reads_everything_and_lists_what_is_damaged(run: Run) -> None:
     assert caught.value.files == ("list/images/0.jpg", "count/manifest.json", "double/double.txt")
     assert caught.value.exit_code == 4
     assert "report: extra.txt not written by it" in events.text()
-    assert run.command() in str(caught.value)
+    assert run.how_to_resume() in str(caught.value)
     assert actions(run_stages(run, STAGES))["count"] == "ran"
     run_stages(run, STAGES, only="double", force=True)
     verify(run, STAGES)

@@ -28,6 +28,11 @@ def test_sizes(count: float, words: str) -> None:
     assert size(count) == words
 
 
+def test_a_finished_stage_says_how_busy_the_cores_were() -> None:
+    assert sentence(event("stage_done", seconds=143.0, cores_busy=1.7, cores=2)) == "done in 2 min 23 s, 1.7 of 2 cores busy"
+    assert sentence(event("stage_done", seconds=143.0, cores_busy=0.0, cores=0)) == "done in 2 min 23 s"
+
+
 def test_lines_are_throttled(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])

@@ -53,8 +53,8 @@ def sentence(event: Event) -> str:
             reason = event.get("reason")
             return f"started ({reason})" if reason else "started"
         case "stage_done":
-            seconds = event.get("seconds")
-            return "done" if seconds is None else f"done in {duration(seconds)}"
+            seconds, cores = event.get("seconds"), event.get("cores")
+            return "done" if seconds is None else f"done in {duration(seconds)}" + (f", {event['cores_busy']:.1f} of {cores} cores busy" if cores else "")
         case "stage_skipped":
             return "up to date"
         case "message":

@@ -12,6 +12,7 @@ from pipeline.run import NAME, Run
 from pipeline.stage import Stage
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, read_config, read_preset, seconds_of, table_of
+from workflows.cli.target import open_run, resume_command
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,9 @@ class Plan:
     def write(self) -> Run:
         """Make the run, or change what the standing one records."""
         if self.new:
-            return Run.create(self.run.path, self.run.source, self.run.settings, preset=self.run.preset, seed=self.run.seed, device=self.run.device)
-        run = Run.open(self.run.path)
+            facts = {"preset": self.run.preset, "seed": self.run.seed, "device": self.run.device, "resume_text": resume_command}
+            return Run.create(self.run.path, self.run.source, self.run.settings, **facts)
+        run = open_run(self.run.path)
         run.update(source=self.run.source, settings=self.run.settings, preset=self.run.preset, seed=self.run.seed, device=self.run.device)
         return run
 
@@ -65,7 +67,7 @@ def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
     standing = _standing(path)
     if standing is None:
         # Before anything else: a wrong folder must not be answered with a remark about settings.
-        Run(path).check_free()
+        Run(path, resume_text=resume_command).check_free()
         if options.source is None:
             raise UsageError(f"{path}: no run is there. To begin one: enerf run SOURCE --out {path}")
         if preset is None:
@@ -101,12 +103,13 @@ def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
         preset=preset or (standing.preset if standing else None),
         seed=seed if seed is not None else (standing.seed if standing else None),
         device=device or (standing.device if standing else None) or "auto",
+        resume_text=resume_command,
     )
     return Plan(run, standing is None, run.device or "auto", warnings)
 
 
 def _standing(path: Path) -> Run | None:
-    return Run.open(path) if (path / NAME).exists() else None
+    return open_run(path) if (path / NAME).exists() else None
 
 
 def _source(given: Path | None, standing: Run | None) -> Path | None:
@@ -123,5 +126,6 @@ def _source(given: Path | None, standing: Run | None) -> Path | None:
     source = Path(os.path.abspath(given))
     unchanged = recorded is None or os.path.realpath(source) == os.path.realpath(recorded)
     if standing is not None and not unchanged and standing.folder("poses").exists() and recorded is not None and recorded.exists():
-        raise UsageError(f"{standing.path}: was made from {recorded}, not from {source}. Give a new folder for another source, or go on: {standing.command()}")
+        remedy = f"Give a new folder for another source, or go on: {standing.how_to_resume()}"
+        raise UsageError(f"{standing.path}: was made from {recorded}, not from {source}. {remedy}")
     return source

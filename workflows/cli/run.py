@@ -61,10 +61,10 @@ def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, a
 def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Run the stage NAME of RUN with what the run already has; the stages before it are never run, and named if they are stale."""
     from pipeline.errors import UsageError
-    from pipeline.run import Run
     from workflows import asset
     from workflows.cli.request import Options, plan_run
     from workflows.cli.resolve import nearest
+    from workflows.cli.target import open_run
 
     names = [each.name for each in asset.STAGES]
     if name not in names:
@@ -72,7 +72,7 @@ def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool
     for text in options["sets"]:
         if text.partition(".")[0].strip() in {*names} - {name}:
             raise UsageError(f"--set {text}: not a setting of {name}, the only stage that runs here. Use: enerf run --out {run_folder} --set {text}")
-    Run.open(run_folder)  # says so where it is none
+    open_run(run_folder)  # says so where it is none
     plan = plan_run(run_folder, asset.STAGES, Options(**options))
     _work(plan, as_json=as_json, quiet=quiet, only=name, force=force, dry_run=dry_run)
 

@@ -20,11 +20,11 @@ def status(run_folder: Path, as_json: bool) -> None:
     Files whose size and time of change are the same are taken to be the same; 'enerf verify' reads them.
     """
     from pipeline.decide import survey
-    from pipeline.run import Run
     from workflows import asset
     from workflows.cli.progress import duration, size, write_json
+    from workflows.cli.target import open_run
 
-    run = Run.open(run_folder)
+    run = open_run(run_folder)
     stages: list[dict[str, Any]] = []
     for decision in survey(asset.STAGES, run):
         made = decision.manifest
@@ -93,13 +93,13 @@ def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
 
 def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
     from pipeline.errors import CorruptArtifact
-    from pipeline.run import Run
     from pipeline.runner import verify as verify_run
     from workflows import asset
     from workflows.cli.failures import Reported
     from workflows.cli.progress import display, size, write_json
+    from workflows.cli.target import open_run
 
-    run = Run.open(run_folder)
+    run = open_run(run_folder)
     try:
         with display(as_json=as_json, quiet=quiet) as show:
             outcomes = verify_run(run, asset.STAGES, show)
@@ -119,12 +119,12 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
 def report(run_folder: Path, as_json: bool) -> None:
     """Write RUN/report.html: what was made, how it looks, how good it is, of what settings. 'enerf run' writes it, too, when it is done."""
     from pipeline.decide import survey
-    from pipeline.run import Run
     from workflows import asset
     from workflows.cli.progress import write_json
+    from workflows.cli.target import open_run
     from workflows.report.page import write_report
 
-    run = Run.open(run_folder)
+    run = open_run(run_folder)
     path = write_report(run, survey(asset.STAGES, run))
     if as_json:
         write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), "exit_code": 0})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,24 @@ from stages.artifacts import BakeOutputs
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
+    from pipeline.run import Run
 
 ASSET = BakeOutputs.asset  # the file's name
+
+
+def resume_command(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+    """What to type to go on with a run; see `pipeline.run.ResumeText`."""
+    folder = shlex.quote(str(run))
+    if only is not None:
+        return f"enerf stage {only} {folder}"
+    return f"enerf run{' SOURCE' if with_source else ''} --out {folder}" + ("" if until is None else f" --until {until}")
+
+
+def open_run(path: Path) -> Run:
+    """The run of a folder, whose messages name commands. Raises BadInput and CorruptArtifact."""
+    from pipeline.run import Run
+
+    return Run.open(path, resume_command)
 
 
 def is_run(path: Path) -> bool:

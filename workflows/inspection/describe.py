@@ -8,7 +8,7 @@ from typing import Any
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, PosesOutputs
 from workflows.cli.progress import plain, size
-from workflows.cli.target import ASSET, describe_asset, is_run
+from workflows.cli.target import ASSET, describe_asset, is_run, open_run
 
 MESHES = (".ply", ".glb", ".obj", ".xyz")
 
@@ -51,11 +51,10 @@ def _describe_file(path: Path) -> dict[str, Any]:
 
 def _describe_run(path: Path) -> dict[str, Any]:
     from pipeline.decide import survey
-    from pipeline.run import Run
     from workflows import asset
     from workflows.report.summary import artifacts, metrics
 
-    run = Run.open(path)
+    run = open_run(path)
     quality = metrics(run.path) or {}
     found: dict[str, Any] = {
         "what": "run",
