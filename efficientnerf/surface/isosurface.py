@@ -20,7 +20,7 @@ from .mesh import Mesh, PointCloud, compact, decimate, face_areas, face_componen
 Progress = Callable[[int, int, str], None]
 Looking = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 BLOCK = 64  # voxels a side that are in memory at a time
-_CHUNK = 1 << 16  # points whose colours are looked up at a time
+CHUNK = 1 << 16  # points whose colours are looked up at a time
 
 
 class NoSurface(ValueError):
@@ -249,7 +249,9 @@ def _crossings(point: np.ndarray, triangles: np.ndarray) -> int:
     return int(((weight * (triangles[hit, :, 0] - point[0])).sum(1) > 0).sum())
 
 
-def surface_colours(tree: Any, positions: np.ndarray, normals: np.ndarray, progress: Progress = _silent, looking: Looking | None = None) -> np.ndarray:
+def surface_colours(
+    tree: Any, positions: np.ndarray, normals: np.ndarray, progress: Progress = _silent, looking: Looking | None = None, chunk: int = CHUNK
+) -> np.ndarray:
     """(N, 3) float32 sRGB of surface points, as seen from outside.
 
     Along the inward normal, from one voxel in front of the point to two behind it, colours are weighted as a ray would weigh them: a single
@@ -259,8 +261,8 @@ def surface_colours(tree: Any, positions: np.ndarray, normals: np.ndarray, progr
     """
     colours = np.empty((len(positions), 3), np.float32)
     steps = np.linspace(-1.0, 2.0, 7) * float(tree.voxel)  # (S,)
-    for start in range(0, len(positions), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(positions), chunk):
+        part = slice(start, start + chunk)
         progress(start, len(positions), "colours")
         point, normal = positions[part], normals[part]
         samples = point[:, None] - steps[:, None] * normal[:, None]  # (N, S, 3)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface, points, surface
-from efficientnerf.surface.isosurface import isosurface as surfaces
-from efficientnerf.surface.mesh import decimate, face_areas, face_volumes, moved, sample, separate, smooth, tidy, topology
+from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface, points, surface, surface_colours
+from efficientnerf.surface.mesh import Mesh, decimate, face_areas, face_volumes, moved, sample, separate, smooth, tidy, topology
 
 LEVEL = 40.0
 NOBODY = np.zeros((0, 3))
@@ -205,12 +204,11 @@ def test_progress_stops_the_work() -> None:
         surface(Balls(((0, 0, 0), 0.5), cells=4), LEVEL, progress=stop)
 
 
-def test_colours_are_looked_up_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_colours_are_looked_up_in_chunks() -> None:
     ball = Balls(((0, 0, 0), 0.5), cells=4)
     whole = surface(ball, LEVEL)
-    monkeypatch.setattr(surfaces, "_CHUNK", 17)
-    np.testing.assert_allclose(surface(ball, LEVEL).colours, whole.colours, atol=1e-6)
+    np.testing.assert_allclose(surface_colours(ball, whole.vertices, whole.normals, chunk=17), whole.colours, atol=1e-6)
 
 
-def _shape(mesh: surfaces.Mesh) -> tuple[np.ndarray, np.ndarray]:
+def _shape(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vertices, mesh.faces
