@@ -20,7 +20,7 @@ from efficientnerf.asset import bake, refinement
 from efficientnerf.asset.refinement import Targets
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model
 from efficientnerf.rendering.render import FieldRenderer
 from efficientnerf.training.loop import train, trainer
@@ -52,7 +52,7 @@ def asset_rates(
     cameras = orbit(side, views + 1)
     test_camera, scene = cameras.pop(views // 2), ball(cameras)
     clock = Clock(device)
-    m = model(Space(BOUNDS, False), TrainSettings(iterations=steps, **settings), WHITE, device)
+    m = model(BoundedSpace(BOUNDS), TrainSettings(iterations=steps, **settings), WHITE, device)
     for _ in train(trainer(m), scene):
         pass
     clock.lap("train")

@@ -16,7 +16,7 @@ import torch
 
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import model
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
@@ -57,7 +57,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     from efficientnerf.rendering.harmonics import basis
 
     generator = torch.Generator().manual_seed(0)
-    m = model(Space(BOUNDS, False), TrainSettings(num_levels=16, log2_hashmap_size=log2_table, finest_resolution=2048), (1.0, 1.0, 1.0), device)
+    m = model(BoundedSpace(BOUNDS), TrainSettings(num_levels=16, log2_hashmap_size=log2_table, finest_resolution=2048), (1.0, 1.0, 1.0), device)
     side = m.voxels.side
     centre = (torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1) + 0.5) / side * 2 - 1
     voxels = ((centre.norm(dim=-1) - 0.7).abs() < 0.08).float().to(device)  # a shell
@@ -178,7 +178,7 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
 
     s = TrainSettings(**{**settings, "iterations": steps + 32})
     pixels = ball(orbit(side, views))
-    t = trainer(model(Space(BOUNDS, False), s, (1.0, 1.0, 1.0), device, (float(pixels.near[0]), float(pixels.far[0]))))
+    t = trainer(model(BoundedSpace(BOUNDS), s, (1.0, 1.0, 1.0), device, (float(pixels.near[0]), float(pixels.far[0]))))
     running = train(t, pixels)
     samples, started, done = 0, 0.0, None
     for number in range(steps):

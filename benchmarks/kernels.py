@@ -168,8 +168,8 @@ def march_kernel(seconds: float) -> dict[str, Any]:
     import torch
 
     from efficientnerf.backends import dispatch
-    from efficientnerf.geometry.spaces import Space
-    from efficientnerf.training.settings import COARSE_SAMPLES, TrainSettings
+    from efficientnerf.geometry.spaces import BoundedSpace
+    from efficientnerf.training.settings import TrainSettings
 
     s = TrainSettings()
     side = s.occupancy_resolution or 128
@@ -179,8 +179,8 @@ def march_kernel(seconds: float) -> dict[str, Any]:
     origins = torch.nn.functional.normalize(torch.randn(RAYS, 3), dim=1) * 4
     directions = torch.nn.functional.normalize(torch.rand(RAYS, 3) - 0.5 - origins, dim=1)
     near, far, offset = torch.full((RAYS,), 2.0), torch.full((RAYS,), 6.0), torch.rand(RAYS)
-    space, step = Space(np.array([[-1.0] * 3, [1.0] * 3]), False), 2 * 3**0.5 / COARSE_SAMPLES
-    marched = (space, origins, directions, near, far, offset, step, COARSE_SAMPLES + 1, voxels, 0.5)
+    space, step = BoundedSpace(np.array([[-1.0] * 3, [1.0] * 3])), 2 * 3**0.5 / BoundedSpace.num_coarse_samples
+    marched = (space, origins, directions, near, far, offset, step, BoundedSpace.num_coarse_samples + 1, voxels, 0.5)
     found = dispatch.valid_samples(*marched)
     took = best(lambda: dispatch.valid_samples(*marched), seconds)
     return {"march (intervals)": row(found.tried, took, found.tried * 4 + len(found.start) * 24)}

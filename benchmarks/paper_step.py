@@ -61,11 +61,11 @@ def trainer_of(pixels: Any) -> Any:
     import numpy as np
     import torch
 
-    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.geometry.spaces import BoundedSpace
     from efficientnerf.model import model
     from efficientnerf.training.loop import train, trainer
 
-    m = model(Space(np.array([[-1.0] * 3, [1.0] * 3]), False), settings(), (1.0, 1.0, 1.0), "cpu", (2.0, 6.0))
+    m = model(BoundedSpace(np.array([[-1.0] * 3, [1.0] * 3])), settings(), (1.0, 1.0, 1.0), "cpu", (2.0, 6.0))
     axis = (torch.arange(m.voxels.side) + 0.5) / m.voxels.side * 2 - 1
     distance = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
     low, high = 0.0, 0.7

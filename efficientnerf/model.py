@@ -22,26 +22,16 @@ from efficientnerf.backends.transfer import to_device
 from efficientnerf.fields.hash import HashField
 from efficientnerf.fields.mlp import MlpField
 from efficientnerf.fields.nerf import NerfField
-from efficientnerf.geometry.spaces import FrameRays, Space, voxel_centres
+from efficientnerf.geometry.spaces import RayBundle, Space, voxel_centres
 from efficientnerf.rendering.compositing import Composite, ray_of_sample
 from efficientnerf.rendering.harmonics import basis, harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels, voxel_weights
-from efficientnerf.sampling.samples import FARTHEST, Samples, clip_to_space, importance_samples, stratified_samples
+from efficientnerf.sampling.samples import Samples, importance_samples, stratified_samples
 from efficientnerf.training.readback import SampleCapacity
-from efficientnerf.training.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
+from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 
 SKY_DEGREE = 2
 COARSEST = 16
-# Where train.distortion_loss_weight says none. In normalised device coordinates depths crowd less, and fog is a smaller part of them: held-back views
-# of LLFF fern at
-# 504x378 after 1000 steps at 0.01: 21.8 dB; 0.002: 22.0; 0: 21.9.
-DISTORTION, DISTORTION_NDC = 0.01, 0.002
-# Where train.occupancy_alpha_threshold says none. In normalised device coordinates most intervals are valid for long, and asking about them is most
-# of a step; with
-# fewer intervals (train.num_coarse_samples) and fewer of them valid a step has half as many rays again. The same views with 2^19 entries, after 1000 steps, two
-# seeds: N_c 128 and 0.01: 22.5 and 22.3 dB; 96 and 0.01: 22.7; 96 and 0.05: 22.8 and 22.6. At 1008x756 after 3000 steps: 22.2 with the first, 22.6 with
-# the last.
-ABSORPTION, ABSORPTION_NDC = 0.01, 0.05
 UNSEEN = 0.5  # grey: what is drawn behind a space that reaches to infinity, where nothing can lie
 
 AnyField = HashField | MlpField | NerfField
@@ -89,7 +79,7 @@ class Model:
     def distortion(self) -> float:
         """Weight of the loss on spread-out densities."""
         given = self.settings.distortion_loss_weight
-        return given if given is not None else DISTORTION if self.space.ndc is None else DISTORTION_NDC
+        return self.space.distortion_loss_weight if given is None else given
 
     @property
     def device(self) -> torch.device:
@@ -114,7 +104,7 @@ class Model:
     def behind(self, directions: Tensor) -> Tensor:
         """Colour (R, 3) beyond all samples."""
         if self.background is None:
-            return self.sky(directions) if self.space.ndc is None else torch.full_like(directions, UNSEEN)
+            return torch.full_like(directions, UNSEEN) if self.space.reaches_infinity else self.sky(directions)
         return torch.stack([torch.full((len(directions),), value, device=directions.device) for value in self.background], dim=1)
 
 
@@ -124,7 +114,7 @@ class RayOutputs(NamedTuple):
     Uniform sampling has no coarse stage: no coarse samples then, and no coarse colour. Samples lie on `rays`, in the frame of the space.
     """
 
-    rays: FrameRays
+    rays: RayBundle
     coarse: Samples
     coarse_raw: Tensor
     coarse_weight: Tensor
@@ -144,27 +134,19 @@ def model(
 ) -> Model:
     """An untrained model; the same settings give the same numbers."""
     if settings.num_coarse_samples == 0:
-        settings = replace(settings, num_coarse_samples=COARSE_SAMPLES if space.ndc is None else COARSE_SAMPLES_NDC)
+        settings = replace(settings, num_coarse_samples=space.num_coarse_samples)
     generator = torch.Generator().manual_seed(settings.seed)
     coarse, fine = _fields(settings, generator)
-    diagonal = 2 * float(np.linalg.norm(space.half))
     if settings.far_plane > 0 and (span is None or space.contracted):
         raise ValueError("train.near_plane and train.far_plane need a scene on a constant background. Leave them 0.")
     span = span if settings.far_plane > 0 else None
-    reach = diagonal if span is None else span[1] - span[0]
-    if space.ndc is not None:  # of a cube as deep as the box: depth, not width, is what is sampled
-        reach = 2 * math.sqrt(3) * float(space.half[2])
-    step = reach / settings.num_coarse_samples
-    slots = math.ceil(diagonal / step) + 1
-    if space.contracted:
-        # In front of the box and behind it: the contracted distance from the edge of space to the box and back, in steps, with some room
-        # for rays that run slantwise through the shell.
-        slots += math.ceil(4 * (1 - FARTHEST) * float(space.half.max()) * math.sqrt(3) / step)
-    side = settings.occupancy_resolution or (192 if space.contracted else 128)
+    step = space.sampled_length(span) / settings.num_coarse_samples
+    slots = space.max_intervals(step)
+    side = settings.occupancy_resolution or space.occupancy_resolution
     # A valid voxel absorbs `voxel_absorption` of the light over one coarse interval.
     absorption = settings.occupancy_alpha_threshold
     if absorption is None:
-        absorption = ABSORPTION if space.ndc is None else ABSORPTION_NDC
+        absorption = space.occupancy_alpha_threshold
     threshold = -math.log1p(-min(absorption, 0.999)) / step if settings.occupancy_rule == "maximum" else 0.0
     voxels = density_voxels(
         side,
@@ -250,7 +232,7 @@ def render_rays(
 
 
 def _looked_by_voxels(
-    m: Model, rays: FrameRays, directions: Tensor, offset: Tensor, behind: Tensor, coarse: Samples, *, prune: bool, rng: np.random.Generator | None,
+    m: Model, rays: RayBundle, directions: Tensor, offset: Tensor, behind: Tensor, coarse: Samples, *, prune: bool, rng: np.random.Generator | None,
     capacity: int | None, fine_samples: int,
 ) -> RayOutputs:  # fmt: skip
     """Pivots by what the density voxels hold, without a coarse field; while nothing is pruned, all intervals, with one sample each."""
@@ -312,7 +294,7 @@ def _even_samples(
         samples = dispatch.valid_samples(m.space, origins, directions, near, far, offset, step, slots, m.voxels.values, -math.inf, capacity)
         return samples, samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
     if m.span is None:
-        near, far = clip_to_space(m.space, origins, directions, near, far)
+        near, far = m.space.clip(origins, directions, near, far)
     jitter = offset[:, None].expand(-1, count)
     if rng is not None:
         jitter = to_device(torch.from_numpy(rng.random((len(origins), count), np.float32)), offset.device)

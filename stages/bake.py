@@ -110,8 +110,7 @@ def run(job: Job) -> None:
 
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
-    depth, mib = _depth_of(job, m), budget_of(s, settings.max_mib)
-    space = m.space if depth == 1 else bake.flattened(m.space, depth)
+    space, mib = _voxel_space(job, m), budget_of(s, settings.max_mib)
     bounds = space.bounds
     low = np.asarray(bounds[0], np.float64)
     pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
@@ -128,7 +127,7 @@ def run(job: Job) -> None:
     refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, resolution, mib)
     shape, voxel = bake.grid_of(bounds, resolution, settings.brick_size)
     job.say(f"{resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
-    points = 0 if m.settings.discretise == resolution and depth == 1 else settings.samples_per_voxel
+    points = 0 if m.settings.discretise == resolution and space is m.space else settings.samples_per_voxel
     facts = metadata_of(s, settings, m)
     plain = behind_of(s)
     if plain is None:
@@ -205,24 +204,20 @@ def spiral_of(forward: Forward) -> dict[str, Any]:
     }
 
 
-# How much deeper than wide voxels are in normalised device coordinates, where a cube's depth means a voxel's width of parallax between the outermost
-# cameras. Held-back views of fern_4 in 24 MiB with 1: 23.32 dB; 2: 23.50. With 4 training pixels were behind those of 2
-# by 0.15 dB halfway through the fit.
-NDC_DEPTH = 2.0
+def _voxel_space(job: Job, m: Any) -> Space:
+    """The network's space, in a frame where voxels are cubes."""
+    from efficientnerf.geometry.spaces import NdcSpace
 
-
-def _depth_of(job: Job, m: Any) -> float:
-    """How many times as deep as wide voxels are; 1 but in normalised device coordinates."""
-    given, discretise = job.settings.ndc_voxel_depth, m.settings.discretise
-    if m.space.ndc is None:
+    given, discretise, space = job.settings.ndc_voxel_depth, m.settings.discretise, m.space
+    if not isinstance(space, NdcSpace):
         if given is not None:
             job.warn("bake.ndc_voxel_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes")
-        return 1.0
+        return m.space
     if given is None:
-        return 1.0 if discretise else NDC_DEPTH
-    if discretise and given != 1:
+        given = 1.0 if discretise else space.voxel_depth
+    elif discretise and given != 1:
         job.warn(f"bake.ndc_voxel_depth={given:g}, but the field was trained on train.discretise={discretise}: on other voxels than are baked")
-    return float(given)
+    return space if given == 1 else space.with_voxel_depth(given)
 
 
 SPARE = 2  # so many times the voxels that there is room for are baked at most: the tree itself then shows which of them matter

@@ -38,17 +38,6 @@ def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int,
     return (x, y, z), voxel
 
 
-def flattened(space: Space, depth: float) -> Space:
-    """A space in normalised device coordinates whose x and y are stretched, so that a cube there is `depth` times as deep as it was wide, per depth.
-
-    Grid coordinates are the same in both. So are lengths along z', which rays nearly run along, and with them densities; what a slanted ray meets more of
-    is left to the fit.
-    """
-    if space.ndc is None:
-        raise ValueError("only normalised device coordinates can be flattened: elsewhere rays come from all sides")
-    return replace(space, bounds=np.asarray(space.bounds, np.float64) * (depth, depth, 1.0), ndc=space.ndc.stretched(depth))
-
-
 @dataclass(frozen=True, eq=False)
 class Visible:
     """What the network showed of the voxels, and of what lies outside of the box.
@@ -75,7 +64,7 @@ def visible_voxels(
     """Greatest weight of each voxel over about `count` training pixels, evenly spread. Memory grows with the cells that are met, not with the grid.
 
     done   called with pixels looked at and their number
-    space  the network's, in the frame that the voxels are cubes of: see `flattened`; None: the network's own
+    space  the network's, in the frame that the voxels are cubes of: see `NdcSpace.with_voxel_depth`; None: the network's own
     """
     space = space or m.space
     size = torch.tensor(shape) * brick

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from efficientnerf.backends.numba.tree.packed import Packed
     from efficientnerf.backends.triton.tree import DeviceTree
     from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.geometry.ndc import Ndc, WarpedRays
+    from efficientnerf.geometry.ndc import Ndc, NdcRays
 
 
 LOOKUPS = ("trilinear", "nearest")
@@ -187,19 +187,19 @@ class NerfTree:
         colour, opacity, along, normal = tree_rays(self, rays.origins, rays.directions, np.asarray(directions), eye, columns)
         return Rendering(colour, opacity, *cpu_ndc.unwarp_hits(self.ndc, rays, along, normal))
 
-    def frame_rays(self, origins: Any, directions: Any) -> WarpedRays:
+    def frame_rays(self, origins: Any, directions: Any) -> NdcRays:
         """World rays (R, 3), unit directions, as rays of the tree's frame: what anything that walks the grid itself has to do first.
 
         `(result.origins - bounds_min) / voxel` are voxel coordinates and `result.directions` the unit directions there; a step of one voxel is
         `voxel` units of the frame, which densities are per. Harmonics are looked up along the directions of the world, as they went in.
         `efficientnerf.geometry.ndc.world_distance` turns distances along the result into those of the world. Numpy arrays and torch tensors alike.
         """
-        from efficientnerf.geometry.ndc import WarpedRays
+        from efficientnerf.geometry.ndc import NdcRays
 
         if self.ndc is not None:
             return self.ndc.rays(origins, directions)
         none = origins[..., 0] * 0
-        return WarpedRays(origins, directions, none, none + 1, none)
+        return NdcRays(origins, directions, none, none + 1, none)
 
     def _in_frame(self, points: np.ndarray) -> np.ndarray:
         return points if self.ndc is None else self.ndc.points(np.asarray(points, np.float64))

@@ -7,7 +7,7 @@ appendix has y up and looks along -z), focal length f, width W, height H and nea
 
 z' is -1 on the near plane and 1 at infinity, and even steps of z' are even steps of parallax. Straight lines stay straight. A ray o + t d that
 begins at t0 (on the near plane, or at o where that lies beyond it) becomes a ray of unit direction; with p = o + t0 d, J the map's
-derivative at p, g = |J d| and k = d_z / p_z (z as above) the point at distance t lies, along the warped ray, at
+derivative at p, g = ds/dt = |J d| and k = d(log z)/dt = d_z / p_z at t0 (z as above) the point at distance t lies, along the warped ray, at
 
     s(t) = g (t - t0) / (1 + k (t - t0))        t(s) = t0 + s / (g - k s)
 
@@ -29,32 +29,32 @@ NUMBERS = ("focal", "width", "height", "near")
 BEYOND = 3.0  # z' from which a ray that never enters the box starts, leaving it
 
 
-class WarpedRays(NamedTuple):
+class NdcRays(NamedTuple):
     """Rays in normalised device coordinates, and the way back to distances of the world.
 
     origins, directions  (R, 3) where the rays begin, and unit directions
     begin                (R,) world distance along the ray at which it begins (t0)
-    pace, bend           (R,) g and k of the module
+    ds_dt, dlogz_dt      (R,) g and k of the module
     """
 
     origins: Any
     directions: Any
     begin: Any
-    pace: Any
-    bend: Any
+    ds_dt: Any
+    dlogz_dt: Any
 
 
-def world_distance(along: Any, begin: Any, pace: Any, bend: Any) -> Any:
+def world_distance(along: Any, begin: Any, ds_dt: Any, dlogz_dt: Any) -> Any:
     """World distance from a ray's own origin of points at distance `along` its warped ray; infinity from the far plane on. Arrays of one shape."""
-    rest = pace - bend * along
-    seen = rest > 1e-6 * pace
-    return _where(seen, begin + along / _where(seen, rest, _one(rest)), np.inf)
+    rest = ds_dt - dlogz_dt * along
+    finite = rest > 1e-6 * ds_dt
+    return _where(finite, begin + along / _where(finite, rest, _one(rest)), np.inf)
 
 
-def warped_distance(distance: Any, begin: Any, pace: Any, bend: Any) -> Any:
+def ndc_distance(distance: Any, begin: Any, ds_dt: Any, dlogz_dt: Any) -> Any:
     """The inverse of `world_distance`; 0 before the warped ray begins."""
     past = _at_least(distance - begin, 0.0)
-    return pace * past / _at_least(1 + bend * past, 1e-6)
+    return ds_dt * past / _at_least(1 + dlogz_dt * past, 1e-6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Ndc:
 
     world_from_camera  (4, 4) its pose, the project's axes
     focal              pixels
-    width, height      pixels; x' and y' are -1 and 1 at the borders of a picture of this size
+    width, height      pixels; x' and y' are -1 and 1 at the borders of an image of this size
     near               distance of the near plane from the camera, world units
     """
 
@@ -78,9 +78,9 @@ class Ndc:
         """x' and y' of a point one unit to the side at a distance of one unit."""
         return 2 * self.focal / self.width, 2 * self.focal / self.height
 
-    def stretched(self, by: float) -> Ndc:
-        """The reference camera whose x' and y' are `by` times these."""
-        return replace(self, width=self.width / by, height=self.height / by)
+    def scaled_xy(self, factor: float) -> Ndc:
+        """The reference camera whose x' and y' are `factor` times these."""
+        return replace(self, width=self.width / factor, height=self.height / factor)
 
     def to_json(self) -> dict[str, Any]:
         return {"world_from_camera": self.world_from_camera.tolist(), **{name: float(getattr(self, name)) for name in NUMBERS}}
@@ -105,9 +105,9 @@ class Ndc:
         """World points (..., 3) to normalised device coordinates. What does not lie before the camera comes out beyond z' = BEYOND: outside of any box."""
         x, y, z = self._camera(world, directions=False)
         a, b = self.slopes
-        seen = z > 1e-6 * self.near
-        z = _where(seen, z, _one(z))
-        return _stack([_where(seen, a * x / z, _one(z) * 0), _where(seen, b * y / z, _one(z) * 0), _where(seen, 1 - 2 * self.near / z, BEYOND)])
+        ahead = z > 1e-6 * self.near
+        z = _where(ahead, z, _one(z))
+        return _stack([_where(ahead, a * x / z, _one(z) * 0), _where(ahead, b * y / z, _one(z) * 0), _where(ahead, 1 - 2 * self.near / z, BEYOND)])
 
     def world(self, ndc: Any) -> Any:
         """The inverse of `points`, for z' < 1."""
@@ -116,16 +116,16 @@ class Ndc:
         local = _stack([ndc[..., 0] * z / a, ndc[..., 1] * z / b, z])
         return local @ _like(self.world_from_camera[:3, :3].T.copy(), ndc) + _like(self.world_from_camera[:3, 3], ndc)
 
-    def sights(self, eye: np.ndarray) -> np.ndarray:
-        """(3, 4): takes (x', y', z', 1) to the world direction, of any length, along which that place is seen from `eye` (3,), world.
+    def view_direction_matrix(self, eye: np.ndarray) -> np.ndarray:
+        """(3, 4): takes (x', y', z', 1) to the view direction in the world, of any length, from `eye` (3,), world, to that point.
 
-        With W = (1 - z') / (2 n) a place is R (x'/a, y'/b, 1) / W + t, for the camera's rotation R and position t; times W, less the eye, it is linear.
+        With W = (1 - z') / (2 n) a point is R (x'/a, y'/b, 1) / W + t, for the camera's rotation R and position t; times W, less the eye, it is linear.
         """
         rotation, beside = self.world_from_camera[:3, :3], (self.world_from_camera[:3, 3] - eye) / (2 * self.near)
         a, b = self.slopes
         return np.stack([rotation[:, 0] / a, rotation[:, 1] / b, -beside, rotation[:, 2] + beside], axis=1)
 
-    def rays(self, origins: Any, directions: Any) -> WarpedRays:
+    def rays(self, origins: Any, directions: Any) -> NdcRays:
         """World rays (R, 3), unit directions, to rays in normalised device coordinates.
 
         One that never comes before the near plane gets an origin beyond z' = BEYOND and looks away.
@@ -141,13 +141,13 @@ class Ndc:
         x, y = x + begin * dx, y + begin * dy
         z = _where(meets, _at_least(z + begin * dz, self.near), _one(z) * self.near)
         jx, jy, jz = a * (dx * z - x * dz) / z**2, b * (dy * z - y * dz) / z**2, 2 * self.near * dz / z**2
-        pace = (jx * jx + jy * jy + jz * jz) ** 0.5
-        nowhere = ~meets | (pace < 1e-12)
-        divisor = _where(nowhere, _one(z), pace)
+        ds_dt = (jx * jx + jy * jy + jz * jz) ** 0.5
+        nowhere = ~meets | (ds_dt < 1e-12)
+        divisor = _where(nowhere, _one(z), ds_dt)
         zero, one = _one(z) * 0, _one(z)
         start = _stack([_where(nowhere, zero, a * x / z), _where(nowhere, zero, b * y / z), _where(nowhere, one * BEYOND, 1 - 2 * self.near / z)])
         along = _stack([_where(nowhere, zero, jx / divisor), _where(nowhere, zero, jy / divisor), _where(nowhere, one, jz / divisor)])
-        return WarpedRays(start, along, begin, divisor, dz / z)
+        return NdcRays(start, along, begin, divisor, dz / z)
 
     def world_normals(self, ndc: Any, normals: Any) -> Any:
         """Normals (N, 3) of surfaces in normalised device coordinates, at points there (N, 3), to unit normals in the world; zero stays zero.

@@ -197,11 +197,7 @@ def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, s
     ray = ray_of_sample(seen.fine.first, len(seen.fine.start))
     middle = seen.fine.start + seen.fine.extent / 2
     origins, directions = seen.rays.origins, seen.rays.directions
-    u = m.space.unit(origins)
-    du = directions / torch.as_tensor(m.space.half, dtype=directions.dtype, device=directions.device)
-    du = torch.where(du.abs() < 1e-12, torch.full_like(du, 1e-12), du)
-    one, other = (-1 - u) / du, (1 - u) / du
-    enter, leave = torch.minimum(one, other).amax(dim=-1), torch.maximum(one, other).amin(dim=-1)
+    enter, leave = m.space.intersect(origins, directions)
     misses = leave <= torch.clamp(enter, min=0)  # such a ray sees nothing but what lies beyond
     enter = torch.where(misses, -torch.inf, enter)
     leave = torch.where(misses, -torch.inf, leave)
@@ -224,7 +220,7 @@ def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, s
     # Depth: the first sample at which half of the light is gone.
     gone = torch.cumsum(seen.fine_weight.double(), dim=0)
     gone = gone - torch.cat([gone.new_zeros(1), gone])[seen.fine.first[:-1]][ray]
-    depth = torch.full_like(slant, torch.inf).scatter_reduce(0, ray, torch.where(gone >= 0.5, seen.rays.world(middle, ray), torch.inf), reduce="amin")
+    depth = torch.full_like(slant, torch.inf).scatter_reduce(0, ray, torch.where(gone >= 0.5, seen.rays.world_distance(middle, ray), torch.inf), reduce="amin")
     return seen.fine_colour, seen.fine_opacity, depth * slant, torch.cat([before, before_opacity[:, None]], dim=1), beyond_colour, inside.clamp(max=1)
 
 

@@ -19,11 +19,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from efficientnerf.backends.transfer import constant
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import FARTHEST, Space
 from efficientnerf.rendering.compositing import ray_of_sample
-
-FARTHEST = 1.0 / 64  # 1 / |u|_inf at which a ray in contracted space ends
 
 
 class Samples(NamedTuple):
@@ -47,16 +44,6 @@ class Samples(NamedTuple):
     complete: Tensor | None = None
 
 
-def clip_to_space(space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances (R,) at which rays enter and leave the space, within near and far; leave <= enter where they miss it."""
-    if space.contracted:
-        return near, far
-    u, du = space.unit(origins), directions / constant(space.half, directions)
-    du = torch.where(du.abs() < 1e-12, torch.full_like(du, 1e-12), du)
-    one, other = (-1 - u) / du, (1 - u) / du
-    return torch.maximum(torch.minimum(one, other).amax(dim=-1), near), torch.minimum(torch.maximum(one, other).amin(dim=-1), far)
-
-
 def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
     *, whole: int = 0,
@@ -69,7 +56,7 @@ def valid_samples(
     voxels               (D, D, D) density voxels over the grid coordinates
     whole                so many rays at the beginning are sampled in every interval, whatever the voxels say
     """
-    t, leave = clip_to_space(space, origins, directions, near, far)
+    t, leave = space.clip(origins, directions, near, far)
     side = voxels.shape[0]
     columns = []
     tried = 0

@@ -210,7 +210,7 @@ def train(t: Trainer, pixels: Pixels, anchors: SparseDepthRays | None = None) ->
         origins, directions, near, far, colour = (torch.as_tensor(a, device=device) for a in there.bundle(chosen))
         offset = to_device(torch.from_numpy(rng.random(count, np.float32)), device)
         behind = m.behind(directions)
-        if m.space.ndc is not None and m.background is None:
+        if m.space.reaches_infinity and m.background is None:
             # Behind a space that reaches to infinity nothing lies: a new colour for each ray keeps the field from leaving it half transparent.
             behind = to_device(torch.from_numpy(rng.random((count, 3), np.float32)), device)
         if transparent:
@@ -237,11 +237,9 @@ def train(t: Trainer, pixels: Pixels, anchors: SparseDepthRays | None = None) ->
         loss = fine_loss if coarse_colour is None else fine_loss + mean_over((coarse_colour - colour) ** 2, whole)
         if t.exposure is not None:
             loss = loss + exposure_loss(t.exposure)
-        if m.space.contracted or m.space.ndc is not None:
-            # In normalised device coordinates it grows from nothing: at first it would gather all matter on the near plane, where cameras overlap least.
-            share = 1.0 if m.space.contracted else way
-            loss = loss + share * m.distortion * mean_over(seen.distortion, whole)
-            if m.space.contracted:  # in normalised device coordinates rays do not crowd together before the cameras
+        if m.space.unbounded:
+            loss = loss + m.space.distortion_schedule(way) * m.distortion * mean_over(seen.distortion, whole)
+            if m.space.scales_near_gradients:
                 _quieten_near_cameras(m, origins, seen)
             strength = settings.sparse_depth_loss_weight * max(0.0, 1 - 2 * way)
             if anchors is not None and strength > 0:
@@ -315,7 +313,7 @@ def anchor_loss(
     room = None if late is None else late.room(2 * count)  # they begin closer to the camera, and end farther away
     seen = render_rays(m, origins, directions, near, far, offset, m.behind(directions).detach(), prune=prune, rng=rng, room=room, fine_samples=fine_samples)
     whole = whole_rays(seen.coarse, seen.fine)
-    distance = seen.rays.frame(distance)
+    distance = seen.rays.frame_distance(distance)
     loss = origins.new_zeros(())
     for samples, weight, share in ((seen.coarse, seen.coarse_weight, 1), (seen.fine, seen.fine_weight, fine_samples)):
         ray = ray_of_sample(samples.first, len(samples.start))

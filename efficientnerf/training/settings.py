@@ -10,10 +10,9 @@ def _setting(default: Any, doc: str, **limits: Any) -> Any:
     return field(default=default, metadata={"doc": doc, **limits})
 
 
-# Where train.log2_hashmap_size, train.finest_resolution and train.num_coarse_samples are 0.
+# Where train.log2_hashmap_size and train.finest_resolution are 0.
 LOG2_TABLE = 17
 FINEST = 1024
-COARSE_SAMPLES, COARSE_SAMPLES_NDC = 128, 96
 
 
 @dataclass(frozen=True)

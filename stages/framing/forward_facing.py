@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.geometry.ndc import Ndc, warped_distance
+from efficientnerf.geometry.ndc import Ndc, ndc_distance
 from stages.io.capture import Photo
 
 SPACES = ("auto", "box", "contracted", "ndc")
@@ -132,8 +132,8 @@ def box_shown(ndc: Ndc, cameras: Sequence[Camera]) -> np.ndarray:
     """(2, 3) the box in normalised device coordinates that all rays of the pictures run in, from the near plane to infinity."""
     ends = []
     for camera in cameras:
-        start, along, begin, pace, bend = ndc.rays(*rays(camera, border(camera)))
-        length = warped_distance(np.full(len(start), 1e12) + begin, begin, pace, bend)
+        start, along, begin, ds_dt, dlogz_dt = ndc.rays(*rays(camera, border(camera)))
+        length = ndc_distance(np.full(len(start), 1e12) + begin, begin, ds_dt, dlogz_dt)
         ends += [start, start + length[:, None] * along]
     corners = np.concatenate(ends)
     low, high = corners.min(0), corners.max(0)

@@ -65,9 +65,9 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def space_of(s: Scene) -> Space:
     """The space that a scene's field lives in."""
-    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.geometry.spaces import space_from
 
-    return Space(s.bounds, s.contracted) if s.forward is None else Space(s.forward.bounds, False, s.forward.ndc)
+    return space_from(s.bounds, contracted=s.contracted) if s.forward is None else space_from(s.forward.bounds, ndc=s.forward.ndc)
 
 
 GAINS = "exposure.gains"
@@ -111,7 +111,7 @@ def load_gains(folder: Path) -> dict[str, np.ndarray]:
 def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     """The trained model in the folder of the train stage, ready to draw."""
     from efficientnerf.geometry.ndc import Ndc
-    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.geometry.spaces import space_from
     from efficientnerf.model import model, restore
     from efficientnerf.rendering.render import FieldRenderer
 
@@ -120,7 +120,7 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     try:
         background = about["background"]
         ndc = None if about.get("ndc") is None else Ndc.from_json(about["ndc"])
-        space = Space(np.asarray(about["bounds"], np.float64).reshape(2, 3), bool(about["contracted"]), ndc)
+        space = space_from(np.asarray(about["bounds"], np.float64).reshape(2, 3), contracted=bool(about["contracted"]), ndc=ndc)
         span = (float(about["near"]), float(about["far"]))
         m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device, span)
         restore(m, tensors)

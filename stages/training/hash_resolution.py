@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.training.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
+from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 from stages.baking.resolution import ndc_pixel
 
 if TYPE_CHECKING:
@@ -35,8 +35,9 @@ def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSett
 
     pixels  how many the training images have
     """
+    from stages.io.field_file import space_of
+
     finest, entries = FINEST, LOG2_TABLE + math.log2(max(pixels, 1) / PIXELS_OF_LEAST) / 2
-    coarse_samples = COARSE_SAMPLES if s.forward is None else COARSE_SAMPLES_NDC
     if s.forward is not None:
         entries = math.log2(max(pixels, 1) / PIXELS_AN_ENTRY)
         longest = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
@@ -46,5 +47,5 @@ def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSett
         settings,
         log2_hashmap_size=settings.log2_hashmap_size or log2_table,
         finest_resolution=settings.finest_resolution or finest,
-        num_coarse_samples=settings.num_coarse_samples or coarse_samples,
+        num_coarse_samples=settings.num_coarse_samples or space_of(s).num_coarse_samples,
     )

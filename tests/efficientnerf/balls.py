@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import space_from
 from efficientnerf.model import Model, model
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
@@ -65,4 +65,4 @@ def settings(**changes: object) -> TrainSettings:
 
 
 def untrained(*, contracted: bool = False, background: tuple[float, float, float] | None = (1.0, 1.0, 1.0), **changes: object) -> Model:
-    return model(Space(BOUNDS, contracted), settings(**changes), None if contracted else background)
+    return model(space_from(BOUNDS, contracted=contracted), settings(**changes), None if contracted else background)

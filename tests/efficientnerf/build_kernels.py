@@ -66,7 +66,7 @@ def build(self: JITFunction, *args: Any, grid: Any, warmup: bool, num_warps: int
 
 def training_step() -> None:
     from efficientnerf.backends.triton import compositing, hash_grid, sampling
-    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.geometry.spaces import space_from
 
     sides, dense, starts = np.array([4, 64]), np.array([True, False]), np.array([0, 64])
     table = torch.zeros(1000, 2, requires_grad=True)
@@ -74,7 +74,7 @@ def training_step() -> None:
     for skip_zeros in (False, True):
         hash_grid.adam(*(torch.zeros(64) for _ in range(4)), 0.1, 0.9, 0.99, 1.0, 1.0, 1e-15, skip_zeros=skip_zeros)
     for contracted in (False, True):
-        space = Space(np.array([[-1.0] * 3, [1.0] * 3]), contracted)
+        space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=contracted)
         rays = (torch.zeros(8, 3), torch.ones(8, 3), torch.zeros(8), torch.ones(8), torch.zeros(8))
         found = sampling.valid_samples(space, *rays, 0.1, 4, torch.ones(4, 4, 4), 0.0, capacity=32)
         pivotal = sampling.select_pivots(found.start, found.first, 0.1, 4)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from efficientnerf.asset import bake
 from efficientnerf.asset.bake import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
 from efficientnerf.asset.tree import tree_from_voxels
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
@@ -118,7 +118,7 @@ def test_looked_at_pixels_are_spread_over_columns_and_rows() -> None:
 def test_of_photographs_it_is_kept_what_lies_before_and_behind_the_box() -> None:
     """A ball within the box over a sky: before is nothing, behind is the sky, for each pixel that was looked at."""
     m = model_of_a_ball()
-    m.space, m.background = Space(BOUNDS, contracted=True), None
+    m.space, m.background = ContractedSpace(BOUNDS), None
     some = pixels(6, 16)
     shape, voxel = grid_of(BOUNDS, 16, 4)
     seen = visible_voxels(m, some, shape, voxel, BOUNDS[0], 4, 10**6, lambda done, total: None)

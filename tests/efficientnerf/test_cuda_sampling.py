@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace, space_from
 from efficientnerf.sampling import samples as sampling
 from efficientnerf.sampling.samples import Samples
 from tests.efficientnerf.device import DEVICE
@@ -34,7 +34,7 @@ def of_ray(samples: Samples, r: int) -> list[torch.Tensor]:
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("threshold", [0.4, -math.inf])
 def test_valid_samples_are_those_of_torch(kind: str, contracted: bool, threshold: float) -> None:
-    rays, space = make_rays(kind), Space(BOUNDS, contracted)
+    rays, space = make_rays(kind), space_from(BOUNDS, contracted=contracted)
     ours = here(cuda.valid_samples(space, *there(rays), STEP, 60, voxels_of().to(DEVICE), threshold))
     theirs = sampling.valid_samples(space, *(t.double() for t in rays), STEP, 60, voxels_of().double(), threshold)
     assert ours.first.dtype == torch.int64
@@ -51,7 +51,7 @@ def test_valid_samples_are_those_of_torch(kind: str, contracted: bool, threshold
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("room", [0, 1, 100, 4000])
 def test_a_capacity_cuts_off_the_end_or_pads_it(contracted: bool, room: int) -> None:
-    rays, space = there(make_rays("outside")), Space(BOUNDS, contracted)
+    rays, space = there(make_rays("outside")), space_from(BOUNDS, contracted=contracted)
     args = (space, *rays, STEP, 60, voxels_of().to(DEVICE), 0.4)
     whole, cut = cuda.valid_samples(*args), cuda.valid_samples(*args, capacity=room)
     total = int(whole.first[-1])
@@ -72,7 +72,7 @@ def test_a_capacity_cuts_off_the_end_or_pads_it(contracted: bool, room: int) -> 
 @pytest.mark.parametrize("room", [None, 300, 4000])
 @pytest.mark.parametrize("contracted", [False, True])
 def test_the_first_rays_can_be_looked_at_whole(contracted: bool, room: int | None) -> None:
-    rays, space = there(make_rays("outside")), Space(BOUNDS, contracted)
+    rays, space = there(make_rays("outside")), space_from(BOUNDS, contracted=contracted)
     args = (space, *rays, STEP, 60, voxels_of().to(DEVICE))
     some = here(cuda.valid_samples(*args, 0.4, room, whole=5))
     every, pruned = (here(cuda.valid_samples(*args, threshold)) for threshold in (-math.inf, 0.4))
@@ -127,10 +127,10 @@ def test_no_rays_no_slots_and_no_samples_are_fine() -> None:
     voxels = voxels_of().to(DEVICE)
     none = there(Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), torch.zeros(0)))
     for room in (None, 4):
-        found = cuda.valid_samples(Space(BOUNDS, False), *none, STEP, 60, voxels, 0.4, room)
+        found = cuda.valid_samples(BoundedSpace(BOUNDS), *none, STEP, 60, voxels, 0.4, room)
         assert found.first.tolist() == [0]
         assert found.point.shape == (room or 0, 3)
-    rays, space = there(make_rays("outside")), Space(BOUNDS, False)
+    rays, space = there(make_rays("outside")), BoundedSpace(BOUNDS)
     empty = cuda.valid_samples(space, *rays, STEP, 0, voxels, 0.4)
     assert not empty.first.any()
     assert cuda.select_pivots(empty.start, empty.first, 0.1, 3).shape == (0,)

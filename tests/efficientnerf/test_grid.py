@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.geometry.spaces import Space, contract, uncontract, voxel_centres
+from efficientnerf.geometry.spaces import contract, space_from, uncontract, voxel_centres
 from tests import reference
 
 BOUNDS = np.array([[-1.0, -0.4, 0.2], [0.5, 0.9, 0.8]])
@@ -42,7 +42,7 @@ def test_contraction_is_continuous_and_monotonic_along_a_ray() -> None:
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_world_is_the_inverse_of_grid(points: torch.Tensor, contracted: bool) -> None:
-    space = Space(BOUNDS, contracted)
+    space = space_from(BOUNDS, contracted=contracted)
     world = torch.as_tensor(space.world(torch.from_numpy(np.random.default_rng(1).uniform(0.02, 0.98, (500, 3)))))
     torch.testing.assert_close(space.world(space.grid(world)), world)
     if contracted:
@@ -53,7 +53,7 @@ def test_world_is_the_inverse_of_grid(points: torch.Tensor, contracted: bool) ->
 
 @pytest.mark.parametrize(("contracted", "low", "high"), [(False, 0.0, 1.0), (True, 0.25, 0.75)])
 def test_the_box_lies_where_it_should(contracted: bool, low: float, high: float) -> None:
-    corners = Space(BOUNDS, contracted).grid(torch.from_numpy(BOUNDS))
+    corners = space_from(BOUNDS, contracted=contracted).grid(torch.from_numpy(BOUNDS))
     torch.testing.assert_close(corners, torch.tensor([[low] * 3, [high] * 3], dtype=torch.float64))
 
 
@@ -61,7 +61,7 @@ def test_the_box_lies_where_it_should(contracted: bool, low: float, high: float)
 def test_voxel_centres_are_those_of_a_baked_grid(contracted: bool) -> None:
     from efficientnerf.asset.bake import grid_of
 
-    space = Space(BOUNDS, contracted)
+    space = space_from(BOUNDS, contracted=contracted)
     shape, side = grid_of(BOUNDS, 10, 1)
     at = np.random.default_rng(0).uniform(BOUNDS[0] - 0.3, BOUNDS[1] + 0.3, (2000, 3))
     inside = ((at > BOUNDS[0]) & (at < BOUNDS[1])).all(axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
 from efficientnerf.rendering.compositing import composite
 from efficientnerf.rendering.render import valid_count
@@ -17,7 +17,7 @@ from efficientnerf.sampling.samples import IMPORTANCE_FLOOR, Samples, importance
 from tests.efficientnerf.balls import pixels, untrained
 
 BOUNDS = np.array([[-1.0] * 3, [1.0] * 3])
-SPACE = Space(BOUNDS, False)
+SPACE = BoundedSpace(BOUNDS)
 
 
 def rays(count: int = 12, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -219,7 +219,7 @@ def test_counts_are_those_of_the_strategies() -> None:
     assert len(found["hierarchical"].coarse.start) == 20 * 10
     assert 0 < len(found["efficient"].coarse.start) <= 20 * math.ceil(2 * math.sqrt(3) / 0.4)  # those in the box
     with pytest.raises(ValueError, match="constant background"):
-        model(Space(BOUNDS, True), settings(near_plane=1.0, far_plane=5.0), None, "cpu", (1.0, 5.0))
+        model(ContractedSpace(BOUNDS), settings(near_plane=1.0, far_plane=5.0), None, "cpu", (1.0, 5.0))
 
 
 def test_some_rays_are_looked_at_whole_in_training_only() -> None:

@@ -13,7 +13,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from efficientnerf.backends import dispatch, transfer
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace, space_from
 from efficientnerf.model import Model, model
 from efficientnerf.rendering import compositing
 from efficientnerf.sampling.occupancy import density_voxels
@@ -139,7 +139,8 @@ def model_of(strategy: str, **changes: Any) -> Model:
         "exploration_fraction": 0.0, **changes,
     }  # fmt: skip
     contracted = strategy == "contracted"
-    m = model(Space(BOUNDS, contracted), settings(**wanted), None if contracted else (1.0, 1.0, 1.0), DEVICE, None if contracted else (1.0, 5.0))
+    background, span = (None, None) if contracted else ((1.0, 1.0, 1.0), (1.0, 5.0))
+    m = model(space_from(BOUNDS, contracted=contracted), settings(**wanted), background, DEVICE, span)
     m.voxels.values[(torch.rand(m.voxels.values.shape, generator=torch.Generator().manual_seed(1)) < 0.5).to(DEVICE)] = EMPTY
     return m
 
@@ -214,7 +215,7 @@ def lines_that_wait(running: Iterator[loop.Progress]) -> list[str]:
 def test_lines_that_wait_are_found() -> None:
     from efficientnerf.sampling.samples import pivotal_samples
 
-    space, found = Space(BOUNDS, False), samples([2, 1])
+    space, found = BoundedSpace(BOUNDS), samples([2, 1])
     with Waits() as waits:
         pivotal_samples(space, torch.zeros(2, 3), torch.ones(2, 3), torch.zeros(2), found, torch.tensor([True, False, True]), 2)
         assert density_voxels(2, "momentum").occupied == 1

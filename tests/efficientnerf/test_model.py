@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model, render_rays, restore, state_of
 from efficientnerf.training.settings import TrainSettings
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
@@ -111,7 +111,7 @@ def test_the_papers_model_has_the_papers_sizes() -> None:
         occupancy_resolution=384,
         occupancy_rule="momentum",
     )
-    m = model(Space(BOUNDS, False), paper, (1.0, 1.0, 1.0))
+    m = model(BoundedSpace(BOUNDS), paper, (1.0, 1.0, 1.0))
     assert m.fine(torch.rand(2, 3)).shape == (2, 49)
     assert m.coarse(torch.rand(2, 3)).shape == (2, 49)
     assert m.voxels.values.shape == (384, 384, 384)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.geometry.ndc import BEYOND, Ndc, warped_distance, world_distance
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.ndc import BEYOND, Ndc, ndc_distance, world_distance
+from efficientnerf.geometry.spaces import BoundedSpace, NdcSpace, space_from
 
 
 def some_pose(rng: np.random.Generator) -> np.ndarray:
@@ -40,10 +40,10 @@ def appendix(ndc: Ndc, points: np.ndarray) -> np.ndarray:
     return np.stack([x, -y, z], -1)
 
 
-def test_sights_point_from_the_eye_to_the_places(ndc: Ndc) -> None:
+def test_view_directions_point_from_the_eye_to_the_places(ndc: Ndc) -> None:
     rng = np.random.default_rng(2)
     points, eye = before(ndc, rng, 100), ndc.world_from_camera[:3, 3] + rng.normal(size=3)
-    sights = ndc.points(points) @ ndc.sights(eye)[:, :3].T + ndc.sights(eye)[:, 3]
+    sights = ndc.points(points) @ ndc.view_direction_matrix(eye)[:, :3].T + ndc.view_direction_matrix(eye)[:, 3]
     expected = points - eye
     unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (sights, expected)]
     np.testing.assert_allclose(*unit, atol=1e-9)
@@ -78,19 +78,19 @@ def rays_of(ndc: Ndc, rng: np.random.Generator, count: int) -> tuple[np.ndarray,
 def test_rays_are_straight_and_distances_invert(ndc: Ndc) -> None:
     rng = np.random.default_rng(1)
     origins, directions = rays_of(ndc, rng, 200)
-    start, along, begin, pace, bend = ndc.rays(origins, directions)
+    start, along, begin, ds_dt, dlogz_dt = ndc.rays(origins, directions)
     np.testing.assert_allclose(np.linalg.norm(along, axis=1), 1)
     t = begin + 10.0 ** rng.uniform(-2, 3, len(begin))
-    s = warped_distance(t, begin, pace, bend)
+    s = ndc_distance(t, begin, ds_dt, dlogz_dt)
     np.testing.assert_allclose(start + s[:, None] * along, ndc.points(origins + t[:, None] * directions), atol=1e-9)
-    np.testing.assert_allclose(world_distance(s, begin, pace, bend), t, rtol=1e-6)
-    assert (warped_distance(begin - 1.0, begin, pace, bend) == 0).all()
+    np.testing.assert_allclose(world_distance(s, begin, ds_dt, dlogz_dt), t, rtol=1e-6)
+    assert (ndc_distance(begin - 1.0, begin, ds_dt, dlogz_dt) == 0).all()
 
 
 def test_rays_are_the_appendix_s_and_end_at_infinity(ndc: Ndc) -> None:
     """o' and o' + d' of equations 25 and 26: from the near plane to the far one."""
     origins, directions = (a[:100] for a in rays_of(ndc, np.random.default_rng(2), 200))
-    start, along, begin, pace, bend = ndc.rays(origins, directions)
+    start, along, begin, ds_dt, dlogz_dt = ndc.rays(origins, directions)
     np.testing.assert_allclose(start[:, 2], -1, atol=1e-12)
     moved = origins + begin[:, None] * directions
     np.testing.assert_allclose(start, appendix(ndc, moved), atol=1e-12)
@@ -98,18 +98,18 @@ def test_rays_are_the_appendix_s_and_end_at_infinity(ndc: Ndc) -> None:
     local_d = directions @ ndc.world_from_camera[:3, :3] * [1, -1, -1]
     slopes = local_d[:, :2] / local_d[:, 2:] - local_o[:, :2] / local_o[:, 2:]
     d = np.stack([-ndc.slopes[0] * slopes[:, 0], ndc.slopes[1] * slopes[:, 1], -2 * ndc.near / local_o[:, 2]], -1)
-    far = warped_distance(begin + 1e15, begin, pace, bend)
+    far = ndc_distance(begin + 1e15, begin, ds_dt, dlogz_dt)
     np.testing.assert_allclose(far[:, None] * along, d, atol=1e-6)
-    assert (world_distance(far * 1.001, begin, pace, bend) == np.inf).all()
+    assert (world_distance(far * 1.001, begin, ds_dt, dlogz_dt) == np.inf).all()
 
 
 def test_rays_that_look_back_end_at_the_near_plane_or_nowhere(ndc: Ndc) -> None:
     rotation, centre = ndc.world_from_camera[:3, :3], ndc.world_from_camera[:3, 3]
     local = np.array([[0.3, 0.0, 6.0], [0.3, 0.0, 1.0], [0.0, 0.0, 6.0]])
     direction = np.array([[0.6, 0.0, -0.8], [0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
-    start, along, begin, pace, bend = ndc.rays(local @ rotation.T + centre, direction @ rotation.T)
+    start, along, begin, ds_dt, dlogz_dt = ndc.rays(local @ rotation.T + centre, direction @ rotation.T)
     t = (6.0 - ndc.near) / 0.8
-    there = start[0] + warped_distance(np.array([t]), begin[:1], pace[:1], bend[:1]) * along[0]
+    there = start[0] + ndc_distance(np.array([t]), begin[:1], ds_dt[:1], dlogz_dt[:1]) * along[0]
     np.testing.assert_allclose(there[2], -1, atol=1e-9)
     assert start[1, 2] == BEYOND
     assert along[1].tolist() == [0, 0, 1]
@@ -135,17 +135,17 @@ def test_normals_are_those_of_the_warped_surface(ndc: Ndc) -> None:
 def test_a_space_warps_rays_and_is_not_contracted(ndc: Ndc) -> None:
     box = np.array([[-1.0, -1, -1], [1, 1, 1]])
     with pytest.raises(ValueError, match="cannot be contracted"):
-        Space(box, True, ndc)
+        space_from(box, contracted=True, ndc=ndc)
     origins, directions = (torch.from_numpy(a) for a in rays_of(ndc, np.random.default_rng(5), 20))
     zero, far = torch.zeros(20, dtype=torch.float64), torch.full((20,), 9.0, dtype=torch.float64)
-    rays = Space(box, False, ndc).rays(origins, directions, zero, far)
+    rays = NdcSpace(box, ndc).rays(origins, directions, zero, far)
     distance = torch.linspace(8, 20, 20, dtype=torch.float64)
-    back = rays.world(rays.frame(distance), torch.arange(20))
+    back = rays.world_distance(rays.frame_distance(distance), torch.arange(20))
     torch.testing.assert_close(back, distance, rtol=1e-6, atol=0)
-    same = Space(box, False).rays(origins, directions, zero, far)
+    same = BoundedSpace(box).rays(origins, directions, zero, far)
     assert same.warp is None
     assert same.origins is origins
-    assert torch.equal(same.world(distance, torch.arange(20)), distance)
+    assert torch.equal(same.world_distance(distance, torch.arange(20)), distance)
 
 
 def test_the_kernels_are_the_functions(ndc: Ndc) -> None:

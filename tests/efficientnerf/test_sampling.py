@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from efficientnerf.backends import dispatch
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace, Space, space_from
 from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.sampling import samples
 from efficientnerf.sampling.samples import Samples
@@ -63,7 +63,7 @@ def voxels_of(seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize("finder", FINDERS)
 def test_valid_samples_are_those_of_the_loop(kind: str, contracted: bool, threshold: float, finder: str) -> None:
     rays, voxels = make_rays(kind), voxels_of()
-    found = FINDERS[finder](Space(BOUNDS, contracted), *rays, STEP, 60, voxels, threshold)
+    found = FINDERS[finder](space_from(BOUNDS, contracted=contracted), *rays, STEP, 60, voxels, threshold)
     compared = 0
     for r in range(len(rays.origins)):
         o, d, near, far, offset = (t[r].double().numpy() for t in rays)
@@ -86,7 +86,7 @@ def test_valid_samples_are_those_of_the_loop(kind: str, contracted: bool, thresh
 
 @pytest.mark.parametrize("contracted", [False, True])
 def test_both_try_the_same_number(contracted: bool) -> None:
-    rays, space = make_rays("outside"), Space(BOUNDS, contracted)
+    rays, space = make_rays("outside"), space_from(BOUNDS, contracted=contracted)
     fast, slow = (find(space, *rays, STEP, 60, voxels_of(), 0.4) for find in (dispatch.valid_samples, samples.valid_samples))
     assert fast.tried == pytest.approx(slow.tried, abs=2)
     assert len(fast.start) < fast.tried
@@ -96,7 +96,7 @@ def test_both_try_the_same_number(contracted: bool) -> None:
 @pytest.mark.parametrize("lost", [float("nan"), float("inf"), 3e38])
 def test_a_ray_that_is_nowhere_leaves_its_neighbours_alone(contracted: bool, lost: float) -> None:
     """The kernel takes rays sixteen at a time; none may make it look at voxels that there are not."""
-    rays, space = make_rays("outside"), Space(BOUNDS, contracted)
+    rays, space = make_rays("outside"), space_from(BOUNDS, contracted=contracted)
     alone = dispatch.valid_samples(space, *rays, STEP, 60, voxels_of(), 0.4)
     odd = Rays(rays.origins.clone(), rays.directions.clone(), *rays[2:])
     odd.origins[20, 1] = odd.directions[40] = lost
@@ -110,7 +110,7 @@ def test_a_ray_that_is_nowhere_leaves_its_neighbours_alone(contracted: bool, los
 @pytest.mark.parametrize("finder", FINDERS)
 @pytest.mark.parametrize("contracted", [False, True])
 def test_the_first_rays_can_be_looked_at_whole(contracted: bool, finder: str) -> None:
-    rays, space, find = make_rays("outside"), Space(BOUNDS, contracted), FINDERS[finder]
+    rays, space, find = make_rays("outside"), space_from(BOUNDS, contracted=contracted), FINDERS[finder]
     some = find(space, *rays, STEP, 60, voxels_of(), 0.4, whole=7)
     parts = [find(space, *(t[which] for t in rays), STEP, 60, voxels_of(), threshold) for which, threshold in ((slice(7), -math.inf), (slice(7, None), 0.4))]
     assert torch.equal(some.first, torch.cat([parts[0].first, parts[1].first[1:] + parts[0].first[-1]]))
@@ -123,7 +123,7 @@ def test_the_first_rays_can_be_looked_at_whole(contracted: bool, finder: str) ->
 @pytest.mark.parametrize("finder", FINDERS)
 def test_a_voxel_at_the_threshold_is_not_valid(finder: str) -> None:
     rays = make_rays("outside")
-    space, voxels = Space(BOUNDS, False), torch.full((SIDE, SIDE, SIDE), 0.5)
+    space, voxels = BoundedSpace(BOUNDS), torch.full((SIDE, SIDE, SIDE), 0.5)
     find = FINDERS[finder]
     assert len(find(space, *rays, STEP, 60, voxels, 0.5).start) == 0
     above = find(space, *rays, STEP, 60, voxels, 0.5 - 1e-6)
@@ -133,7 +133,7 @@ def test_a_voxel_at_the_threshold_is_not_valid(finder: str) -> None:
 @pytest.mark.parametrize("finder", FINDERS)
 @pytest.mark.parametrize("contracted", [False, True])
 def test_intervals_lie_end_to_end_and_samples_in_them(finder: str, contracted: bool) -> None:
-    rays, space = make_rays("outside"), Space(BOUNDS, contracted)
+    rays, space = make_rays("outside"), space_from(BOUNDS, contracted=contracted)
     rays = rays._replace(far=torch.full_like(rays.far, 1e6))
     found = FINDERS[finder](space, *rays, STEP, 200, voxels_of(), -math.inf)
     ray = ray_of_sample(found.first, len(found.start))
@@ -158,7 +158,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     from efficientnerf.model import model
     from efficientnerf.training.settings import TrainSettings
 
-    space = Space(np.array([np.negative(half), half]), True)
+    space = ContractedSpace(np.array([np.negative(half), half]))
     m = model(space, TrainSettings(num_coarse_samples=coarse_samples, occupancy_resolution=8, num_levels=2, log2_hashmap_size=8), None)
     rng = np.random.default_rng(5)
     directions = rng.normal(size=(300, 3))
@@ -189,7 +189,7 @@ def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[.
 
 
 def coarse_samples_of(rays: Rays, contracted: bool) -> tuple[Space, Samples, torch.Tensor]:
-    space = Space(BOUNDS, contracted)
+    space = space_from(BOUNDS, contracted=contracted)
     coarse = samples.valid_samples(space, *rays, STEP, 60, voxels_of().to(rays.origins.dtype), 0.4)
     return space, coarse, torch.rand(len(coarse.start), generator=torch.Generator().manual_seed(0)) < 0.5
 
@@ -233,6 +233,6 @@ def test_no_point_is_evaluated_twice() -> None:
 @pytest.mark.parametrize("find", FINDERS.values(), ids=FINDERS.keys())
 def test_no_rays_and_no_slots_are_fine(find: Callable[..., Samples]) -> None:
     none = Rays(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0), torch.zeros(0))
-    found = find(Space(BOUNDS, False), *none, STEP, 60, voxels_of(), 0.4)
+    found = find(BoundedSpace(BOUNDS), *none, STEP, 60, voxels_of(), 0.4)
     assert found.first.tolist() == [0]
     assert found.point.shape == (0, 3)

@@ -149,7 +149,7 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
     view = load(inputs["poses"]).views[-1]
     white = (1.0, 1.0, 1.0)
     field = load_renderer(inputs["train"]).render(view.camera).colour
-    made = job(tmp_path, dataclasses.replace(QUICK, optimise=0), **inputs)
+    made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=0), **inputs)
     run(made)
     raw = NerfTree.load(made.out / BakeOutputs.asset).render(view.camera, background=white).colour
     fitted = NerfTree.load(undisturbed[1].out / BakeOutputs.asset).render(view.camera, background=white).colour
@@ -188,7 +188,7 @@ def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None
 
 def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is room the pixels decide, else the room, and the coarser asset is as if that resolution had been asked for."""
-    fitted = dataclasses.replace(QUICK, resolution=0, points=1, optimise=2, weight=0.0)
+    fitted = dataclasses.replace(QUICK, resolution=0, samples_per_voxel=1, refine_steps=2, weight_threshold=0.0)
     monkeypatch.setattr(resolution, "PIXELS", 0.2)
     sizes = {}
     for room in (10**7, 20_000):
@@ -211,9 +211,9 @@ def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_aske
     chosen = BakeSettings(refine_rays_per_batch=1000)
     assert [refinement.steps_of(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
     assert {refinement.steps_of(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
-    asked = dataclasses.replace(chosen, optimise=7)
+    asked = dataclasses.replace(chosen, refine_steps=7)
     assert {refinement.steps_of(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
-    made = job(tmp_path, dataclasses.replace(QUICK, optimise=None, optimise_rays=64), **inputs)
+    made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=None, refine_rays_per_batch=64), **inputs)
     run(made)
     report = json.loads((made.out / "report.json").read_text())["optimisation"]
     assert report["steps"] == max(320, -(-5 * report["voxels_baked"] // 64))
@@ -241,7 +241,7 @@ def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: 
     scene = inputs["poses"]
     train.run(job(tmp_path / "train", settings(iterations=30, sample_batch_size=4096, occupancy_warmup_steps=10, discretise=20), poses=scene))
     given = {"poses": scene, "train": tmp_path / "train" / "out"}
-    near = dataclasses.replace(QUICK, resolution=0, lookup="nearest", layout="sparse", optimise=0)
+    near = dataclasses.replace(QUICK, resolution=0, lookup="nearest", layout="sparse", refine_steps=0)
     made = job(tmp_path / "raw", near, **given)
     run(made)
     tree = NerfTree.load(made.out / BakeOutputs.asset)
@@ -255,7 +255,7 @@ def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: 
     lit = tree.density_values > 0
     assert lit.any()
     np.testing.assert_allclose(tree.density_values[lit], np.minimum(said[lit], 65000), rtol=2e-3)
-    fitted = job(tmp_path / "fitted", dataclasses.replace(near, optimise=12), **given)
+    fitted = job(tmp_path / "fitted", dataclasses.replace(near, refine_steps=12), **given)
     run(fitted)
     assert NerfTree.load(fitted.out / BakeOutputs.asset).lookup == "nearest"
     facts = json.loads((fitted.out / "report.json").read_text())["optimisation"]
@@ -269,7 +269,7 @@ def test_other_voxels_than_those_of_the_training_are_told_of(tmp_path: Path, inp
     save_model(m.model, m.near, m.far, tmp_path / "train" / TrainOutputs.field)
     given = {"poses": inputs["poses"], "train": tmp_path / "train"}
     events: list[dict[str, Any]] = []
-    made = job(tmp_path / "bake", dataclasses.replace(QUICK, resolution=20, lookup="nearest", optimise=0), events=events, **given)
+    made = job(tmp_path / "bake", dataclasses.replace(QUICK, resolution=20, lookup="nearest", refine_steps=0), events=events, **given)
     run(made)
     told = [event["text"] for event in events if event["event"] == "warning"]
     assert len(told) == 1

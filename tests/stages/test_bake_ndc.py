@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.bake import flattened
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import rays
+from efficientnerf.geometry.spaces import NdcSpace
 from stages import bake, train
 from stages.artifacts import BakeOutputs
-from stages.bake import NDC_DEPTH, BakeSettings
+from stages.bake import BakeSettings
 from stages.baking.refinement import WEIGHED_NDC
 from stages.baking.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
 from stages.framing.forward_facing import forward_of
@@ -27,7 +27,7 @@ from tests.stages.balls import ORBIT, SIMILARITY, job, poses
 from tests.stages.test_forward import depths, row
 from tests.stages.test_lattice import forward_facing
 
-QUICK: dict[str, Any] = {"resolution": 64, "pixels": 4000, "weight": 0.0, "max_mib": 8, "points": 4, "optimise": 0}
+QUICK: dict[str, Any] = {"resolution": 64, "visibility_rays": 4000, "weight_threshold": 0.0, "max_mib": 8, "samples_per_voxel": 4, "refine_steps": 0}
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +56,16 @@ def baked(folder: Path, inputs: dict[str, Path], told: list[dict[str, Any]] | No
 
 
 def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path) -> None:
-    cubes, deep = baked(tmp_path / "cubes", inputs, ndc_depth=1.0), baked(tmp_path / "deep", inputs)
+    cubes, deep = baked(tmp_path / "cubes", inputs, ndc_voxel_depth=1.0), baked(tmp_path / "deep", inputs)
     space = load_renderer(inputs["train"], "cpu").model.space
     assert cubes.ndc is not None
     assert deep.ndc is not None
     assert space.ndc is not None
     assert cubes.ndc.to_json() == space.ndc.to_json()
-    assert deep.ndc.slopes == pytest.approx(tuple(NDC_DEPTH * slope for slope in space.ndc.slopes))
+    assert deep.ndc.slopes == pytest.approx(tuple(NdcSpace.voxel_depth * slope for slope in space.ndc.slopes))
     # As many voxels across, half as many in depth.
     assert deep.resolution[:2] == cubes.resolution[:2]
-    assert deep.resolution[2] == pytest.approx(cubes.resolution[2] / NDC_DEPTH, abs=4)
+    assert deep.resolution[2] == pytest.approx(cubes.resolution[2] / NdcSpace.voxel_depth, abs=4)
     view = load(inputs["poses"]).views[0]
     one, other = (tree.render(view.camera, background=(0.5, 0.5, 0.5)) for tree in (cubes, deep))
     assert one.colour.std() > 0.1
@@ -79,7 +79,7 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     import json
 
     told: list[dict[str, Any]] = []
-    baked(tmp_path, inputs, told, optimise=20, optimise_rays=2048, pixels=1000)
+    baked(tmp_path, inputs, told, refine_steps=20, refine_rays_per_batch=2048, visibility_rays=1000)
     fitted = json.loads((tmp_path / "out" / "report.json").read_text())["optimisation"]
     assert fitted["psnr_after"] > fitted["psnr_before"] + 0.5
     looked = {event["total"] for event in told if event.get("text") == "dropping what does not show"}
@@ -97,7 +97,7 @@ def test_cubes_stay_where_the_field_was_trained_on_them(inputs: dict[str, Path],
     assert tree.ndc is not None
     assert tree.ndc.to_json() == load_renderer(made.out, "cpu").model.space.ndc.to_json()
     assert not [event for event in told if event["event"] == "warning"]
-    baked(tmp_path / "other", on_voxels, told, resolution=48, ndc_depth=2.0)
+    baked(tmp_path / "other", on_voxels, told, resolution=48, ndc_voxel_depth=2.0)
     assert any("bake.ndc_voxel_depth=2" in event["text"] and "train.discretise=48" in event["text"] for event in told if event["event"] == "warning")
 
 
@@ -105,23 +105,19 @@ def test_elsewhere_voxels_are_cubes_and_it_is_said(tmp_path: Path) -> None:
     scene = poses(tmp_path / "poses")
     train.run(job(tmp_path / "train", settings(iterations=12, sample_batch_size=2048, occupancy_warmup_steps=4), poses=scene))
     told: list[dict[str, Any]] = []
-    tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_depth=2.0)
+    tree = baked(tmp_path / "bake", {"poses": scene, "train": tmp_path / "train" / "out"}, told, resolution=24, ndc_voxel_depth=2.0)
     assert tree.ndc is None
     assert len(set(tree.resolution)) == 1
     assert any("bake.ndc_voxel_depth" in event["text"] for event in told if event["event"] == "warning")
-    m = load_renderer(tmp_path / "train" / "out", "cpu").model
-    with pytest.raises(ValueError, match="normalised device coordinates"):
-        flattened(m.space, 2.0)
 
 
-def test_a_flattened_space_has_the_same_grid_coordinates(inputs: dict[str, Path]) -> None:
+def test_a_space_of_deeper_voxels_has_the_same_grid_coordinates(inputs: dict[str, Path]) -> None:
     space = load_renderer(inputs["train"], "cpu").model.space
-    flat = flattened(space, 3.0)
-    assert space.ndc is not None
-    assert flat.ndc is not None
+    assert isinstance(space, NdcSpace)
+    flat = space.with_voxel_depth(3.0)
     world = space.ndc.world(np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3)))
     np.testing.assert_allclose(flat.ndc.points(world), space.ndc.points(world) * (3, 3, 1), rtol=1e-9, atol=1e-12)
-    one, other = (s.grid(torch.from_numpy(s.ndc.points(world))) for s in (space, flat))  # type: ignore[union-attr]
+    one, other = (s.grid(torch.from_numpy(s.ndc.points(world))) for s in (space, flat))
     torch.testing.assert_close(one, other)
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import rays
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import BoundedSpace, NdcSpace
 from efficientnerf.model import model
-from efficientnerf.training.settings import COARSE_SAMPLES, COARSE_SAMPLES_NDC, FINEST, LOG2_TABLE, TrainSettings
+from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 from pipeline.errors import UsageError
 from pipeline.stage import settings_from
 from stages import train
@@ -71,9 +71,9 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
 def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_them_and_fog_weighs_less() -> None:
     s = forward_facing(400)
     small = TrainSettings(log2_hashmap_size=8, num_levels=2, occupancy_resolution=8)
-    m, usual = model(space_of(s), small, None), model(Space(BOUNDS, False), small, None)
-    assert m.settings.num_coarse_samples == with_auto_sizes(TrainSettings(), s, 1000).num_coarse_samples == COARSE_SAMPLES_NDC
-    assert m.step == pytest.approx(2 * math.sqrt(3) / COARSE_SAMPLES_NDC, rel=1e-6)  # the box is 2 deep
+    m, usual = model(space_of(s), small, None), model(BoundedSpace(BOUNDS), small, None)
+    assert m.settings.num_coarse_samples == with_auto_sizes(TrainSettings(), s, 1000).num_coarse_samples == NdcSpace.num_coarse_samples
+    assert m.step == pytest.approx(2 * math.sqrt(3) / NdcSpace.num_coarse_samples, rel=1e-6)  # the box is 2 deep
     assert 1 - math.exp(-m.voxels.threshold * m.step) == pytest.approx(0.05)
     assert 1 - math.exp(-usual.voxels.threshold * usual.step) == pytest.approx(0.01)
     assert (m.distortion, usual.distortion) == (0.002, 0.01)
@@ -88,7 +88,7 @@ def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path:
     assert [each.log2_hashmap_size for each in found] == [17, 17, 18, 19, 19]
     assert {each.finest_resolution for each in found} == {FINEST}
     assert with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512), s, 2**26) == TrainSettings(
-        log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=COARSE_SAMPLES
+        log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=BoundedSpace.num_coarse_samples
     )
 
 

@@ -12,7 +12,7 @@ import torch
 from efficientnerf.asset.bake import voxel_coordinates
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, project
-from efficientnerf.geometry.spaces import Space
+from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
 from stages import bake, train
@@ -25,7 +25,7 @@ from stages.io.scene import save as save_scene
 from tests.efficientnerf import balls
 from tests.stages.balls import job, poses
 
-SPACE = Space(np.array([[-1.0, -0.8, -1.0], [1.0, 0.9, 1.2]]), contracted=True)
+SPACE = ContractedSpace(np.array([[-1.0, -0.8, -1.0], [1.0, 0.9, 1.2]]))
 SIDE = 24
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from efficientnerf.geometry.ndc import BEYOND, Ndc, WarpedRays
+from efficientnerf.geometry.ndc import BEYOND, Ndc, NdcRays
 
 BLOCK = 4096  # rays of a task
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _warp_rays(origins, directions, turn, place, a, b, near, beyond, start, along, begin, pace, bend):  # type: ignore[no-untyped-def]
+def _warp_rays(origins, directions, turn, place, a, b, near, beyond, start, along, begin, ds_dt, dlogz_dt):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(origins), block * BLOCK + BLOCK)):
             px, py, pz = origins[n, 0] - place[0], origins[n, 1] - place[1], origins[n, 2] - place[2]
@@ -30,30 +30,30 @@ def _warp_rays(origins, directions, turn, place, a, b, near, beyond, start, alon
             x, y, z = x + t * dx, y + t * dy, max(z + t * dz, near) if meets else near
             jx, jy, jz = a * (dx * z - x * dz) / (z * z), b * (dy * z - y * dz) / (z * z), 2 * near * dz / (z * z)
             g = np.sqrt(jx * jx + jy * jy + jz * jz)
-            begin[n], bend[n] = t, dz / z
+            begin[n], dlogz_dt[n] = t, dz / z
             if not meets or g < 1e-12:
                 start[n, 0], start[n, 1], start[n, 2] = 0.0, 0.0, beyond
                 along[n, 0], along[n, 1], along[n, 2] = 0.0, 0.0, 1.0
-                pace[n] = 1.0
+                ds_dt[n] = 1.0
                 continue
             start[n, 0], start[n, 1], start[n, 2] = a * x / z, b * y / z, 1 - 2 * near / z
             along[n, 0], along[n, 1], along[n, 2] = jx / g, jy / g, jz / g
-            pace[n] = g
+            ds_dt[n] = g
 
 
-def warp_rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> WarpedRays:
+def warp_rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> NdcRays:
     """`Ndc.rays` of float64 arrays."""
     count = len(origins)
     start, along = np.empty((count, 3)), np.empty((count, 3))
-    begin, pace, bend = np.empty(count), np.empty(count), np.empty(count)
+    begin, ds_dt, dlogz_dt = np.empty(count), np.empty(count), np.empty(count)
     pose = np.ascontiguousarray(ndc.world_from_camera, np.float64)
     given = (np.ascontiguousarray(part, np.float64) for part in (origins, directions, pose[:3, :3], pose[:3, 3]))
-    _warp_rays(*given, *ndc.slopes, ndc.near, BEYOND, start, along, begin, pace, bend)
-    return WarpedRays(start, along, begin, pace, bend)
+    _warp_rays(*given, *ndc.slopes, ndc.near, BEYOND, start, along, begin, ds_dt, dlogz_dt)
+    return NdcRays(start, along, begin, ds_dt, dlogz_dt)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _unwarp_hits(start, along, begin, pace, bend, distance, normal, turn, a, b, near, out_distance, out_normal):  # type: ignore[no-untyped-def]
+def _unwarp_hits(start, along, begin, ds_dt, dlogz_dt, distance, normal, turn, a, b, near, out_distance, out_normal):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(start) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(start), block * BLOCK + BLOCK)):
             s = np.float64(distance[n])
@@ -61,8 +61,8 @@ def _unwarp_hits(start, along, begin, pace, bend, distance, normal, turn, a, b, 
             out_normal[n, 0] = out_normal[n, 1] = out_normal[n, 2] = 0
             if not np.isfinite(s):
                 continue
-            rest = pace[n] - bend[n] * s
-            if rest > 1e-6 * pace[n]:
+            rest = ds_dt[n] - dlogz_dt[n] * s
+            if rest > 1e-6 * ds_dt[n]:
                 out_distance[n] = begin[n] + s / rest
             z = 2 * near / max(1 - (start[n, 2] + s * along[n, 2]), 1e-9)
             x, y = (start[n, 0] + s * along[n, 0]) * z / a, (start[n, 1] + s * along[n, 1]) * z / b
@@ -74,7 +74,7 @@ def _unwarp_hits(start, along, begin, pace, bend, distance, normal, turn, a, b, 
                     out_normal[n, k] = (turn[k, 0] * nx + turn[k, 1] * ny + turn[k, 2] * nz) / length
 
 
-def unwarp_hits(ndc: Ndc, warped: WarpedRays, distance: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def unwarp_hits(ndc: Ndc, warped: NdcRays, distance: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Hits on rays of `warp_rays` in the world: distances (R,) float32, `world_distance`, and normals (R, 3) float32, `Ndc.world_normals`.
 
     distance  (R,)   float32 along the warped rays; infinity where nothing is hit

@@ -14,7 +14,7 @@ import numpy as np
 from efficientnerf.backends.numba import intervals
 from efficientnerf.backends.numba.intervals import RAYS
 from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.sampling.samples import FARTHEST
+from efficientnerf.geometry.spaces import FARTHEST
 
 BLOCK = 64  # rays per task
 

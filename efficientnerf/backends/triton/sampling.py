@@ -13,8 +13,8 @@ import triton.language as tl
 from torch import Tensor
 
 from efficientnerf.backends.triton.hash_grid import INTERPRETED, LANES, blocks
-from efficientnerf.geometry.spaces import Space
-from efficientnerf.sampling.samples import FARTHEST, Samples
+from efficientnerf.geometry.spaces import FARTHEST, Space
+from efficientnerf.sampling.samples import Samples
 
 RAYS = 256 if INTERPRETED else 32  # one warp: the end of a program's loop is decided without shared memory
 NEAREST_SHELL = tl.constexpr(FARTHEST)

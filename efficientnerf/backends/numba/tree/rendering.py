@@ -266,7 +266,7 @@ def _sights_of_voxels(tree: NerfTree, eye: np.ndarray) -> np.ndarray:
     """The directions along which points are seen from one of the world, as `cpu_blocks.View` takes them."""
     if tree.ndc is None:
         return _toward((np.asarray(eye, np.float64) - tree.bounds_min) / tree.voxel)
-    sights = tree.ndc.sights(np.asarray(eye, np.float64))
+    sights = tree.ndc.view_direction_matrix(np.asarray(eye, np.float64))
     return np.concatenate([sights[:, :3] * tree.voxel, (sights[:, :3] @ tree.bounds_min + sights[:, 3])[:, None]], axis=1)
 
 
