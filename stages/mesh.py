@@ -16,7 +16,7 @@ from stages.settings import setting
 
 if TYPE_CHECKING:
     from efficientnerf.surface.mesh import Mesh
-    from stages.io.exporters import SourceFrame
+    from stages.io.exporters.writing import SourceFrame
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def run(job: Job) -> None:
 
     capture = read(job, settings, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
-    keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].module == "transforms")
+    keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].renders)
     capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
     framed = framing.frame(capture, up=settings.up, box=settings.crop_box, margin=settings.box_margin, space=settings.space)
     splits = assign_splits(capture.photos, settings.test_every, warn)

@@ -75,19 +75,19 @@ def has_transparency(path: Path) -> bool:
     return pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any())
 
 
-def composites(photos: tuple[Photo, ...], choice: str, posed_by_json: bool) -> bool:
+def composites(photos: tuple[Photo, ...], choice: str, may_be_renders: bool) -> bool:
     """Whether alpha is coverage (the images are composited on a constant background) instead of a mask.
 
-    choice         the setting: "auto", "composite" or "mask"
-    posed_by_json  whether the capture is a transforms.json data set
+    choice          the setting: "auto", "composite" or "mask"
+    may_be_renders  whether the capture's format may hold renders of an object, as transforms.json may
 
-    "auto" composites where every image of a transforms.json data set holds an alpha channel and most have transparent pixels: renders of
-    an object. Opaque images, also in Blender's dialect, show real or rendered surroundings, and a few images with alpha among opaque ones
-    are masked photographs. Images that cannot be read have no say.
+    "auto" composites where every image of such a format holds an alpha channel and most have transparent pixels: renders of an object. Opaque
+    images, also in Blender's dialect, show real or rendered surroundings, and a few images with alpha among opaque ones are masked photographs.
+    Images that cannot be read have no say.
     """
     if choice != "auto":
         return choice == "composite"
-    if not posed_by_json or not all(read_header(photo.image).alpha for photo in photos):
+    if not may_be_renders or not all(read_header(photo.image).alpha for photo in photos):
         return False
     transparent = opaque = 0
     for photo in photos:

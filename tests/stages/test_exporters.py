@@ -15,9 +15,9 @@ import pytest
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
 from pipeline.errors import BadInput
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SourceFrame
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from stages.io.exporters.glb import gltf_from_capture
-from stages.io.exporters.writing import source_frame
+from stages.io.exporters.writing import SourceFrame, source_frame
 
 Z_UP = SourceFrame(Similarity.identity())
 Y_DOWN = SourceFrame(Similarity(0.5, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([1.0, 2, 3])), metric=True)

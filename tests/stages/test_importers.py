@@ -12,6 +12,7 @@ from efficientnerf.geometry.cameras import Camera, opengl_from_pose, project, qu
 from stages.io import importers
 from stages.io.capture import Capture
 from stages.io.importers import colmap_model
+from stages.io.importers.description import describe_source
 from tests.stages import captures
 from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS, Settings
 
@@ -54,7 +55,7 @@ def test_every_format_gives_the_same_rays(how: str, tmp_path: Path) -> None:
     listed = importers.files(folder, Settings())
     assert {photo.image for photo in capture.photos} < set(listed)
     assert len(listed) - len(capture.photos) == {"blender": 2, "colmap": 3}.get(name, 1)
-    described = importers.describe(folder)
+    described = describe_source(folder)
     json.dumps(described, allow_nan=False)
     assert described["count"] == 6
     assert described["format"] == name
@@ -188,7 +189,7 @@ def test_photographs_anywhere_below(tmp_path: Path) -> None:
     captures.write_pictures(tmp_path / "a" / "day 1", ["1.png"])
     captures.write_pictures(tmp_path / "a" / "day 2", ["1.png"])
     captures.write_pictures(tmp_path / "a" / "masks", ["1.png"])
-    described = importers.describe(tmp_path / "a")
+    described = describe_source(tmp_path / "a")
     assert described["format"] == "photographs"
     assert described["count"] == 2
 
@@ -241,7 +242,7 @@ def test_an_image_listed_twice_counts_once(tmp_path: Path) -> None:
 def test_several_formats_in_one_folder_are_named(tmp_path: Path) -> None:
     folder = captures.nerfstudio(captures.colmap_bin(tmp_path / "a"))
     assert importers.candidates(folder) == ["nerfstudio", "colmap", "photographs"]
-    assert any("--as colmap" in odd for odd in importers.describe(folder)["odd"])
+    assert any("--as colmap" in odd for odd in describe_source(folder)["odd"])
 
 
 def shared(name: str) -> Path:

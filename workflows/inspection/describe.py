@@ -7,10 +7,11 @@ from typing import Any
 
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from workflows.cli.progress import plain, size
 from workflows.cli.target import ASSET, describe_asset, is_run, open_run
 
-MESHES = (".ply", ".glb", ".obj", ".xyz")
+MESHES = tuple(dict.fromkeys((*MESH_EXPORTERS, *POINT_EXPORTERS)))
 
 
 def describe(path: Path) -> dict[str, Any]:

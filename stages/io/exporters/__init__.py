@@ -7,16 +7,31 @@ It raises BadInput, before anything is written, for what would make a broken fil
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from efficientnerf.surface.mesh import Mesh, PointCloud
+if TYPE_CHECKING:
+    from efficientnerf.surface.mesh import Mesh, PointCloud
+    from stages.io.exporters.writing import SourceFrame
 
-from .glb import write_mesh as _glb_mesh
-from .obj import write_mesh as _obj_mesh
-from .ply import write_mesh as _ply_mesh
-from .ply import write_points as _ply_points
-from .writing import SourceFrame
-from .xyz import write_points as _xyz_points
 
-MESH_EXPORTERS: dict[str, Callable[[Mesh, Path, SourceFrame], None]] = {".ply": _ply_mesh, ".glb": _glb_mesh, ".obj": _obj_mesh}
-POINT_EXPORTERS: dict[str, Callable[[PointCloud, Path, SourceFrame], None]] = {".ply": _ply_points, ".xyz": _xyz_points}
+def _of(module: str, function: str) -> Callable[[Any, Path, SourceFrame], None]:
+    """The function of a module of this package, imported when it is called."""
+
+    def write(what: Any, path: Path, frame: SourceFrame) -> None:
+        getattr(import_module(f"{__name__}.{module}"), function)(what, path, frame)
+
+    return write
+
+
+def _mesh(module: str) -> Callable[[Mesh, Path, SourceFrame], None]:
+    return _of(module, "write_mesh")
+
+
+def _points(module: str) -> Callable[[PointCloud, Path, SourceFrame], None]:
+    return _of(module, "write_points")
+
+
+MESH_EXPORTERS = {".ply": _mesh("ply"), ".glb": _mesh("glb"), ".obj": _mesh("obj")}
+POINT_EXPORTERS = {".ply": _points("ply"), ".xyz": _points("xyz")}

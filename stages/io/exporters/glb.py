@@ -19,8 +19,7 @@ import numpy as np
 
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
-
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
+from stages.io.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _FLOAT, _USHORT, _UINT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963  # buffer view targets

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.surface.mesh import Mesh
-
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
+from stages.io.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _ROWS = 50_000  # lines made at a time
 

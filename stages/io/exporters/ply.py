@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.surface.mesh import Mesh, PointCloud
-
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_mesh, check_points, write_parts
+from stages.io.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_mesh, check_points, write_parts
 
 _VERTEX = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((name, "u1") for name in ("red", "green", "blue"))])
 _FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.surface.mesh import PointCloud
-
-from .writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_points, write_parts
+from stages.io.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_points, write_parts
 
 _ROWS = 50_000  # lines made at a time
 _LINE = "%.9g %.9g %.9g %d %d %d %.5f %.5f %.5f\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -17,45 +16,45 @@ from stages.io.importers.source import ImportSettings
 class Importer:
     """How one format is read.
 
-    module  of this package, with files(folder, settings), and read(folder, settings) where the format states cameras
-    posed   whether the format states cameras; else they are found from the photographs
-    dialect passed on to `read` where one module reads several
+    module   of this package, with recognises(folder), files(folder, settings) and, where the format states cameras, read(folder, settings)
+    posed    whether the format states cameras; else they are found from the photographs
+    renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
+    dialect  passed on to `recognises` and `read` where one module reads several formats
     """
 
     module: str
     posed: bool = True
+    renders: bool = False
     dialect: str | None = None
+
+    def recognises(self, folder: Path) -> bool:
+        """Whether a folder holds files of this format; BadInput where they cannot be read."""
+        return bool(self._call("recognises", folder))
 
     def read(self, folder: Path, settings: ImportSettings) -> Capture:
         """The capture; raises BadInput."""
-        reader: Callable[..., Capture] = import_module(f"stages.io.importers.{self.module}").read
-        return reader(folder, settings) if self.dialect is None else reader(folder, settings, self.dialect)
+        capture: Capture = self._call("read", folder, settings)
+        return capture
 
     def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
         """What the capture depends on; raises BadInput."""
-        lister: Callable[..., list[Path]] = import_module(f"stages.io.importers.{self.module}").files
-        return lister(folder, settings)
+        paths: list[Path] = import_module(f"{__name__}.{self.module}").files(folder, settings)
+        return paths
+
+    def _call(self, function: str, *arguments: Any) -> Any:
+        return getattr(import_module(f"{__name__}.{self.module}"), function)(*arguments, *(() if self.dialect is None else (self.dialect,)))
 
 
 # In the order in which they are looked for: a folder may hold several, and the most explicit one counts.
 IMPORTERS: dict[str, Importer] = {
-    "blender": Importer("transforms", dialect="blender"),
-    "nerfstudio": Importer("transforms", dialect="nerfstudio"),
-    "instant-ngp": Importer("transforms", dialect="instant-ngp"),
+    "blender": Importer("transforms", renders=True, dialect="blender"),
+    "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
+    "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
     "llff": Importer("llff"),
     "colmap": Importer("colmap"),
     "photographs": Importer("photographs", posed=False),
 }
 FORMATS = ("auto", *IMPORTERS)
-
-
-@dataclass(frozen=True)
-class ReadingDefaults:
-    """What `describe` reads with."""
-
-    strict: bool = False
-    allow_outside: bool = False
-    llff_factor: int | None = None
 
 
 def detect(folder: Path) -> str:
@@ -69,20 +68,11 @@ def candidates(folder: Path) -> list[str]:
         raise BadInput(f"{folder}: no such folder. Expected a folder of photographs or a posed data set.")
     if not folder.is_dir():
         raise BadInput(f"{folder}: a file; expected a folder of photographs or of a posed data set. Name the folder that holds it.")
-    from stages.io.importers import colmap, llff, photographs, transforms
-    from stages.io.importers.source import images_in
+    found = [name for name, importer in IMPORTERS.items() if importer.recognises(folder)]
+    if not found:
+        from stages.io.importers.photographs import photographs
 
-    found = []
-    if transforms.json_files(folder):
-        found.append(transforms.dialect(folder))
-    if (folder / llff.POSES).is_file():
-        found.append("llff")
-    if colmap.model_folders(folder):
-        found.append("colmap")
-    if images_in(folder) or images_in(folder / "images"):
-        found.append("photographs")
-    elif not found:
-        photographs.photographs(folder)  # anywhere below; says what is there instead
+        photographs(folder)  # anywhere below; says what is there instead
         found.append("photographs")
     return found
 
@@ -91,10 +81,3 @@ def files(folder: Path, settings: Any) -> list[Path]:
     """What the poses stage depends on: the files of the format in question that it reads."""
     name = detect(folder) if settings.format == "auto" else settings.format
     return sorted(set(IMPORTERS[name].files(folder, settings)))
-
-
-def describe(source: Path, format: str = "auto") -> dict[str, Any]:
-    """What `enerf inspect SOURCE` prints of a data set as it stands; raises BadInput."""
-    from stages.io.importers.description import describe_source
-
-    return describe_source(source, format)

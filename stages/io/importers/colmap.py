@@ -31,6 +31,10 @@ def model_folders(folder: Path) -> list[Path]:
     return sorted(found, key=count_images, reverse=True) if len(found) > 1 else found
 
 
+def recognises(folder: Path) -> bool:
+    return bool(model_folders(folder))
+
+
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The files of the model that is used, the images that it names and their masks."""
     source = Source(folder, settings.allow_outside)

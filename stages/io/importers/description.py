@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stages.io.capture import Capture
-from stages.io.importers import IMPORTERS, ReadingDefaults, candidates, lenses
+from stages.io.importers import IMPORTERS, candidates, lenses
 from stages.io.importers.photographs import masks_of, photographs
 from stages.io.importers.source import Source
 
 
+@dataclass(frozen=True)
+class Defaults:
+    """The settings that a source is described with."""
+
+    strict: bool = False
+    allow_outside: bool = False
+    llff_factor: int | None = None
+
+
 def describe_source(folder: Path, format: str = "auto") -> dict[str, Any]:
-    """Count, resolutions, camera models, bounds and oddities of a source, as plain JSON values."""
+    """What `enerf inspect SOURCE` prints of a data set as it stands: count, resolutions, camera models, bounds, oddities. Raises BadInput."""
     possible = candidates(folder)
     name = possible[0] if format == "auto" else format
-    described = _posed(IMPORTERS[name].read(folder, ReadingDefaults())) if IMPORTERS[name].posed else _photographs(folder)
+    described = _posed(IMPORTERS[name].read(folder, Defaults())) if IMPORTERS[name].posed else _photographs(folder)
     others = [other for other in possible if other not in (name, "photographs")]
     if others:
         described["odd"].append(f"can also be read --as {' or '.join(others)}.")

@@ -21,6 +21,10 @@ from stages.io.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Sour
 POSES = "poses_bounds.npy"
 
 
+def recognises(folder: Path) -> bool:
+    return (folder / POSES).is_file()
+
+
 def image_folders(folder: Path) -> dict[int, Path]:
     """Reduction factor -> folder of images: images/ is 1, images_4/ is 4."""
     folders = {1: folder / "images"} if images_in(folder / "images") else {}

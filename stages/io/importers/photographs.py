@@ -18,6 +18,10 @@ MASKS = "masks"
 _NOT_PHOTOGRAPHS = {MASKS, "mask", "depth", "depths", "sparse", "dense", "stereo"}
 
 
+def recognises(folder: Path) -> bool:
+    return bool(images_in(folder) or images_in(folder / "images"))
+
+
 def photographs(folder: Path) -> list[Path]:
     """The photographs of a folder: directly in it, else in its folder images/, else anywhere below it; sorted by path."""
     found = images_in(folder) or images_in(folder / "images")

@@ -82,6 +82,11 @@ def dialect(folder: Path) -> str:
     return "blender" if "camera_angle_x" in document and "fl_x" not in document else "nerfstudio"
 
 
+def recognises(folder: Path, kind: str) -> bool:
+    """Whether a folder holds a transforms.json of this dialect. Raises BadInput where it cannot be read."""
+    return bool(json_files(folder)) and dialect(folder) == kind
+
+
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The JSON files, the images and masks that they name, and the points."""
     source = Source(folder, settings.allow_outside)
