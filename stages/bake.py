@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.files import atomic
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, inputs_of, needs_of
+from stages.compiling import compiling_kernels
 from stages.settings import setting
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ class BakeSettings:
     licence: str = setting("", "licence text to write into the asset")
 
 
+@compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset import bake, format, serialisation
     from efficientnerf.asset.refinement import Targets

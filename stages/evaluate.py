@@ -25,6 +25,7 @@ from efficientnerf.geometry.cameras import MODELS, Camera
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, inputs_of, needs_of
+from stages.compiling import compiling_kernels
 from stages.io.scene import Scene, View
 from stages.lpips_weights import load_lpips
 from stages.settings import setting
@@ -71,6 +72,7 @@ class Truth:
     inside: np.ndarray | None
 
 
+@compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.tree import NerfTree
 

@@ -12,6 +12,7 @@ from pipeline.errors import StageFailed
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
+from stages.compiling import compiling_kernels
 from stages.settings import setting
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
     }
 
 
+@compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
     from stages.io.exporters import MESH_EXPORTERS

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
+from stages.compiling import compiling_kernels
 from stages.mesh import orbit_places, remedy
 from stages.settings import setting
 
@@ -48,6 +49,7 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
     return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
 
 
+@compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
     from stages.io.exporters import POINT_EXPORTERS

@@ -23,6 +23,7 @@ import numpy as np
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job, Stage
 from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
+from stages.compiling import compiling_kernels
 from stages.training.budget import MOST, TIMED, Budget
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ clock = time.monotonic
 NOWHERE = 1e-9  # scene is 2 across: nearer to a camera than this, a point has no direction
 
 
+@compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.model import model
     from efficientnerf.rendering.render import FieldRenderer

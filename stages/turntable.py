@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pipeline.stage import Job, Stage
 from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of, needs_of
+from stages.compiling import compiling_kernels
 from stages.settings import setting
 
 
@@ -28,6 +29,7 @@ class TurntableSettings:
     exr: str = setting("first", "Which frames are written as EXR (linear colour, alpha, depth, normals) too.", choices=("none", "first", "all"))
 
 
+@compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.tree import NerfTree
 

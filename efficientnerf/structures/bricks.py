@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.structures.voxels import Voxels
 from efficientnerf.structures.words import CHUNK, ONE, TASK, ZERO, atomic_or, bits_below, fill, number_bits, population, whole, within
 

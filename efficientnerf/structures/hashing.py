@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.structures.voxels import Voxels
 from efficientnerf.structures.words import CHUNK, ONE, TASK, ZERO, compare_and_swap, fill, whole, within
 

@@ -6,9 +6,9 @@ the voxels of the least scores are taken until the share is reached. Scattered: 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.structures.voxels import Voxels
 
 BODIES = 24  # half of them solid, half of them shells

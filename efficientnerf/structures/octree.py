@@ -14,9 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.structures.voxels import Voxels
 from efficientnerf.structures.words import CHUNK, ONE, TASK, ZERO, atomic_or, bits_below, fill, number_bits, whole, within
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
+
+from efficientnerf.backends.numba.runtime import numba
 
 TASK = 4096  # voxels or points that a thread takes at a time
 CHUNK = 256  # look-ups that go through each step side by side, so that their accesses to memory overlap

@@ -236,9 +236,9 @@ class _Others:
 
 def _machine(busy: _Others) -> str:
     """Threads, caches, and what memory can do: reads at random and in a row."""
-    import numba
     import numpy as np
 
+    from efficientnerf.backends.numba.runtime import numba
     from efficientnerf.structures.words import fill, gather
 
     table = np.empty(1 << 27, np.uint64)

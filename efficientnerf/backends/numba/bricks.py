@@ -5,8 +5,9 @@ B coarse cells with a row of brick^3 voxels each, N voxels.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -8,9 +8,9 @@ R rays, N samples, K harmonics.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.rendering.compositing import LARGEST_LOGIT
 
 BLOCK = 64  # rays per task

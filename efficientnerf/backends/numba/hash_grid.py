@@ -11,9 +11,9 @@ timing nor on the number of threads.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.table_entries import LINE, add_to_entries, interpolated_entry, touch
 

@@ -7,8 +7,9 @@ n vectors of D numbers, P centroids.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
 
 LANES = 64
 

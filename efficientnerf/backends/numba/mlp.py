@@ -15,9 +15,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tiles import LANES, ROWS, narrowed, pairs_of_rows, product, product_added, product_masked, product_relu, put_narrowed, turn
 

@@ -5,9 +5,9 @@ The letters are those of that module, whose functions are the reference. R rays.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.geometry.ndc import BEYOND, Ndc, NdcRays
 
 BLOCK = 4096  # rays of a task

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from efficientnerf.backends.numba.compositing import activate_density
+from efficientnerf.backends.numba.runtime import numba
 
 BLOCK = 1024  # samples per task
 

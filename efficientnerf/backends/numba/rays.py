@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -8,11 +8,11 @@ R rays, N samples.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from efficientnerf.backends.numba import intervals
 from efficientnerf.backends.numba.intervals import RAYS
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.geometry.spaces import FARTHEST
 

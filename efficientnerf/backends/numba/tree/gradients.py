@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.march import STEP, STOP
 from efficientnerf.backends.numba.tree.rendering import stored_voxel
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.march import STEP, STOP
 from efficientnerf.backends.numba.tree.rendering import normal_at
 from efficientnerf.rendering.harmonics import basis_numpy

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba
 import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.blocks import QUEUE, Pool, View, grid_of
 from efficientnerf.backends.numba.tree.march import STEP, Bench, march, normal_into

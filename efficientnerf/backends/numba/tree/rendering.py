@@ -10,9 +10,9 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING, NamedTuple
 
-import numba
 import numpy as np
 
+from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.blocks import LEAST_BLOCKS, POOL_BYTES, paint
 from efficientnerf.backends.numba.tree.march import LOG2E, STEP
 from efficientnerf.backends.numba.tree.picture import TILE, Shot, merge, trace

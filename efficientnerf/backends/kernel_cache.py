@@ -1,0 +1,171 @@
+"""Where compiled CPU kernels are kept: a private folder for each set of kernel sources and compiler versions.
+
+numba compares the file of a cached function with the one it was compiled from, but not the files of the functions it calls, whose code it
+holds as well, nor those of constants. Here a change to any of these leads to another folder. Within a folder numba tells processors apart by name and features.
+
+The first of these that can be written by the user alone is taken:
+
+    $ENERF_CACHE_DIR/kernels
+    $NUMBA_CACHE_DIR/efficientnerf   where numba was told a folder
+    kernels in the user's cache folder (platformdirs: ~/.cache/efficientnerf on Linux)
+    efficientnerf-UID in the folder for temporary files
+    a new folder there, removed at exit
+
+numba unpickles what it finds, so a folder that others could write to is never used.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import hashlib
+import os
+import platform
+import re
+import shutil
+import stat
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import platformdirs
+
+PACKAGE = Path(__file__).resolve().parent.parent
+KERNELS = ("backends/numba", "structures")  # folders of the package that hold kernels
+CONSTANTS = ("geometry/cameras.py", "geometry/ndc.py", "rendering/compositing.py", "rendering/harmonics.py", "sampling/samples.py")  # modules that they import
+KEPT, UNUSED_DAYS = 8, 30  # folders of other keys: so many, unless used within a day; none that was not used for so many days
+DAY = 86400.0
+
+
+@functools.cache
+def key() -> str:
+    """`key_of` this package."""
+    return key_of(PACKAGE)
+
+
+def key_of(package: Path) -> str:
+    """16 hexadecimal digits that stand for the kernels' sources in a package and for what compiles them."""
+    digest = hashlib.sha256()
+    versions = (version("numba"), version("llvmlite"), version("numpy"), sys.implementation.cache_tag or sys.version, platform.machine())
+    digest.update("\n".join(versions).encode())
+    paths = [path for folder in KERNELS for path in sorted((package / folder).rglob("*.py"))]
+    for path in (*paths, *(package / name for name in CONSTANTS)):
+        content = path.read_bytes()
+        digest.update(f"\n{path.relative_to(package).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:16]
+
+
+@functools.cache
+def folder() -> Path:
+    """The folder for kernels of this key, made if need be. A RuntimeWarning says so where the preferred one cannot be used."""
+    place, refusals = first_private(_roots(), key())
+    if place is None:
+        place = Path(tempfile.mkdtemp(prefix="efficientnerf-kernels-"))
+        atexit.register(shutil.rmtree, place, ignore_errors=True)
+    if refusals:
+        warnings.warn(f"compiled kernels are kept in {place}; refused: {', '.join(refusals)}. ENERF_CACHE_DIR chooses a folder.", RuntimeWarning, stacklevel=2)
+    return place
+
+
+def first_private(roots: Iterable[Path], key: str) -> tuple[Path | None, list[str]]:
+    """(the folder of a key under the first root that the user alone can write to, what spoke against those before). Removes what was long out of use."""
+    refusals = []
+    for root in roots:
+        place = root / key
+        try:
+            _make_private(root)
+            _make_private(place)
+            os.utime(place)
+            _prune(root, key)
+        except OSError as error:
+            refusals.append(f"{root} ({error.strerror or error})")
+        else:
+            return place, refusals
+    return None, refusals
+
+
+def _roots() -> Iterator[Path]:
+    if chosen := os.environ.get("ENERF_CACHE_DIR"):
+        yield Path(chosen).absolute() / "kernels"
+    elif chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        yield Path(chosen).absolute() / "efficientnerf"
+    else:
+        yield Path(platformdirs.user_cache_dir("efficientnerf", appauthor=False)).absolute() / "kernels"
+    yield Path(tempfile.gettempdir()).absolute() / (f"efficientnerf-{os.geteuid()}" if hasattr(os, "geteuid") else "efficientnerf")
+
+
+def _make_private(place: Path) -> None:
+    """Create a folder with mode 0700. Raises OSError where that fails, and PermissionError where others could write to it or replace it."""
+    place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    place.mkdir(mode=0o700, exist_ok=True)
+    if hasattr(os, "geteuid"):
+        found = place.lstat()
+        if not stat.S_ISDIR(found.st_mode):
+            raise PermissionError(f"{place} is a link")
+        if found.st_uid != os.geteuid():
+            raise PermissionError(f"{place} belongs to another user")
+        if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            raise PermissionError(f"others can write to {place}")
+        for above in place.resolve().parents:
+            if above.stat().st_uid not in (0, os.geteuid()):
+                raise PermissionError(f"{above} belongs to another user")
+            if above.stat().st_mode & stat.S_IWOTH and not above.stat().st_mode & stat.S_ISVTX:
+                raise PermissionError(f"others can write to {above}")
+    tempfile.TemporaryFile(dir=place).close()  # raises on a full or read-only disk
+
+
+def _prune(root: Path, own: str) -> None:
+    """Remove folders of other keys that have been out of use."""
+    others = []
+    for place in root.iterdir():
+        if place.name != own and re.fullmatch(r"[0-9a-f]{16}", place.name):
+            try:
+                others.append((time.time() - place.stat().st_mtime, place))
+            except FileNotFoundError:  # another process removes it too
+                continue
+    for rank, (age, place) in enumerate(sorted(others)):
+        if age > UNUSED_DAYS * DAY or (rank >= KEPT and age > DAY):
+            shutil.rmtree(place, ignore_errors=True)
+
+
+@dataclass
+class Compilation:
+    """What was compiled since somebody asked."""
+
+    started: Callable[[], None]
+    functions: int = 0
+    seconds: float = 0.0
+
+
+_watched: list[Compilation] = []
+
+
+@contextmanager
+def compilation(started: Callable[[], None]) -> Iterator[Compilation]:
+    """Count kernels that are compiled, rather than loaded, within; `started` is called before the first of them."""
+    found = Compilation(started)
+    _watched.append(found)
+    try:
+        yield found
+    finally:
+        _watched.remove(found)
+
+
+def note_start() -> None:
+    """A kernel is about to be compiled."""
+    for each in _watched:
+        if each.functions == 0:
+            each.started()
+        each.functions += 1
+
+
+def note_end(seconds: float) -> None:
+    """A kernel, and those it calls, were compiled."""
+    for each in _watched:
+        each.seconds += seconds

@@ -1,0 +1,198 @@
+"""Compiled kernels are kept where the user alone can write, are found again, and never outlive their sources; and which threads they run on."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from efficientnerf.backends import kernel_cache
+
+PACKAGE = kernel_cache.PACKAGE
+KEY = "0123456789abcdef"
+INNER = """
+from efficientnerf.backends.numba.runtime import numba
+
+@numba.njit(cache=True)
+def inner(x):
+    return x + {}
+"""
+OUTER = """
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.inner import inner
+
+@numba.njit(cache=True, parallel=True)
+def outer(x):
+    total = 0
+    for i in numba.prange(x):
+        total += inner(i)
+    return total
+"""
+PROGRAM = """
+import json, numba, sys
+from efficientnerf.backends import kernel_cache
+from efficientnerf.backends.numba.outer import outer
+
+started = []
+with kernel_cache.compilation(lambda: started.append(1)) as found:
+    result = outer(3)
+maps = open("/proc/self/maps").read() if sys.platform == "linux" else ""
+facts = {"result": result, "functions": found.functions, "seconds": found.seconds, "started": len(started), "layer": numba.threading_layer()}
+print(json.dumps({**facts, "folder": str(kernel_cache.folder()), "tbb": "libtbb.so" in maps}))
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package with two kernels, one of which calls the other from another file."""
+    copy = tmp_path / "one" / "efficientnerf"
+    (copy / "backends" / "numba").mkdir(parents=True)
+    for name in ("__init__.py", "backends/__init__.py", "backends/kernel_cache.py", "backends/numba/__init__.py", "backends/numba/runtime.py"):
+        shutil.copyfile(PACKAGE / name, copy / name)
+    for name in kernel_cache.CONSTANTS:
+        (copy / name).parent.mkdir(exist_ok=True)
+        (copy / name).write_text("")
+    (copy / "backends" / "numba" / "inner.py").write_text(INNER.format(1))
+    (copy / "backends" / "numba" / "outer.py").write_text(OUTER)
+    return copy
+
+
+def run(package: Path, **environment: str) -> dict[str, Any]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    environment = {**kept, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(package.parent), "PYTHONSAFEPATH": "1", **environment}
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, cwd=package.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_kernel_is_compiled_once_for_the_same_sources_wherever_they_lie_and_anew_when_one_that_it_calls_changes(package: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    first = run(package, ENERF_CACHE_DIR=str(cache))
+    assert (first["result"], first["functions"], first["started"]) == (6, 1, 1)  # the one called counts with the one that calls it
+    assert first["seconds"] > 0
+    assert Path(first["folder"]).parent == cache / "kernels"
+    assert {path.stat().st_mode & 0o777 for path in (cache, cache / "kernels", Path(first["folder"]))} == {0o700}
+    elsewhere = tmp_path / "two" / "efficientnerf"
+    shutil.copytree(package, elsewhere)
+    again = run(elsewhere, ENERF_CACHE_DIR=str(cache))
+    assert (again["result"], again["functions"], again["started"], again["folder"]) == (6, 0, 0, first["folder"])
+    (elsewhere / "backends" / "numba" / "inner.py").write_text(INNER.format(2))
+    changed = run(elsewhere, ENERF_CACHE_DIR=str(cache))
+    assert (changed["result"], changed["functions"]) == (9, 1)
+    assert changed["folder"] != first["folder"]
+
+
+def test_threads_are_those_of_openmp_whatever_else_is_installed(package: Path, tmp_path: Path) -> None:
+    found = run(package, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    assert not found["tbb"]
+    assert found["layer"] in ("omp", "workqueue")
+    assert Path(found["folder"]).parent == tmp_path / "cache" / "efficientnerf"
+
+
+def test_a_threading_layer_that_the_user_asks_for_is_used(package: Path, tmp_path: Path) -> None:
+    assert run(package, ENERF_CACHE_DIR=str(tmp_path / "cache"), NUMBA_THREADING_LAYER="workqueue")["layer"] == "workqueue"
+
+
+def test_the_key_stands_for_each_kernel_source_and_its_place(package: Path) -> None:
+    inner = package / "backends" / "numba" / "inner.py"
+    keys = [kernel_cache.key_of(package)]
+    inner.write_text(INNER.format(2))
+    keys.append(kernel_cache.key_of(package))
+    inner.rename(inner.with_name("outermost.py"))
+    keys.append(kernel_cache.key_of(package))
+    (package / "structures").mkdir()
+    (package / "structures" / "new.py").touch()
+    keys.append(kernel_cache.key_of(package))
+    (package / kernel_cache.CONSTANTS[0]).write_text("FARTHEST = 1")
+    keys.append(kernel_cache.key_of(package))
+    assert len(set(keys)) == 5
+    (package / "model.py").write_text("no kernel")
+    assert kernel_cache.key_of(package) == keys[-1]
+
+
+def test_the_key_stands_for_all_that_kernels_import() -> None:
+    """Module-level constants are part of the compiled code; what a function imports is not."""
+    folders = tuple("efficientnerf." + name.replace("/", ".") for name in kernel_cache.KERNELS)
+    constants = {"efficientnerf." + name.removesuffix(".py").replace("/", ".") for name in kernel_cache.CONSTANTS}
+    found = set()
+    for folder in kernel_cache.KERNELS:
+        for path in (PACKAGE / folder).rglob("*.py"):
+            if path.name == "runtime.py":
+                continue
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ImportFrom):
+                    assert node.level == 0, path
+                    modules = {f"{node.module}.{alias.name}" for alias in node.names} & constants or {node.module or ""}
+                    found |= {name for name in modules if name.startswith("efficientnerf") and not name.startswith(folders)}
+                elif isinstance(node, ast.Import):
+                    found |= {alias.name for alias in node.names if alias.name.startswith("efficientnerf")}
+    assert found <= constants, "kernel_cache.CONSTANTS"
+
+
+def imports_numba(node: ast.AST) -> bool:
+    if isinstance(node, ast.Import):
+        return any(alias.name == "numba" for alias in node.names)
+    return isinstance(node, ast.ImportFrom) and node.module == "numba" and any(alias.name in ("njit", "jit", "vectorize") for alias in node.names)
+
+
+def test_numba_is_imported_with_its_threads_and_cache_set_up() -> None:
+    for package in ("efficientnerf", "stages", "workflows"):
+        for path in (PACKAGE.parent / package).rglob("*.py"):
+            if path.name != "runtime.py" and any(imports_numba(node) for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+                pytest.fail(f"{path}: from efficientnerf.backends.numba.runtime import numba")
+
+
+def test_a_folder_that_others_could_write_to_is_refused(tmp_path: Path) -> None:
+    shared, linked, file, good = (tmp_path / name for name in ("shared", "linked", "file", "good"))
+    shared.mkdir()
+    shared.chmod(0o777)
+    (tmp_path / "elsewhere").mkdir()
+    linked.symlink_to(tmp_path / "elsewhere")
+    file.touch()
+    (tmp_path / "group" / KEY).mkdir(parents=True)
+    (tmp_path / "group" / KEY).chmod(0o770)
+    roots = [shared, shared / "below", linked, file, tmp_path / "group", good]
+    place, refusals = kernel_cache.first_private(roots, KEY)
+    assert place == good / KEY
+    assert good.stat().st_mode & 0o777 == place.stat().st_mode & 0o777 == 0o700
+    assert [refusal.partition(" (")[0] for refusal in refusals] == [str(root) for root in roots[:-1]]
+    assert "others can write to" in refusals[0]
+    assert f"others can write to {shared})" in refusals[1]
+    assert "is a link" in refusals[2]
+    assert kernel_cache.first_private([shared], KEY)[0] is None
+
+
+def test_a_folder_of_another_user_is_refused(tmp_path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can give a folder away")
+    (tmp_path / "theirs").mkdir(mode=0o700)
+    os.chown(tmp_path / "theirs", 12345, 12345)
+    assert kernel_cache.first_private([tmp_path / "theirs"], KEY)[0] is None
+    assert kernel_cache.first_private([tmp_path / "theirs" / "mine"], KEY)[0] is None
+
+
+def test_folders_out_of_use_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    root = tmp_path / "kernels"
+    root.mkdir(mode=0o700)
+    now = kernel_cache.time.time()
+
+    def made(name: str, days: float) -> Path:
+        (root / name / "numba").mkdir(parents=True)
+        (root / name / "numba" / "code.nbc").touch()
+        os.utime(root / name, (now - days * kernel_cache.DAY,) * 2)
+        return root / name
+
+    recent = [made(f"{number:016x}", number / 100) for number in range(12)]
+    week = [made(f"a{number:015x}", 7) for number in range(3)]
+    old, own, foreign = made("b" * 16, 31), made(KEY, 100), made("notes", 100)
+    assert kernel_cache.first_private([root], KEY) == (own, [])
+    assert all(place.exists() for place in (*recent, own, foreign))
+    assert not any(place.exists() for place in (*week, old))
+    assert now - own.stat().st_mtime < 60
