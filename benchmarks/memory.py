@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="where to write the figures")
     parser.add_argument("--keep", type=Path, help="folder that is kept, with the photographs and the run; else one that is removed")
     arguments = parser.parse_args()
-    sets = [f"poses.max_image_size={arguments.width}", "train.iterations=300", "train.preview_every=0", "bake.refine_steps=8", *arguments.sets]
+    sets = [f"poses.max_image_size={arguments.width}", "train.iterations=300", "train.preview_every=off", "bake.refine_steps=8", *arguments.sets]
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.keep or Path(temporary)
         (folder / "photographs").mkdir(parents=True, exist_ok=True)

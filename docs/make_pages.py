@@ -21,12 +21,9 @@ NOTE = "<!-- Made from the code by `make docs`; changes belong there. -->"
 
 def limits(info: SettingInfo) -> str:
     """What a setting may be, for the third column."""
-    if info.choices is not None:
+    if info.choices is not None and info.listed:
         return ", ".join(f"`{shown(choice)}`" for choice in info.choices)
-    bounds = [f"at least {info.minimum}"] if info.minimum is not None else []
-    bounds += [f"at most {info.maximum}"] if info.maximum is not None else []
-    bounds += [f"or {shown(number)}" for number in info.besides]
-    return ", ".join([info.type_name, *bounds])
+    return info.type_name
 
 
 def cell(text: str) -> str:

@@ -27,6 +27,7 @@ from efficientnerf.rendering.compositing import Composite, ray_of_sample
 from efficientnerf.rendering.harmonics import basis, harmonics_count
 from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels, voxel_weights
 from efficientnerf.sampling.samples import Samples, importance_samples, stratified_samples
+from efficientnerf.settings import given
 from efficientnerf.training.readback import SampleCapacity
 from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 
@@ -78,8 +79,15 @@ class Model:
     @property
     def distortion(self) -> float:
         """Weight of the loss on spread-out densities."""
-        given = self.settings.distortion_loss_weight
-        return self.space.distortion_loss_weight if given is None else given
+        stated = given(self.settings.distortion_loss_weight)
+        return self.space.distortion_loss_weight if stated is None else stated
+
+    @property
+    def num_coarse_samples(self) -> int:
+        """N_c, which `model` settles."""
+        count = given(self.settings.num_coarse_samples)
+        assert count is not None
+        return count
 
     @property
     def device(self) -> torch.device:
@@ -92,7 +100,8 @@ class Model:
 
     def snapped_points(self, points: Tensor) -> Tensor:
         """Where the fields are asked for what lies at points (N, 3) in grid coordinates: there, or at the centres of voxels where the settings say so."""
-        return voxel_centres(self.space, points, self.settings.discretise) if self.settings.discretise else points
+        side = given(self.settings.discretise)
+        return points if side is None else voxel_centres(self.space, points, side)
 
     def parameters(self) -> list[tuple[str, nn.Parameter]]:
         """Everything that is learned, by name, in a fixed order."""
@@ -133,18 +142,18 @@ def model(
     space: Space, settings: TrainSettings, background: tuple[float, float, float] | None, device: str = "cpu", span: tuple[float, float] | None = None
 ) -> Model:
     """An untrained model; the same settings give the same numbers."""
-    if settings.num_coarse_samples == 0:
-        settings = replace(settings, num_coarse_samples=space.num_coarse_samples)
+    coarse_samples = given(settings.num_coarse_samples) or space.num_coarse_samples
+    settings = replace(settings, num_coarse_samples=coarse_samples)
     generator = torch.Generator().manual_seed(settings.seed)
     coarse, fine = _fields(settings, generator)
-    if settings.far_plane > 0 and (span is None or space.contracted):
-        raise ValueError("train.near_plane and train.far_plane need a scene on a constant background. Leave them 0.")
-    span = span if settings.far_plane > 0 else None
-    step = space.sampled_length(span) / settings.num_coarse_samples
+    if settings.far_plane != "auto" and (span is None or space.contracted):
+        raise ValueError("train.near_plane and train.far_plane need a scene on a constant background. Leave them auto.")
+    span = span if settings.far_plane != "auto" else None
+    step = space.sampled_length(span) / coarse_samples
     slots = space.max_intervals(step)
-    side = settings.occupancy_resolution or space.occupancy_resolution
+    side = given(settings.occupancy_resolution) or space.occupancy_resolution
     # A valid voxel absorbs `voxel_absorption` of the light over one coarse interval.
-    absorption = settings.occupancy_alpha_threshold
+    absorption = given(settings.occupancy_alpha_threshold)
     if absorption is None:
         absorption = space.occupancy_alpha_threshold
     threshold = -math.log1p(-min(absorption, 0.999)) / step if settings.occupancy_rule == "maximum" else 0.0
@@ -162,7 +171,7 @@ def model(
 
 def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[AnyField | None, AnyField]:
     """The coarse field, if there is one, and the fine one, untrained."""
-    log2_table, finest = s.log2_hashmap_size or LOG2_TABLE, s.finest_resolution or FINEST
+    log2_table, finest = given(s.log2_hashmap_size) or LOG2_TABLE, given(s.finest_resolution) or FINEST
     if s.field == "hash":
         return None if s.coarse == "voxels" else HashField(
             levels=max(1, s.num_levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
@@ -203,7 +212,7 @@ def render_rays(
     rays = m.space.rays(origins, directions, near, far)
     bundle = (rays.origins, rays.directions, rays.near, rays.far)
     if m.settings.sampling == "uniform":
-        count = m.settings.num_coarse_samples + m.settings.num_importance_samples
+        count = m.num_coarse_samples + m.settings.num_importance_samples
         samples, _ = _even_samples(m, *bundle, offset, count, rng, None if room is None else room.fine)
         raw, out = _seen(m, m.fine, directions, samples, behind)
         nothing = samples.start[:0]
@@ -211,7 +220,7 @@ def render_rays(
         return RayOutputs(rays, none, raw[:0], out.weight[:0], None, torch.zeros(0, dtype=torch.bool, device=raw.device), samples, raw, *_summed(out, 0.0))
     for_coarse, for_fine = (None, None) if room is None else room
     if m.settings.sampling == "hierarchical":
-        coarse, at = _even_samples(m, *bundle, offset, m.settings.num_coarse_samples, rng, for_coarse)
+        coarse, at = _even_samples(m, *bundle, offset, m.num_coarse_samples, rng, for_coarse)
     else:
         coarse, at = _valid_samples(m, *bundle, offset, prune=prune, rng=rng, capacity=for_coarse), None
     if m.coarse is None:
@@ -289,8 +298,8 @@ def _even_samples(
 ) -> tuple[Samples, Tensor]:  # fmt: skip
     """`count` stratified samples between near and far, or between where the ray enters the box and leaves it; their distances (N,)."""
     if m.space.contracted:  # intervals that grow with the distance, all of them
-        step = m.step * m.settings.num_coarse_samples / count
-        slots = math.ceil(m.slots * count / m.settings.num_coarse_samples)
+        step = m.step * m.num_coarse_samples / count
+        slots = math.ceil(m.slots * count / m.num_coarse_samples)
         samples = dispatch.valid_samples(m.space, origins, directions, near, far, offset, step, slots, m.voxels.values, -math.inf, capacity)
         return samples, samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
     if m.span is None:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import msgspec
+
 from pipeline.errors import Interrupted, UnknownSetting, UsageError
 
 T = TypeVar("T")
@@ -130,25 +132,25 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
 
     where  put before names in errors, e.g. "train": `train.iterations: ...`
 
-    Types are int, float (an int will do), bool, str, None, Literal, tuples (lists will do) and unions of these. A field's metadata may
-    hold "choices", "minimum" and "maximum" (of a tuple: of each of its numbers), and "besides", numbers outside of these limits that
-    are admitted all the same, such as a 0 for "choose". Raises UnknownSetting, which names the nearest, and UsageError for a wrong type
-    or value.
+    Types are those that msgspec decodes strictly: int, float (an int will do, infinities and nan will not), bool, str, None, Literal, tuples (lists will
+    do), unions of these, and limits as `Annotated[int, msgspec.Meta(ge=1)]`. Raises UnknownSetting, which names the nearest, and UsageError for a wrong
+    type or value.
     """
     prefix = f"{where}." if where else ""
     if not isinstance(mapping, Mapping):
-        raise UsageError(f"{where or cls.__name__}: expected a table of settings, found {_shown(mapping)}")
-    hints = typing.get_type_hints(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+        raise UsageError(f"{where or cls.__name__}: expected a table of settings, found {_shown(mapping)}.")
+    hints = typing.get_type_hints(cls, include_extras=True)
+    names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
     values = {}
     for name, value in mapping.items():
-        if name not in fields:
-            raise UnknownSetting(_unknown(prefix, str(name), list(fields)))
+        if name not in names:
+            raise UnknownSetting(_unknown(prefix, str(name), names))
         try:
-            values[name] = _decoded(hints[name], value)
-        except TypeError:
-            raise UsageError(f"{prefix}{name}: expected {_type_text(hints[name])}, found {_shown(value)}") from None
-        _check_range(prefix + name, values[name], fields[name].metadata)
+            values[name] = msgspec.convert(value, hints[name], strict=True)
+        except msgspec.ValidationError:
+            raise UsageError(f"{prefix}{name}: found {_shown(value)}, expected {type_in_words(hints[name])}.{_near(hints[name], value)}") from None
+        if not all(math.isfinite(number) for number in _numbers(values[name])):
+            raise UsageError(f"{prefix}{name}: found {_shown(value)}, expected a finite number.")
     return cls(**values)
 
 
@@ -167,84 +169,53 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
-def _decoded(hint: Any, value: Any) -> Any:
-    """The value as the hint has it; TypeError where it does not fit."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        return _decoded_union(arguments, value)
-    if origin is typing.Literal:
-        for choice in arguments:
-            if type(choice) is type(value) and choice == value:
-                return choice
-        raise TypeError
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise TypeError
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_decoded(arguments[0], item) for item in value)
-        if len(arguments) != len(value):
-            raise TypeError
-        return tuple(_decoded(item_hint, item) for item_hint, item in zip(arguments, value, strict=True))
-    if hint is None or hint is type(None):
-        if value is not None:
-            raise TypeError
-        return None
-    if hint is float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise TypeError
-        return float(value)
-    if hint in (int, bool, str):
-        if type(value) is not hint:
-            raise TypeError
-        return value
-    raise NotImplementedError(f"settings cannot hold {hint!r}")
-
-
-def _decoded_union(arms: tuple[Any, ...], value: Any) -> Any:
-    for arm in sorted(arms, key=lambda option: type(value) is not option):  # the exact type first: 1 stays an int where both fit
-        try:
-            return _decoded(arm, value)
-        except TypeError:
-            continue
-    raise TypeError
-
-
-def _check_range(name: str, value: Any, metadata: Mapping[str, Any]) -> None:
-    choices = metadata.get("choices")
-    if choices is not None and value not in choices:
-        near = difflib.get_close_matches(str(value), [str(choice) for choice in choices], n=1)
-        hint = f" Did you mean {near[0]}?" if near else ""
-        raise UsageError(f"{name}: found {_shown(value)}, expected one of {', '.join(map(str, choices))}.{hint}")
-    least, most, besides = metadata.get("minimum"), metadata.get("maximum"), metadata.get("besides", ())
-    otherwise = "".join(f", or {number}" for number in besides)
-    for number in _numbers(value):
-        if number in besides:
-            continue
-        if least is not None and number < least:
-            raise UsageError(f"{name}: found {_shown(value)}, expected at least {least}{otherwise}")
-        if most is not None and number > most:
-            raise UsageError(f"{name}: found {_shown(value)}, expected at most {most}{otherwise}")
-
-
 def _numbers(value: Any) -> list[float]:
     if isinstance(value, tuple):
         return [number for item in value for number in _numbers(item)]
-    return [value] if isinstance(value, int | float) and not isinstance(value, bool) else []
+    return [value] if isinstance(value, int | float) else []
 
 
-def _type_text(hint: Any) -> str:
-    """The hint in words: "a whole number or none"."""
+def type_in_words(hint: Any) -> str:
+    """What a value of this type may be: `a whole number, at least 8, or auto`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return type_in_words(arguments[0]) + _limits_in_words(hint)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_type_text(arm) for arm in arguments)
+        arms = [type_in_words(arm) for arm in arguments]
+        return (", or " if any("," in arm for arm in arms) else " or ").join(arms)
     if origin is typing.Literal:
-        return "one of " + ", ".join(map(repr, arguments))
+        return ("one of " if len(arguments) > 1 else "") + ", ".join(map(str, arguments))
     if origin is tuple:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return f"a list, each {_type_text(arguments[0])}"
-        return f"a list of {len(arguments)} ({', '.join(_type_text(item) for item in arguments)})"
-    words = {int: "a whole number", float: "a finite number", bool: "true or false", str: "text", type(None): "none", None: "none"}
+            return f"a list, each {type_in_words(arguments[0])}"
+        items = [type_in_words(item) for item in arguments]
+        return f"a list of {len(items)}, " + (f"each {items[0]}" if len(set(items)) == 1 else " and ".join(items))
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "none", None: "none"}
     return words.get(hint, str(hint))
+
+
+def limits_of(hint: Any) -> tuple[float | None, float | None]:
+    """Lowest and highest number that an annotation admits, exclusive ones included; None where it sets none."""
+    low: float | None = None
+    high: float | None = None
+    for limit in typing.get_args(hint)[1:] if typing.get_origin(hint) is typing.Annotated else ():
+        low = next((bound for bound in (limit.ge, limit.gt) if bound is not None), low)
+        high = next((bound for bound in (limit.le, limit.lt) if bound is not None), high)
+    return low, high
+
+
+def _limits_in_words(hint: Any) -> str:
+    words = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+    found = [(word, getattr(limit, name)) for limit in typing.get_args(hint)[1:] for name, word in words.items()]
+    return "".join(f", {word} {bound:g}" if isinstance(bound, float) else f", {word} {bound}" for word, bound in found if bound is not None)
+
+
+def _near(hint: Any, value: Any) -> str:
+    """` Did you mean x?` where the text is close to a word that the type admits."""
+    arms = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+    words = [str(choice) for arm in arms if typing.get_origin(arm) is typing.Literal for choice in typing.get_args(arm)]
+    near = difflib.get_close_matches(value, words, n=1) if isinstance(value, str) else []
+    return f" Did you mean {near[0]}?" if near else ""
 
 
 def _shown(value: Any) -> str:

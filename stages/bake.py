@@ -11,15 +11,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 
+from efficientnerf.settings import Auto, Count, Fraction, NonNegative, PositiveInt, given, setting
 from pipeline.files import atomic
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
-from stages.settings import setting
 
 if TYPE_CHECKING:
     from efficientnerf.asset.bake import Visible
@@ -34,61 +35,56 @@ if TYPE_CHECKING:
 class BakeSettings:
     """How finely the field is baked."""
 
-    resolution: int = setting(
-        0, "voxels along the longest side of the box; 0: train.discretise, or else chosen: what max_mib has room for, but none smaller than pixels show",
-        minimum=0, maximum=4096,
-    )  # fmt: skip
-    lookup: str = setting(
-        "trilinear", "what a point gets; trilinear: interpolated from the voxels around it; nearest: what its own voxel holds, drawn more slowly on CPUs",
-        choices=("trilinear", "nearest"),
-    )  # fmt: skip
-    max_resolution: int | None = setting(
-        None, "the most voxels along the longest side that are chosen by themselves; none: 1024 for cut-out objects, 384 where surroundings are learned"
-        " (1024 in normalised device coordinates)",
-        minimum=32, maximum=4096,
-    )  # fmt: skip
-    ndc_voxel_depth: float | None = setting(
-        None, "in normalised device coordinates, how many times as deep as wide a voxel is; none: 2, or 1 where train.discretise has voxels of its own",
-        minimum=1.0, maximum=8.0,
-    )  # fmt: skip
-    brick_size: int = setting(4, "D_f: voxels along a side of a coarse cell", minimum=1, maximum=16)
-    visibility_rays: int = setting(1_000_000, "training pixels that the network is drawn for, to see which voxels matter", minimum=1000)
-    weight_threshold: float = setting(1e-3, "a voxel is kept if it ever contributes more than this to a pixel", minimum=0.0, maximum=1.0)
-    max_mib: int | None = setting(
-        None, "how large the asset may get; its resolution follows, and the time about in proportion; where that is set, the lightest voxels are left out;"
-        " none: 24, and in normalised device coordinates 36 bytes for each pixel that the cameras show, but 24 at least and 56 at most",
-        minimum=1, unit="MiB",
-    )  # fmt: skip
-    layout: str = setting(
-        "compact",
-        "how the voxels lie in the asset: compact (codes of 8 bits), small (a coarser palette, half the bytes) or sparse (16-bit floats)",
-        choices=("compact", "small", "sparse"),
+    resolution: Annotated[int, Meta(ge=1, le=4096)] | Auto = setting(
+        "auto", "Voxels along the longest side of the box; auto: train.discretise, or as many as max_mib holds and the images resolve."
     )
-    dilate: int = setting(1, "voxels by which the kept ones are grown", minimum=0, maximum=8)
-    min_component: float = setting(
-        0.02, "where surroundings are learned: pieces apart with less than this share of the largest one's voxels are left out if the box cuts them off,"
-        " and anywhere with less than a hundredth of it",
-        minimum=0.0, maximum=1.0,
-    )  # fmt: skip
-    samples_per_voxel: int = setting(
-        8, "jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels", minimum=1, maximum=256
+    lookup: Literal["trilinear", "nearest"] = setting(
+        "trilinear", "Value of a point in the asset: interpolated from the voxels around it (trilinear), or that of its own voxel (nearest).", advanced=True
     )
-    seed: int = setting(0, "seed of the jitter, and of the pixels of the optimisation", minimum=0)
-    refine_steps: int | None = setting(
-        None, "steps in which the baked values are fitted to the training images; 0: they stay as the network says; none: so many that five rays come to a"
-        " voxel, 320 at least, and for photographs, whose noise would be learned too, 160",
-        minimum=0,
-    )  # fmt: skip
-    refine_rays_per_batch: int = setting(32768, "training pixels of a step of the optimisation", minimum=1, maximum=1 << 22)
-    density_lr: float = setting(0.3, "optimisation: rate of RMSprop for the logarithm of a voxel's optical thickness", minimum=0.0)
-    sh_lr: float = setting(0.03, "optimisation: rate of RMSprop for the harmonics", minimum=0.0)
-    view_dependent_lr_ratio: float | None = setting(
-        None, "optimisation: share of colour_rate for what depends on the direction; none: 1 for cut-out objects, and 0.2 where surroundings are learned,"
-        " for noise of photographs and small errors of their cameras would go there",
-        minimum=0.0, maximum=1.0,
-    )  # fmt: skip
-    lr_final_ratio: float = setting(0.3, "optimisation: what is left of the rates at the last step; they fall exponentially", minimum=0.0, maximum=1.0)
-    licence: str = setting("", "licence text to write into the asset")
+    max_resolution: Annotated[int, Meta(ge=32, le=4096)] | Auto = setting(
+        "auto", "Most voxels along the longest side where resolution is auto; auto: 384 in contracted scenes, else 1024.", advanced=True
+    )
+    ndc_voxel_depth: Annotated[float, Meta(ge=1.0, le=8.0)] | Auto = setting(
+        "auto", "Depth of a voxel over its width, in normalised device coordinates; auto: 2, or 1 with train.discretise.", advanced=True
+    )
+    brick_size: Annotated[int, Meta(ge=1, le=16)] = setting(4, "Voxels D_f along a side of a coarse cell of the NerfTree.", advanced=True)
+    visibility_rays: Annotated[int, Meta(ge=1000)] = setting(
+        1_000_000, "Training pixels that the field is rendered for, to find the visible voxels.", advanced=True
+    )
+    weight_threshold: Fraction = setting(1e-3, "A voxel is kept where its weight in some pixel exceeds this.", advanced=True)
+    max_mib: PositiveInt | Auto = setting(
+        "auto",
+        "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 24, or 36 bytes for each pixel"
+        " of a forward-facing capture, from 24 to 56.",
+        unit="MiB",
+    )
+    layout: Literal["compact", "small", "sparse"] = setting(
+        "compact", "How voxels are stored: codes of 8 bits (compact), a coarser palette of half the bytes (small), or 16-bit floats (sparse)."
+    )
+    dilate: Annotated[int, Meta(ge=0, le=8)] = setting(1, "Voxels by which the visible ones are dilated.", advanced=True)
+    min_component: Fraction = setting(
+        0.02,
+        "Size below which connected components that the box cuts off are dropped in unbounded scenes, as a fraction of the largest one's voxels; a hundredth"
+        " of this applies to all components.",
+        advanced=True,
+    )
+    samples_per_voxel: Annotated[int, Meta(ge=1, le=256)] = setting(
+        8, "Jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels.", advanced=True
+    )
+    seed: Count = setting(0, "Seed of the jitter and of the rays of the refinement.", advanced=True)
+    refine_steps: Count | Auto = setting(
+        "auto",
+        "Steps in which the baked values are refined on the training images; auto: five rays for each voxel, at least 320 steps, or 160 in unbounded scenes.",
+        advanced=True,
+    )
+    refine_rays_per_batch: Annotated[int, Meta(ge=1, le=1 << 22)] = setting(32768, "Rays in a step of the refinement.", advanced=True)
+    density_lr: NonNegative = setting(0.3, "Learning rate of the refinement for the logarithm of a voxel's optical thickness.", advanced=True)
+    sh_lr: NonNegative = setting(0.03, "Learning rate of the refinement for the spherical harmonics.", advanced=True)
+    view_dependent_lr_ratio: Fraction | Auto = setting(
+        "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 1 for objects with alpha, 0.2 in unbounded scenes.", advanced=True
+    )
+    lr_final_ratio: Fraction = setting(0.3, "Ratio to which the learning rates of the refinement fall exponentially.", advanced=True)
+    licence: str = setting("", "Licence text to write into the asset.")
 
 
 @compiling_kernels
@@ -112,14 +108,14 @@ def run(job: Job) -> None:
 
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
-    space, mib = _voxel_space(job, m), budget_of(s, settings.max_mib)
+    space, mib = _voxel_space(job, m), budget_of(s, given(settings.max_mib))
     bounds = space.bounds
     low = np.asarray(bounds[0], np.float64)
     pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
     choice, seen, indices = _chosen(job, m, s, pixels, space, mib)
     resolution = choice.resolution
     indices = _seen_by_enough(m, s, indices, resolution)
-    if settings.lookup == "nearest" and m.settings.discretise not in (0, resolution):
+    if settings.lookup == "nearest" and m.settings.discretise not in ("off", resolution):
         job.warn(f"bake.resolution={resolution}, but the field was trained on train.discretise={m.settings.discretise}: on other voxels than are baked")
     if not len(indices):
         from pipeline.errors import StageFailed
@@ -210,16 +206,16 @@ def _voxel_space(job: Job, m: Any) -> Space:
     """The network's space, in a frame where voxels are cubes."""
     from efficientnerf.geometry.spaces import NdcSpace
 
-    given, discretise, space = job.settings.ndc_voxel_depth, m.settings.discretise, m.space
+    depth, discretise, space = given(job.settings.ndc_voxel_depth), given(m.settings.discretise), m.space
     if not isinstance(space, NdcSpace):
-        if given is not None:
+        if depth is not None:
             job.warn("bake.ndc_voxel_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes")
         return m.space
-    if given is None:
-        given = 1.0 if discretise else space.voxel_depth
-    elif discretise and given != 1:
-        job.warn(f"bake.ndc_voxel_depth={given:g}, but the field was trained on train.discretise={discretise}: on other voxels than are baked")
-    return space if given == 1 else space.with_voxel_depth(given)
+    if depth is None:
+        depth = 1.0 if discretise else space.voxel_depth
+    elif discretise and depth != 1:
+        job.warn(f"bake.ndc_voxel_depth={depth:g}, but the field was trained on train.discretise={discretise}: on other voxels than are baked")
+    return space if depth == 1 else space.with_voxel_depth(depth)
 
 
 SPARE = 2  # so many times the voxels that there is room for are baked at most: the tree itself then shows which of them matter
@@ -240,13 +236,15 @@ def _chosen(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) 
         shape, _ = bake.grid_of(bounds, resolution, brick)
         return serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, brick)
 
-    if settings.resolution or m.settings.discretise:
-        choice = Choice(settings.resolution, "bake.resolution") if settings.resolution else Choice(m.settings.discretise, "train.discretise")
+    stated: int | None = given(settings.resolution)
+    discretise: int | None = given(m.settings.discretise)
+    if (fixed := stated or discretise) is not None:
+        choice = Choice(fixed, "bake.resolution" if stated else "train.discretise")
         shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
         seen = _seen(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         return choice, seen, _kept(job, seen, shape, SPARE * room(choice.resolution))
 
-    finest = finest_resolution(s, settings.max_resolution)
+    finest = finest_resolution(s, given(settings.max_resolution))
     top_shape, top_voxel = bake.grid_of(bounds, finest.resolution, brick)
     seen = _seen(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64), space)
     last: tuple[int, Visible, np.ndarray] | None = None
@@ -316,7 +314,7 @@ def _seen_by_enough(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> n
     from stages.framing.view_coverage import has_min_views
     from stages.io import scene
 
-    if not m.space.contracted or m.settings.min_views == 0:
+    if not m.space.contracted or m.settings.min_views == "off":
         return indices
     cameras = [view.camera for view in scene.views_of(s, "train")]
     low, high = np.asarray(m.space.bounds, np.float64)

@@ -17,18 +17,19 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from efficientnerf.geometry.cameras import MODELS, Camera
+from efficientnerf.settings import Auto, PositiveInt, given, setting
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.io.scene import Scene, View
 from stages.lpips_weights import load_lpips
-from stages.settings import setting
 
 if TYPE_CHECKING:
     from efficientnerf.evaluation.lpips import Lpips
@@ -47,15 +48,17 @@ NETWORKS = ("alex", "vgg")  # of LPIPS
 class EvaluateSettings:
     """How much is measured."""
 
-    field_views: int = setting(4, "How many held-back views the network is drawn for, spread evenly; 0: all of them.", minimum=0)
-    field_image_scale: float | None = setting(
-        None, f"One over the thinning of the pixels the network draws; none: at most {NETWORK_SIDE} along the longest side.", minimum=0.01, maximum=1
+    field_views: PositiveInt | Literal["all"] = setting(4, "Number of test views that the field is rendered for, spread evenly.", advanced=True)
+    field_image_scale: Annotated[float, Meta(ge=0.01, le=1.0)] | Auto = setting(
+        "auto", f"Scale of the pixel grid on which the field is rendered; auto: at most {NETWORK_SIDE} along the longest side.", advanced=True
     )
-    field_background_rays: int = setting(
-        500_000, "On photographs, pixels in all that the network draws as background for the asset on other views (then enlarged).", minimum=1
+    field_background_rays: PositiveInt = setting(
+        500_000, "Total number of rays through the field for the background of the asset's other views, in unbounded scenes.", advanced=True
     )
-    lpips: str = setting("none", "Whether LPIPS is measured too, by which networks; their weights are files of their own.", choices=("none", *NETWORKS, "both"))
-    lpips_weights: str = setting("", "Folder with the weights of LPIPS; besides it, torch's cache and the package torchmetrics are looked at.")
+    lpips: Literal["off", "alex", "vgg", "both"] = setting("off", "Network of LPIPS, where that is measured too; its weights are files of their own.")
+    lpips_weights: str = setting(
+        "auto", "Folder with the weights of LPIPS; auto: torch's cache and the package torchmetrics, which are searched in any case.", advanced=True
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +102,13 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
     views, split = held_back(scene)
     if split == "train":
         job.warn("no view was held back from training: the figures below are of views that training saw")
-    drawn = set(spread(len(views), settings.field_views))
+    drawn = set(spread(len(views), None if settings.field_views == "all" else settings.field_views))
     longest = max(max(view.camera.width, view.camera.height) for view in views)
-    stride = max(1, math.ceil(longest / NETWORK_SIDE if settings.field_image_scale is None else 1.0 / settings.field_image_scale - 1e-6))
+    scale = given(settings.field_image_scale)
+    stride = max(1, math.ceil(longest / NETWORK_SIDE if scale is None else 1.0 / scale - 1e-6))
     rest = background_stride([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
-    wanted = {"none": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
-    perceptual = {f"lpips_{network}": load_lpips(network, settings.lpips_weights) for network in wanted}
+    wanted = {"off": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
+    perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in wanted}
     field: Any = None
     figures = []
     for k, view in enumerate(views):
@@ -137,9 +141,9 @@ def held_back(scene: Scene) -> tuple[tuple[View, ...], str]:
     raise ValueError("the scene holds no views")
 
 
-def spread(count: int, wanted: int) -> list[int]:
-    """Indices of `wanted` of `count` things, evenly spread; 0: all."""
-    if wanted == 0 or wanted >= count:
+def spread(count: int, wanted: int | None) -> list[int]:
+    """Indices of `wanted` of `count` things, evenly spread; None: all."""
+    if wanted is None or wanted >= count:
         return list(range(count))
     return [int((k + 0.5) * count / wanted) for k in range(wanted)]
 

@@ -16,7 +16,7 @@ BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 SITE = "https://download.pytorch.org/models/"
 
 
-def load_lpips(network: str, folder: str) -> Lpips:
+def load_lpips(network: str, folder: str | None) -> Lpips:
     """The metric by "alex" or "vgg"; UsageError says what is missing and where to get it."""
     from efficientnerf.evaluation.lpips import Lpips
 
@@ -41,7 +41,7 @@ def _found(name: str, places: list[Path], remedy: str) -> Path:
         if (place / name).is_file():
             return place / name
     looked = ", ".join(str(place) for place in places) or "nowhere"
-    raise UsageError(f"evaluate.lpips: the weights {name} were not found (looked in {looked}). {remedy} Or leave it out: evaluate.lpips=none.")
+    raise UsageError(f"evaluate.lpips: the weights {name} were not found (looked in {looked}). {remedy} Or leave it out: evaluate.lpips=off.")
 
 
 def _state(path: Path) -> dict[str, Any]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
+from efficientnerf.settings import Auto, Fraction, given, setting
 from pipeline.errors import StageFailed
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
-from stages.settings import setting
 
 if TYPE_CHECKING:
     from efficientnerf.surface.mesh import Mesh
@@ -22,10 +23,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MeshSettings:
-    max_faces: int = setting(200_000, "most faces of the mesh; it is decimated to this many", minimum=100)
-    density_threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
-    min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area are removed", minimum=0.0, maximum=1.0)
-    smoothing_iterations: int = setting(10, "rounds of smoothing (Taubin's, which keeps the volume); 0: none", minimum=0, maximum=200)
+    """How the surface is meshed."""
+
+    max_faces: Annotated[int, Meta(ge=100)] = setting(200_000, "Most faces of the mesh, which is decimated to this many.")
+    density_threshold: float | Auto = setting("auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.")
+    min_component: Fraction = setting(0.01, "Area below which connected components are dropped, as a fraction of the largest one's.", advanced=True)
+    smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(10, "Iterations of Taubin smoothing, which keeps the volume.", advanced=True)
 
 
 def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:
@@ -35,7 +38,7 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
     try:
         return surface(
             tree,
-            settings.density_threshold,
+            given(settings.density_threshold),
             faces=settings.max_faces,
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
@@ -43,7 +46,7 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"mesh: {error}. {remedy('mesh', settings.density_threshold)}") from error
+        raise StageFailed(f"mesh: {error}. {remedy('mesh', given(settings.density_threshold))}") from error
 
 
 def orbit_places(metadata: Mapping[str, Any]) -> np.ndarray:
@@ -60,7 +63,7 @@ def remedy(stage: str, threshold: float | None) -> str:
     """What to do where no surface was found."""
     if threshold is None:
         return f"The asset is nearly empty: train longer, or set {stage}.density_threshold by hand."
-    return f"Lower {stage}.density_threshold (found {threshold:g}), or leave it out to have it chosen."
+    return f"Lower {stage}.density_threshold (found {threshold:g}), or set it to auto."
 
 
 def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+from msgspec import Meta
+
+from efficientnerf.settings import Auto, Count, Fraction, PositiveInt, given, setting
 from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.mesh import orbit_places, remedy
-from stages.settings import setting
 
 if TYPE_CHECKING:
     from efficientnerf.surface.mesh import PointCloud
@@ -20,11 +22,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PointsSettings:
-    num_points: int = setting(200_000, "points", minimum=1)
-    density_threshold: float | None = setting(None, "density at which the surface is drawn, per unit of the training frame; none: chosen from the densities")
-    min_component: float = setting(0.01, "pieces with less than this share of the largest piece's area get no points", minimum=0.0, maximum=1.0)
-    smoothing_iterations: int = setting(10, "rounds of smoothing of the surface that the points lie on; 0: none", minimum=0, maximum=200)
-    seed: int = setting(0, "where on the surface the points fall", minimum=0)
+    """How points are spread over the surface."""
+
+    num_points: PositiveInt = setting(200_000, "Number of points.")
+    density_threshold: float | Auto = setting(
+        "auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.", advanced=True
+    )
+    min_component: Fraction = setting(0.01, "Area below which connected components get no points, as a fraction of the largest one's.", advanced=True)
+    smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(10, "Iterations of Taubin smoothing of the surface.", advanced=True)
+    seed: Count = setting(0, "Seed of the places of the points on the surface.", advanced=True)
 
 
 def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None]) -> PointCloud:
@@ -36,7 +42,7 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
         cloud = points(
             tree,
             settings.num_points,
-            settings.density_threshold,
+            given(settings.density_threshold),
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             seed=settings.seed,
@@ -44,7 +50,7 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"points: {error}. {remedy('points', settings.density_threshold)}") from error
+        raise StageFailed(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
     back = frame.world_from_capture.inverse()
     return PointCloud(back.points(cloud.positions), cloud.normals @ back.rotation.T, cloud.colours)
 

@@ -11,19 +11,25 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from msgspec import Meta
 
 from efficientnerf.geometry.cameras import resized
+from efficientnerf.settings import Auto, PositiveInt, given, setting
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
-from stages.framing.forward_facing import SPACES
 from stages.io import importers
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers.source import FEWEST, Source, listed
 from stages.io.scene import SPLITS, Scene, View, save, save_points
-from stages.settings import setting
+
+if TYPE_CHECKING:
+    Format = str
+else:
+    Format = Literal[importers.FORMATS]  # the table of importers says which
 
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
 
@@ -32,36 +38,39 @@ WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every p
 class PosesSettings:
     """How a source is read and framed."""
 
-    format: str = setting("auto", "Format of the source; auto looks at what is there.", choices=importers.FORMATS)
-    max_image_size: int = setting(1024, "Longest side of the images that later stages read; larger ones are reduced.", minimum=32, maximum=16384, unit="pixels")
-    up: str = setting("auto", "Axis of the capture's frame that points up; auto estimates it.", choices=("auto", "x", "y", "z", "-x", "-y", "-z"))
-    crop_box: tuple[float, float, float, float, float, float] | None = setting(
-        None, "Crop box in the capture's frame: x y z of one corner, then of the opposite one; none estimates it."
+    format: Format = setting("auto", "Format of the source; auto: found out from its files.")
+    max_image_size: Annotated[int, Meta(ge=32, le=16384)] = setting(
+        1024, "Longest side of the images that later stages read; larger ones are reduced.", unit="pixels"
     )
-    box_margin: float = setting(0.05, "Room left on each side of an estimated box, as a fraction of its longest side.", minimum=0.0, maximum=2.0)
-    space: str = setting(
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = setting("auto", "Axis of the capture's frame that points up; auto: estimated.")
+    crop_box: tuple[float, float, float, float, float, float] | Auto = setting(
+        "auto", "Crop box in the capture's frame: x y z of one corner, then of the opposite one; auto: estimated."
+    )
+    box_margin: Annotated[float, Meta(ge=0.0, le=2.0)] = setting(
+        0.05, "Margin on each side of an estimated crop box, as a fraction of its longest side.", advanced=True
+    )
+    space: Literal["auto", "box", "contracted", "ndc"] = setting(
         "auto",
-        "Where the field lives: box (what lies beyond is a backdrop without depth), contracted (the box and all beyond), ndc (normalised device coordinates, "
-        "for captures that all look the same way); auto takes ndc for LLFF folders that do, contracted for other photographs, and the box for cut-out objects.",
-        choices=SPACES,
+        "Space of the field: the box alone, with a background without depth beyond it (box); all of an unbounded scene (contracted); or normalised device"
+        " coordinates, for forward-facing captures (ndc); auto: ndc for forward-facing LLFF folders, box for objects with alpha, else contracted.",
     )
-    alpha: str = setting(
-        "auto",
-        "What alpha means: composite (an object on a constant background, white) or mask (transparent pixels are left out).",
-        choices=("auto", "composite", "mask"),
+    alpha: Literal["auto", "composite", "mask"] = setting(
+        "auto", "What alpha means: an object to be composited on white (composite), or pixels to be left out where it is 0 (mask); auto: by the format."
     )
-    test_every: int = setting(8, "Every n-th image in sorted order is held back for testing where the source states no split.", minimum=2)
-    llff_factor: int | None = setting(None, "Reduction of the LLFF images to use (images_N); none takes the largest there are.", minimum=1)
-    strict: bool = setting(False, "Refuse a source of which images are missing, cannot be read or find no place, instead of warning.")
-    allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.")
-    matching: str = setting(
-        "auto",
-        "Which photographs are compared: all pairs, or each with those that follow; auto goes by their number.",
-        choices=("auto", "exhaustive", "sequential"),
+    test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
+    llff_factor: PositiveInt | Auto = setting(
+        "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
     )
-    max_features: int = setting(4096, "Most features found in a photograph.", minimum=256, maximum=65536)
-    feature_image_size: int = setting(1600, "Longest side of the photographs at which features are found.", minimum=320, maximum=8192, unit="pixels")
-    seed: int = setting(0, "Seed of every random choice in finding cameras.", minimum=0, maximum=2**31 - 1)
+    strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
+    allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
+    matching: Literal["auto", "exhaustive", "sequential"] = setting(
+        "auto", "Which photographs are matched: all pairs (exhaustive), or each with those that follow (sequential); auto: by their number."
+    )
+    max_features: Annotated[int, Meta(ge=256, le=65536)] = setting(4096, "Most features detected in a photograph.", advanced=True)
+    feature_image_size: Annotated[int, Meta(ge=320, le=8192)] = setting(
+        1600, "Longest side of the photographs in which features are detected.", unit="pixels", advanced=True
+    )
+    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = setting(0, "Seed of every random choice in finding cameras.", advanced=True)
 
 
 def run(job: Job) -> None:
@@ -83,7 +92,7 @@ def run(job: Job) -> None:
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].renders)
     capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
-    framed = framing.frame(capture, up=settings.up, box=settings.crop_box, margin=settings.box_margin, space=settings.space)
+    framed = framing.frame(capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space)
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = tuple(

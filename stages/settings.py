@@ -9,87 +9,70 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Sequence
 from typing import Any
 
+from efficientnerf.settings import setting
+from pipeline.stage import limits_of, type_in_words
 
-def setting(
-    default: Any,
-    doc: str,
-    *,
-    choices: Sequence[Any] | None = None,
-    minimum: float | None = None,
-    maximum: float | None = None,
-    besides: Sequence[float] | None = None,
-    unit: str | None = None,
-) -> Any:
-    """A field of a settings dataclass.
-
-    default            an immutable value: number, text, true or false, None or a tuple of these
-    doc                one sentence: what the setting does
-    choices            the values it may take
-    minimum, maximum   inclusive limits of a number; of a tuple, of each of its numbers
-    besides            numbers outside of these limits that it may be all the same: 0 where that means "choose"
-    unit               of the number, as printed in the documentation
-    """
-    about = {"doc": doc, "choices": None if choices is None else tuple(choices), "minimum": minimum, "maximum": maximum}
-    about |= {"besides": None if besides is None else tuple(besides), "unit": unit}
-    return dataclasses.field(default=default, metadata={name: value for name, value in about.items() if value is not None})
+__all__ = ["SettingInfo", "describe_settings", "setting"]
 
 
 @dataclasses.dataclass(frozen=True)
 class SettingInfo:
-    """What a settings field says about itself."""
+    """What a settings field says about itself.
+
+    type      its annotation, evaluated
+    choices   the values it may take, where they can be listed; else the words it may be besides, such as auto
+    minimum   of its numbers, exclusive ones included; maximum likewise
+    advanced  whether it is listed apart from the settings that most users want
+    """
 
     name: str
     type: Any
     default: Any
     doc: str
-    choices: tuple[Any, ...] | None
-    minimum: float | None
-    maximum: float | None
-    besides: tuple[float, ...]
     unit: str | None
+    advanced: bool
 
     @property
     def type_name(self) -> str:
-        return name_of_type(self.type)
+        """What it may be, in words: `a whole number, at least 8, or auto`."""
+        return type_in_words(self.type)
+
+    @property
+    def choices(self) -> tuple[Any, ...] | None:
+        return tuple(choice for arm in _arms(self.type) if typing.get_origin(arm) is typing.Literal for choice in typing.get_args(arm)) or None
+
+    @property
+    def listed(self) -> bool:
+        """Whether it is one of its choices and nothing else."""
+        return all(typing.get_origin(arm) is typing.Literal for arm in _arms(self.type))
+
+    @property
+    def minimum(self) -> float | None:
+        return next((low for arm in _arms(self.type) if (low := limits_of(arm)[0]) is not None), None)
+
+    @property
+    def maximum(self) -> float | None:
+        return next((high for arm in _arms(self.type) if (high := limits_of(arm)[1]) is not None), None)
 
 
 def describe_settings(settings_type: type) -> list[SettingInfo]:
     """The fields of a settings dataclass in the order in which they are written."""
-    hints = typing.get_type_hints(settings_type)
-    described = []
-    for entry in dataclasses.fields(settings_type):
-        about = entry.metadata
-        described.append(
-            SettingInfo(
-                name=entry.name,
-                type=hints[entry.name],
-                default=entry.default,
-                doc=about.get("doc", ""),
-                choices=about.get("choices"),
-                minimum=about.get("minimum"),
-                maximum=about.get("maximum"),
-                besides=about.get("besides", ()),
-                unit=about.get("unit"),
-            )
+    hints = typing.get_type_hints(settings_type, include_extras=True)
+    return [
+        SettingInfo(
+            name=entry.name,
+            type=hints[entry.name],
+            default=entry.default,
+            doc=entry.metadata.get("doc", ""),
+            unit=entry.metadata.get("unit"),
+            advanced=entry.metadata.get("advanced", False),
         )
-    return described
+        for entry in dataclasses.fields(settings_type)
+    ]
 
 
-def name_of_type(annotation: Any) -> str:
-    """A type as it is shown to users: `whole number`, `number or none`, `3 x number`."""
-    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(name_of_type(argument) for argument in arguments)
-    if origin is typing.Literal:
-        return ", ".join(str(argument) for argument in arguments)
-    if origin is tuple:
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return f"list of {name_of_type(arguments[0])}"
-        if len(set(arguments)) == 1:
-            return f"{len(arguments)} x {name_of_type(arguments[0])}"
-        return "(" + ", ".join(name_of_type(argument) for argument in arguments) + ")"
-    names = {str: "text", bool: "true or false", int: "whole number", float: "number", type(None): "none"}
-    return names.get(annotation, str(annotation))
+def _arms(annotation: Any) -> tuple[Any, ...]:
+    """The alternatives of a union, or the type itself."""
+    return typing.get_args(annotation) if typing.get_origin(annotation) in (typing.Union, types.UnionType) else (annotation,)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job, Stage
 from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
@@ -62,7 +63,7 @@ def run(job: Job) -> None:
     t = loop.trainer(m, len(views))
     log = job.work / TrainOutputs.log
     spent = _resume(t, job, log)
-    budget = Budget(settings, job.work, spent, clock) if settings.time_budget else None
+    budget = Budget(settings, job.work, spent, clock) if settings.time_budget != "off" else None
     if budget is not None:
         m.settings = budget.planned()
 
@@ -129,7 +130,7 @@ def _close(m: Model, views: tuple[View, ...], job: Job) -> None:
     from efficientnerf.sampling.occupancy import mask_cells
     from stages.framing.view_coverage import cells_below_min_views
 
-    if not m.space.contracted or m.settings.min_views == 0:
+    if not m.space.contracted or m.settings.min_views == "off":
         return
     job.progress(0, m.settings.iterations, "looking for what few photographs show")
     mask_cells(m.voxels, torch.from_numpy(cells_below_min_views(m.space, [view.camera for view in views], m.settings.min_views, m.voxels.side)))
@@ -149,7 +150,7 @@ def _settle_steps(job: Job, m: Model, budget: Budget, step: int) -> None:
     known = m.settings.iterations
     if (settled := budget.after(step)) is not None:
         m.settings = settled
-        job.say(f"{settled.iterations} steps fit into the budget of {job.settings.time_budget:g} s" + ("" if known == MOST else f" (so far: {known})"))
+        job.say(f"{settled.iterations} steps fit into the budget of {job.settings.time_budget} s" + ("" if known == MOST else f" (so far: {known})"))
 
 
 def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> None:
@@ -173,12 +174,12 @@ def _report(job: Job, t: Trainer, seconds: float, held_back: float | None) -> No
 def _again(reached: TrainSettings) -> str:
     """Options that give the same field again."""
     aims = f" --set train.rate_aims={json.dumps(reached.rate_aims, separators=(',', ':'))}" if reached.rate_aims else ""
-    return f"--set train.time_budget=0 --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}{aims}"
+    return f"--set train.time_budget=off --set train.iterations={reached.iterations} --set train.rate_hold={reached.rate_hold}{aims}"
 
 
 def _range(s: Scene, pixels: Pixels, settings: TrainSettings) -> tuple[float, float]:
     """Nearest and farthest of all views along their axes; where the settings state them, of the pixels too."""
-    if settings.far_plane > 0:
+    if settings.far_plane != "auto":
         near, far = stated_range(s, settings)
         pixels.near[:], pixels.far[:] = near, far
         return near, far
@@ -190,10 +191,11 @@ def stated_range(s: Scene, settings: TrainSettings) -> tuple[float, float]:
     from pipeline.errors import UsageError
 
     if s.background is None:
-        raise UsageError("train.near_plane and train.far_plane are for scenes on a constant background; this one has surroundings. Leave them 0.")
-    if settings.near_plane >= settings.far_plane:
-        raise UsageError(f"train.near_plane={settings.near_plane:g}, train.far_plane={settings.far_plane:g}: rays must end beyond where they begin.")
-    return settings.near_plane * float(s.world_from_capture.scale), settings.far_plane * float(s.world_from_capture.scale)
+        raise UsageError("train.near_plane and train.far_plane are for scenes on a constant background; this one has surroundings. Leave them auto.")
+    near, far = given(settings.near_plane), given(settings.far_plane)
+    if near is None or far is None or near >= far:
+        raise UsageError(f"train.near_plane={settings.near_plane}, train.far_plane={settings.far_plane}: expected two numbers, the second one greater.")
+    return near * float(s.world_from_capture.scale), far * float(s.world_from_capture.scale)
 
 
 def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
@@ -338,7 +340,7 @@ PREVIEW_SIDE = 200
 
 def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int, settings: TrainSettings) -> float | None:
     """Draw the watched view small, keep the picture, return its PSNR."""
-    if view is None or settings.preview_every == 0 or step == 0 or step % settings.preview_every:
+    if view is None or settings.preview_every == "off" or step == 0 or step % settings.preview_every:
         return None
     from efficientnerf.evaluation.metrics import psnr
     from stages.evaluate import thinned, thinned_camera, truth_of

@@ -4,29 +4,45 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from msgspec import Meta
+
+from efficientnerf.settings import Auto, given, setting
 from pipeline.stage import Job, Stage
 from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
-from stages.settings import setting
+
+if TYPE_CHECKING:
+    from efficientnerf.geometry.cameras import Camera
 
 
 @dataclass(frozen=True)
 class TurntableSettings:
     """What the turntable shows and how it is written."""
 
-    frames: int = setting(60, "Number of pictures in the circle.", minimum=1, maximum=9999)
-    width: int = setting(640, "Width of the pictures.", minimum=16, maximum=8192, unit="pixels")
-    height: int = setting(480, "Height of the pictures.", minimum=16, maximum=8192, unit="pixels")
-    fps: int = setting(30, "Frames per second of the video.", minimum=1, maximum=240)
-    background: str = setting("white", "Colour behind the asset: white, black, transparent or #rrggbb. With transparent the video lies on white.")
-    elevation: float | None = setting(None, "Angle above the horizon; none: as the capture's cameras stood.", minimum=-90, maximum=90, unit="degrees")
-    radius: float | None = setting(None, "Distance from the centre in the capture's units; none: as the cameras stood, further if needed.", minimum=1e-9)
-    fov: float | None = setting(None, "Vertical field of view; none: so that the asset fits, its middle in the middle.", minimum=1, maximum=160, unit="degrees")
-    sway: float = setting(10.0, "How far the camera swings about the middle for captures taken from one side.", minimum=0, maximum=90, unit="degrees")
-    supersample: int = setting(1, "Rays along each side of a pixel.", minimum=1, maximum=8)
-    crf: int = setting(18, "Quality of the video: 0 is lossless, 51 the worst.", minimum=0, maximum=51)
-    exr: str = setting("first", "Which frames are written as EXR (linear colour, alpha, depth, normals) too.", choices=("none", "first", "all"))
+    frames: Annotated[int, Meta(ge=1, le=9999)] = setting(60, "Number of frames in the circle.")
+    width: Annotated[int, Meta(ge=16, le=8192)] = setting(640, "Width of the frames.", unit="pixels")
+    height: Annotated[int, Meta(ge=16, le=8192)] = setting(480, "Height of the frames.", unit="pixels")
+    fps: Annotated[int, Meta(ge=1, le=240)] = setting(30, "Frames per second of the video.", advanced=True)
+    background: str = setting("white", "Background colour: white, black, transparent or #rrggbb; the video of a transparent one lies on white.")
+    elevation: Annotated[float, Meta(ge=-90.0, le=90.0)] | Auto = setting(
+        "auto", "Angle of the camera above the horizon; auto: that of the capture's cameras.", unit="degrees", advanced=True
+    )
+    radius: Annotated[float, Meta(ge=1e-9)] | Auto = setting(
+        "auto", "Distance of the camera from the centre in the capture's units; auto: that of the capture's cameras, or more to fit the asset.", advanced=True
+    )
+    fov: Annotated[float, Meta(ge=1.0, le=160.0)] | Auto = setting(
+        "auto", "Vertical field of view; auto: the asset fits, centred.", unit="degrees", advanced=True
+    )
+    sway: Annotated[float, Meta(ge=0.0, le=90.0)] = setting(
+        10.0, "Amplitude of the camera's swing about the middle, for forward-facing captures.", unit="degrees", advanced=True
+    )
+    supersample: Annotated[int, Meta(ge=1, le=8)] = setting(1, "Rays along each side of a pixel.", advanced=True)
+    crf: Annotated[int, Meta(ge=0, le=51)] = setting(18, "Constant rate factor of the video: 0 is lossless, 51 the worst.", advanced=True)
+    exr: Literal["off", "first", "all"] = setting(
+        "first", "Frames that are written as EXR too, with linear colour, alpha, depth and normals: none (off), the first, or all."
+    )
 
 
 @compiling_kernels
@@ -37,12 +53,21 @@ def run(job: Job) -> None:
     draw_turntable(NerfTree.load(inputs.bake.asset).to(job.device), job)
 
 
+def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
+    """The cameras of the turntable's frames; `tree` has the interface of a NerfTree."""
+    from stages.framing.camera_paths import turntable_cameras
+
+    return turntable_cameras(
+        tree, frames=s.frames, width=s.width, height=s.height, elevation=given(s.elevation), radius=given(s.radius), fov=given(s.fov), sway=s.sway
+    )
+
+
 def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # anything with the interface of a NerfTree
     """Frames go to job.work one by one, so that a kill costs at most one of them; the video is made of the PNGs, so that it does not depend on where."""
-    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames, turntable_cameras
+    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames
 
     s: TurntableSettings = job.settings
-    cameras = turntable_cameras(tree, frames=s.frames, width=s.width, height=s.height, elevation=s.elevation, radius=s.radius, fov=s.fov, sway=s.sway)
+    cameras = cameras_of(tree, s)
     options = RenderOptions(background=s.background, supersample=s.supersample, exr=s.exr, fps=s.fps, crf=s.crf)
 
     def each(done: int, total: int) -> None:

@@ -168,11 +168,7 @@ class FieldRenderer:
         count = camera.width * camera.height
         parts, counts = [], SampleCounts()
         # Where nothing is pruned a ray has as many samples as there are.
-        block = (
-            FIELD_RAYS_PER_BLOCK
-            if m.prunes
-            else min(FIELD_RAYS_PER_BLOCK, max(64, 2**19 // (m.settings.num_coarse_samples + m.settings.num_importance_samples)))
-        )
+        block = FIELD_RAYS_PER_BLOCK if m.prunes else min(FIELD_RAYS_PER_BLOCK, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
         for begin in range(0, count, block):
             index = np.arange(begin, min(count, begin + block))
             pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)

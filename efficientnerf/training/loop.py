@@ -25,6 +25,7 @@ from efficientnerf.backends.transfer import to_device
 from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.rendering.compositing import activate, ray_of_sample
 from efficientnerf.sampling.occupancy import apply_decay, cell_of, refresh_cells, reset_cells, sweep_cells, update
+from efficientnerf.settings import given
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure import exposed, exposure_loss
 from efficientnerf.training.pixels import Pixels
@@ -203,7 +204,7 @@ def train(t: Trainer, pixels: Pixels, anchors: SparseDepthRays | None = None) ->
         # A bundle of rays of about as many samples as the settings ask for.
         count = (
             int(min(settings.max_rays_per_batch, max(FEWEST_RAYS, settings.sample_batch_size / t.samples_per_ray)))
-            if settings.sample_batch_size
+            if settings.sample_batch_size != "off"
             else settings.max_rays_per_batch
         )
         chosen = pixels.choose(count, rng, middle=number <= settings.precrop_steps)
@@ -246,7 +247,7 @@ def train(t: Trainer, pixels: Pixels, anchors: SparseDepthRays | None = None) ->
                 few = max(1, count // ANCHOR_SHARE)
                 loss = loss + strength * anchor_loss(m, anchors, few, rng, late, prune=number > settings.occupancy_warmup_steps, fine_samples=fine_samples)
         loss.backward()
-        ends = (settings.iterations, settings.lr_decay_steps, settings.rate_hold, settings.rate_aims)
+        ends = (settings.iterations, given(settings.lr_decay_steps) or 0, settings.rate_hold, settings.rate_aims)
         rate = learning_rate(number, settings.learning_rate, settings.lr_final_ratio, *ends)
         t.adam.step(number, rate)
 
@@ -291,7 +292,7 @@ def fine_samples_at(settings: TrainSettings, way: float) -> int:
     *chair* at 800x800 after 2500 steps: 29.52 dB with 2, 30.00 dB with 4, but 28.7 dB both after 900 steps, and at 200x200 30.8 and 30.2 dB after 700,
     30.8 with 2 and then 4.
     """
-    return settings.early_samples_per_pivot if settings.early_samples_per_pivot and way < 0.5 else settings.samples_per_pivot
+    return settings.early_samples_per_pivot if settings.early_samples_per_pivot != "off" and way < 0.5 else settings.samples_per_pivot
 
 
 def anchor_loss(

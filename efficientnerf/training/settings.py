@@ -1,148 +1,143 @@
-"""What can be set about training; imports nothing heavy, so that it can be listed in no time."""
+"""Settings of training; imports nothing heavy, so that they can be listed at once."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
+from msgspec import Meta
 
-def _setting(default: Any, doc: str, **limits: Any) -> Any:
-    return field(default=default, metadata={"doc": doc, **limits})
+from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, PositiveInt, setting
 
-
-# Where train.log2_hashmap_size and train.finest_resolution are 0.
+# What `auto` means for train.log2_hashmap_size and train.finest_resolution in bounded scenes.
 LOG2_TABLE = 17
 FINEST = 1024
 
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """How a scene is learned. The defaults are for two CPU cores (`preview`)."""
+    """How a field is trained. The defaults are for two CPU cores (`preview`)."""
 
-    iterations: int = _setting(4000, "optimisation steps", minimum=1)
-    time_budget: float = _setting(
-        0.0, "seconds to train for, in place of a number of steps: steps are timed, the number that fits is settled on the way and reported; 0: iterations",
-        minimum=0.0,
-    )  # fmt: skip
-    sample_batch_size: int = _setting(65536, "network evaluations aimed at in a step; the number of rays follows from it; 0: always `rays`", minimum=0)
-    max_rays_per_batch: int = _setting(8192, "rays in a step at most", minimum=1)
-    seed: int = _setting(0, "seed of every random choice", minimum=0)
-    field: str = _setting(
-        "hash", "hash: multiresolution hash grid; mlp: the paper's networks; nerf: those of the original NeRF, which can't be baked",
-        choices=("hash", "mlp", "nerf"),
-    )  # fmt: skip
-    precision: str = _setting(
-        "auto", "what matrix products of training are computed in; auto: bfloat16 where the device has it", choices=("auto", "float32", "bfloat16")
+    iterations: PositiveInt = setting(4000, "Optimisation steps.")
+    time_budget: Annotated[float, Meta(gt=0.0)] | Off = setting(
+        "off", "Time to train for, in place of a number of steps: steps are timed, and as many are taken as fit; off: train.iterations steps.", unit="seconds"
     )
-    sampling: str = _setting(
+    sample_batch_size: PositiveInt | Off = setting(
+        65536, "Target number of samples in a step, from which the number of rays follows; off: always max_rays_per_batch rays.", advanced=True
+    )
+    max_rays_per_batch: PositiveInt = setting(8192, "Most rays in a step.", advanced=True)
+    seed: Count = setting(0, "Seed of every random choice in training.")
+    field: Literal["hash", "mlp", "nerf"] = setting(
+        "hash", "Kind of field: a multiresolution hash grid (hash), the paper's networks (mlp), or those of the original NeRF, which cannot be baked (nerf)."
+    )
+    precision: Literal["auto", "float32", "bfloat16"] = setting(
+        "auto", "Number type of matrix products in training; auto: bfloat16 where the device has it.", advanced=True
+    )
+    sampling: Literal["efficient", "valid", "hierarchical", "uniform"] = setting(
         "efficient",
-        "efficient: valid, then pivotal samples; valid: valid, then by importance; hierarchical: NeRF's, all, then by importance; uniform: evenly, once",
-        choices=("efficient", "valid", "hierarchical", "uniform"),
+        "Sampling strategy: valid then pivotal samples (efficient), valid samples then by importance (valid), all samples then by importance as in NeRF"
+        " (hierarchical), or evenly and once (uniform).",
+        advanced=True,
     )
-    discretise: int = _setting(
-        0,
-        "voxels along the longest side of the box whose centres stand for all points in them, so that baking with bake.lookup=nearest loses nothing; "
-        "looks up a single voxel a sample, but at 160 voxels a short run on chair came out 1.9 dB below interpolation; 0: off",
-        minimum=0, maximum=4096,
-    )  # fmt: skip
-    sh_degree: int = _setting(2, "degree of the spherical harmonics", minimum=0, maximum=4)
-    num_levels: int = _setting(16, "hash: levels", minimum=1, maximum=24)
-    log2_hashmap_size: int = _setting(
-        0, "hash: entries of a level's table, as a power of two; 0: from 17 to 19, by the number of training pixels",
-        minimum=8, maximum=24, besides=(0,),
-    )  # fmt: skip
-    finest_resolution: int = _setting(
-        0, "hash: lattice points a side of the finest level; 0: 1024, and more in normalised device coordinates, one for a pixel, up to 4096",
-        minimum=16, maximum=16384, besides=(0,),
-    )  # fmt: skip
-    hidden_dim: int = _setting(
-        128, "width of the fine network (the paper: 256, with field mlp); one wide layer learned more in a step than two of 64, at the same cost",
-        minimum=8, maximum=1024,
-    )  # fmt: skip
-    num_layers: int = _setting(1, "hidden layers of the fine network (the paper: 8)", minimum=1, maximum=16)
-    coarse_hidden_dim: int = _setting(32, "width of the coarse network (the paper: 128)", minimum=8, maximum=1024)
-    coarse_num_layers: int = _setting(1, "hidden layers of the coarse network (the paper: 4)", minimum=1, maximum=16)
-    num_coarse_samples: int = _setting(
-        0, "N_c: intervals over the diagonal of the box, or between near and far; 0: 128, and 96 in normalised device coordinates",
-        minimum=8, maximum=1024, besides=(0,),
-    )  # fmt: skip
-    samples_per_pivot: int = _setting(4, "N_s: fine samples in a pivotal interval", minimum=1, maximum=16)
-    early_samples_per_pivot: int = _setting(
-        2, "N_s in the first half of the steps, when more rays are worth more than more samples on each; 0: fine_samples", minimum=0, maximum=16
+    discretise: Annotated[int, Meta(ge=1, le=4096)] | Off = setting(
+        "off",
+        "Voxels along the longest side of the box at whose centres alone the field is evaluated, so that baking with bake.lookup=nearest is exact.",
+        advanced=True,
     )
-    num_importance_samples: int = _setting(
-        128, "N_f: fine samples of a ray by importance, beside the coarse ones (sampling valid, hierarchical; uniform adds them to N_c)",
-        minimum=1, maximum=4096,
+    sh_degree: Annotated[int, Meta(ge=0, le=4)] = setting(2, "Degree of the spherical harmonics.", advanced=True)
+    num_levels: Annotated[int, Meta(ge=1, le=24)] = setting(16, "Levels of the hash grid.", advanced=True)
+    log2_hashmap_size: Annotated[int, Meta(ge=8, le=24)] | Auto = setting(
+        "auto", "Entries of the hash table of a level, as a power of two; auto: from 17 to 19, by the number of training pixels.", advanced=True
+    )
+    finest_resolution: Annotated[int, Meta(ge=16, le=16384)] | Auto = setting(
+        "auto", "Grid points along a side of the finest level of the hash grid; auto: 1024, or one for a pixel in normalised device coordinates, up to 4096.",
+        advanced=True,
     )  # fmt: skip
-    near_plane: float = _setting(
-        0.0, "where rays begin, in the capture's units along the view axis (the paper: 2 for synthetic scenes); with far = 0 the scene says", minimum=0.0
+    hidden_dim: Annotated[int, Meta(ge=8, le=1024)] = setting(128, "Width of the fine network (the paper: 256).", advanced=True)
+    num_layers: Annotated[int, Meta(ge=1, le=16)] = setting(1, "Hidden layers of the fine network (the paper: 8).", advanced=True)
+    coarse_hidden_dim: Annotated[int, Meta(ge=8, le=1024)] = setting(32, "Width of the coarse network (the paper: 128).", advanced=True)
+    coarse_num_layers: Annotated[int, Meta(ge=1, le=16)] = setting(1, "Hidden layers of the coarse network (the paper: 4).", advanced=True)
+    num_coarse_samples: Annotated[int, Meta(ge=8, le=1024)] | Auto = setting(
+        "auto", "Coarse samples N_c along the diagonal of the box, or between near and far; auto: 128, or 96 in normalised device coordinates.", advanced=True
     )
-    far_plane: float = _setting(
-        0.0, "where rays end (the paper: 6); N_c intervals lie between near and far then, and those outside of the box are never valid", minimum=0.0
+    samples_per_pivot: Annotated[int, Meta(ge=1, le=16)] = setting(4, "Fine samples N_s in a pivotal interval.", advanced=True)
+    early_samples_per_pivot: Annotated[int, Meta(ge=1, le=16)] | Off = setting(
+        2, "Fine samples N_s in a pivotal interval during the first half of the steps; off: samples_per_pivot throughout.", advanced=True
     )
-    pivotal_threshold: float = _setting(1e-4, "epsilon: weight above which a coarse sample is pivotal", minimum=0.0, maximum=1.0)
-    max_pivots: int = _setting(
-        8, "pivotal samples on a ray at most; the lightest are dropped, which while all is fog are those behind (the paper drops none)", minimum=1, maximum=4096
+    num_importance_samples: Annotated[int, Meta(ge=1, le=4096)] = setting(
+        128, "Fine samples N_f of a ray by importance, with sampling valid and hierarchical; uniform adds them to N_c.", advanced=True
     )
-    coarse: str = _setting(
-        "field", "hash: what pivots are chosen by; field: a lighter field that gives densities alone; voxels: the density voxels, and no coarse field",
-        choices=("field", "voxels"),
+    near_plane: NonNegative | Auto = setting(
+        "auto", "Where rays begin along the view axis, in the capture's units (the paper: 2 for synthetic scenes); auto: the scene's.", advanced=True
+    )
+    far_plane: Annotated[float, Meta(gt=0.0)] | Auto = setting(
+        "auto", "Where rays end along the view axis, in the capture's units (the paper: 6); N_c samples lie between near and far then; auto: the scene's.",
+        advanced=True,
     )  # fmt: skip
-    exploration_fraction: float = _setting(
-        0.1, "share of the valid intervals without a pivot that the fine network is trained on all the same", minimum=0.0, maximum=1.0
+    pivotal_threshold: Fraction = setting(1e-4, "Weight epsilon above which a coarse sample is pivotal.", advanced=True)
+    max_pivots: Annotated[int, Meta(ge=1, le=4096)] = setting(
+        8, "Most pivotal samples on a ray; those of least weight are dropped (the paper drops none).", advanced=True
     )
-    distortion_loss_weight: float | None = _setting(
-        None, "weight of the loss on spread-out densities, where surroundings are learned: it clears fog; none: 0.01, in normalised device coordinates 0.002",
-        minimum=0.0,
-    )  # fmt: skip
-    sparse_depth_loss_weight: float = _setting(
-        0.1, "weight of the loss that puts matter at the sparse points, and none before them; gone by half of the steps", minimum=0.0
+    coarse: Literal["field", "voxels"] = setting(
+        "field", "What pivots of the hash field are chosen by: a lighter field of densities, or the density voxels.", advanced=True
     )
-    exposure: str = _setting(
-        "off", "gain: a factor for each colour and photograph is learned beside the field and left out of it, where surroundings are learned; off: none",
-        choices=("off", "gain"),
-    )  # fmt: skip
-    initial_density: float = _setting(0.1, "hash: density that the fields start with, per world unit", minimum=1e-6, maximum=1e3)
-    occupancy_resolution: int = _setting(0, "D: side of the density voxels; 0 chooses 128, or 192 where surroundings are learned too", minimum=0, maximum=512)
-    min_views: int = _setting(
-        2, "training photographs that must have a place in the box in view for matter to be learned there, where surroundings are learned: what fewer show"
-        " could be at any distance, and is left to the surroundings; at most a quarter of the photographs, so that up to four ask for nothing; 0: anywhere",
-        minimum=0, maximum=64,
-    )  # fmt: skip
-    occupancy_rule: str = _setting(
-        "maximum", "momentum: equation 7 on raw densities, threshold 0, as in the paper; maximum: decayed maximum of densities", choices=("momentum", "maximum")
+    exploration_fraction: Fraction = setting(
+        0.1, "Fraction of the valid samples that are not pivotal on which the fine network is trained all the same.", advanced=True
     )
-    occupancy_beta: float = _setting(0.1, "beta of equation 7", minimum=0.0, maximum=1.0)
-    occupancy_initial_density: float = _setting(10.0, "density that the voxels start with", minimum=0.0)
-    occupancy_decay: float = _setting(0.95, "maximum: what a voxel keeps at each refresh", minimum=0.0, maximum=1.0)
-    occupancy_alpha_threshold: float | None = _setting(
-        None, "maximum: share of light that an interval of a valid voxel absorbs at least; none: 0.01, and 0.05 in normalised device coordinates",
-        minimum=0.0, maximum=1.0,
-    )  # fmt: skip
-    occupancy_update_interval: int = _setting(16, "steps between looks at random voxels, which let pruned space return", minimum=1)
-    occupancy_update_fraction: float = _setting(
-        0.03125, "share of the voxels looked at in a refresh; in the warm-up an eighth, unless 0", minimum=0.0, maximum=1.0
+    distortion_loss_weight: NonNegative | Auto = setting(
+        "auto",
+        "Weight of the distortion loss of mip-NeRF 360 in unbounded scenes; auto: 0.01, or 0.002 in normalised device coordinates.",
+        advanced=True,
     )
-    occupancy_update_ray_fraction: float = _setting(
-        0.0, "share of the rays of a step whose pruned samples are looked at too, which lets pruned space return (the authors' release: 0.01)",
-        minimum=0.0, maximum=1.0,
-    )  # fmt: skip
-    occupancy_warmup_steps: int = _setting(256, "steps in which no voxel is pruned", minimum=0)
-    learning_rate: float = _setting(2e-2, "Adam's rate after the first steps (the paper: 5e-4, with field mlp)", minimum=0.0)
-    lr_final_ratio: float = _setting(0.05, "what is left of the rate after rate_steps; it falls exponentially", minimum=0.0, maximum=1.0)
-    lr_decay_steps: int = _setting(0, "steps in which the rate falls to final_rate of itself (the paper: 0.1 every 500,000); 0: all of them", minimum=0)
-    rate_hold: int = _setting(0, "first steps in which the rate does not fall; 0: none, or with a budget those that are timed", minimum=0)
-    rate_aims: tuple[int, ...] = _setting(
-        (), "pairs n, s: up to step s the schedule was one of n steps; a budget writes them, so that its steps can be repeated", minimum=1
+    sparse_depth_loss_weight: NonNegative = setting(
+        0.1, "Weight of the loss that puts the surface at the sparse points (DS-NeRF); it falls to zero by half of the steps.", advanced=True
     )
-    adam_beta2: float = _setting(0.99, "Adam's second decay (0.999 by default elsewhere, so for the paper)", minimum=0.0, maximum=0.99999)
-    adam_epsilon: float = _setting(1e-15, "Adam's epsilon: this small because a table entry's gradient can be (1e-8 by default elsewhere)", minimum=0.0)
-    precrop_steps: int = _setting(
-        0, "first steps that see only the middle half of each picture's sides, so that thin scenes on white don't collapse to white (NeRF: 500)", minimum=0
+    exposure: Literal["off", "gain"] = setting(
+        "off", "What is learned of the exposure of each photograph in unbounded scenes: nothing (off), or a gain for each colour channel (gain)."
     )
-    background_color: str = _setting(
-        "random", "behind cut-out objects in training; random: a colour for each ray, so that none is learned; scene: its own (NeRF; the paper doesn't say)",
-        choices=("random", "scene"),
-    )  # fmt: skip
-    checkpoint_every: int = _setting(250, "steps between checkpoints", minimum=1)
-    preview_every: int = _setting(500, "steps between preview pictures of a held-back view; 0: none", minimum=0)
+    initial_density: Annotated[float, Meta(ge=1e-6, le=1e3)] = setting(
+        0.1, "Density that the hash field begins with, per unit of the training frame.", advanced=True
+    )
+    occupancy_resolution: Annotated[int, Meta(ge=1, le=512)] | Auto = setting(
+        "auto", "Density voxels D along a side of the occupancy grid; auto: 128, or 192 in contracted scenes.", advanced=True
+    )
+    min_views: Annotated[int, Meta(ge=1, le=64)] | Off = setting(
+        2,
+        "Training views that a point of the box must lie in for density to be learned there, in unbounded scenes; a quarter of the views is always enough;"
+        " off: density is learned everywhere.",
+        advanced=True,
+    )
+    occupancy_rule: Literal["momentum", "maximum"] = setting(
+        "maximum", "How the density voxels are updated: with momentum, as in the paper's equation 7, or by a decayed maximum, as in instant-ngp.", advanced=True
+    )
+    occupancy_beta: Fraction = setting(0.1, "Momentum beta of the paper's equation 7.", advanced=True)
+    occupancy_initial_density: NonNegative = setting(10.0, "Density that the voxels begin with.", advanced=True)
+    occupancy_decay: Fraction = setting(0.95, "Factor by which the density voxels fall at an update, with occupancy_rule maximum.", advanced=True)
+    occupancy_alpha_threshold: Fraction | Auto = setting(
+        "auto",
+        "Opacity of a coarse interval from which its voxel is valid, with occupancy_rule maximum; auto: 0.01, or 0.05 in normalised device coordinates.",
+        advanced=True,
+    )
+    occupancy_update_interval: PositiveInt = setting(16, "Steps between updates of randomly chosen density voxels.", advanced=True)
+    occupancy_update_fraction: Fraction = setting(
+        0.03125, "Fraction of the density voxels that an update evaluates; an eighth during the warm-up, unless this is 0.", advanced=True
+    )
+    occupancy_update_ray_fraction: Fraction = setting(
+        0.0, "Fraction of the rays of a step on which pruned samples are evaluated too (the authors' release: 0.01).", advanced=True
+    )
+    occupancy_warmup_steps: Count = setting(256, "First steps, in which no density voxel is pruned.", advanced=True)
+    learning_rate: NonNegative = setting(2e-2, "Learning rate of Adam after the first steps (the paper: 5e-4).", advanced=True)
+    lr_final_ratio: Fraction = setting(0.05, "Ratio to which the learning rate falls exponentially over lr_decay_steps.", advanced=True)
+    lr_decay_steps: PositiveInt | Auto = setting(
+        "auto", "Steps in which the learning rate falls to lr_final_ratio of itself (the paper: 500,000); auto: all steps.", advanced=True
+    )
+    rate_hold: Count = setting(0, "First steps in which the learning rate does not fall.", advanced=True)
+    rate_aims: tuple[PositiveInt, ...] = setting((), "Pairs n, s: up to step s the schedule was one of n steps.", advanced=True)
+    adam_beta2: Annotated[float, Meta(ge=0.0, le=0.99999)] = setting(0.99, "Decay beta_2 of Adam's second moment (the paper: 0.999).", advanced=True)
+    adam_epsilon: NonNegative = setting(1e-15, "Epsilon of Adam (the paper: 1e-8).", advanced=True)
+    precrop_steps: Count = setting(0, "First steps, in which rays go through the middle half of each image's sides alone (NeRF: 500).", advanced=True)
+    background_color: Literal["random", "scene"] = setting(
+        "random", "Background of images with alpha in training: a random colour for each ray, or the scene's own.", advanced=True
+    )
+    checkpoint_every: PositiveInt = setting(250, "Steps between checkpoints.", advanced=True)
+    preview_every: PositiveInt | Off = setting(500, "Steps between preview renders of a validation view; off: none.", advanced=True)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from efficientnerf.settings import given
 from pipeline.files import atomic
 from pipeline.stage import Job
 
@@ -79,8 +80,8 @@ def _decibels(error: float) -> float:
 
 def steps_of(settings: BakeSettings, voxels: int, cut_out: bool) -> int:
     """Steps of the optimisation of so many voxels, of a cut-out object or of photographs with surroundings."""
-    if settings.refine_steps is not None:
-        return settings.refine_steps
+    if (stated := given(settings.refine_steps)) is not None:
+        return stated
     return max(LEAST_STEPS, math.ceil(RAYS_PER_VOXEL * voxels / settings.refine_rays_per_batch)) if cut_out else PHOTOGRAPHED_STEPS
 
 
@@ -89,11 +90,12 @@ def _fit(job: Job, o: Optimiser, targets: Targets, steps: int, until: int, prune
     from efficientnerf.asset import refinement
 
     settings = job.settings
+    ratio = given(settings.view_dependent_lr_ratio)
     written, smooth = time.monotonic(), 0.0
     run = refinement.optimise(
         o, targets, until=until, steps=steps, rays=settings.refine_rays_per_batch, density_rate=settings.density_lr,
         colour_rate=settings.sh_lr, final=settings.lr_final_ratio, seed=settings.seed,
-        view_share=settings.view_dependent_lr_ratio if settings.view_dependent_lr_ratio is not None else 1.0 if o.tree.background is not None else PHOTOGRAPHS,
+        view_share=ratio if ratio is not None else 1.0 if o.tree.background is not None else PHOTOGRAPHS,
     )  # fmt: skip
     for error in run:
         smooth = error if not smooth else 0.9 * smooth + 0.1 * error

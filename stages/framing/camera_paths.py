@@ -310,7 +310,7 @@ class RenderOptions:
 
     background   white, black, transparent or #rrggbb; with transparent the PNG carry alpha and the video lies on white
     supersample  rays along each side of a pixel
-    exr          "none", "first" or "all": which frames are written as EXR too
+    exr          "off", "first" or "all": which frames are written as EXR too
     video        name of the MP4 in the output folder, or None
     fps, crf     of the video
     """

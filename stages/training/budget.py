@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
 
@@ -57,12 +58,14 @@ class Budget:
     started: float = field(init=False)
     timed: tuple[int, float] | None = field(init=False, default=None)  # step and seconds from which on steps are timed
     plan: Plan | None = field(init=False)
+    seconds_given: float = field(init=False)
     marks: list[float] = field(init=False)  # seconds at which to settle, those to come
 
     def __post_init__(self) -> None:
         self.started = self.clock()
         self.plan = _read(self.work / FILE)
-        self.marks = [share * self.settings.time_budget for share in MARKS]
+        self.seconds_given = given(self.settings.time_budget) or 0.0
+        self.marks = [share * self.seconds_given for share in MARKS]
 
     @property
     def seconds(self) -> float:
@@ -76,7 +79,7 @@ class Budget:
     def planned(self) -> TrainSettings:
         """The settings to begin or to go on with: those of the plan if there is one, else without an end in sight."""
         plan = self.plan or Plan(MOST, self.hold, ())
-        return replace(self.settings, time_budget=0.0, **plan._asdict())
+        return replace(self.settings, time_budget="off", **plan._asdict())
 
     def after(self, step: int) -> TrainSettings | None:
         """What is settled after a step: the settings with the number of steps, or None where nothing changes. Writes the plan."""
@@ -86,11 +89,11 @@ class Budget:
         if not self._due(step, now):
             return None
         iterations = step
-        if now < self.settings.time_budget:
+        if now < self.seconds_given:
             # An attempt may have begun just before the number has to be settled; then all the steps tell, slow ones of the beginning too.
             known = self.timed is not None and step > self.timed[0]
             each = (now - self.timed[1]) / (step - self.timed[0]) if known and self.timed is not None else now / step
-            iterations += max(0, int(((1 - RESERVE) * self.settings.time_budget - now) / max(each, 1e-6)))
+            iterations += max(0, int(((1 - RESERVE) * self.seconds_given - now) / max(each, 1e-6)))
         if self.plan is None:
             self.plan = Plan(iterations, self.hold, ())
         else:
@@ -103,7 +106,7 @@ class Budget:
         """Whether the number of steps is to be settled after this one."""
         passed = [mark for mark in self.marks if mark <= now]
         if self.plan is None:
-            due = step >= self.hold or now >= self.settings.time_budget
+            due = step >= self.hold or now >= self.seconds_given
         else:  # an interrupted run takes steps again that the plan has been made for
             enough = self.timed is not None and step - self.timed[0] >= FEWEST
             due = bool(passed) and enough and self.plan.settled < step < self.plan.iterations

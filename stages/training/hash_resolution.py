@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.settings import given
 from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 from stages.baking.resolution import ndc_pixel
 
@@ -45,7 +46,7 @@ def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSett
     log2_table = int(np.clip(round(entries), LOG2_TABLE, LARGEST))
     return replace(
         settings,
-        log2_hashmap_size=settings.log2_hashmap_size or log2_table,
-        finest_resolution=settings.finest_resolution or finest,
-        num_coarse_samples=settings.num_coarse_samples or space_of(s).num_coarse_samples,
+        log2_hashmap_size=given(settings.log2_hashmap_size) or log2_table,
+        finest_resolution=given(settings.finest_resolution) or finest,
+        num_coarse_samples=given(settings.num_coarse_samples) or space_of(s).num_coarse_samples,
     )

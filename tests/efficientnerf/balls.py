@@ -17,7 +17,7 @@ CENTRE, RADIUS, SIGMA = np.array([0.1, -0.05, 0.0]), 0.55, 30.0
 SMALL = {
     "num_levels": 4, "log2_hashmap_size": 11, "finest_resolution": 64, "hidden_dim": 16, "num_layers": 1, "coarse_hidden_dim": 16,
     "coarse_num_layers": 1, "sh_degree": 1, "occupancy_resolution": 24, "num_coarse_samples": 16, "samples_per_pivot": 2,
-    "sample_batch_size": 6144, "occupancy_warmup_steps": 20, "occupancy_update_interval": 4, "checkpoint_every": 10, "preview_every": 0,
+    "sample_batch_size": 6144, "occupancy_warmup_steps": 20, "occupancy_update_interval": 4, "checkpoint_every": 10, "preview_every": "off",
     "learning_rate": 3e-2, "iterations": 60,
 }  # fmt: skip
 

@@ -135,7 +135,7 @@ def model_of(strategy: str, **changes: Any) -> Model:
     """On a device where there is one."""
 
     wanted = {
-        **STRATEGIES[strategy], "sample_batch_size": 0, "max_rays_per_batch": 6, "occupancy_warmup_steps": 1, "occupancy_update_interval": 3,
+        **STRATEGIES[strategy], "sample_batch_size": "off", "max_rays_per_batch": 6, "occupancy_warmup_steps": 1, "occupancy_update_interval": 3,
         "exploration_fraction": 0.0, **changes,
     }  # fmt: skip
     contracted = strategy == "contracted"
@@ -236,8 +236,8 @@ def test_no_line_that_makes_a_bundle_waits() -> None:
     assert waits.lines == []
 
 
-@pytest.mark.parametrize("discretise", [0, 12])
-def test_no_line_of_a_step_on_photographs_waits(discretise: int, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("discretise", ["off", 12])
+def test_no_line_of_a_step_on_photographs_waits(discretise: int | str, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """With exposures, anchors, and explored intervals."""
     monkeypatch.setattr(dispatch, "composite", compositing.composite)
     m = model_of("contracted", iterations=9, exposure="gain", exploration_fraction=0.1, discretise=discretise)

@@ -61,7 +61,7 @@ def test_it_learns(field: str, rule: str) -> None:
 def test_intervals_are_sampled_more_finely_in_the_second_half_of_the_schedule() -> None:
     steps = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot=2))
     assert [step.fine for step in steps] == [(2 if step.step < 20 else 5) * step.pivotal for step in steps]
-    constant = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot=0))
+    constant = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot="off"))
     assert all(step.fine == 5 * step.pivotal > 0 for step in constant)
     # A schedule that was settled anew counts by its own share, not by steps over all steps: of 40 steps to step 10, then of 20.
     settled = TrainSettings(samples_per_pivot=5, early_samples_per_pivot=2, iterations=20, rate_aims=(40, 10))
@@ -192,7 +192,7 @@ def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
     """
     paper = {
         "background_color": "scene", "occupancy_rule": "momentum", "occupancy_update_fraction": 0.0,
-        "occupancy_update_ray_fraction": 0.05, "exploration_fraction": 0.0, "sample_batch_size": 0, "max_rays_per_batch": 256,
+        "occupancy_update_ray_fraction": 0.05, "exploration_fraction": 0.0, "sample_batch_size": "off", "max_rays_per_batch": 256,
     }  # fmt: skip
     m = untrained(**paper, **MLP, iterations=300, occupancy_warmup_steps=220, precrop_steps=60)
     thin = pixels(8, 20, 0.25)
@@ -222,7 +222,7 @@ def test_the_middle_of_the_pictures_comes_first() -> None:
 @pytest.mark.parametrize("strategy", ["uniform", "hierarchical", "valid"])
 @pytest.mark.parametrize("field", ["mlp", "nerf"])
 def test_other_samplings_learn_too_and_only_those_that_prune_touch_the_voxels(field: str, strategy: str) -> None:
-    m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, num_importance_samples=16, sample_batch_size=0, max_rays_per_batch=128)
+    m = untrained(**dict(MLP, field=field), iterations=40, sampling=strategy, num_importance_samples=16, sample_batch_size="off", max_rays_per_batch=128)
     steps = run(m)
     assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 1
     assert {step.rays for step in steps} == {128}  # a fixed batch

@@ -23,7 +23,7 @@ class Settings:
     format: str = "auto"
     strict: bool = False
     allow_outside: bool = False
-    llff_factor: int | None = None
+    llff_factor: int | str = "auto"
 
 
 def cameras(count: int = 6, model: str = "SIMPLE_PINHOLE", params: tuple[float, ...] = (FOCAL, WIDTH / 2, HEIGHT / 2)) -> list[Camera]:

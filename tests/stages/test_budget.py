@@ -24,7 +24,7 @@ from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
 QUICK: dict[str, Any] = {
-    "checkpoint_every": 10, "sample_batch_size": 512, "occupancy_warmup_steps": 4, "preview_every": 0, "iterations": 5, "time_budget": 40.0,
+    "checkpoint_every": 10, "sample_batch_size": 512, "occupancy_warmup_steps": 4, "preview_every": "off", "iterations": 5, "time_budget": 40.0,
 }  # fmt: skip
 
 
@@ -60,7 +60,7 @@ def report(made: Job) -> dict[str, Any]:
 
 def repeated(said: dict[str, Any]) -> TrainSettings:
     """The settings of a plain run, as the report names them."""
-    return replace(settings(**QUICK), time_budget=0.0, iterations=said["iterations"], rate_hold=said["rate_hold"], rate_aims=tuple(said["rate_aims"]))
+    return replace(settings(**QUICK), time_budget="off", iterations=said["iterations"], rate_hold=said["rate_hold"], rate_aims=tuple(said["rate_aims"]))
 
 
 def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_pa
     assert len(said["rate_aims"]) >= 2  # settled anew on the way
     aims = json.dumps(said["rate_aims"], separators=(",", ":"))
     steps = f"--set train.iterations={said['iterations']} --set train.rate_hold={said['rate_hold']}"
-    assert said["again"] == f"--set train.time_budget=0 {steps} --set train.rate_aims={aims}"
+    assert said["again"] == f"--set train.time_budget=off {steps} --set train.rate_aims={aims}"
     plain = repeated(said)
     assert digest(job(tmp_path / "b", plain, poses=scene)) == first
     assert load_renderer(budgeted.out).model.settings == plain

@@ -93,7 +93,7 @@ def test_elsewhere_tables_are_twice_as_large_for_four_times_the_pixels(tmp_path:
 
 
 def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
-    made = job(tmp_path, settings(log2_hashmap_size=0, finest_resolution=0, iterations=2, sample_batch_size=256), poses=poses(tmp_path / "poses"))
+    made = job(tmp_path, settings(log2_hashmap_size="auto", finest_resolution="auto", iterations=2, sample_batch_size=256), poses=poses(tmp_path / "poses"))
     train.run(made)
     m = load_renderer(made.out).model
     assert (m.settings.log2_hashmap_size, m.settings.finest_resolution) == (LOG2_TABLE, FINEST)

@@ -80,7 +80,7 @@ def test_what_a_mask_leaves_out_does_not_count(tmp_path: Path) -> None:
 
 
 def test_missing_weights_are_named_with_the_remedy(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"alexnet-owt-7be5be79\.pth.*download\.pytorch\.org.*lpips_weights.*lpips=none"):
+    with pytest.raises(UsageError, match=r"alexnet-owt-7be5be79\.pth.*download\.pytorch\.org.*lpips_weights.*lpips=off"):
         load_lpips("alex", str(tmp_path))
     folder = Path(written(tmp_path / "weights", "vgg"))
     (folder / "vgg.pth").unlink()
@@ -93,7 +93,7 @@ def test_weights_in_torchs_cache_are_found(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "home/hub/checkpoints").mkdir(parents=True)
     (folder / BACKBONES["alex"]).rename(tmp_path / "home/hub/checkpoints" / BACKBONES["alex"])
     monkeypatch.setattr(lpips_weights, "_shipped", lambda: [folder])
-    load_lpips("alex", "")
+    load_lpips("alex", None)
 
 
 def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_pa
 @pytest.mark.parametrize("observers", [2, 0])
 def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, observers: int) -> None:
     s = narrow_scene(tmp_path / "poses")
-    trained = job(tmp_path / "train", balls.settings(iterations=30, min_views=observers), poses=tmp_path / "poses")
+    trained = job(tmp_path / "train", balls.settings(iterations=30, min_views=observers or "off"), poses=tmp_path / "poses")
     train.run(trained)
     made = job(
         tmp_path / "bake",
@@ -146,7 +146,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, obs
 
 def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_the_box(tmp_path: Path) -> None:
     narrow_scene(tmp_path / "poses")
-    anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, min_views=0), poses=tmp_path / "poses")
+    anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, min_views="off"), poses=tmp_path / "poses")
     cut_out = job(tmp_path / "cut_out", balls.settings(iterations=2), poses=poses(tmp_path / "cut", count=10))
     for made in (anywhere, cut_out):
         train.run(made)

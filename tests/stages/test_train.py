@@ -183,7 +183,7 @@ def test_points_in_a_camera_or_behind_it_are_no_anchors(tmp_path: Path) -> None:
 
 def test_exposures_are_saved(tmp_path: Path) -> None:
     scene = poses(tmp_path / "poses", photographs=True)
-    made = job(tmp_path / "a", settings(exposure="gain", iterations=6, preview_every=0), poses=scene)
+    made = job(tmp_path / "a", settings(exposure="gain", iterations=6, preview_every="off"), poses=scene)
     train.run(made)
     gains = load_gains(made.out)
     assert len(gains) == 7  # of the training views alone

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
+from msgspec import Meta
 
+from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
-from stages.settings import describe_settings, name_of_type, setting
+from stages.settings import describe_settings
 from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
 
 
 @dataclass(frozen=True)
 class Toy:
-    steps: int = setting(10, "How many.", minimum=1, maximum=100)
-    rate: float = setting(0.5, "How fast.", minimum=0.0, unit="per second")
-    kind: str = setting("plain", "Which.", choices=("plain", "fancy"))
+    steps: Annotated[int, Meta(ge=1, le=100)] = setting(10, "How many.")
+    rate: NonNegative = setting(0.5, "How fast.", unit="per second")
+    kind: Literal["plain", "fancy"] = setting("plain", "Which.")
     label: str = setting("", "What to call it.")
-    box: tuple[float, float, float] | None = setting(None, "Where.")
+    box: tuple[float, float, float] | Auto = setting("auto", "Where.", advanced=True)
     flag: bool = setting(False, "Whether.")
     seed: int = setting(0, "Of the random numbers.")
 
@@ -45,7 +48,7 @@ TYPES = {"toy": Toy, "other": Other}
         ("toy.label=", ""),
         ("toy.box=[1, 2, 3.5]", (1.0, 2.0, 3.5)),
         ("toy.box=1,2,3", (1.0, 2.0, 3.0)),
-        ("toy.box=none", None),
+        ("toy.box=auto", "auto"),
         ("toy.flag=true", True),
     ],
 )
@@ -98,7 +101,7 @@ def test_the_last_word_wins() -> None:
     settings.put_option("toy.seed=1")
     settings.put_seed(7)
     assert settings.resolved() == {"toy": Toy(steps=3, rate=2.0, seed=7), "other": Other(steps=5)}
-    assert table_of(settings.resolved())["toy"]["box"] is None
+    assert table_of(settings.resolved())["toy"]["box"] == "auto"
 
 
 def test_what_a_run_recorded_comes_back() -> None:
@@ -117,7 +120,7 @@ def test_recorded_settings_of_another_version_are_named() -> None:
 
 def test_config_files(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text('preset = "tiny"\nseed = 3\n[toy]\nsteps = 4\nbox = "none"\n', encoding="utf-8")
+    path.write_text('preset = "tiny"\nseed = 3\n[toy]\nsteps = 4\nbox = "auto"\n', encoding="utf-8")
     config = read_config(path)
     assert config.options == {"preset": "tiny", "seed": 3}
     settings = Settings(TYPES)
@@ -151,7 +154,7 @@ def test_an_unknown_preset_names_the_nearest() -> None:
 
 
 def test_values_are_shown_as_they_are_given() -> None:
-    for value in (None, True, 3, 0.25, [1, 2], "words"):
+    for value in (True, 3, 0.25, [1, 2], "words"):
         assert value in parse_value(shown(value))
 
 
@@ -160,8 +163,11 @@ def test_what_settings_say_about_themselves() -> None:
     assert about["rate"].unit == "per second"
     assert about["steps"].minimum == 1
     assert about["kind"].choices == ("plain", "fancy")
-    assert name_of_type(tuple[int, ...]) == "list of whole number"
-    assert about["box"].type_name == "3 x number or none"
+    assert about["kind"].listed
+    assert not about["box"].listed
+    assert (about["box"].advanced, about["steps"].advanced) == (True, False)
+    assert about["box"].type_name == "a list of 3, each a number, or auto"
+    assert about["steps"].type_name == "a whole number, at least 1, at most 100"
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("90s", 90), ("10m", 600), ("1h30m", 5400), ("1.5m", 90), (" 2m30s ", 150), ("0", 0)])

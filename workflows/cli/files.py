@@ -134,9 +134,9 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
     from dataclasses import replace
 
     from pipeline.errors import UsageError
-    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames, read_camera_path, similarity_of, turntable_cameras
+    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames, read_camera_path, similarity_of
     from stages.io.exporters.frames import background_from_text
-    from stages.turntable import TurntableSettings
+    from stages.turntable import TurntableSettings, cameras_of
     from workflows.cli.progress import write_json
     from workflows.cli.target import load_asset
 
@@ -155,8 +155,7 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
         path = read_camera_path(camera_path, similarity_of(tree), width=given["width"], height=given["height"])
         cameras, fps = list(path.cameras), path.fps or fps
     else:
-        shape = {name: getattr(settings, name) for name in ("frames", "width", "height", "elevation", "radius", "fov", "sway")}
-        cameras = turntable_cameras(tree, **shape)
+        cameras = cameras_of(tree, settings)
     options = RenderOptions(background=settings.background, supersample=settings.supersample, exr=settings.exr, video=None, fps=fps, crf=settings.crf)
     with _shown(as_json, quiet) as show:
         progress = _progress("render", show)

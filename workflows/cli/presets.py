@@ -35,7 +35,7 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
         described: dict[str, Any] = {
             stage: [
                 {"name": info.name, "value": values[stage][info.name], "type": info.type_name, "choices": info.choices, "minimum": info.minimum}
-                | {"maximum": info.maximum, "besides": info.besides, "unit": info.unit, "meaning": info.doc}
+                | {"maximum": info.maximum, "unit": info.unit, "meaning": info.doc}
                 for info in describe_settings(types[stage])
             ]
             for stage in stages or types
@@ -48,5 +48,5 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
         click.echo(f"\n[{stage}]")
         for info in describe_settings(types[stage]):
             value = shown(values[stage][info.name])
-            choices = f" One of: {', '.join(shown(choice) for choice in info.choices)}." if info.choices else ""
+            choices = f" One of: {', '.join(shown(choice) for choice in info.choices)}." if info.choices and info.listed else ""
             click.echo(f"{info.name + ' = ' + value:<36} {meaning(info)}{choices}")

@@ -95,7 +95,7 @@ def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
         if value is not None:
             settings.put("poses", name, [value], origin)
     if options.budget is not None:
-        settings.put("train", "budget", [seconds_of(options.budget)], f"--budget {options.budget}")
+        settings.put("train", "time_budget", [seconds_of(options.budget)], f"--budget {options.budget}")
     run = Run(
         path,
         _source(options.source, standing),

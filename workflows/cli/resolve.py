@@ -78,7 +78,7 @@ def read_config(path: Path) -> Config:
 
 
 def parse_value(text: str) -> list[Any]:
-    """What the text of a `--set` may mean, the likeliest first: a TOML value, a list without its brackets, none, the text itself."""
+    """What the text of a `--set` may mean, the likeliest first: a TOML value, a list without its brackets, the text itself."""
     readings: list[Any] = []
     for candidate in (text, f"[{text}]") if "," in text else (text,):
         try:
@@ -87,7 +87,7 @@ def parse_value(text: str) -> list[Any]:
             continue
         if parsed.keys() == {"value"}:
             readings.append(parsed["value"])
-    return [None, text] if text == "none" else [*readings, text]
+    return [*readings, text]
 
 
 def seconds_of(text: str) -> float:
@@ -140,8 +140,7 @@ class Settings:
             if not entries and stage not in self.about:
                 self._info(stage, "", origin)
             for name, value in entries.items():
-                # TOML has no null: the word for it is none.
-                self.put(stage, name, [None, value] if value == "none" else [value], origin)
+                self.put(stage, name, [value], origin)
 
     def put_recorded(self, table: Table) -> list[str]:
         """Take over what a run recorded; returns the names that this version no longer has, or no longer admits."""
@@ -180,8 +179,6 @@ def table_of(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def shown(value: Any) -> str:
     """A value as it is written after `--set stage.name=`."""
-    if value is None:
-        return "none"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (list, tuple)):
@@ -191,6 +188,5 @@ def shown(value: Any) -> str:
 
 def meaning(info: SettingInfo) -> str:
     """What a setting means, as a sentence with its unit."""
-    text = info.doc if ":" in info.doc.split(" ")[0] else info.doc[:1].upper() + info.doc[1:]
     unit = f" ({info.unit})" if info.unit else ""
-    return f"{text.rstrip('.')}{unit}."
+    return f"{info.doc.rstrip('.')}{unit}."

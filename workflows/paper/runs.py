@@ -101,25 +101,25 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
         return max(16, 16 * round(units * scale**0.15 / 16))
 
     train["iterations"] = max(60, round(train["iterations"] * scale))
-    train["rays"] = max(64, 32 * round(train["rays"] * fifth / 32))
-    for name in ("hidden", "coarse_hidden"):
+    train["max_rays_per_batch"] = max(64, 32 * round(train["max_rays_per_batch"] * fifth / 32))
+    for name in ("hidden_dim", "coarse_hidden_dim"):
         train[name] = width(train[name])
-    for name in ("layers", "coarse_layers"):
+    for name in ("num_layers", "coarse_num_layers"):
         train[name] = max(2, round(train[name] * scale**0.05))
-    train["voxels"] = max(32, 8 * round(train["voxels"] * scale**0.225 / 8))
+    train["occupancy_resolution"] = max(32, 8 * round(train["occupancy_resolution"] * scale**0.225 / 8))
     train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
-    train["rate_steps"] = max(1, round(train["rate_steps"] * scale**0.9))
-    train["warm_up"] = round(train["iterations"] * min(0.35, train["warm_up"] / 1e6 * scale**-0.6))
-    train["refresh_rays"] = min(max(0.05, train["refresh_rays"]), train["refresh_rays"] * scale**-0.3)
-    train["crop_steps"] = min(train["crop_steps"], train["iterations"] // 10)
+    train["lr_decay_steps"] = max(1, round(train["lr_decay_steps"] * scale**0.9))
+    train["occupancy_warmup_steps"] = round(train["iterations"] * min(0.35, train["occupancy_warmup_steps"] / 1e6 * scale**-0.6))
+    train["occupancy_update_ray_fraction"] = min(max(0.05, train["occupancy_update_ray_fraction"]), train["occupancy_update_ray_fraction"] * scale**-0.3)
+    train["precrop_steps"] = min(train["precrop_steps"], train["iterations"] // 10)
     train["checkpoint_every"] = max(50, train["iterations"] // 4)
     train["preview_every"] = max(10, train["iterations"] // 8)
-    out["poses"]["max_side"] = max(48, 4 * round(800 * scale**0.3 / 4))
+    out["poses"]["max_image_size"] = max(48, 4 * round(800 * scale**0.3 / 4))
     out["bake"]["resolution"] = max(96, 8 * round(out["bake"]["resolution"] * scale**0.3 / 8))
-    out["bake"]["points"] = max(4, round(out["bake"]["points"] * fifth))
-    out["bake"]["pixels"] = max(50_000, round(1e6 * fifth))
-    out["bake"]["optimise_rays"] = max(4096, 1024 * round(out["bake"]["optimise_rays"] * fifth / 1024))
-    out["evaluate"] |= {"views": 10 if scale < 0.1 else 0, "scale": 1.0}
+    out["bake"]["samples_per_voxel"] = max(4, round(out["bake"]["samples_per_voxel"] * fifth))
+    out["bake"]["visibility_rays"] = max(50_000, round(1e6 * fifth))
+    out["bake"]["refine_rays_per_batch"] = max(4096, 1024 * round(out["bake"]["refine_rays_per_batch"] * fifth / 1024))
+    out["evaluate"] |= {"field_views": 10 if scale < 0.1 else "all", "field_image_scale": 1.0}
     return out
 
 
@@ -156,7 +156,7 @@ def measured(request: Request, scene: Path, row: Row) -> Figures:
     lines = [json.loads(line) for line in TrainOutputs.of_run(run.path).log.read_text(encoding="utf-8").splitlines()]
     return Figures(
         **{name: quality[name] for name in ("psnr", "ssim", "valid", "pivotal")}, **_pace(lines),
-        tree=_tree_figures(run, settings["evaluate"]["views"], request.device) if row.bakes else None,
+        tree=_tree_figures(run, _count(settings["evaluate"]["field_views"]), request.device) if row.bakes else None,
     )  # fmt: skip
 
 
@@ -196,7 +196,7 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
     from stages.train import use_all_cores
 
     kept = run.path / "network.json"
-    key = {"field": digest, "views": settings["evaluate"]["views"]}
+    key = {"field": digest, "views": settings["evaluate"]["field_views"]}
     if kept.exists() and (found := json.loads(kept.read_text(encoding="utf-8")))["of"] == key:
         return dict(found)
     use_all_cores()
@@ -204,7 +204,7 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
     views, split = held_back(s)
     renderer = load_renderer(run.folder("train"), device)
     decibels, similarities, counts = [], [], SampleCounts()
-    for view in [views[k] for k in spread(len(views), settings["evaluate"]["views"])]:
+    for view in [views[k] for k in spread(len(views), _count(settings["evaluate"]["field_views"]))]:
         rendering = renderer.render(view.camera)
         truth = truth_of(run.folder("poses"), view, s.background).colour
         picture = np.clip(rendering.colour, 0, 1)
@@ -222,6 +222,11 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
     }
     kept.write_text(json.dumps(quality, indent=1) + "\n", encoding="utf-8")
     return quality
+
+
+def _count(field_views: int | str) -> int | None:
+    """evaluate.field_views for `spread`."""
+    return None if isinstance(field_views, str) else field_views
 
 
 def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None) -> float:
@@ -245,8 +250,8 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
     return time.perf_counter() - begun
 
 
-def _tree_figures(run: Run, wanted: int, device: str) -> dict[str, Any]:
-    """PSNR and SSIM of the baked tree on `wanted` of the held-back views (0: all), those of the network, and how many frames it draws in a second at
+def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
+    """PSNR and SSIM of the baked tree on `wanted` of the test views (None: all), those of the network, and how many frames it draws in a second at
     their size."""
     import numpy as np
 

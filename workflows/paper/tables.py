@@ -15,11 +15,13 @@ SHARES = {
     "mic": (8.44, 3.14), "ship": (11.32, 4.62),
 }  # fmt: skip
 # Original NeRF: 64 coarse samples, 128 more by importance, both networks 8x256, the direction a further input.
-NERF: dict[str, Any] = {"field": "nerf", "sampling": "hierarchical", "coarse_samples": 64, "importance_samples": 128, "coarse_hidden": 256, "coarse_layers": 8}
-LARGE = {"coarse_hidden": 256, "coarse_layers": 8}
-SMALL = {"hidden": 128, "layers": 4}
+NERF: dict[str, Any] = {
+    "field": "nerf", "sampling": "hierarchical", "num_coarse_samples": 64, "num_importance_samples": 128, "coarse_hidden_dim": 256, "coarse_num_layers": 8
+}  # fmt: skip
+LARGE = {"coarse_hidden_dim": 256, "coarse_num_layers": 8}
+SMALL = {"hidden_dim": 128, "num_layers": 4}
 # The fine stage by importance cannot tell 128 coarse samples from 64 in its own cost; NeRF's counts are kept until pivotal sampling comes.
-IMPORTANCE = {"coarse_samples": 64, "importance_samples": 128}
+IMPORTANCE = {"num_coarse_samples": 64, "num_importance_samples": 128}
 
 TIMED = "Frames/s are of drawing alone: on a device pictures stay there."
 FIT = "The tree's values were fitted to the training images after they were baked, so that it may be ahead of its network; the paper caches the network's."
@@ -73,7 +75,7 @@ def versions(request: Request) -> Result:
     """Table 3."""
     printed = {"n1": (64, 2, 29.54, 493.62), "n2": (64, 3, 30.49, 403.28), "n3": (96, 4, 31.22, 324.62), "n4": (128, 5, 31.68, 238.46)}
     columns = ["version", "coarse", "fine", "PSNR network", "PSNR tree", "PSNR" + PAPER, "frames/s", "frames/s" + PAPER, "frame", "s/iteration"]
-    rows = [Row(name, {"coarse_samples": coarse, "fine_samples": fine}, bakes=True) for name, (coarse, fine, *_) in printed.items()]
+    rows = [Row(name, {"num_coarse_samples": coarse, "samples_per_pivot": fine}, bakes=True) for name, (coarse, fine, *_) in printed.items()]
     means, curves = _means(request, rows)
     table = []
     for (name, (coarse, fine, psnr, fps)), figures in zip(printed.items(), means, strict=True):
@@ -88,9 +90,9 @@ def networks(request: Request) -> Result:
     """Table 4: NeRF's sampling and head with light or standard networks."""
     cases: list[tuple[str, str, dict[str, Any], float, float]] = [
         ("standard", "standard", NERF, 0.184, 31.01),
-        ("light", "light", {**NERF, "coarse_hidden": 128, "coarse_layers": 4, **SMALL}, 0.121, 29.28),
+        ("light", "light", {**NERF, "coarse_hidden_dim": 128, "coarse_num_layers": 4, **SMALL}, 0.121, 29.28),
         ("standard", "light", {**NERF, **SMALL}, 0.132, 29.39),
-        ("light", "standard", {**NERF, "coarse_hidden": 128, "coarse_layers": 4}, 0.138, 30.96),
+        ("light", "standard", {**NERF, "coarse_hidden_dim": 128, "coarse_num_layers": 4}, 0.138, 30.96),
     ]
     columns = ["coarse MLP", "fine MLP", *PACE, "PSNR", "PSNR" + PAPER]
     rows = [Row("nerf" if changes is NERF else f"nerf-{coarse}-{fine}", changes) for coarse, fine, changes, *_ in cases]

@@ -115,7 +115,7 @@ def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[
     if not folders:
         raise BadInput(f"{source.root}: {POSES} without images: expected a folder images, images_4, images_8 ... beside it.")
     counts = {factor: len(images_in(folder)) for factor, folder in folders.items()}
-    if settings.llff_factor is not None:
+    if settings.llff_factor != "auto":
         if settings.llff_factor not in folders:
             there = ", ".join(folder.name for folder in folders.values())
             raise BadInput(f"{source.root}: no images reduced by {settings.llff_factor} (poses.llff_factor); there are {there}.")

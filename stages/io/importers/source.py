@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Protocol
 
+from efficientnerf.settings import Auto
 from pipeline.errors import BadInput
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -30,7 +31,7 @@ class ImportSettings(Protocol):
     @property
     def allow_outside(self) -> bool: ...
     @property
-    def llff_factor(self) -> int | None: ...
+    def llff_factor(self) -> int | Auto: ...
 
 
 def listed(names: Sequence[str]) -> str:

@@ -1,0 +1,37 @@
+"""Fields of settings dataclasses: their types with limits, and what they say about themselves.
+
+`auto` leaves a value to be chosen, `off` switches something off. A limit is a `msgspec.Meta` in the annotation, which the engine heeds when it reads
+settings (`pipeline.stage.settings_from`). Imports nothing heavy.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Annotated, Any, Literal, TypeVar
+
+from msgspec import Meta
+
+T = TypeVar("T")
+
+Auto = Literal["auto"]
+Off = Literal["off"]
+Count = Annotated[int, Meta(ge=0)]
+PositiveInt = Annotated[int, Meta(ge=1)]
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+def setting(default: Any, doc: str, *, unit: str | None = None, advanced: bool = False) -> Any:
+    """A field of a settings dataclass.
+
+    default   an immutable value
+    doc       one sentence: what the setting does
+    unit      of the number, as printed in the documentation
+    advanced  listed apart from the settings that most users want
+    """
+    return dataclasses.field(default=default, metadata={"doc": doc, "unit": unit, "advanced": advanced})
+
+
+def given(value: T | Literal["auto", "off"]) -> T | None:
+    """The value, or None where it is `auto` or `off`."""
+    return None if value in ("auto", "off") else value  # type: ignore[return-value]
