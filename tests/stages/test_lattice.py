@@ -100,10 +100,10 @@ def test_a_field_keeps_the_size_that_was_chosen(tmp_path: Path) -> None:
     assert max(m.fine.sides) == FINEST
 
 
-@pytest.mark.parametrize(("name", "least"), [("log2_hashmap_size", 8), ("finest_resolution", 16), ("num_coarse_samples", 8)])
-def test_a_table_too_small_is_refused_when_settings_are_read(name: str, least: int) -> None:
-    for wrong in (-1, 1, least - 1):
-        with pytest.raises(UsageError, match=rf"train\.{name}: found {wrong} \(int\), expected at least {least}, or 0$"):
+@pytest.mark.parametrize(("name", "least", "most"), [("log2_hashmap_size", 8, 24), ("finest_resolution", 16, 16384), ("num_coarse_samples", 8, 1024)])
+def test_a_table_too_small_is_refused_when_settings_are_read(name: str, least: int, most: int) -> None:
+    for wrong in (-1, 0, least - 1, most + 1):
+        with pytest.raises(UsageError, match=rf"train\.{name}: found {wrong} \(int\), expected a whole number, at least {least}, at most {most}, or auto\.$"):
             settings_from(TrainSettings, {name: wrong}, where="train")
-    for right in (0, least):
+    for right in ("auto", least, most):
         assert getattr(settings_from(TrainSettings, {name: right}), name) == right

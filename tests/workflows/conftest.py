@@ -6,13 +6,14 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import pytest
+from msgspec import Meta
 
+from efficientnerf.settings import PositiveInt, setting
 from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
-from stages.settings import setting
 from workflows import asset
 from workflows.cli.main import main
 
@@ -50,18 +51,18 @@ def enerf(capfd: pytest.CaptureFixture[str]) -> Callable[..., Result]:
 
 @dataclass(frozen=True)
 class PosesSettings:
-    format: str = setting("auto", "What the source is.", choices=("auto", "photographs"))
+    format: Literal["auto", "photographs"] = setting("auto", "What the source is.")
     strict: bool = setting(False, "Whether to refuse.")
     allow_outside: bool = setting(False, "Whether to allow.")
-    repeat: int = setting(1, "How often the text is repeated.", minimum=1, maximum=9)
+    repeat: Annotated[int, Meta(ge=1, le=9)] = setting(1, "How often the text is repeated.")
 
 
 @dataclass(frozen=True)
 class TrainSettings:
-    iterations: int = setting(4, "Steps.", minimum=1)
+    iterations: PositiveInt = setting(4, "Steps.")
     rate: float = setting(0.5, "Speed.")
     seed: int = setting(0, "Of the random numbers.")
-    fail: str = setting("", "How to fail.", choices=("", "bad", "error", "disk", "memory"))
+    fail: Literal["", "bad", "error", "disk", "memory"] = setting("", "How to fail.")
 
 
 @dataclass(frozen=True)

@@ -213,11 +213,12 @@ def test_a_source_that_is_not_there(enerf: Enerf, tmp_path: Path) -> None:
     assert (result.code, "is a file" in result.err) == (2, True)
 
 
-@pytest.mark.parametrize(("name", "least"), [("log2_table", 8), ("finest", 16), ("coarse_samples", 8)])
-def test_a_setting_too_small_for_training_is_refused_before_the_poses(enerf: Enerf, tmp_path: Path, name: str, least: int) -> None:
+@pytest.mark.parametrize(("name", "limits"), [("log2_hashmap_size", "at least 8, at most 24"), ("num_coarse_samples", "at least 8, at most 1024")])
+def test_a_setting_too_small_for_training_is_refused_before_the_poses(enerf: Enerf, tmp_path: Path, name: str, limits: str) -> None:
     blender(tmp_path / "source")
     result = enerf("run", tmp_path / "source", "--out", tmp_path / "run", "--set", f"train.{name}=3")
-    expected = f"enerf: --set train.{name}=3: train.{name}: found 3 (int), expected at least {least}, or 0. 'enerf presets train' says what it means."
+    expected = f"enerf: --set train.{name}=3: train.{name}: found 3 (int), expected a whole number, {limits}, or auto."
+    expected += " 'enerf presets train' says what it means."
     assert (result.code, result.err.strip()) == (2, expected)
     assert not (tmp_path / "run").exists()
 

@@ -45,7 +45,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_meshes_lie_in_the_frame_of_the_capture(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     files = [tmp_path / f"ball{extension}" for extension in (".ply", ".glb", ".obj")]
-    result = enerf("export", ball, "--to", *files, "--set", "mesh.faces=500", "--json")
+    result = enerf("export", ball, "--to", *files, "--set", "mesh.max_faces=500", "--json")
     assert result.code == 0, result.err
     assert [entry["path"] for entry in result.objects[-1]["written"]] == [str(path) for path in files]
     for path in files:
@@ -69,7 +69,7 @@ def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
         (["--to", "ball.obj", "--points"], 2, ".ply, .xyz"),
         (["--to", "no/where/ball.ply"], 2, "does not exist"),
         (["--to", "cameras.json"], 2, "has no cameras"),
-        (["--to", "ball.ply", "--set", "mesh.facs=3"], 2, "Nearest: mesh.faces."),
+        (["--to", "ball.ply", "--set", "mesh.max_facs=3"], 2, "Nearest: mesh.max_faces."),
         (["--to", "ball.ply", "--set", "mesh.density_threshold=1e9"], 3, "Lower mesh.density_threshold"),
         ([], 2, "--to"),
     ],

@@ -40,18 +40,19 @@ def ball(folder: Path) -> Path:
 def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
     whole, small = (settings_of(Row("n4"), scale) for scale in (1.0, 0.001))
     assert whole["train"]["iterations"] == 1_000_000
-    assert (whole["train"]["hidden"], whole["train"]["voxels"], whole["poses"]["max_side"]) == (256, 384, 800)
+    assert (whole["train"]["hidden_dim"], whole["train"]["occupancy_resolution"], whole["poses"]["max_image_size"]) == (256, 384, 800)
     assert small["train"]["iterations"] == 1000
-    for name in ("rays", "hidden", "coarse_hidden", "layers", "voxels"):
+    for name in ("max_rays_per_batch", "hidden_dim", "coarse_hidden_dim", "num_layers", "occupancy_resolution"):
         assert small["train"][name] < whole["train"][name], name
-    assert small["poses"]["max_side"] < 800
+    assert small["poses"]["max_image_size"] < 800
     assert small["bake"]["resolution"] < whole["bake"]["resolution"]
-    for name in ("coarse_samples", "fine_samples", "near", "far", "degree", "pivotal_weight", "voxel_beta", "voxel_initial", "sampling", "max_pivots"):
+    kept = ("num_coarse_samples", "samples_per_pivot", "near_plane", "far_plane", "sh_degree", "pivotal_threshold", "occupancy_beta")
+    for name in (*kept, "occupancy_initial_density", "sampling", "max_pivots"):
         assert small["train"][name] == whole["train"][name], name
     light, standard = settings_of(Row("n4"), 0.001)["train"], settings_of(Row("nerf", tables.NERF), 0.001)["train"]
-    assert light["coarse_hidden"] < standard["coarse_hidden"] == standard["hidden"]
+    assert light["coarse_hidden_dim"] < standard["coarse_hidden_dim"] == standard["hidden_dim"]
     differ = {name for name in light if light[name] != standard[name]}
-    assert differ == {"field", "sampling", "coarse_samples", "coarse_hidden", "coarse_layers"}  # so the rest is shared
+    assert differ == {"field", "sampling", "num_coarse_samples", "coarse_hidden_dim", "coarse_num_layers"}  # so the rest is shared
 
 
 def test_the_pace_is_that_of_the_log() -> None:
@@ -137,13 +138,13 @@ def test_a_tree_is_measured_on_as_many_views_as_the_network(tmp_path: Path, monk
     save(dataclasses.replace(s, views=tuple(dataclasses.replace(view, split="test" if n < 3 else "train") for n, view in enumerate(s.views))), folder)
     (tmp_path / "bake").mkdir()
     dataclasses.replace(random_tree(2, brick=4, degree=1, share=0.6), bounds_min=np.array([-0.6] * 3)).save(tmp_path / "bake" / "asset.nerftree")
-    run: Any = types.SimpleNamespace(folder=lambda name: tmp_path / name)
+    run: Any = types.SimpleNamespace(path=tmp_path, folder=lambda name: tmp_path / name)
     sent: list[str] = []
     monkeypatch.setattr(NerfTree, "to", lambda self, device: sent.append(device) or self)
     drawn: list[str] = []
     seconds = runs._frame_seconds
     monkeypatch.setattr(runs, "_frame_seconds", lambda tree, camera, background: drawn.append(camera.name) or seconds(tree, camera, background))
-    for wanted, count in ((2, 2), (0, 3)):
+    for wanted, count in ((2, 2), (None, 3)):
         drawn.clear()
         figures = runs._tree_figures(run, wanted, "cuda")
         assert len(drawn) == 1 + count  # the first, which compiles, is not counted

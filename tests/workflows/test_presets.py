@@ -43,7 +43,7 @@ def test_the_papers_presets_are_the_papers() -> None:
         assert (train.occupancy_resolution, train.occupancy_initial_density, train.occupancy_beta, train.occupancy_rule) == (384, 10.0, 0.1, "momentum")
         assert (train.pivotal_threshold, train.sampling, train.near_plane, train.far_plane) == (1e-4, "efficient", 2.0, 6.0)
         assert train.max_pivots >= train.num_coarse_samples  # the paper drops none
-        assert (train.max_rays_per_batch, train.sample_batch_size, train.iterations, train.learning_rate) == (1024, 0, 1_000_000, 5e-4)
+        assert (train.max_rays_per_batch, train.sample_batch_size, train.iterations, train.learning_rate) == (1024, "off", 1_000_000, 5e-4)
         assert (train.lr_final_ratio, train.lr_decay_steps) == (0.1, 500_000)
         assert (bake.resolution // bake.brick_size, bake.brick_size) == (384, 4)
     assert samples == [(64, 2), (64, 3), (96, 4), (128, 5)]

@@ -40,7 +40,7 @@ def shares(request: Request) -> Result:
             rows.append(dict(zip(columns, [scene.name, method, ours[0], printed[0], ours[1], printed[1], figures.psnr], strict=True)))
             curves[f"{scene.name}, {method}"] = figures.curve
     notes = [
-        "Shares are counts over all rays of the held-back views times N_c (NeRF 64, EfficientNeRF 128), between near 2 and far 6, at the end of the run."
+        "Shares are counts over all rays of the test views times N_c (NeRF 64, EfficientNeRF 128), between near 2 and far 6, at the end of the run."
         " Valid: of a NeRF, coarse samples with a density before its activation above zero; of EfficientNeRF, those that its density voxels left."
         " Pivotal: with a coarse weight above 1e-4. The paper measured its shares on trained NeRFs.",
     ]
@@ -180,12 +180,12 @@ def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
     found = scenes(_data(request))
     train = settings_of(rows[-1], request.scale)["train"]
     poses = settings_of(rows[-1], request.scale)["poses"]
-    sizes = f"{train['layers']}x{train['hidden']} and {train['coarse_layers']}x{train['coarse_hidden']}"
+    sizes = f"{train['num_layers']}x{train['hidden_dim']} and {train['coarse_num_layers']}x{train['coarse_hidden_dim']}"
     notes = [
-        f"Scenes: {', '.join(scene.name for scene in found)}; images of at most {poses['max_side']} pixels, {train['iterations']} iterations of"
-        f" {train['rays']} rays, networks {sizes} (last row), density voxels {train['voxels']}^3, rate {train['learning_rate']:.2g},"
-        f" {train['warm_up']} steps before pruning.",
-        "All rows share kernels, number type, batch, rate and loss. Seconds are of training steps alone; PSNR is of the network on held-back views.",
+        f"Scenes: {', '.join(scene.name for scene in found)}; images of at most {poses['max_image_size']} pixels, {train['iterations']} iterations of"
+        f" {train['max_rays_per_batch']} rays, networks {sizes} (last row), density voxels {train['occupancy_resolution']}^3, learning rate {train['learning_rate']:.2g},"
+        f" {train['occupancy_warmup_steps']} steps before pruning.",
+        "All rows share kernels, number type, batch, learning rate and loss. Seconds are of training steps alone; PSNR is of the network on test views.",
     ]
     if request.scale != 1:
         low = [f"{row.name} on {scene.name}" for row in rows for scene in found if not measured(_quiet(request), scene, row).counts]
