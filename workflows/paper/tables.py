@@ -183,8 +183,8 @@ def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
     sizes = f"{train['num_layers']}x{train['hidden_dim']} and {train['coarse_num_layers']}x{train['coarse_hidden_dim']}"
     notes = [
         f"Scenes: {', '.join(scene.name for scene in found)}; images of at most {poses['max_image_size']} pixels, {train['iterations']} iterations of"
-        f" {train['max_rays_per_batch']} rays, networks {sizes} (last row), density voxels {train['occupancy_resolution']}^3, learning rate {train['learning_rate']:.2g},"
-        f" {train['occupancy_warmup_steps']} steps before pruning.",
+        f" {train['max_rays_per_batch']} rays, networks {sizes} (last row),"
+        f" density voxels {train['occupancy_resolution']}^3, learning rate {train['learning_rate']:.2g}, warm-up of {train['occupancy_warmup_steps']} steps.",
         "All rows share kernels, number type, batch, learning rate and loss. Seconds are of training steps alone; PSNR is of the network on test views.",
     ]
     if request.scale != 1:
