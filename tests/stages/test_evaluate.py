@@ -222,7 +222,7 @@ def test_the_field_is_not_loaded_where_nothing_needs_it(tmp_path: Path) -> None:
 
 
 def test_spread_is_even_and_complete() -> None:
-    assert spread(10, 0) == spread(10, 12) == list(range(10))
+    assert spread(10, None) == spread(10, 12) == list(range(10))
     assert spread(10, 2) == [2, 7]
     assert spread(9, 1) == [4]
     for count in range(1, 30):
