@@ -21,7 +21,7 @@ class Defaults:
 
     strict: bool = False
     allow_outside: bool = False
-    llff_factor: int | None = None
+    llff_factor: int | Auto = "auto"
 
 
 def describe_source(folder: Path, format: str = "auto") -> dict[str, Any]:
