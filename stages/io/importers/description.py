@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.settings import Auto
 from stages.io.capture import Capture
 from stages.io.importers import IMPORTERS, candidates, lenses
 from stages.io.importers.photographs import masks_of, photographs
