@@ -53,7 +53,7 @@ def copy_rate(device: str, mebibytes: int, repeats: int) -> float:
 
 def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict[str, dict[str, float]]:
     """Each kernel of a step at the sizes of a bundle of `rays_` rays: milliseconds, samples a second, and bytes moved at least over that time."""
-    from efficientnerf.backends.triton import compositing, hash_grid, sampling
+    from efficientnerf.backends.triton import adam, compositing, hash_grid, sampling
     from efficientnerf.rendering.harmonics import basis
 
     generator = torch.Generator().manual_seed(0)
@@ -96,7 +96,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
         ("encode_backward", lambda: torch.autograd.grad(features, table, grad_features, retain_graph=True), samples, 12 + 2 * corner + 8 * levels),
         ("composite", composite, samples, 28 * 4 + 4 + 16.0),
         ("composite_backward", lambda: torch.autograd.grad(colour.sum(), raw, retain_graph=True), samples, 2 * 28 * 4 + 4 + 16.0),
-        ("adam", lambda: hash_grid.adam(value, grad, first, second, 0.01, 0.9, 0.99, 0.5, 0.5, 1e-15, skip_zeros=True), table.numel(), 4 + 24 / 2.0),
+        ("adam", lambda: adam.adam(value, grad, first, second, 0.01, 0.9, 0.99, 0.5, 0.5, 1e-15, skip_zeros=True), table.numel(), 4 + 24 / 2.0),
     ]
     out = {}
     for name, run, items, each in jobs:
@@ -146,10 +146,10 @@ def frame_rates(device: str, tree: NerfTree, side: int, repeats: int, variants: 
     for tile, warps in [usual, *variants]:
         cuda_tree.TILE = tile
         cuda_tree.WARPS[row] = warps
-        took = milliseconds(lambda: [cuda_tree.draw(on_device, camera, background=(1.0, 1.0, 1.0)) for camera in cameras], device, repeats) / len(cameras)
+        took = milliseconds(lambda: [cuda_tree.render_image(on_device, c, background=(1.0, 1.0, 1.0)) for c in cameras], device, repeats) / len(cameras)
         timed.append({"tile": list(tile), "warps": warps, "ms": round(took, 4), "frames_per_second": round(1e3 / took, 1)})
     cuda_tree.TILE, cuda_tree.WARPS[row] = usual
-    ours = cuda_tree.draw(on_device, cameras[0]).colour.cpu().numpy()
+    ours = cuda_tree.render_image(on_device, cameras[0]).colour.cpu().numpy()
     off = np.abs(ours - tree.render(cameras[0]).colour).max(axis=-1)
     return {
         "pixels": [side, side], "voxels": len(tree.density_values), "bytes_on_device": on_device.bytes, "runs": timed,

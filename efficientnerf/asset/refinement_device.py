@@ -49,12 +49,12 @@ class DeviceFit:
     def step(self, number: int, rays: Rays, seen: Any, density_rate: float, colour_rate: float, view_share: float = 1.0) -> Tensor:
         """Losses (R,) of the rays before the step."""
         v, sums = self.values, (self.by_thickness, self.by_sh)
-        seen_as = tree_gradients.look(self.grid, rays, v["density"], v["sh"])
-        loss, *by = tree_gradients.loss_of(*seen_as, seen)
-        tree_gradients.pull(self.grid, rays, v["density"], v["sh"], seen_as, (by[0], by[1]), sums, self.stamp, number)
-        tree_gradients.descend(
+        outputs = tree_gradients.forward(self.grid, rays, v["density"], v["sh"])
+        loss, *by = tree_gradients.loss_and_gradients(*outputs, seen)
+        tree_gradients.backward(self.grid, rays, v["density"], v["sh"], outputs, (by[0], by[1]), sums, self.stamp, number)
+        tree_gradients.rmsprop_step(
             self.grid, (v["density"], v["sh"]), sums, (v["square_density"], v["square_sh"]), v["visits"], self.stamp,
-            number=number, rays=len(loss), density_rate=density_rate, colour_rate=colour_rate, view_share=view_share, decay=DECAY, epsilon=EPSILON,
+            number=number, rays=len(loss), density_rate=density_rate, sh_rate=colour_rate, view_share=view_share, decay=DECAY, epsilon=EPSILON,
         )  # fmt: skip
         return loss
 
@@ -112,7 +112,7 @@ def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> f
     grid, density, sh = values_of(tree, targets.pixels.device)
     total = torch.zeros((), dtype=torch.float64, device=density.device)
     for origins, directions, seen in bundles:
-        loss, _, _ = tree_gradients.loss_of(*tree_gradients.look(grid, rays_in_voxels(tree, origins, directions), density, sh), seen)
+        loss, _, _ = tree_gradients.loss_and_gradients(*tree_gradients.forward(grid, rays_in_voxels(tree, origins, directions), density, sh), seen)
         total += loss.double().sum()
     return float(total)
 
@@ -123,5 +123,5 @@ def greatest_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]
     grid, density, _ = values_of(tree, targets.pixels.device)
     greatest = torch.zeros_like(density)
     for origins, directions, seen in bundles:
-        tree_gradients.weigh(grid, rays_in_voxels(tree, origins, directions), density, seen.transmittance.contiguous(), greatest)
+        tree_gradients.max_contributions(grid, rays_in_voxels(tree, origins, directions), density, seen.transmittance.contiguous(), greatest)
     return greatest.cpu().numpy()

@@ -37,11 +37,22 @@ def triton_usable() -> bool:
     if not torch.cuda.is_available():
         return False
     try:
-        from efficientnerf.backends.triton import hash_grid
+        from efficientnerf.backends.triton.adam import adam
     except ImportError as error:
         warnings.warn(f"Triton cannot be imported ({error}); plain torch is used on CUDA, many times slower. Install triton.", RuntimeWarning, stacklevel=3)
         return False
-    return hash_grid.usable()
+    try:
+        probe = torch.ones(1, device="cuda")
+        adam(probe, probe.clone(), probe.clone(), probe.clone(), 0.0, 0.9, 0.99, 1.0, 1.0, 1e-8, skip_zeros=False)
+    except Exception as error:  # whatever the compiler, the driver or the launcher may say
+        reason = str(error).strip().splitlines()[-1:] or [type(error).__name__]
+        warnings.warn(
+            f"The CUDA kernels cannot be built here ({reason[0][:200]}); plain torch is used, many times slower. Usually a C compiler is missing: install gcc.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return False
+    return True
 
 
 def _refuse(capacity: int | None) -> None:
@@ -138,7 +149,7 @@ def tree_rays(
 
         given = (origins, directions) if looking is None else (origins, directions, looking)
         there = [torch.from_numpy(np.ascontiguousarray(a, np.float64)).to(tree.device) for a in given]
-        return tuple(part.cpu().numpy() for part in cuda_tree.draw_rays(tree.on_device, *there))
+        return tuple(part.cpu().numpy() for part in cuda_tree.render_rays(tree.on_device, *there))
     if tree.lookup == "nearest":
         from efficientnerf.backends.numba.tree import nearest
 

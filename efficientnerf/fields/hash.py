@@ -85,7 +85,7 @@ def encode(points: Tensor, field: HashField) -> Tensor:
     if on_device(points, field.table):
         from efficientnerf.backends.triton import hash_grid as cuda
 
-        return cuda.Encode.apply(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
+        return cuda.encode(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
     return encode_reference(points, field.table, field.sides, field.dense, field.starts, int(field.mask))
 
 

@@ -38,9 +38,9 @@ def render_tree(tree: NerfTree, camera: Camera, *, background: tuple[float, floa
     if behind.shape != (3,):
         raise ValueError(f"background {background}: expected three numbers, red, green and blue")
     if tree.ndc is None and tree.device != "cpu" and dispatch.triton_usable():
-        from efficientnerf.backends.triton.tree import draw
+        from efficientnerf.backends.triton import tree as cuda_tree
 
-        return Rendering(*(part.cpu().numpy() for part in draw(tree.on_device, camera, background=background, supersample=supersample)))
+        return Rendering(*(part.cpu().numpy() for part in cuda_tree.render_image(tree.on_device, camera, background=background, supersample=supersample)))
     if tree.ndc is not None or tree.lookup == "nearest":
         return _render_by_rays(tree, camera, behind, supersample)
     return Rendering(*render_image(tree, camera, supersample, behind, normals=True, rays_per_band=RAYS_PER_BAND))

@@ -77,10 +77,10 @@ class Adam:
                 flat = [t.detach().view(-1).numpy() for t in (p, p.grad.contiguous(), first, second)]
                 cpu_adam.adam(*flat, *(np.float32(x) for x in (rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
             elif dispatch.on_device(p, p.grad):
-                from efficientnerf.backends.triton import hash_grid
+                from efficientnerf.backends.triton.adam import adam
 
                 moments = (first, second, rate, BETA1, self.beta2, correction1, correction2, self.epsilon)
-                hash_grid.adam(p, p.grad, *moments, skip_zeros=sparse)
+                adam(p, p.grad, *moments, skip_zeros=sparse)
             else:
                 with torch.no_grad():
                     touched = (p.grad != 0) if sparse else torch.ones_like(p.grad, dtype=torch.bool)

@@ -65,14 +65,14 @@ def build(self: JITFunction, *args: Any, grid: Any, warmup: bool, num_warps: int
 
 
 def training_step() -> None:
-    from efficientnerf.backends.triton import compositing, hash_grid, sampling
+    from efficientnerf.backends.triton import adam, compositing, hash_grid, sampling
     from efficientnerf.geometry.spaces import space_from
 
     sides, dense, starts = np.array([4, 64]), np.array([True, False]), np.array([0, 64])
     table = torch.zeros(1000, 2, requires_grad=True)
-    hash_grid.Encode.apply(torch.zeros(8, 3), table, sides, dense, starts, 255).sum().backward()
+    hash_grid.encode(torch.zeros(8, 3), table, sides, dense, starts, 255).sum().backward()
     for skip_zeros in (False, True):
-        hash_grid.adam(*(torch.zeros(64) for _ in range(4)), 0.1, 0.9, 0.99, 1.0, 1.0, 1e-15, skip_zeros=skip_zeros)
+        adam.adam(*(torch.zeros(64) for _ in range(4)), 0.1, 0.9, 0.99, 1.0, 1.0, 1e-15, skip_zeros=skip_zeros)
     for contracted in (False, True):
         space = space_from(np.array([[-1.0] * 3, [1.0] * 3]), contracted=contracted)
         rays = (torch.zeros(8, 3), torch.ones(8, 3), torch.zeros(8), torch.ones(8), torch.zeros(8))
@@ -86,7 +86,7 @@ def training_step() -> None:
             out.colour.sum().backward()
 
 
-def pictures() -> None:
+def images() -> None:
     from efficientnerf.backends.triton import tree as cuda_tree
     from efficientnerf.geometry.cameras import Camera
     from tests.efficientnerf.trees import random_tree
@@ -94,10 +94,10 @@ def pictures() -> None:
     camera = Camera("view", 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), np.eye(4))
     for degree in range(5):
         tree = cuda_tree.device_tree(random_tree(0, degree=degree, brick=4), "cpu")
-        cuda_tree.draw(tree, camera, background=(1.0, 1.0, 1.0))
+        cuda_tree.render_image(tree, camera, background=(1.0, 1.0, 1.0))
         if degree == 2:
-            cuda_tree.draw(cuda_tree.device_tree(random_tree(0, degree=degree, brick=4, lookup="nearest"), "cpu"), camera)
-            cuda_tree.draw_rays(tree, torch.zeros(8, 3), torch.ones(8, 3))
+            cuda_tree.render_image(cuda_tree.device_tree(random_tree(0, degree=degree, brick=4, lookup="nearest"), "cpu"), camera)
+            cuda_tree.render_rays(tree, torch.zeros(8, 3), torch.ones(8, 3))
 
 
 def fit() -> None:
@@ -111,15 +111,15 @@ def fit() -> None:
         values, squares = (torch.zeros(count), torch.zeros(count, width)), (torch.zeros(count), torch.zeros(count))
         sums = torch.zeros(count, dtype=torch.int64), torch.zeros(count, width, dtype=torch.int64)
         visits, stamp = torch.zeros(count, dtype=torch.int32), torch.zeros(count, dtype=torch.int32)
-        seen_as = tree_gradients.look(g, rays, *values)
-        tree_gradients.pull(g, rays, *values, seen_as, (seen_as[0], seen_as[1]), sums, stamp, 7)
-        tree_gradients.weigh(g, rays, values[0], seen_as[1], squares[0])
-        told = {"number": 7, "rays": 8, "density_rate": 0.1, "colour_rate": 0.1, "view_share": 0.5, "decay": 0.9, "epsilon": 1e-10}
-        tree_gradients.descend(g, values, sums, squares, visits, stamp, **told)
+        outputs = tree_gradients.forward(g, rays, *values)
+        tree_gradients.backward(g, rays, *values, outputs, (outputs[0], outputs[1]), sums, stamp, 7)
+        tree_gradients.max_contributions(g, rays, values[0], outputs[1], squares[0])
+        rates = {"number": 7, "rays": 8, "density_rate": 0.1, "sh_rate": 0.1, "view_share": 0.5, "decay": 0.9, "epsilon": 1e-10}
+        tree_gradients.rmsprop_step(g, values, sums, squares, visits, stamp, **rates)
 
 
 if __name__ == "__main__":
     JITFunction.run = build
     fit()
     training_step()
-    pictures()
+    images()

@@ -13,6 +13,7 @@ from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.test_kernels import RATES, gradients
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.hash_grid")
+cuda_adam = pytest.importorskip("efficientnerf.backends.triton.adam")
 
 
 def field(log2_table: int = 9) -> HashField:
@@ -36,7 +37,7 @@ def points(count: int) -> Tensor:
 def encoded(made: HashField, x: Tensor, pull: Tensor, kernel: bool) -> tuple[Tensor, Tensor]:
     made.table.grad = None
     if kernel:
-        out = cuda.Encode.apply(x, made.table, made.sides, made.dense, made.starts, int(made.mask))
+        out = cuda.encode(x, made.table, made.sides, made.dense, made.starts, int(made.mask))
     else:
         out = encode_reference(x, made.table, made.sides, made.dense, made.starts, int(made.mask))
     (out * pull).sum().backward()
@@ -78,7 +79,7 @@ def test_adam_is_the_cpu_kernel(skip_zeros: bool) -> None:
     for number, (grad, rate) in enumerate(zip(gradients((1300, 2)), RATES, strict=True), 1):
         grad[300 : 900 if number > 1 else 300 : 2] = 0
         corrections = (1 - 0.9**number, 1 - 0.99**number)
-        cuda.adam(ours[0], grad.to(DEVICE), *ours[1:], rate, 0.9, 0.99, *corrections, 1e-15, skip_zeros=skip_zeros)
+        cuda_adam.adam(ours[0], grad.to(DEVICE), *ours[1:], rate, 0.9, 0.99, *corrections, 1e-15, skip_zeros=skip_zeros)
         flat = [t.view(-1).numpy() for t in (theirs[0], grad.clone(), *theirs[1:])]
         adam.adam(*flat, *(np.float32(x) for x in (rate, 0.9, 0.99, *corrections, 1e-15)), skip_zeros)
     for a, b in zip(ours, theirs, strict=True):

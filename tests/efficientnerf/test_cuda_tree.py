@@ -20,12 +20,12 @@ cuda = pytest.importorskip("efficientnerf.backends.triton.tree")
 
 
 def drawn_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> Rendering:
-    found = cuda.draw_rays(cuda.device_tree(tree, DEVICE), *(t.to(DEVICE) for t in tensors(origins, directions)))
+    found = cuda.render_rays(cuda.device_tree(tree, DEVICE), *(t.to(DEVICE) for t in tensors(origins, directions)))
     return Rendering(*(t.cpu().numpy() for t in found))
 
 
 def drawn(tree: NerfTree, camera: Camera, **options: object) -> Rendering:
-    return Rendering(*(t.cpu().numpy() for t in cuda.draw(cuda.device_tree(tree, DEVICE), camera, **options)))
+    return Rendering(*(t.cpu().numpy() for t in cuda.render_image(cuda.device_tree(tree, DEVICE), camera, **options)))
 
 
 def agree(ours: Rendering, theirs: Rendering, faces: float = 0.0) -> None:
@@ -172,7 +172,7 @@ def test_rays_of_another_frame_are_looked_at_along_those_of_the_world() -> None:
     tree = random_tree(3, degree=2)
     origins, directions = rays_at(tree, 60)
     looking = np.roll(directions, 1, axis=0)
-    found = cuda.draw_rays(cuda.device_tree(tree, DEVICE), *(t.to(DEVICE) for t in tensors(origins, directions, looking)))
+    found = cuda.render_rays(cuda.device_tree(tree, DEVICE), *(t.to(DEVICE) for t in tensors(origins, directions, looking)))
     from efficientnerf.backends.numba.tree.rendering import render_rays
 
     agree(Rendering(*(t.cpu().numpy() for t in found)), Rendering(*render_rays(tree, origins, directions, looking)), faces=0.02)

@@ -34,12 +34,12 @@ def gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen:
     """Loss of each ray, and the gradients of their sum by density and harmonics."""
     rays = device.rays_in_voxels(tree, *(torch.from_numpy(a).to(DEVICE) for a in (origins, directions)))
     grid, density, sh = device.values_of(tree, torch.device(DEVICE))
-    seen_as = kernels.look(grid, rays, density, sh)
-    loss, *by = kernels.loss_of(*seen_as, there(seen))
+    seen_as = kernels.forward(grid, rays, density, sh)
+    loss, *by = kernels.loss_and_gradients(*seen_as, there(seen))
     sums = torch.zeros(density.shape, dtype=torch.int64, device=DEVICE), torch.zeros(sh.shape, dtype=torch.int64, device=DEVICE)
     stamp = torch.zeros(len(density), dtype=torch.int32, device=DEVICE)
-    kernels.pull(grid, rays, density, sh, seen_as, tuple(by), sums, stamp, 3)
-    by_thickness, by_sh = (part.cpu().double().numpy() / kernels.resolution(len(origins)) for part in sums)
+    kernels.backward(grid, rays, density, sh, seen_as, tuple(by), sums, stamp, 3)
+    by_thickness, by_sh = (part.cpu().double().numpy() / kernels.fixed_point_scale(len(origins)) for part in sums)
     assert set(stamp.tolist()) <= {0, 3}
     assert np.array_equal(by_sh.any(axis=1) & (stamp.cpu().numpy() != 3), np.zeros(len(by_sh), bool))
     return loss.cpu().numpy(), by_thickness * tree.voxel, by_sh.reshape(tree.sh.shape)
@@ -78,8 +78,8 @@ def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
 def test_sums_of_the_most_rays_cannot_overflow() -> None:
     """The greatest gradients there are: full light through thin matter onto a pixel that is off by 2, all on one voxel."""
     for rays in (1, 32768, 2**22):
-        assert 25.0 * 7 * rays * kernels.resolution(rays) < 2**62.5
-        assert kernels.resolution(rays) >= 2**32
+        assert 25.0 * 7 * rays * kernels.fixed_point_scale(rays) < 2**62.5
+        assert kernels.fixed_point_scale(rays) >= 2**32
     tree = uniform_tree((1, 1, 1), brick=1, sigma=1e-3, logit=0.0)
     count = 500
     middle = (tree.bounds_min + tree.bounds_max) / 2

@@ -241,11 +241,11 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
         return time.perf_counter() - begun
     import torch
 
-    from efficientnerf.backends.triton.tree import draw
+    from efficientnerf.backends.triton.tree import render_image
 
     torch.cuda.synchronize()
     begun = time.perf_counter()
-    draw(tree.on_device, camera, background=background)
+    render_image(tree.on_device, camera, background=background)
     torch.cuda.synchronize()
     return time.perf_counter() - begun
 

@@ -14,7 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from efficientnerf.backends.triton.tree_walk import sigmoid
+from efficientnerf.backends.triton.vectors import sigmoid
 from efficientnerf.rendering.compositing import LARGEST_LOGIT, Composite
 
 CHUNK = 32
@@ -49,11 +49,11 @@ def _forward(  # type: ignore[no-untyped-def]
     end = tl.load(first + r + 1)
     k = tl.arange(0, KP)
     basis = tl.load(harmonics + r * K + k, k < K, other=0.0)
-    passed = 0.0  # optical depth of the chunks before
-    at = 0.0  # length of the chunks before
-    near_weight = 0.0
-    near_moment = 0.0
-    spread = 0.0
+    depth_before = 0.0  # optical depth of the chunks before
+    length_before = 0.0  # length of the chunks before
+    weight_before_chunk = 0.0
+    moment_before_chunk = 0.0
+    ray_distortion = 0.0
     red = 0.0
     green = 0.0
     blue = 0.0
@@ -63,12 +63,12 @@ def _forward(  # type: ignore[no-untyped-def]
         size = tl.load(length + n, live, other=0.0)
         density, _ = _activate(tl.load(raw + n * WIDTH, live, other=0.0), EXPONENTIAL)
         depth = tl.where(live, tl.minimum(density * size, OPAQUE), 0.0)
-        w = tl.exp(-(passed + tl.cumsum(depth, 0) - depth)) * (1 - tl.exp(-depth))
-        tile = raw + n[:, None] * WIDTH + 1 + k[None, :]
-        seen = live[:, None] & (k < K)[None, :]
-        cr = sigmoid(tl.sum(tl.load(tile, seen, other=0.0) * basis[None, :], 1))
-        cg = sigmoid(tl.sum(tl.load(tile + K, seen, other=0.0) * basis[None, :], 1))
-        cb = sigmoid(tl.sum(tl.load(tile + 2 * K, seen, other=0.0) * basis[None, :], 1))
+        w = tl.exp(-(depth_before + tl.cumsum(depth, 0) - depth)) * (1 - tl.exp(-depth))
+        coefficients = raw + n[:, None] * WIDTH + 1 + k[None, :]
+        stored = live[:, None] & (k < K)[None, :]
+        cr = sigmoid(tl.sum(tl.load(coefficients, stored, other=0.0) * basis[None, :], 1))
+        cg = sigmoid(tl.sum(tl.load(coefficients + K, stored, other=0.0) * basis[None, :], 1))
+        cb = sigmoid(tl.sum(tl.load(coefficients + 2 * K, stored, other=0.0) * basis[None, :], 1))
         tl.store(weight + n, w, live)
         tl.store(rgb + n * 3, cr, live)
         tl.store(rgb + n * 3 + 1, cg, live)
@@ -76,38 +76,31 @@ def _forward(  # type: ignore[no-untyped-def]
         red += tl.sum(w * cr, 0)
         green += tl.sum(w * cg, 0)
         blue += tl.sum(w * cb, 0)
-        middle = at + tl.cumsum(size, 0) - 0.5 * size
+        middle = length_before + tl.cumsum(size, 0) - 0.5 * size
         moment = w * middle
-        before_weight = near_weight + tl.cumsum(w, 0) - w
-        before_moment = near_moment + tl.cumsum(moment, 0) - moment
-        spread += tl.sum(2 * w * (middle * before_weight - before_moment) + w * w * size / 3, 0)
-        near_weight += tl.sum(w, 0)
-        near_moment += tl.sum(moment, 0)
-        passed += tl.sum(depth, 0)
-        at += tl.sum(size, 0)
+        before_weight = weight_before_chunk + tl.cumsum(w, 0) - w
+        before_moment = moment_before_chunk + tl.cumsum(moment, 0) - moment
+        ray_distortion += tl.sum(2 * w * (middle * before_weight - before_moment) + w * w * size / 3, 0)
+        weight_before_chunk += tl.sum(w, 0)
+        moment_before_chunk += tl.sum(moment, 0)
+        depth_before += tl.sum(depth, 0)
+        length_before += tl.sum(size, 0)
         base += CHUNK
-    light = tl.exp(-passed)
-    tl.store(colour + r * 3, red + light * tl.load(background + r * 3))
-    tl.store(colour + r * 3 + 1, green + light * tl.load(background + r * 3 + 1))
-    tl.store(colour + r * 3 + 2, blue + light * tl.load(background + r * 3 + 2))
-    tl.store(opacity + r, 1 - light)
-    tl.store(distortion + r, spread)
+    transmittance = tl.exp(-depth_before)
+    tl.store(colour + r * 3, red + transmittance * tl.load(background + r * 3))
+    tl.store(colour + r * 3 + 1, green + transmittance * tl.load(background + r * 3 + 1))
+    tl.store(colour + r * 3 + 2, blue + transmittance * tl.load(background + r * 3 + 2))
+    tl.store(opacity + r, 1 - transmittance)
+    tl.store(distortion + r, ray_distortion)
 
 
 @triton.jit
-def _backward(  # type: ignore[no-untyped-def]
-    raw, length, first, harmonics, background, weight, rgb, grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background,
-    K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
-):  # fmt: skip
-    """Totals first, then the chunks from the last to the first: what lies behind a sample is summed up, never a small difference of large numbers."""
-    WIDTH: tl.constexpr = 1 + 3 * K
-    r = tl.program_id(0).to(tl.int64)
-    begin = tl.load(first + r)
-    end = tl.load(first + r + 1)
-    passed = 0.0
-    at = 0.0
-    all_weight = 0.0
-    all_moment = 0.0
+def _totals(raw, length, weight, begin, end, WIDTH: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Of a ray: optical depth, length, weight and moment of all its samples, and where the chunk after the last one begins."""
+    total_depth = 0.0
+    total_length = 0.0
+    total_weight = 0.0
+    total_moment = 0.0
     base = begin
     while base < end:
         n = base + tl.arange(0, CHUNK)
@@ -115,26 +108,40 @@ def _backward(  # type: ignore[no-untyped-def]
         size = tl.load(length + n, live, other=0.0)
         w = tl.load(weight + n, live, other=0.0)
         density, _ = _activate(tl.load(raw + n * WIDTH, live, other=0.0), EXPONENTIAL)
-        passed += tl.sum(tl.where(live, tl.minimum(density * size, OPAQUE), 0.0), 0)
-        all_weight += tl.sum(w, 0)
-        all_moment += tl.sum(w * (at + tl.cumsum(size, 0) - 0.5 * size), 0)
-        at += tl.sum(size, 0)
+        total_depth += tl.sum(tl.where(live, tl.minimum(density * size, OPAQUE), 0.0), 0)
+        total_weight += tl.sum(w, 0)
+        total_moment += tl.sum(w * (total_length + tl.cumsum(size, 0) - 0.5 * size), 0)
+        total_length += tl.sum(size, 0)
         base += CHUNK
-    g0 = tl.load(grad_colour + r * 3)
-    g1 = tl.load(grad_colour + r * 3 + 1)
-    g2 = tl.load(grad_colour + r * 3 + 2)
-    gs = tl.load(grad_distortion + r)
-    light = tl.exp(-passed)
-    tl.store(grad_background + r * 3, light * g0)
-    tl.store(grad_background + r * 3 + 1, light * g1)
-    tl.store(grad_background + r * 3 + 2, light * g2)
-    # What lies behind a sample contributes `rest`: the background, and the samples after it.
+    return total_depth, total_length, total_weight, total_moment, base
+
+
+@triton.jit
+def _backward(  # type: ignore[no-untyped-def]
+    raw, length, first, harmonics, background, weight, rgb, grad_colour, grad_opacity, grad_distortion, grad_weight, grad_raw, grad_background,
+    K: tl.constexpr, KP: tl.constexpr, EXPONENTIAL: tl.constexpr, CHUNK: tl.constexpr,
+):  # fmt: skip
+    """Chunks from the last to the first: what lies behind a sample is summed up, never a small difference of large numbers."""
+    WIDTH: tl.constexpr = 1 + 3 * K
+    r = tl.program_id(0).to(tl.int64)
+    begin = tl.load(first + r)
+    end = tl.load(first + r + 1)
+    depth_before, length_before, total_weight, total_moment, base = _totals(raw, length, weight, begin, end, WIDTH, EXPONENTIAL, CHUNK)
+    g_red = tl.load(grad_colour + r * 3)
+    g_green = tl.load(grad_colour + r * 3 + 1)
+    g_blue = tl.load(grad_colour + r * 3 + 2)
+    g_distortion = tl.load(grad_distortion + r)
+    transmittance = tl.exp(-depth_before)
+    tl.store(grad_background + r * 3, transmittance * g_red)
+    tl.store(grad_background + r * 3 + 1, transmittance * g_green)
+    tl.store(grad_background + r * 3 + 2, transmittance * g_blue)
+    # What lies behind a sample contributes `behind_chunk`: the background, and the samples after it.
     b0 = tl.load(background + r * 3)
     b1 = tl.load(background + r * 3 + 1)
     b2 = tl.load(background + r * 3 + 2)
-    rest = light * (g0 * b0 + g1 * b1 + g2 * b2 - tl.load(grad_opacity + r))
-    far_weight = 0.0
-    far_moment = 0.0
+    behind_chunk = transmittance * (g_red * b0 + g_green * b1 + g_blue * b2 - tl.load(grad_opacity + r))
+    weight_after_chunk = 0.0
+    moment_after_chunk = 0.0
     k = tl.arange(0, KP)
     basis = tl.load(harmonics + r * K + k, k < K, other=0.0)
     while base > begin:
@@ -145,31 +152,31 @@ def _backward(  # type: ignore[no-untyped-def]
         w = tl.load(weight + n, live, other=0.0)
         density, slope = _activate(tl.load(raw + n * WIDTH, live, other=0.0), EXPONENTIAL)
         depth = tl.where(live, tl.minimum(density * size, OPAQUE), 0.0)
-        passed -= tl.sum(depth, 0)
-        at -= tl.sum(size, 0)
-        middle = at + tl.cumsum(size, 0) - 0.5 * size
+        depth_before -= tl.sum(depth, 0)
+        length_before -= tl.sum(size, 0)
+        middle = length_before + tl.cumsum(size, 0) - 0.5 * size
         moment = w * middle
-        after_weight = far_weight + tl.sum(w, 0) - tl.cumsum(w, 0)
-        after_moment = far_moment + tl.sum(moment, 0) - tl.cumsum(moment, 0)
-        before_weight = all_weight - after_weight - w
-        before_moment = all_moment - after_moment - moment
-        spread = 2 * (middle * (before_weight - after_weight) - before_moment + after_moment) + 2.0 / 3.0 * w * size
+        after_weight = weight_after_chunk + tl.sum(w, 0) - tl.cumsum(w, 0)
+        after_moment = moment_after_chunk + tl.sum(moment, 0) - tl.cumsum(moment, 0)
+        before_weight = total_weight - after_weight - w
+        before_moment = total_moment - after_moment - moment
+        by_weight = 2 * (middle * (before_weight - after_weight) - before_moment + after_moment) + 2.0 / 3.0 * w * size
         cr = tl.load(rgb + n * 3, live, other=0.0)
         cg = tl.load(rgb + n * 3 + 1, live, other=0.0)
         cb = tl.load(rgb + n * 3 + 2, live, other=0.0)
-        own = tl.load(grad_weight + n, live, other=0.0) + g0 * cr + g1 * cg + g2 * cb + gs * spread
-        pulled = w * own
-        behind = rest + tl.sum(pulled, 0) - tl.cumsum(pulled, 0)
-        after = tl.exp(-(tl.maximum(passed, 0.0) + tl.cumsum(depth, 0)))
-        tl.store(grad_raw + n * WIDTH, (after * own - behind) * size * slope, live)
-        tile = grad_raw + n[:, None] * WIDTH + 1 + k[None, :]
-        seen = live[:, None] & (k < K)[None, :]
-        tl.store(tile, (w * g0 * cr * (1 - cr))[:, None] * basis[None, :], seen)
-        tl.store(tile + K, (w * g1 * cg * (1 - cg))[:, None] * basis[None, :], seen)
-        tl.store(tile + 2 * K, (w * g2 * cb * (1 - cb))[:, None] * basis[None, :], seen)
-        rest += tl.sum(pulled, 0)
-        far_weight += tl.sum(w, 0)
-        far_moment += tl.sum(moment, 0)
+        grad_own = tl.load(grad_weight + n, live, other=0.0) + g_red * cr + g_green * cg + g_blue * cb + g_distortion * by_weight
+        weighted = w * grad_own
+        behind = behind_chunk + tl.sum(weighted, 0) - tl.cumsum(weighted, 0)
+        after = tl.exp(-(tl.maximum(depth_before, 0.0) + tl.cumsum(depth, 0)))
+        tl.store(grad_raw + n * WIDTH, (after * grad_own - behind) * size * slope, live)
+        coefficients = grad_raw + n[:, None] * WIDTH + 1 + k[None, :]
+        stored = live[:, None] & (k < K)[None, :]
+        tl.store(coefficients, (w * g_red * cr * (1 - cr))[:, None] * basis[None, :], stored)
+        tl.store(coefficients + K, (w * g_green * cg * (1 - cg))[:, None] * basis[None, :], stored)
+        tl.store(coefficients + 2 * K, (w * g_blue * cb * (1 - cb))[:, None] * basis[None, :], stored)
+        behind_chunk += tl.sum(weighted, 0)
+        weight_after_chunk += tl.sum(w, 0)
+        moment_after_chunk += tl.sum(moment, 0)
 
 
 def _padded(terms: int) -> int:

@@ -7,12 +7,15 @@ samples out of its loss.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from efficientnerf.backends.triton.hash_grid import INTERPRETED, LANES, blocks
+from efficientnerf.backends.triton.launch import INTERPRETED, LANES, blocks
+from efficientnerf.backends.triton.vectors import Vec3, along, store_vec3
 from efficientnerf.geometry.spaces import FARTHEST, Space
 from efficientnerf.sampling.samples import Samples
 
@@ -20,36 +23,79 @@ RAYS = 256 if INTERPRETED else 32  # one warp: the end of a program's loop is de
 NEAREST_SHELL = tl.constexpr(FARTHEST)
 
 
+class Box(NamedTuple):
+    """centre, half: Vec3 of the scene's box, world units."""
+
+    centre: Any
+    half: Any
+
+
+class Buffers(NamedTuple):
+    """start, extent, length (N,) and point (N, 3) of Samples, which are written."""
+
+    start: Any
+    extent: Any
+    length: Any
+    point: Any
+
+
 @triton.jit
-def _grid(px, py, pz, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
+def _grid(p, CONTRACTED: tl.constexpr):  # type: ignore[no-untyped-def]
     """Unit coordinates to grid coordinates; see `efficientnerf.geometry.spaces`."""
     if CONTRACTED:
-        m = tl.maximum(tl.maximum(tl.abs(px), tl.abs(py)), tl.maximum(tl.abs(pz), 1.0))
+        m = tl.maximum(tl.maximum(tl.abs(p.x), tl.abs(p.y)), tl.maximum(tl.abs(p.z), 1.0))
         f = (2 - 1 / m) / m
-        gx, gy, gz = (px * f + 2) * 0.25, (py * f + 2) * 0.25, (pz * f + 2) * 0.25
+        gx, gy, gz = (p.x * f + 2) * 0.25, (p.y * f + 2) * 0.25, (p.z * f + 2) * 0.25
     else:
-        gx, gy, gz = (px + 1) * 0.5, (py + 1) * 0.5, (pz + 1) * 0.5
-    return gx, gy, gz
+        gx, gy, gz = (p.x + 1) * 0.5, (p.y + 1) * 0.5, (p.z + 1) * 0.5
+    return Vec3(gx, gy, gz)
 
 
 @triton.jit
-def _ray(origins, directions, r, live, cx, cy, cz, hx, hy, hz):  # type: ignore[no-untyped-def]
-    """Rays in unit coordinates: origin and direction."""
-    ux = (tl.load(origins + r * 3, live, other=0.0) - cx) / hx
-    uy = (tl.load(origins + r * 3 + 1, live, other=0.0) - cy) / hy
-    uz = (tl.load(origins + r * 3 + 2, live, other=0.0) - cz) / hz
-    vx = tl.load(directions + r * 3, live, other=1.0) / hx
-    vy = tl.load(directions + r * 3 + 1, live, other=1.0) / hy
-    vz = tl.load(directions + r * 3 + 2, live, other=1.0) / hz
-    return ux, uy, uz, vx, vy, vz
+def _unit_rays(origins, directions, r, live, box):  # type: ignore[no-untyped-def]
+    """Origins and directions (Vec3 each) of rays in unit coordinates."""
+    ux = (tl.load(origins + r * 3, live, other=0.0) - box.centre.x) / box.half.x
+    uy = (tl.load(origins + r * 3 + 1, live, other=0.0) - box.centre.y) / box.half.y
+    uz = (tl.load(origins + r * 3 + 2, live, other=0.0) - box.centre.z) / box.half.z
+    vx = tl.load(directions + r * 3, live, other=1.0) / box.half.x
+    vy = tl.load(directions + r * 3 + 1, live, other=1.0) / box.half.y
+    vz = tl.load(directions + r * 3 + 2, live, other=1.0) / box.half.z
+    return Vec3(ux, uy, uz), Vec3(vx, vy, vz)
 
 
 @triton.jit
 def _slab(u, v):  # type: ignore[no-untyped-def]
-    """Where rays cross the faces at -1 and 1 of one axis, nearer first."""
+    """Distances at which rays cross the faces at -1 and 1 of one axis, nearer first."""
     safe = tl.where(tl.abs(v) < 1e-12, 1e-12, v)
     one, other = (-1 - u) / safe, (1 - u) / safe
     return tl.minimum(one, other), tl.maximum(one, other)
+
+
+@triton.jit
+def _clip_to_box(u, v, near, far):  # type: ignore[no-untyped-def]
+    """Distances at which rays enter and leave the box, within near and far."""
+    ax, bx = _slab(u.x, v.x)
+    ay, by = _slab(u.y, v.y)
+    az, bz = _slab(u.z, v.z)
+    return tl.maximum(tl.maximum(ax, ay), tl.maximum(az, near)), tl.minimum(tl.minimum(bx, by), tl.minimum(bz, far))
+
+
+@triton.jit
+def _voxel_of(g, side):  # type: ignore[no-untyped-def]
+    """Flat index of the density voxel at grid coordinates. Clamped before they become integers: lanes whose ray has ended may be anywhere."""
+    i = tl.minimum(tl.maximum(g.x * side, 0.0), side - 1.0).to(tl.int32)
+    j = tl.minimum(tl.maximum(g.y * side, 0.0), side - 1.0).to(tl.int32)
+    k = tl.minimum(tl.maximum(g.z * side, 0.0), side - 1.0).to(tl.int32)
+    return (i * side + j) * side + k
+
+
+@triton.jit
+def _store(buffers, at, t, size, length, point, live):  # type: ignore[no-untyped-def]
+    """Samples to their places."""
+    tl.store(buffers.start + at, t, live)
+    tl.store(buffers.extent + at, size, live)
+    tl.store(buffers.length + at, length, live)
+    store_vec3(buffers.point, at, point, live)
 
 
 @triton.jit(do_not_specialize=["whole"])
@@ -60,16 +106,12 @@ def _march(  # type: ignore[no-untyped-def]
     """Counts the valid samples of each ray, or writes them from `first` on."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = r < rays
-    ux, uy, uz, vx, vy, vz = _ray(origins, directions, r, live, cx, cy, cz, hx, hy, hz)
+    u, v = _unit_rays(origins, directions, r, live, Box(Vec3(cx, cy, cz), Vec3(hx, hy, hz)))
     shift = tl.load(offset + r, live, other=0.0)
     t = tl.load(near + r, live, other=1.0)
     leave = tl.load(far + r, live, other=0.0)
     if not CONTRACTED:
-        ax, bx = _slab(ux, vx)
-        ay, by = _slab(uy, vy)
-        az, bz = _slab(uz, vz)
-        t = tl.maximum(tl.maximum(ax, ay), tl.maximum(az, t))
-        leave = tl.minimum(tl.minimum(bx, by), tl.minimum(bz, leave))
+        t, leave = _clip_to_box(u, v, t, leave)
     at = tl.zeros((BLOCK,), tl.int64)
     end = tl.zeros((BLOCK,), tl.int64)
     if WRITE:
@@ -77,45 +119,34 @@ def _march(  # type: ignore[no-untyped-def]
         end = tl.load(first + r + 1, live, other=0)
     limit = tl.where(r < whole, float("-inf"), threshold)
     valid = tl.zeros((BLOCK,), tl.int32)
-    seen = tl.zeros((BLOCK,), tl.int32)
+    passed = tl.zeros((BLOCK,), tl.int32)
     alive = live & (t < leave)
     if WRITE:
         alive = alive & (at < end)
-    k = 0
-    while (k < slots) & (tl.max(alive.to(tl.int32), 0) > 0):
-        stretch = tl.full((BLOCK,), 1.0, tl.float32)
+    n = 0
+    while (n < slots) & (tl.max(alive.to(tl.int32), 0) > 0):
+        scale = tl.full((BLOCK,), 1.0, tl.float32)  # world length of a contracted one
         if CONTRACTED:
-            reach = tl.maximum(tl.maximum(tl.abs(ux + t * vx), tl.abs(uy + t * vy)), tl.maximum(tl.abs(uz + t * vz), 1.0))
-            stretch = reach * reach
+            reach = tl.maximum(tl.maximum(tl.abs(u.x + t * v.x), tl.abs(u.y + t * v.y)), tl.maximum(tl.abs(u.z + t * v.z), 1.0))
+            scale = reach * reach
             alive = alive & (reach * NEAREST_SHELL <= 1)
-        size = tl.minimum(step * stretch, leave - t)
-        s = t + shift * size
-        gx, gy, gz = _grid(ux + s * vx, uy + s * vy, uz + s * vz, CONTRACTED)
-        # Clamped before they become integers: lanes whose ray has ended may be anywhere.
-        i = tl.minimum(tl.maximum(gx * side, 0.0), side - 1.0).to(tl.int32)
-        j = tl.minimum(tl.maximum(gy * side, 0.0), side - 1.0).to(tl.int32)
-        l = tl.minimum(tl.maximum(gz * side, 0.0), side - 1.0).to(tl.int32)
-        found = alive & (tl.load(voxels + (i * side + j) * side + l, alive, other=0.0) > limit)
+        size = tl.minimum(step * scale, leave - t)
+        g = _grid(along(u, v, t + shift * size), CONTRACTED)
+        found = alive & (tl.load(voxels + _voxel_of(g, side), alive, other=0.0) > limit)
         if WRITE:
-            put = found & (at < end)
-            tl.store(start + at, t, put)
-            tl.store(extent + at, size, put)
-            tl.store(length + at, size / stretch, put)
-            tl.store(point + at * 3, gx, put)
-            tl.store(point + at * 3 + 1, gy, put)
-            tl.store(point + at * 3 + 2, gz, put)
+            _store(Buffers(start, extent, length, point), at, t, size, size / scale, g, found & (at < end))
             at += found.to(tl.int64)
         else:
             valid += found.to(tl.int32)
-            seen += alive.to(tl.int32)
-        t = tl.where(alive, t + step * stretch, t)
+            passed += alive.to(tl.int32)
+        t = tl.where(alive, t + step * scale, t)
         alive = alive & (t < leave)
         if WRITE:
             alive = alive & (at < end)
-        k += 1
+        n += 1
     if not WRITE:
         tl.store(counts + r, valid, live)
-        tl.store(tried + r, seen, live)
+        tl.store(tried + r, passed, live)
 
 
 def _box(space: Space) -> tuple[float, ...]:
@@ -211,7 +242,7 @@ def _pivotal(  # type: ignore[no-untyped-def]
     live = n < samples
     live = live & (tl.load(pivotal + n, live, other=0) != 0)
     ray = _ray_of(first, n, rays, BITS)
-    ux, uy, uz, vx, vy, vz = _ray(origins, directions, ray, live, cx, cy, cz, hx, hy, hz)
+    u, v = _unit_rays(origins, directions, ray, live, Box(Vec3(cx, cy, cz), Vec3(hx, hy, hz)))
     shift = tl.load(offset + ray, live, other=0.0)
     size = tl.load(extent + n, live, other=0.0) / PER_PIVOT
     part = tl.load(length + n, live, other=0.0) / PER_PIVOT
@@ -220,14 +251,8 @@ def _pivotal(  # type: ignore[no-untyped-def]
     for slot in tl.static_range(PER_PIVOT):
         put = live & (at + slot < capacity)
         t = begin + slot * size
-        s = t + shift * size
-        gx, gy, gz = _grid(ux + s * vx, uy + s * vy, uz + s * vz, CONTRACTED)
-        tl.store(fine_start + at + slot, t, put)
-        tl.store(fine_extent + at + slot, size, put)
-        tl.store(fine_length + at + slot, part, put)
-        tl.store(point + (at + slot) * 3, gx, put)
-        tl.store(point + (at + slot) * 3 + 1, gy, put)
-        tl.store(point + (at + slot) * 3 + 2, gz, put)
+        g = _grid(along(u, v, t + shift * size), CONTRACTED)
+        _store(Buffers(fine_start, fine_extent, fine_length, point), at + slot, t, size, part, g, put)
 
 
 def pivotal_samples(

@@ -1,4 +1,4 @@
-"""A NerfTree on a CUDA device, and its pictures: the kernel is `efficientnerf.backends.triton.tree_march`.
+"""A NerfTree on a CUDA device, and images of it: the kernel is `efficientnerf.backends.triton.tree_rendering`.
 
 The tree is laid out anew for a device, whose memory is large and whose caches are small. A brick gets a border one voxel wide, copied from its
 neighbours, so that the eight corners of any point in its cell lie together, at places that the point alone decides; coefficients of a voxel are a row of
@@ -19,15 +19,15 @@ import triton
 from torch import Tensor
 
 from efficientnerf.backends.transfer import constant, to_device
-from efficientnerf.backends.triton.hash_grid import INTERPRETED
-from efficientnerf.backends.triton.tree_march import march
+from efficientnerf.backends.triton.launch import INTERPRETED
+from efficientnerf.backends.triton.tree_rendering import render
 from efficientnerf.geometry.cameras import Camera, rays
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 TILE = (32, 16) if INTERPRETED else (8, 4)  # pixels of a program
-BRICKS_AT_ONCE = 2**14
+BRICKS_PER_BLOCK = 2**14
 # A program's warps by the length of a voxel's row of coefficients: as few as keep the row and the basis in registers.
 WARPS = {4: 1, 16: 1, 32: 1, 64: 4, 128: 4}
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -37,7 +37,7 @@ PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 class DeviceTree:
     """What the kernel reads.
 
-    grid     (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may leap
+    grid     (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may skip
     density  (B, E^3) float16, voxels of a brick with its border, z fastest; 0 where nothing is stored
     index    (B, E^3) int32: which voxel's coefficients, -1 where nothing is stored
     sh       (N, row) float16: K coefficients for red, green and blue each, then zeros
@@ -60,7 +60,7 @@ class DeviceTree:
         return sum(t.numel() * t.element_size() for t in (self.grid, self.density, self.index, self.sh))
 
 
-class Drawing(NamedTuple):
+class DeviceRendering(NamedTuple):
     """`efficientnerf.asset.tree.Rendering` on the device: colour (..., 3), opacity (...), depth (...), normal (..., 3), float32."""
 
     colour: Tensor
@@ -69,7 +69,7 @@ class Drawing(NamedTuple):
     normal: Tensor
 
 
-def laid_out(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Tensor]:
+def brick_arrays(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Tensor]:
     """`grid` and `index` of a DeviceTree, on the device; bricks are taken in blocks, so that little more than the result is needed."""
     brick_index = torch.from_numpy(tree.brick_index).to(device)
     leap = torch.from_numpy(tree.leap.astype(np.int32)).to(device)
@@ -81,26 +81,26 @@ def laid_out(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Tensor
     cells = cells[torch.argsort(brick_index[tuple(cells.unbind(1))])]
     size = torch.tensor(tree.resolution, device=device)
     index = torch.empty(bricks, edge**3, dtype=torch.int32, device=device)
-    for begin in range(0, bricks, BRICKS_AT_ONCE):
-        at = cells[begin : begin + BRICKS_AT_ONCE, None] * d + border  # (b, E^3, 3)
+    for begin in range(0, bricks, BRICKS_PER_BLOCK):
+        at = cells[begin : begin + BRICKS_PER_BLOCK, None] * d + border  # (b, E^3, 3)
         there = ((at >= 0) & (at < size)).all(dim=-1)
         at = at.clamp(min=0).minimum(size - 1)
         cell = at // d
         owner = brick_index[cell[..., 0], cell[..., 1], cell[..., 2]].long()
         local = at - cell * d
         slot = (local[..., 0] * d + local[..., 1]) * d + local[..., 2]
-        index[begin : begin + BRICKS_AT_ONCE] = torch.where(there & (owner >= 0), voxel_index[owner.clamp(min=0), slot], -1)
+        index[begin : begin + BRICKS_PER_BLOCK] = torch.where(there & (owner >= 0), voxel_index[owner.clamp(min=0), slot], -1)
     return torch.where(brick_index >= 0, brick_index, -leap).contiguous(), index
 
 
 def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTree:
     """Send a tree to the device; in blocks, so that little more than the result is needed."""
-    grid, index = laid_out(tree, device)
+    grid, index = brick_arrays(tree, device)
     values = torch.from_numpy(np.ascontiguousarray(tree.density_values, np.float32)).to(device)
     density = torch.empty(index.shape, dtype=torch.float16, device=device)
-    for begin in range(0, len(index), BRICKS_AT_ONCE):
-        found = index[begin : begin + BRICKS_AT_ONCE].long()
-        density[begin : begin + BRICKS_AT_ONCE] = torch.where(found >= 0, values[found.clamp(min=0)], 0).clamp(max=65504).half()
+    for begin in range(0, len(index), BRICKS_PER_BLOCK):
+        found = index[begin : begin + BRICKS_PER_BLOCK].long()
+        density[begin : begin + BRICKS_PER_BLOCK] = torch.where(found >= 0, values[found.clamp(min=0)], 0).clamp(max=65504).half()
     terms, row = tree.harmonics_count, triton.next_power_of_2(3 * tree.harmonics_count)
     sh = torch.zeros(len(values), row, dtype=torch.float16, device=device)
     step = 2**18
@@ -113,16 +113,16 @@ def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTr
 def _launch(
     t: DeviceTree, count: int, buffers: tuple[Tensor, Tensor, Tensor] | None, camera: tuple[float, ...], size: tuple[int, int],
     background: tuple[float, float, float] | None,
-) -> Drawing:  # fmt: skip
+) -> DeviceRendering:  # fmt: skip
     device = t.grid.device
-    out = Drawing(*(torch.empty(count, *tail, device=device) for tail in ((3,), (), (), (3,))))
+    out = DeviceRendering(*(torch.empty(count, *tail, device=device) for tail in ((3,), (), (), (3,))))
     if count == 0:
         return out
     wide, high = TILE
     programs = triton.cdiv(count, wide * high) if buffers else triton.cdiv(size[0], wide) * triton.cdiv(size[1], high)
     # Without voxels there is nothing that the kernel would read, but it must have something to point at.
     density, index, sh = (x if len(x) else x.new_zeros(1, x.shape[1]) for x in (t.density, t.index, t.sh))
-    march[(programs,)](
+    render[(programs,)](
         *(buffers or (out.colour, out.colour, out.colour)), t.grid, density, index, sh, *out,
         count, *size, *t.grid.shape, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
         PINHOLE=buffers is None, OVER=background is not None, NEAREST=t.nearest, BRICK=t.brick, K=t.terms, ROW=t.sh.shape[1], WIDE=wide, HIGH=high,
@@ -131,19 +131,19 @@ def _launch(
     return out
 
 
-def draw_rays(t: DeviceTree, origins: Tensor, directions: Tensor, looking: Tensor | None = None) -> Drawing:
+def render_rays(t: DeviceTree, origins: Tensor, directions: Tensor, views: Tensor | None = None) -> DeviceRendering:
     """Rays of the tree's frame on the device: origins (R, 3), unit directions (R, 3), and those in the world where the frame is another.
 
     Depth is the distance along the ray, normals are of the frame; nothing waits for the device.
     """
     start = ((origins.double() - constant(t.low, origins.double())) / t.voxel).float().contiguous()
     along = directions.float().contiguous()
-    seen_from = along if looking is None else looking.float().contiguous()
-    return _launch(t, len(start), (start, along, seen_from), (0.0,) * 16, (0, 0), None)
+    seen_along = along if views is None else views.float().contiguous()
+    return _launch(t, len(start), (start, along, seen_along), (0.0,) * 16, (0, 0), None)
 
 
 @functools.lru_cache(maxsize=4)
-def _lens(width: int, height: int, model: str, params: tuple[float, ...], supersample: int, device: torch.device) -> Tensor:
+def _camera_directions(width: int, height: int, model: str, params: tuple[float, ...], supersample: int, device: torch.device) -> Tensor:
     """Unit directions (rays, 3) in the camera, of all samples row by row; kept, because distortion is inverted on the host."""
     still = Camera("lens", width, height, model, params, np.eye(4))
     y, x = np.mgrid[0 : height * supersample, 0 : width * supersample]
@@ -151,8 +151,8 @@ def _lens(width: int, height: int, model: str, params: tuple[float, ...], supers
     return torch.from_numpy(rays(still, pixels)[1].astype(np.float32)).to(device)
 
 
-def draw(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Drawing:
-    """The picture that a camera of the tree's frame takes, (H, W, ...), on the device; nothing waits for it.
+def render_image(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> DeviceRendering:
+    """The image of a camera in the tree's frame, (H, W, ...), on the device; nothing waits for it.
 
     One launch where the camera is a pinhole and `supersample` is 1; else rays are made, or samples averaged, by some more. See `NerfTree.render`.
     """
@@ -166,7 +166,7 @@ def draw(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float
         lens = (k["fx"] * supersample, k["fy"] * supersample, k["cx"] * supersample, k["cy"] * supersample)
         flat = _launch(t, height * width, None, tuple(float(x) for x in (*place, *lens)), (width, height), over)
     else:
-        local = _lens(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
+        local = _camera_directions(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
         rotation = to_device(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), local.device)
         place = tuple(float(x) for x in (camera.centre - t.low) / t.voxel)
         start = torch.stack([torch.full_like(local[:, 0], x) for x in place], dim=1)
@@ -175,11 +175,11 @@ def draw(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float
         flat = flat._replace(depth=flat.depth * local[:, 2])
     shape = (camera.height, supersample, camera.width, supersample)
     if supersample == 1:
-        return Drawing(*(x.reshape(camera.height, camera.width, *x.shape[1:]) for x in flat))
-    return _averaged(Drawing(*(x.reshape(*shape, *x.shape[1:]) for x in flat)), background)
+        return DeviceRendering(*(x.reshape(camera.height, camera.width, *x.shape[1:]) for x in flat))
+    return _averaged(DeviceRendering(*(x.reshape(*shape, *x.shape[1:]) for x in flat)), background)
 
 
-def _averaged(samples: Drawing, background: tuple[float, float, float] | None) -> Drawing:
+def _averaged(samples: DeviceRendering, background: tuple[float, float, float] | None) -> DeviceRendering:
     """Pixels from samples (H, s, W, s, ...), as `efficientnerf.rendering.render.render_tree` makes them."""
     height, s, width, _ = samples.opacity.shape
     colour, opacity = samples.colour.mean(dim=(1, 3)), samples.opacity.mean(dim=(1, 3))
@@ -193,4 +193,4 @@ def _averaged(samples: Drawing, background: tuple[float, float, float] | None) -
     if background is not None:
         for channel, value in enumerate(background):
             colour[..., channel] += (1 - opacity) * value
-    return Drawing(colour, opacity, depth, normal)
+    return DeviceRendering(colour, opacity, depth, normal)

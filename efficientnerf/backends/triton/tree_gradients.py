@@ -1,10 +1,10 @@
-"""Rays through a tree forward and backward on CUDA (Triton), for the optimisation of its values; `cpu_tree_grad` is the same on the CPU.
+"""Loss gradients of a tree's values, and steps along them, on CUDA (Triton); `efficientnerf.backends.numba.tree.gradients` is the same on the CPU.
 
-A ray is walked twice (`efficientnerf.backends.triton.tree_walk`): first for its colour and the light left, then, with the gradients of its loss by these known,
-once more from the front; what lies behind a sample is its ray's colour less what was met so far. Nothing is kept of the samples.
+A ray is marched twice (`efficientnerf.backends.triton.tree_march`): first for its colour and final transmittance, then, with the gradients of its loss by
+these known, once more from the front; what lies behind a sample is its ray's colour less what was composited so far. Samples are not stored.
 
-Many rays add to the gradients of one voxel, in whatever order the device runs them. They are added as whole numbers, 2^-k each, which no order changes:
-the same steps give the same bytes, on one kind of device and one version of Triton. k is chosen so that the sums cannot overflow (`resolution`).
+Many rays add to the gradients of one voxel, in whatever order the device runs them. They are added as fixed-point integers, which no order changes:
+the same steps give the same bytes, on one kind of device and one version of Triton. `fixed_point_scale` says of how many bits.
 
 R rays, N voxels, K harmonics. Harmonics lie as in `NerfTree.sh`: coefficient k of channel c at 3 k + c of a voxel's row.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 import triton
@@ -21,9 +21,11 @@ import triton.language as tl
 from torch import Tensor
 
 from efficientnerf.backends.numba.tree.gradients import MAX_THICKNESS, MIN_THICKNESS, RayTargets
-from efficientnerf.backends.triton.hash_grid import INTERPRETED
-from efficientnerf.backends.triton.tree import laid_out
-from efficientnerf.backends.triton.tree_walk import STEP, STOP, at_corner, coefficients, entry, goes_on, harmonics_along, sample, shade, share, vectors
+from efficientnerf.backends.triton.harmonics import basis_columns
+from efficientnerf.backends.triton.launch import INTERPRETED, blocks
+from efficientnerf.backends.triton.tree import brick_arrays
+from efficientnerf.backends.triton.tree_march import STEP, Grid, colour_of, corner_place, corner_weight, interpolate_harmonics, march, ray_in_grid
+from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, store_vec3, zeros_vec3
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
@@ -31,20 +33,20 @@ if TYPE_CHECKING:
 # Rays and warps of a program by the length of a row of coefficients: so few that what a sample needs stays in registers. Rays of a bundle come from
 # anywhere, and a program lasts as long as its longest.
 SHAPES = {4: (32, 1), 16: (16, 1), 32: (8, 1), 64: (8, 2), 128: (8, 4)}
-RAYS_AT_ONCE = 256 if INTERPRETED else 32  # of a program that looks at no coefficients
-VOXELS = 256 if INTERPRETED else 32  # of a program that takes a step
-# A sample's gradients are below 25 (four for each channel's colour, through the light behind and against the background, and the opacity's), and a voxel
+RAYS_PER_PROGRAM = 256 if INTERPRETED else 32  # where no coefficients are read
+VOXELS_PER_PROGRAM = 256 if INTERPRETED else 32  # of a step
+# A sample's gradients are below 25 (four for each channel's colour, through the colour behind and against the background, and the opacity's), and a voxel
 # is a corner of at most 7 samples of a ray: the sums stay below 2^8 a ray.
-BITS_A_RAY = 8
-MOST_VISITS = 60000  # from there on they no longer show
+BITS_PER_RAY = 8
+MAX_VISITS = 60000  # beyond it the bias correction is one
 
 
 class Rays(NamedTuple):
-    """Of a bundle, on the device, contiguous: origins, directions (R, 3) float32 in voxel coordinates, directions in the world `looking` (R, 3)."""
+    """Of a batch, on the device, contiguous float32 (R, 3): origins and directions in voxel coordinates, and directions in the world, `views`."""
 
     origins: Tensor
     directions: Tensor
-    looking: Tensor
+    views: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,240 +62,280 @@ class DeviceGrid:
 
     @property
     def row(self) -> int:
+        """Columns of a program: the coefficients of a voxel, up to a power of two."""
         return triton.next_power_of_2(3 * self.terms)
 
     @property
     def rays(self) -> int:
         """Rays of a program."""
-        return RAYS_AT_ONCE if INTERPRETED else SHAPES[self.row][0]
+        return RAYS_PER_PROGRAM if INTERPRETED else SHAPES[self.row][0]
 
 
 def device_grid(tree: NerfTree, device: str | torch.device) -> DeviceGrid:
-    grid, index = laid_out(tree, device)
+    grid, index = brick_arrays(tree, device)
     if not len(index):
-        index = index.new_full((1, index.shape[1]), -1)  # nothing is read, but there must be something to point at
+        index = index.new_full((1, index.shape[1]), -1)  # nothing is read, but kernels need a pointer
     return DeviceGrid(grid, index, tree.brick, tree.harmonics_count, tree.voxel, tree.lookup == "nearest")
 
 
-@triton.jit
-def _thickness(index, density, base, fx, fy, fz, live, units, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Optical thickness of samples a step long."""
-    sigma = tl.zeros_like(fx)
-    for corner in tl.static_range(1 if NEAREST else 8):
-        voxel = tl.load(index + at_corner(base, corner, BRICK), live, other=-1)
-        sigma += share(fx, fy, fz, corner) * tl.load(density + voxel, voxel >= 0, other=0.0)
-    return sigma * (STEP * units)
+class Scene(NamedTuple):
+    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: a voxel's side in the frame; basis (R, C) harmonics of the columns; column (C,)."""
+
+    index: Any
+    density: Any
+    sh: Any
+    voxel: Any
+    basis: Any
+    column: Any
+
+
+class Sums(NamedTuple):
+    """Where gradients are added, `scale` to a one: thickness (N,), sh (N, 3 K); stamp (N,), set to `number`."""
+
+    thickness: Any
+    sh: Any
+    stamp: Any
+    number: Any
+    scale: Any
+
+
+class Upstream(NamedTuple):
+    """Gradients of the loss: colour, by the rays' colour (Vec3); end, by the final transmittance, negated, times it."""
+
+    colour: Any
+    end: Any
+
+
+class Forward(NamedTuple):
+    """transmittance; colour (Vec3), premultiplied."""
+
+    transmittance: Any
+    colour: Any
+
+
+class Backward(NamedTuple):
+    """transmittance; behind (Vec3): colour of the samples still to come."""
+
+    transmittance: Any
+    behind: Any
+
+
+class Absorption(NamedTuple):
+    """transmittance."""
+
+    transmittance: Any
 
 
 @triton.jit
-def _rays(origins, directions, looking, rays, nx, ny, nz, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """This program's rays: numbers, which of them there are, origins, directions, harmonics of each column of a row (BLOCK, ROW); and `entry`."""
+def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Optical thickness of samples over a step."""
+    sigma = tl.zeros_like(sample.fraction.x)
+    for n in tl.static_range(1 if NEAREST else 8):
+        place = tl.load(index + corner_place(sample.corner, n, BRICK), sample.inside, other=-1)
+        sigma += corner_weight(sample.fraction, n) * tl.load(density + place, place >= 0, other=0.0)
+    return sigma * (STEP * voxel)
+
+
+@triton.jit
+def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Of samples: whether they absorb, weight, colour (Vec3), transmittance behind them, and the sum of the corners' weights."""
+    thickness = _thickness(scene.index, scene.density, sample, scene.voxel, BRICK, NEAREST)
+    after = transmittance * tl.exp(-thickness)
+    weight = transmittance - after
+    visible = thickness > 0
+    mixed, total = interpolate_harmonics(scene.index, scene.sh, sample, visible, scene.column, 3 * K, BRICK, NEAREST)
+    return visible, weight, colour_of(mixed, total, scene.basis, scene.column % 3), after, total
+
+
+@triton.jit
+def _rays(origins, directions, views, rays, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """This program's rays: numbers, which of them exist, origins, directions, and harmonics of each column of a row (BLOCK, ROW)."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = r < rays
-    x0, y0, z0 = vectors(origins, r, live)
-    dx, dy, dz = vectors(directions, r, live)
-    sx, sy, sz = vectors(looking, r, live)
-    basis = harmonics_along(sx, sy, sz, tl.arange(0, ROW) // 3, K)
-    ix, iy, iz, begin, end = entry(x0, y0, z0, dx, dy, dz, nx, ny, nz, BRICK)
-    return r, live, x0, y0, z0, dx, dy, dz, basis, ix, iy, iz, begin, end
+    origin, direction = load_vec3(origins, r, live), load_vec3(directions, r, live)
+    return r, live, origin, direction, basis_columns(load_vec3(views, r, live), tl.arange(0, ROW) // 3, K)
 
 
 @triton.jit
-def _see(  # type: ignore[no-untyped-def]
-    origins, directions, looking, grid, index, density, sh, colour, rest, rays, nx, ny, nz, units,
+def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+    _, weight, rgb, after, _ = _shaded(scene, sample, state.transmittance, BRICK, NEAREST, K)
+    return Forward(after, add_scaled(state.colour, weight, rgb))
+
+
+@triton.jit
+def _forward(  # type: ignore[no-untyped-def]
+    origins, directions, views, owner, index, density, sh, colour, transmittance, rays, nx, ny, nz, voxel,
     NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Premultiplied colour (R, 3) of rays, and the light left (R,)."""
-    column = tl.arange(0, ROW)
-    r, live, x0, y0, z0, dx, dy, dz, basis, ix, iy, iz, begin, end = _rays(origins, directions, looking, rays, nx, ny, nz, BRICK, K, ROW, BLOCK)
-    light = tl.full((BLOCK,), 1.0, tl.float32)
-    cr, cg, cb = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
-    k = tl.zeros((BLOCK,), tl.int32)
-    alive = live & goes_on(k, begin, end)
-    while tl.max(alive.to(tl.int32), 0) > 0:
-        _, inside, base, fx, fy, fz, k = sample(grid, k, begin, end, x0, y0, z0, dx, dy, dz, ix, iy, iz, nx, ny, nz, alive, BRICK, NEAREST)
-        if tl.max(inside.to(tl.int32), 0) > 0:
-            thickness = _thickness(index, density, base, fx, fy, fz, inside, units, BRICK, NEAREST)
-            left = light * tl.exp(-thickness)
-            weight = light - left
-            seen = thickness > 0
-            mixed, total = coefficients(index, sh, base, fx, fy, fz, seen, column, 3 * K, BRICK, NEAREST)
-            sr, sg, sb = shade(mixed, total, basis, column % 3)
-            cr += weight * sr
-            cg += weight * sg
-            cb += weight * sb
-            light = left
-        alive = alive & (light >= STOP) & goes_on(k, begin, end)
-    tl.store(colour + r * 3, cr, live)
-    tl.store(colour + r * 3 + 1, cg, live)
-    tl.store(colour + r * 3 + 2, cb, live)
-    tl.store(rest + r, light, live)
+    """Premultiplied colour (R, 3) and final transmittance (R,) of rays."""
+    r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
+    grid = Grid(owner, Vec3(nx, ny, nz))
+    scene = Scene(index, density, sh, voxel, basis, tl.arange(0, ROW))
+    start = Forward(tl.full((BLOCK,), 1.0, tl.float32), zeros_vec3(BLOCK))
+    end = march(grid, ray_in_grid(grid, origin, direction, BRICK), live, scene, start, _composite, BRICK, NEAREST, K, ROW)
+    store_vec3(colour, r, end.colour, live)
+    tl.store(transmittance + r, end.transmittance, live)
+
+
+@triton.jit
+def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """given  Scene, Upstream and Sums"""
+    scene, by, sums = given[0], given[1], given[2]
+    column, channel = scene.column, scene.column % 3
+    visible, weight, rgb, after, total = _shaded(scene, sample, state.transmittance, BRICK, NEAREST, K)
+    behind = Vec3(state.behind.x - weight * rgb.x, state.behind.y - weight * rgb.y, state.behind.z - weight * rgb.z)
+    g = by.colour
+    by_depth = by.end + g.x * (after * rgb.x - behind.x) + g.y * (after * rgb.y - behind.y) + g.z * (after * rgb.z - behind.z)
+    by_red, by_green, by_blue = g.x * weight * rgb.x * (1 - rgb.x), g.y * weight * rgb.y * (1 - rgb.y), g.z * weight * rgb.z * (1 - rgb.z)
+    by_logit = tl.where((channel == 0)[None, :], by_red[:, None], tl.where((channel == 1)[None, :], by_green[:, None], by_blue[:, None]))
+    by_column = scene.basis * by_logit / total[:, None]
+    for n in tl.static_range(1 if NEAREST else 8):
+        voxel = tl.load(scene.index + corner_place(sample.corner, n, BRICK), visible, other=-1).to(tl.int64)
+        stored = voxel >= 0
+        scaled = corner_weight(sample.fraction, n) * sums.scale
+        tl.store(sums.stamp + voxel, sums.number, stored)
+        tl.atomic_add(sums.thickness + voxel, (scaled * by_depth * STEP).to(tl.int64), stored, sem="relaxed")
+        row = sums.sh + voxel[:, None] * (3 * K) + column[None, :]
+        tl.atomic_add(row, (scaled[:, None] * by_column).to(tl.int64), stored[:, None] & (column < 3 * K)[None, :], sem="relaxed")
+    return Backward(after, behind)
 
 
 @triton.jit(do_not_specialize=["number"])
-def _pull(  # type: ignore[no-untyped-def]
-    origins, directions, looking, grid, index, density, sh, colour, rest, by_colour, by_opacity, by_thickness, by_sh, stamp,
-    rays, nx, ny, nz, units, number, ones,
+def _backward(  # type: ignore[no-untyped-def]
+    origins, directions, views, owner, index, density, sh, colour, transmittance, grad_colour, grad_opacity, sum_thickness, sum_sh, stamp,
+    rays, nx, ny, nz, voxel, number, scale,
     NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Adds `ones` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as whole numbers; `stamp` of voxels that were met."""
-    column = tl.arange(0, ROW)
-    channel = column % 3
-    r, live, x0, y0, z0, dx, dy, dz, basis, ix, iy, iz, begin, end = _rays(origins, directions, looking, rays, nx, ny, nz, BRICK, K, ROW, BLOCK)
-    # The colour that is still to come.
-    cr, cg, cb = vectors(colour, r, live)
-    pr, pg, pb = vectors(by_colour, r, live)
-    at_end = tl.load(rest + r, live, other=1.0) * tl.load(by_opacity + r, live, other=0.0)
-    light = tl.full((BLOCK,), 1.0, tl.float32)
-    k = tl.zeros((BLOCK,), tl.int32)
-    alive = live & goes_on(k, begin, end)
-    while tl.max(alive.to(tl.int32), 0) > 0:
-        _, inside, base, fx, fy, fz, k = sample(grid, k, begin, end, x0, y0, z0, dx, dy, dz, ix, iy, iz, nx, ny, nz, alive, BRICK, NEAREST)
-        if tl.max(inside.to(tl.int32), 0) > 0:
-            thickness = _thickness(index, density, base, fx, fy, fz, inside, units, BRICK, NEAREST)
-            left = light * tl.exp(-thickness)
-            weight = light - left
-            seen = thickness > 0
-            mixed, total = coefficients(index, sh, base, fx, fy, fz, seen, column, 3 * K, BRICK, NEAREST)
-            sr, sg, sb = shade(mixed, total, basis, channel)
-            cr -= weight * sr
-            cg -= weight * sg
-            cb -= weight * sb
-            by_depth = at_end + pr * (left * sr - cr) + pg * (left * sg - cg) + pb * (left * sb - cb)
-            by_red, by_green, by_blue = pr * weight * sr * (1 - sr), pg * weight * sg * (1 - sg), pb * weight * sb * (1 - sb)
-            pulled = tl.where((channel == 0)[None, :], by_red[:, None], tl.where((channel == 1)[None, :], by_green[:, None], by_blue[:, None]))
-            spread = basis * pulled / total[:, None]
-            for corner in tl.static_range(1 if NEAREST else 8):
-                voxel = tl.load(index + at_corner(base, corner, BRICK), seen, other=-1).to(tl.int64)
-                met = voxel >= 0
-                part = share(fx, fy, fz, corner) * ones
-                tl.store(stamp + voxel, number, met)
-                tl.atomic_add(by_thickness + voxel, (part * by_depth * STEP).to(tl.int64), met, sem="relaxed")
-                row = by_sh + voxel[:, None] * (3 * K) + column[None, :]
-                tl.atomic_add(row, (part[:, None] * spread).to(tl.int64), met[:, None] & (column < 3 * K)[None, :], sem="relaxed")
-            light = left
-        alive = alive & (light >= STOP) & goes_on(k, begin, end)
+    """Adds `scale` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as integers; stamps the voxels that rays meet."""
+    r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
+    grid = Grid(owner, Vec3(nx, ny, nz))
+    scene = Scene(index, density, sh, voxel, basis, tl.arange(0, ROW))
+    behind = load_vec3(colour, r, live)
+    by_colour = load_vec3(grad_colour, r, live)
+    by_end = tl.load(transmittance + r, live, other=1.0) * tl.load(grad_opacity + r, live, other=0.0)
+    given = (scene, Upstream(by_colour, by_end), Sums(sum_thickness, sum_sh, stamp, number, scale))
+    start = Backward(tl.full((BLOCK,), 1.0, tl.float32), behind)
+    march(grid, ray_in_grid(grid, origin, direction, BRICK), live, given, start, _add_gradients, BRICK, NEAREST, K, ROW)
 
 
 @triton.jit
-def _weigh(  # type: ignore[no-untyped-def]
-    origins, directions, grid, index, density, gain, greatest, rays, nx, ny, nz, units, NEAREST: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr
-):
-    """Raises `greatest` (N,) to what voxels contribute to rays, through what interpolation leaves them."""
+def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """given  index, density, voxel as in a Scene; transmittance at which rays reach the grid; the buffer that is raised (N,)"""
+    index, density, voxel, arriving, maximum = given[0], given[1], given[2], given[3], given[4]
+    after = state.transmittance * tl.exp(-_thickness(index, density, sample, voxel, BRICK, NEAREST))
+    weight = arriving * (state.transmittance - after)
+    for n in tl.static_range(1 if NEAREST else 8):
+        place = tl.load(index + corner_place(sample.corner, n, BRICK), sample.inside, other=-1)
+        tl.atomic_max(maximum + place, weight * corner_weight(sample.fraction, n), (place >= 0) & (weight > 0), sem="relaxed")
+    return Absorption(after)
+
+
+@triton.jit
+def _max_contributions(  # type: ignore[no-untyped-def]
+    origins, directions, owner, index, density, transmittance, maximum, rays, nx, ny, nz, voxel,
+    NEAREST: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Raises `maximum` (N,) to what voxels contribute to rays."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = r < rays
-    x0, y0, z0 = vectors(origins, r, live)
-    dx, dy, dz = vectors(directions, r, live)
-    ix, iy, iz, begin, end = entry(x0, y0, z0, dx, dy, dz, nx, ny, nz, BRICK)
-    light = tl.full((BLOCK,), 1.0, tl.float32)
-    arriving = tl.load(gain + r, live, other=0.0)
-    k = tl.zeros((BLOCK,), tl.int32)
-    alive = live & goes_on(k, begin, end)
-    while tl.max(alive.to(tl.int32), 0) > 0:
-        _, inside, base, fx, fy, fz, k = sample(grid, k, begin, end, x0, y0, z0, dx, dy, dz, ix, iy, iz, nx, ny, nz, alive, BRICK, NEAREST)
-        if tl.max(inside.to(tl.int32), 0) > 0:
-            left = light * tl.exp(-_thickness(index, density, base, fx, fy, fz, inside, units, BRICK, NEAREST))
-            weight = arriving * (light - left)
-            for corner in tl.static_range(1 if NEAREST else 8):
-                voxel = tl.load(index + at_corner(base, corner, BRICK), inside, other=-1)
-                tl.atomic_max(greatest + voxel, weight * share(fx, fy, fz, corner), (voxel >= 0) & (weight > 0), sem="relaxed")
-            light = left
-        alive = alive & (light >= STOP) & goes_on(k, begin, end)
+    grid = Grid(owner, Vec3(nx, ny, nz))
+    ray = ray_in_grid(grid, load_vec3(origins, r, live), load_vec3(directions, r, live), BRICK)
+    given = (index, density, voxel, tl.load(transmittance + r, live, other=0.0), maximum)
+    march(grid, ray, live, given, Absorption(tl.full((BLOCK,), 1.0, tl.float32)), _raise_maximum, BRICK, NEAREST, 0, 0)
 
 
 @triton.jit(do_not_specialize=["number"])
-def _descend(  # type: ignore[no-untyped-def]
-    density, sh, by_thickness, by_sh, square_density, square_sh, visits, stamp,
-    voxels, number, a_one, voxel, density_rate, colour_rate, view_share, decay, log_decay, epsilon, least, greatest, most_visits,
+def _rmsprop_step(  # type: ignore[no-untyped-def]
+    density, sh, sum_thickness, sum_sh, square_density, square_sh, visits, stamp,
+    voxels, number, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, min_thickness, max_thickness, max_visits,
     WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`efficientnerf.backends.numba.tree.gradients.rmsprop_step` from gradients in whole numbers, `a_one` each."""
+    """`efficientnerf.backends.numba.tree.gradients.rmsprop_step` from gradients as integers, of `unit` each."""
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     met = tl.load(stamp + v, v < voxels, other=-1) == number
     if tl.max(met.to(tl.int32), 0) > 0:
-        visited = tl.minimum(tl.load(visits + v, met, other=0) + 1, most_visits)
+        visited = tl.minimum(tl.load(visits + v, met, other=0) + 1, max_visits)
         tl.store(visits + v, visited, met)
-        right = 1 / (1 - tl.exp(visited.to(tl.float32) * log_decay))
-        # Of the logarithm of the optical thickness; where there is none a little is taken, so that matter may come.
-        depth = tl.maximum(tl.load(density + v, met, other=0.0) * voxel, least)
-        slope = tl.load(by_thickness + v, met, other=0).to(tl.float32) * a_one * depth
-        square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * slope * slope
-        change = density_rate * slope / (tl.sqrt(square * right) + epsilon)
-        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), least), greatest) / voxel, met)
+        correction = 1 / (1 - tl.exp(visited.to(tl.float32) * log_decay))
+        # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
+        depth = tl.maximum(tl.load(density + v, met, other=0.0) * voxel, min_thickness)
+        g = tl.load(sum_thickness + v, met, other=0).to(tl.float32) * unit * depth
+        square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * g * g
+        change = density_rate * g / (tl.sqrt(square * correction) + epsilon)
+        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), min_thickness), max_thickness) / voxel, met)
         tl.store(square_density + v, square, met)
-        tl.store(by_thickness + v, tl.zeros_like(v), met)
+        tl.store(sum_thickness + v, tl.zeros_like(v), met)
         column = tl.arange(0, ROW)
         at = v[:, None] * WIDTH + column[None, :]
         there = met[:, None] & (column < WIDTH)[None, :]
-        grown = tl.load(by_sh + at, there, other=0).to(tl.float32) * a_one
-        square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(grown * grown, 1) / WIDTH
+        by_sh = tl.load(sum_sh + at, there, other=0).to(tl.float32) * unit
+        square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
         tl.store(square_sh + v, square, met)
-        scale = colour_rate / (tl.sqrt(square * right) + epsilon)
-        of_column = tl.where(column < 3, 1.0, view_share)
-        tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * of_column[None, :] * grown, there)
-        tl.store(by_sh + at, tl.zeros_like(at), there)
+        scale = sh_rate / (tl.sqrt(square * correction) + epsilon)
+        share = tl.where(column < 3, 1.0, view_share)
+        tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * share[None, :] * by_sh, there)
+        tl.store(sum_sh + at, tl.zeros_like(at), there)
 
 
-def resolution(rays: int) -> float:
-    """2^k, how many whole numbers a gradient of one is, so that the sums over so many rays stay below 2^62."""
-    return 2.0 ** (62 - BITS_A_RAY - math.ceil(math.log2(max(rays, 1))))
+def fixed_point_scale(rays: int) -> float:
+    """2^k, the integer that stands for a gradient of one: the sums over so many rays stay below 2^62."""
+    return 2.0 ** (62 - BITS_PER_RAY - math.ceil(math.log2(max(rays, 1))))
 
 
-def look(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor) -> tuple[Tensor, Tensor]:
-    """Premultiplied colour (R, 3) of rays through voxels of density (N,) and harmonics (N, 3 K), and the light left (R,)."""
+def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor) -> tuple[Tensor, Tensor]:
+    """Premultiplied colour (R, 3) and final transmittance (R,) of rays through voxels of density (N,) and harmonics (N, 3 K)."""
     count = len(rays.origins)
-    colour, rest = torch.empty(count, 3, device=density.device), torch.empty(count, device=density.device)
-    _see[(max(1, triton.cdiv(count, g.rays)),)](
-        *rays, g.grid, g.index, density, sh, colour, rest, count, *g.grid.shape, float(g.voxel),
+    colour, transmittance = torch.empty(count, 3, device=density.device), torch.empty(count, device=density.device)
+    _forward[(blocks(count, g.rays),)](
+        *rays, g.grid, g.index, density, sh, colour, transmittance, count, *g.grid.shape, float(g.voxel),
         NEAREST=g.nearest, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
-    return colour, rest
+    return colour, transmittance
 
 
-def loss_of(colour: Tensor, rest: Tensor, seen: RayTargets) -> tuple[Tensor, Tensor, Tensor]:
+def loss_and_gradients(colour: Tensor, transmittance: Tensor, targets: RayTargets) -> tuple[Tensor, Tensor, Tensor]:
     """Loss (R,) of rays, see `RayTargets`, and its gradients by their colour (R, 3) and opacity (R,)."""
-    error = seen.transmittance[:, None] * (colour + rest[:, None] * seen.background) - seen.colour
-    missing = 1 - rest - seen.opacity
-    by_colour = 2 * error * seen.transmittance[:, None]
-    by_opacity = 2 * seen.opacity_weight * missing - (by_colour * seen.background).sum(dim=1)
-    return (error * error).sum(dim=1) + seen.opacity_weight * missing * missing, by_colour, by_opacity
+    error = targets.transmittance[:, None] * (colour + transmittance[:, None] * targets.background) - targets.colour
+    missing = 1 - transmittance - targets.opacity
+    by_colour = 2 * error * targets.transmittance[:, None]
+    by_opacity = 2 * targets.opacity_weight * missing - (by_colour * targets.background).sum(dim=1)
+    return (error * error).sum(dim=1) + targets.opacity_weight * missing * missing, by_colour, by_opacity
 
 
-def pull(
-    g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, seen_as: tuple[Tensor, Tensor], by: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor],
+def backward(
+    g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, outputs: tuple[Tensor, Tensor], by: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor],
     stamp: Tensor, number: int,
 ) -> None:  # fmt: skip
-    """Add the gradients by optical thickness and harmonics to `sums`, (N,) and (N, 3 K) int64, `resolution(R)` to a one.
+    """Add the gradients by optical thickness and harmonics to `sums`, (N,) and (N, 3 K) int64, `fixed_point_scale(R)` to a one.
 
-    seen_as  what `look` said of the rays
-    by       gradients by their colour (R, 3) and opacity (R,)
-    stamp    (N,) int32: `number` where a voxel was met
+    outputs  of `forward`
+    by       gradients by colour (R, 3) and opacity (R,)
+    stamp    (N,) int32: set to `number` where a ray meets a voxel
     """
     count = len(rays.origins)
-    _pull[(max(1, triton.cdiv(count, g.rays)),)](
-        *rays, g.grid, g.index, density, sh, *seen_as, *(part.contiguous() for part in by), *sums, stamp,
-        count, *g.grid.shape, float(g.voxel), number, resolution(count),
+    _backward[(blocks(count, g.rays),)](
+        *rays, g.grid, g.index, density, sh, *outputs, *(part.contiguous() for part in by), *sums, stamp,
+        count, *g.grid.shape, float(g.voxel), number, fixed_point_scale(count),
         NEAREST=g.nearest, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
 
 
-def weigh(g: DeviceGrid, rays: Rays, density: Tensor, gain: Tensor, greatest: Tensor) -> None:
-    """Raise `greatest` (N,) to the greatest contributions of voxels to the rays, of which `gain` (R,) of the light reaches the box."""
+def max_contributions(g: DeviceGrid, rays: Rays, density: Tensor, transmittance: Tensor, maximum: Tensor) -> None:
+    """Raise `maximum` (N,) to the greatest contributions of voxels to rays, which reach the box with `transmittance` (R,)."""
     count = len(rays.origins)
-    _weigh[(max(1, triton.cdiv(count, RAYS_AT_ONCE)),)](
-        rays.origins, rays.directions, g.grid, g.index, density, gain, greatest, count, *g.grid.shape, float(g.voxel),
-        NEAREST=g.nearest, BRICK=g.brick, BLOCK=RAYS_AT_ONCE, num_warps=1,
+    _max_contributions[(blocks(count, RAYS_PER_PROGRAM),)](
+        rays.origins, rays.directions, g.grid, g.index, density, transmittance, maximum, count, *g.grid.shape, float(g.voxel),
+        NEAREST=g.nearest, BRICK=g.brick, BLOCK=RAYS_PER_PROGRAM, num_warps=1,
     )  # fmt: skip
 
 
-def descend(
+def rmsprop_step(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], squares: tuple[Tensor, Tensor], visits: Tensor, stamp: Tensor, *,
-    number: int, rays: int, density_rate: float, colour_rate: float, view_share: float, decay: float, epsilon: float,
+    number: int, rays: int, density_rate: float, sh_rate: float, view_share: float, decay: float, epsilon: float,
 ) -> None:  # fmt: skip
-    """A step of RMSprop for the voxels that the last `pull`, of so many rays, met; see `efficientnerf.backends.numba.tree.gradients.rmsprop_step`."""
+    """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree.gradients.rmsprop_step`."""
     voxels = len(visits)
-    _descend[(max(1, triton.cdiv(voxels, VOXELS)),)](
-        *values, *sums, *squares, visits, stamp, voxels, number, 1 / resolution(rays), float(g.voxel), density_rate, colour_rate, float(view_share),
-        decay, math.log(decay),
-        epsilon, MIN_THICKNESS, MAX_THICKNESS, MOST_VISITS, WIDTH=3 * g.terms, ROW=g.row, BLOCK=VOXELS, num_warps=4,
+    _rmsprop_step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
+        *values, *sums, *squares, visits, stamp, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel), density_rate, sh_rate, float(view_share),
+        decay, math.log(decay), epsilon, MIN_THICKNESS, MAX_THICKNESS, MAX_VISITS, WIDTH=3 * g.terms, ROW=g.row, BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

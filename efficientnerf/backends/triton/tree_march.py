@@ -1,112 +1,222 @@
-"""The kernel that draws a NerfTree on CUDA (Triton): one program a block of rays, one launch a picture. See `tree_walk`.
+"""Rays marched through a NerfTree by the CUDA kernels (Triton): the one loop over samples, and what a sample finds in the tree.
 
-All lanes of a block stay in one loop until the last ray has ended, so the rays of a block are a small tile of the picture, and a block is one warp.
-A sample's coefficients are a row of halves that neighbouring lanes read together; sums over the corners come first, the harmonics once after them.
+Rays are sampled as `efficientnerf/asset/FORMAT.md` says, sections 6 and 9: every half voxel, nothing in empty coarse cells, and a ray in such a cell
+skips to the end of the empty cube around it. Coordinates are in voxels. `grid` and `index`: see `efficientnerf.backends.triton.tree.DeviceTree`.
+Offsets that grow with the tree have 64 bits: 1536^3 cells are more than 2^31.
+
+NEAREST: a sample takes the value of the voxel that holds it, which stands for corner 0 with weight 1; there are no other corners.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import triton
 import triton.language as tl
 
-from efficientnerf.backends.triton.tree_walk import STEP, STOP, coefficients, density_at, entry, goes_on, harmonics_along, interpolated, sample, shade, vectors
+from efficientnerf.backends.triton.vectors import Vec3, along, sigmoid
 
-FAINT = tl.constexpr(1e-4)  # weight under which a sample's colour is not looked up; the next one that is looked up stands for it
+STEP = tl.constexpr(0.5)  # of a voxel
+STOP = tl.constexpr(1e-3)  # transmittance at which a ray ends
+
+
+class Grid(NamedTuple):
+    """owner  pointer to (X, Y, Z) int32: the brick of a coarse cell, or the negative of the cells that a ray may skip
+    shape     coarse cells along each axis"""
+
+    owner: Any
+    shape: Any
+
+
+class Ray(NamedTuple):
+    """origin, direction (unit), inverse (1 / direction) Vec3; enter, leave: distances between which it is in the grid, enter >= 0."""
+
+    origin: Any
+    direction: Any
+    inverse: Any
+    enter: Any
+    leave: Any
+
+
+class Sample(NamedTuple):
+    """distance  along the ray
+    inside       whether it lies in a brick
+    corner       place of its lowest corner in the arrays of bricks with border
+    fraction     Vec3 from there to the next corner, 0 to 1
+    """
+
+    distance: Any
+    inside: Any
+    corner: Any
+    fraction: Any
 
 
 @triton.jit
-def _pixels(width, height, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, WIDE: tl.constexpr, HIGH: tl.constexpr):  # type: ignore[no-untyped-def]
-    """This program's tile of a pinhole camera's picture: pixels, which of them there are, rays, and the cosines of their angles to the view axis."""
-    lane = tl.arange(0, WIDE * HIGH)
-    across = (width + WIDE - 1) // WIDE
-    px = (tl.program_id(0) % across) * WIDE + lane % WIDE
-    py = (tl.program_id(0) // across) * HIGH + lane // WIDE
-    lx = (px.to(tl.float32) + 0.5 - cx) / fx
-    ly = (py.to(tl.float32) + 0.5 - cy) / fy
-    slant = 1 / tl.sqrt(lx * lx + ly * ly + 1)
-    dx, dy, dz = (r00 * lx + r01 * ly + r02) * slant, (r10 * lx + r11 * ly + r12) * slant, (r20 * lx + r21 * ly + r22) * slant
-    return py.to(tl.int64) * width + px, (px < width) & (py < height), ox + 0 * dx, oy + 0 * dx, oz + 0 * dx, dx, dy, dz, slant
+def _slab(o, d, high):  # type: ignore[no-untyped-def]
+    """Along one axis: 1 / d, and the distances at which a ray enters and leaves 0 to `high`; never, where it is parallel and outside."""
+    parallel = d == 0
+    inverse = tl.where(parallel, 1e30, 1 / tl.where(parallel, 1.0, d))
+    one, other = -o * inverse, (high - o) * inverse
+    missed = parallel & ((o < 0) | (o > high))
+    return inverse, tl.where(missed, 1e30, tl.minimum(one, other)), tl.where(missed, -1e30, tl.maximum(one, other))
 
 
 @triton.jit
-def _normal(u, v, w, lit, grid, density, nx, ny, nz, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Down the density's gradient, by differences of one voxel to each side; zero where it is flat."""
-    gx = density_at(u - 1, v, w, lit, grid, density, nx, ny, nz, BRICK, NEAREST) - density_at(u + 1, v, w, lit, grid, density, nx, ny, nz, BRICK, NEAREST)
-    gy = density_at(u, v - 1, w, lit, grid, density, nx, ny, nz, BRICK, NEAREST) - density_at(u, v + 1, w, lit, grid, density, nx, ny, nz, BRICK, NEAREST)
-    gz = density_at(u, v, w - 1, lit, grid, density, nx, ny, nz, BRICK, NEAREST) - density_at(u, v, w + 1, lit, grid, density, nx, ny, nz, BRICK, NEAREST)
-    length = tl.sqrt(gx * gx + gy * gy + gz * gz)
-    length = tl.where(length > 0, length, 1.0)
-    return gx / length, gy / length, gz / length
+def ray_in_grid(grid, origin, direction, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """A Ray from its origin and direction, voxel coordinates."""
+    ix, ax, bx = _slab(origin.x, direction.x, grid.shape.x * BRICK)
+    iy, ay, by = _slab(origin.y, direction.y, grid.shape.y * BRICK)
+    iz, az, bz = _slab(origin.z, direction.z, grid.shape.z * BRICK)
+    enter = tl.maximum(tl.maximum(ax, ay), tl.maximum(az, 0.0))
+    return Ray(origin, direction, Vec3(ix, iy, iz), enter, tl.minimum(tl.minimum(bx, by), bz))
+
+
+@triton.jit
+def _cell_of(u, cells, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Coarse cell of a voxel coordinate, clamped to the grid."""
+    return (tl.minimum(tl.maximum(u, 0.0), cells * BRICK - 0.5) / BRICK).to(tl.int32)
+
+
+@triton.jit
+def _cells_of(grid, point, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+    return Vec3(_cell_of(point.x, grid.shape.x, BRICK), _cell_of(point.y, grid.shape.y, BRICK), _cell_of(point.z, grid.shape.z, BRICK))
+
+
+@triton.jit
+def _owner(grid, cell, live):  # type: ignore[no-untyped-def]
+    return tl.load(grid.owner + (cell.x.to(tl.int64) * grid.shape.y + cell.y) * grid.shape.z + cell.z, live, other=-1)
+
+
+@triton.jit
+def _cube_exit(o, d, inverse, cell, radius, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Distance at which a ray leaves the empty cube of `radius` cells around its own, along one axis."""
+    face = tl.where(d > 0, cell + radius, cell - radius + 1) * BRICK
+    return tl.where(d == 0, 1e30, (face - o) * inverse)
+
+
+@triton.jit
+def _first_corner(u, cell, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Along one axis: the lower corner of a point in the brick of `cell` with its border, and the fraction from there to the next corner."""
+    if NEAREST:
+        i = tl.minimum(tl.maximum(tl.floor(u) - cell * BRICK, 0.0), BRICK - 1.0)
+        fraction = tl.zeros_like(u)
+    else:
+        x = u - cell * BRICK - 0.5
+        i = tl.minimum(tl.maximum(tl.floor(x), -1.0), BRICK - 1.0)
+        fraction = x - i
+    return i.to(tl.int32) + 1, fraction
+
+
+@triton.jit
+def _place_in_brick(point, cell, brick, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """`corner` and `fraction` of a Sample."""
+    EDGE: tl.constexpr = BRICK + 2
+    i, fx = _first_corner(point.x, cell.x, BRICK, NEAREST)
+    j, fy = _first_corner(point.y, cell.y, BRICK, NEAREST)
+    k, fz = _first_corner(point.z, cell.z, BRICK, NEAREST)
+    return brick.to(tl.int64) * (EDGE * EDGE * EDGE) + (i * EDGE + j) * EDGE + k, Vec3(fx, fy, fz)
+
+
+@triton.jit
+def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """The `k`-th Sample of rays, and the number of the next one."""
+    t = ray.enter + (k.to(tl.float32) + 0.5) * STEP
+    point = along(ray.origin, ray.direction, t)
+    cell = _cells_of(grid, point, BRICK)
+    owner = _owner(grid, cell, alive)
+    o, d, inverse = ray.origin, ray.direction, ray.inverse
+    radius = -tl.minimum(owner, 0)
+    exit_y, exit_z = _cube_exit(o.y, d.y, inverse.y, cell.y, radius, BRICK), _cube_exit(o.z, d.z, inverse.z, cell.z, radius, BRICK)
+    exit = tl.minimum(_cube_exit(o.x, d.x, inverse.x, cell.x, radius, BRICK), tl.minimum(exit_y, exit_z))
+    after = tl.minimum(tl.maximum(tl.ceil((tl.minimum(exit, ray.leave) - ray.enter) / STEP - 0.5), 0.0), 1e9).to(tl.int32)
+    corner, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
+    return Sample(t, alive & (owner >= 0), corner, fraction), tl.where(owner < 0, tl.maximum(k + 1, after), k + 1)
+
+
+@triton.jit
+def _in_grid(ray, k):  # type: ignore[no-untyped-def]
+    """Whether sample `k` lies in the grid."""
+    return ray.enter + (k.to(tl.float32) + 0.5) * STEP < ray.leave
 
 
 @triton.jit
 def march(  # type: ignore[no-untyped-def]
-    origins, directions, looking, grid, density, index, sh, colour, opacity, depth, normal,
-    rays, width, height, nx, ny, nz, units, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, red, green, blue,
-    PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr,
-    WIDE: tl.constexpr, HIGH: tl.constexpr,
-):  # fmt: skip
-    """PINHOLE: pixels of a camera at (ox, oy, oz), voxel coordinates, with the rotation r, camera to world; depth along the view axis, infinity
-    where less than half of the light is absorbed. Else: rays of the buffers, voxel coordinates, harmonics along `looking`; depth along the ray.
+    grid, ray, live, scene, state, VISIT: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr
+):
+    """Calls VISIT for the samples of rays that lie in bricks, front to back, until each ray is opaque or leaves the grid; returns the last state.
 
-    OVER composites over (red, green, blue). WIDE x HIGH pixels make a program.
+    VISIT  (scene, sample, state, BRICK, NEAREST, K, COLUMNS) -> state
+    scene  what does not change along the ray
+    state  a tuple with a `transmittance`, which ends a ray below STOP
     """
-    BLOCK: tl.constexpr = WIDE * HIGH
-    column = tl.arange(0, ROW)
-    if PINHOLE:
-        r, live, x0, y0, z0, dx, dy, dz, slant = _pixels(
-            width, height, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, WIDE, HIGH
-        )  # fmt: skip
-        basis = harmonics_along(dx, dy, dz, column % K, K)
-    else:
-        r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-        live = r < rays
-        dx, dy, dz = vectors(directions, r, live)
-        x0, y0, z0 = vectors(origins, r, live)
-        sx, sy, sz = vectors(looking, r, live)
-        slant = tl.full((BLOCK,), 1.0, tl.float32)
-        basis = harmonics_along(sx, sy, sz, column % K, K)
-    ix, iy, iz, begin, end = entry(x0, y0, z0, dx, dy, dz, nx, ny, nz, BRICK)
-
-    light = tl.full((BLOCK,), 1.0, tl.float32)
-    owed = tl.zeros((BLOCK,), tl.float32)
-    cr, cg, cb = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
-    hit = tl.full((BLOCK,), float("inf"), tl.float32)
-    k = tl.zeros((BLOCK,), tl.int32)
-    alive = live & goes_on(k, begin, end)
+    k = tl.zeros_like(ray.enter).to(tl.int32)
+    alive = live & _in_grid(ray, k)
     while tl.max(alive.to(tl.int32), 0) > 0:
-        t, inside, base, gx, gy, gz, k = sample(grid, k, begin, end, x0, y0, z0, dx, dy, dz, ix, iy, iz, nx, ny, nz, alive, BRICK, NEAREST)
-        if tl.max(inside.to(tl.int32), 0) > 0:
-            sigma = interpolated(density, base, gx, gy, gz, inside, BRICK, NEAREST)
-            alpha = 1 - tl.exp(-sigma * (STEP * units))
-            owed += light * alpha
-            seen = inside & (owed > FAINT) & (sigma > 0)
-            if tl.max(seen.to(tl.int32), 0) > 0:
-                mixed, total = coefficients(index, sh, base, gx, gy, gz, seen, column, ROW, BRICK, NEAREST)
-                sr, sg, sb = shade(mixed, total, basis, column // K)
-                weight = tl.where(seen, owed, 0.0)
-                cr += weight * sr
-                cg += weight * sg
-                cb += weight * sb
-                owed = tl.where(seen, 0.0, owed)
-            left = light * (1 - alpha)
-            crossing = inside & (light > 0.5) & (left <= 0.5)
-            hit = tl.where(crossing, t - 0.5 * STEP + tl.log(2 * tl.maximum(light, 0.5)) / (tl.maximum(sigma, 1e-20) * units), hit)
-            light = left
-        alive = alive & (light >= STOP) & goes_on(k, begin, end)
+        sample, k = _sample(grid, ray, k, alive, BRICK, NEAREST)
+        if tl.max(sample.inside.to(tl.int32), 0) > 0:
+            state = VISIT(scene, sample, state, BRICK, NEAREST, K, COLUMNS)
+        alive = alive & (state.transmittance >= STOP) & _in_grid(ray, k)
+    return state
 
-    lit = live & (light <= 0.5)
-    at = tl.where(lit, hit, 0.0)
-    gx, gy, gz = _normal(x0 + at * dx, y0 + at * dy, z0 + at * dz, lit, grid, density, nx, ny, nz, BRICK, NEAREST)
-    if OVER:
-        cr += light * red
-        cg += light * green
-        cb += light * blue
-    tl.store(colour + r * 3, cr, live)
-    tl.store(colour + r * 3 + 1, cg, live)
-    tl.store(colour + r * 3 + 2, cb, live)
-    tl.store(opacity + r, 1 - light, live)
-    tl.store(depth + r, tl.where(lit, hit * units * slant, float("inf")), live)
-    tl.store(normal + r * 3, gx, live)
-    tl.store(normal + r * 3 + 1, gy, live)
-    tl.store(normal + r * 3 + 2, gz, live)
+
+@triton.jit
+def corner_weight(fraction, CORNER: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Trilinear weight of a corner, numbered with z fastest."""
+    p: tl.constexpr = CORNER // 4
+    q: tl.constexpr = CORNER // 2 % 2
+    s: tl.constexpr = CORNER % 2
+    return (fraction.x if p else 1 - fraction.x) * (fraction.y if q else 1 - fraction.y) * (fraction.z if s else 1 - fraction.z)
+
+
+@triton.jit
+def corner_place(corner, CORNER: tl.constexpr, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Place of a corner in the arrays of bricks with border, from that of the lowest."""
+    EDGE: tl.constexpr = BRICK + 2
+    return corner + (((CORNER // 4) * EDGE + CORNER // 2 % 2) * EDGE + CORNER % 2)
+
+
+@triton.jit
+def density_at(grid, density, point, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Density at any point: zero outside of the grid and in empty coarse cells."""
+    n = grid.shape
+    inside = live & (point.x >= 0) & (point.y >= 0) & (point.z >= 0) & (point.x < n.x * BRICK) & (point.y < n.y * BRICK) & (point.z < n.z * BRICK)
+    cell = _cells_of(grid, point, BRICK)
+    owner = _owner(grid, cell, inside)
+    corner, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
+    return interpolate_density(density, corner, fraction, owner >= 0, BRICK, NEAREST)
+
+
+@triton.jit
+def interpolate_density(density, corner, fraction, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Density from values of bricks with border."""
+    total = tl.zeros_like(fraction.x)
+    for n in tl.static_range(1 if NEAREST else 8):
+        total += corner_weight(fraction, n) * tl.load(density + corner_place(corner, n, BRICK), live, other=0.0).to(tl.float32)
+    return total
+
+
+@triton.jit
+def interpolate_harmonics(index, sh, sample, live, column, WIDTH: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Coefficients (R, C) of samples summed over the stored corners by their weights, and the sum of these weights (R,), which is positive.
+
+    sh  rows of WIDTH coefficients; columns beyond it are zero
+    """
+    mixed = tl.zeros_like(sample.fraction.x)[:, None] + tl.zeros_like(column)[None, :].to(tl.float32)
+    total = tl.zeros_like(sample.fraction.x)
+    for n in tl.static_range(1 if NEAREST else 8):
+        voxel = tl.load(index + corner_place(sample.corner, n, BRICK), live, other=-1)
+        weight = tl.where(voxel >= 0, corner_weight(sample.fraction, n), 0.0)
+        total += weight
+        row = tl.load(sh + voxel.to(tl.int64)[:, None] * WIDTH + column[None, :], (voxel >= 0)[:, None] & (column < WIDTH)[None, :], other=0.0)
+        mixed += weight[:, None] * row.to(tl.float32)
+    return mixed, tl.maximum(total, 1e-20)
+
+
+@triton.jit
+def colour_of(mixed, total, basis, channel):  # type: ignore[no-untyped-def]
+    """Colours of samples (Vec3) from `interpolate_harmonics`; `channel` (C,) of each column, 0 to 2."""
+    terms = mixed * basis
+    red = sigmoid(tl.sum(tl.where((channel == 0)[None, :], terms, 0.0), 1) / total)
+    green = sigmoid(tl.sum(tl.where((channel == 1)[None, :], terms, 0.0), 1) / total)
+    blue = sigmoid(tl.sum(tl.where((channel == 2)[None, :], terms, 0.0), 1) / total)
+    return Vec3(red, green, blue)

@@ -1,0 +1,139 @@
+"""The kernel that renders a NerfTree on CUDA (Triton): one program a block of rays, one launch an image.
+
+All lanes of a block stay in the loop until the last ray has ended, so the rays of a block are a small tile of the image, and a block is one warp.
+A sample's coefficients are a row of halves that neighbouring lanes read together; sums over the corners come first, the harmonics once after them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import triton
+import triton.language as tl
+
+from efficientnerf.backends.triton.harmonics import basis_columns
+from efficientnerf.backends.triton.tree_march import STEP, Grid, colour_of, density_at, interpolate_density, interpolate_harmonics, march, ray_in_grid
+from efficientnerf.backends.triton.vectors import Vec3, add_scaled, along, load_vec3, store_vec3, zeros_vec3
+
+MIN_WEIGHT = tl.constexpr(1e-4)  # below it a sample's colour is not looked up, and its weight is added to that of the next one
+
+
+class Camera(NamedTuple):
+    """centre Vec3, voxel coordinates; x, y, z Vec3, rows of the rotation, camera to world; focal lengths and principal point, pixels."""
+
+    centre: Any
+    x: Any
+    y: Any
+    z: Any
+    focal_x: Any
+    focal_y: Any
+    principal_x: Any
+    principal_y: Any
+
+
+class Scene(NamedTuple):
+    """density, index, sh of `DeviceTree`; voxel: length of a step's unit; basis (R, C) harmonics of the columns; column (C,)."""
+
+    density: Any
+    index: Any
+    sh: Any
+    voxel: Any
+    basis: Any
+    column: Any
+
+
+class State(NamedTuple):
+    """transmittance; pending_weight of samples without a colour; colour (Vec3, premultiplied); depth along the ray where the transmittance is a half."""
+
+    transmittance: Any
+    pending_weight: Any
+    colour: Any
+    depth: Any
+
+
+@triton.jit
+def _pixel_rays(camera, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr):  # type: ignore[no-untyped-def]
+    """This program's tile of a pinhole camera's image: pixels, which of them exist, origins, directions, and the cosines of their angles to the axis."""
+    lane = tl.arange(0, WIDE * HIGH)
+    across = (width + WIDE - 1) // WIDE
+    px = (tl.program_id(0) % across) * WIDE + lane % WIDE
+    py = (tl.program_id(0) // across) * HIGH + lane // WIDE
+    u = (px.to(tl.float32) + 0.5 - camera.principal_x) / camera.focal_x
+    v = (py.to(tl.float32) + 0.5 - camera.principal_y) / camera.focal_y
+    cosine = 1 / tl.sqrt(u * u + v * v + 1)
+    rx, ry, rz = camera.x, camera.y, camera.z
+    direction = Vec3((rx.x * u + rx.y * v + rx.z) * cosine, (ry.x * u + ry.y * v + ry.z) * cosine, (rz.x * u + rz.y * v + rz.z) * cosine)
+    origin = Vec3(camera.centre.x + 0 * direction.x, camera.centre.y + 0 * direction.x, camera.centre.z + 0 * direction.x)
+    return py.to(tl.int64) * width + px, (px < width) & (py < height), origin, direction, cosine
+
+
+@triton.jit
+def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Add a sample to the State of its rays."""
+    sigma = interpolate_density(scene.density, sample.corner, sample.fraction, sample.inside, BRICK, NEAREST)
+    alpha = 1 - tl.exp(-sigma * (STEP * scene.voxel))
+    pending = state.pending_weight + state.transmittance * alpha
+    visible = sample.inside & (pending > MIN_WEIGHT) & (sigma > 0)
+    colour = state.colour
+    if tl.max(visible.to(tl.int32), 0) > 0:
+        mixed, total = interpolate_harmonics(scene.index, scene.sh, sample, visible, scene.column, COLUMNS, BRICK, NEAREST)
+        rgb = colour_of(mixed, total, scene.basis, scene.column // K)
+        colour = add_scaled(colour, tl.where(visible, pending, 0.0), rgb)
+        pending = tl.where(visible, 0.0, pending)
+    after = state.transmittance * (1 - alpha)
+    crossing = sample.inside & (state.transmittance > 0.5) & (after <= 0.5)
+    at_half = sample.distance - 0.5 * STEP + tl.log(2 * tl.maximum(state.transmittance, 0.5)) / (tl.maximum(sigma, 1e-20) * scene.voxel)
+    return State(after, pending, colour, tl.where(crossing, at_half, state.depth))
+
+
+@triton.jit
+def _normal(grid, density, p, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Unit vectors down the density's gradient at points, by central differences of one voxel; zero where it is flat."""
+    gx = density_at(grid, density, Vec3(p.x - 1, p.y, p.z), live, BRICK, NEAREST) - density_at(grid, density, Vec3(p.x + 1, p.y, p.z), live, BRICK, NEAREST)
+    gy = density_at(grid, density, Vec3(p.x, p.y - 1, p.z), live, BRICK, NEAREST) - density_at(grid, density, Vec3(p.x, p.y + 1, p.z), live, BRICK, NEAREST)
+    gz = density_at(grid, density, Vec3(p.x, p.y, p.z - 1), live, BRICK, NEAREST) - density_at(grid, density, Vec3(p.x, p.y, p.z + 1), live, BRICK, NEAREST)
+    length = tl.sqrt(gx * gx + gy * gy + gz * gz)
+    length = tl.where(length > 0, length, 1.0)
+    return Vec3(gx / length, gy / length, gz / length)
+
+
+@triton.jit
+def render(  # type: ignore[no-untyped-def]
+    origins, directions, views, owner, density, index, sh, colour, opacity, depth, normal,
+    rays, width, height, nx, ny, nz, voxel, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, red, green, blue,
+    PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr,
+    WIDE: tl.constexpr, HIGH: tl.constexpr,
+):  # fmt: skip
+    """PINHOLE: pixels of a camera at (ox, oy, oz), voxel coordinates, with the rotation r, camera to world; depth along the view axis, infinity
+    where the opacity is below a half. Else: rays of the buffers, voxel coordinates, harmonics along `views`; depth along the ray.
+
+    OVER composites over (red, green, blue). WIDE x HIGH pixels make a program.
+    """
+    BLOCK: tl.constexpr = WIDE * HIGH
+    column = tl.arange(0, ROW)
+    if PINHOLE:
+        camera = Camera(Vec3(ox, oy, oz), Vec3(r00, r01, r02), Vec3(r10, r11, r12), Vec3(r20, r21, r22), fx, fy, cx, cy)
+        r, live, origin, direction, cosine = _pixel_rays(camera, width, height, WIDE, HIGH)
+        basis = basis_columns(direction, column % K, K)
+    else:
+        r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+        live = r < rays
+        direction = load_vec3(directions, r, live)
+        origin = load_vec3(origins, r, live)
+        cosine = tl.full((BLOCK,), 1.0, tl.float32)
+        basis = basis_columns(load_vec3(views, r, live), column % K, K)
+    grid = Grid(owner, Vec3(nx, ny, nz))
+    ray = ray_in_grid(grid, origin, direction, BRICK)
+    start = State(tl.full((BLOCK,), 1.0, tl.float32), tl.zeros((BLOCK,), tl.float32), zeros_vec3(BLOCK), tl.full((BLOCK,), float("inf"), tl.float32))
+    end = march(grid, ray, live, Scene(density, index, sh, voxel, basis, column), start, _composite, BRICK, NEAREST, K, ROW)
+
+    opaque = live & (end.transmittance <= 0.5)
+    surface = along(origin, direction, tl.where(opaque, end.depth, 0.0))
+    facing = _normal(grid, density, surface, opaque, BRICK, NEAREST)
+    rgb = end.colour
+    if OVER:
+        rgb = add_scaled(rgb, end.transmittance, Vec3(red, green, blue))
+    store_vec3(colour, r, rgb, live)
+    tl.store(opacity + r, 1 - end.transmittance, live)
+    tl.store(depth + r, tl.where(opaque, end.depth * voxel * cosine, float("inf")), live)
+    store_vec3(normal, r, facing, live)
