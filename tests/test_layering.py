@@ -1,8 +1,9 @@
-"""Who may import whom, over the syntax trees; and that what must start quickly imports nothing heavy."""
+"""Who may import whom, how large folders, functions and signatures may be, over the syntax trees; and that what must start quickly imports nothing heavy."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,15 @@ ALLOWED = {
     "stages": {"stages", "pipeline", "efficientnerf"},
     "workflows": set(OURS),
 }
+KERNELS = ("efficientnerf/backends/numba", "efficientnerf/backends/triton", "efficientnerf/structures")  # compiled code, and what launches it
+MODULES_A_FOLDER, LINES, ARGUMENTS = 15, 60, 12
+# To be mended; nothing is to be added here.
+IN_RINGS = {
+    "efficientnerf.asset.format", "efficientnerf.asset.quantisation", "efficientnerf.asset.serialisation", "efficientnerf.asset.tree",
+    "efficientnerf.backends.numba.tree.packed", "efficientnerf.rendering.render", "efficientnerf.asset.refinement",
+    "efficientnerf.asset.refinement_device",
+}  # fmt: skip
+LONG = {"efficientnerf.training.loop:train", "stages.train:run"}
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
 
 
@@ -31,10 +41,13 @@ def imported(path: Path) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            if node.level:
-                yield ".".join([*path.relative_to(ROOT).parts[: -node.level], node.module or ""]).rstrip(".")
-            else:
-                yield node.module or ""
+            yield source_of(node, path)
+
+
+def source_of(node: ast.ImportFrom, path: Path) -> str:
+    """The full name of the module that a file imports from."""
+    above = path.relative_to(ROOT).parts[: -node.level] if node.level else ()
+    return ".".join([*above, node.module or ""]).rstrip(".")
 
 
 @pytest.mark.parametrize("package", OURS)
@@ -52,6 +65,76 @@ def test_the_engine_needs_the_standard_library_filelock_and_msgspec_only() -> No
         tops = {name.partition(".")[0] for name in imported(path)}
         wrong += [f"{path.relative_to(ROOT)} imports {top}" for top in sorted(tops - sys.stdlib_module_names - {"pipeline", "filelock", "msgspec"})]
     assert wrong == []
+
+
+def dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def at_run_time(node: ast.AST) -> Iterator[ast.AST]:
+    """A node and all below it, but what stands under `if TYPE_CHECKING`."""
+    yield node
+    for child in ast.iter_child_nodes(node):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and child in node.body:
+            continue
+        yield from at_run_time(child)
+
+
+def import_graph() -> dict[str, set[str]]:
+    """Module -> the modules of ours that it imports at run time, on top or within functions."""
+    paths = {dotted(path): path for package in OURS for path in modules(package)}
+    graph: dict[str, set[str]] = {}
+    for name, path in paths.items():
+        found = graph.setdefault(name, set())
+        for node in at_run_time(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                base = source_of(node, path)
+                found |= {f"{base}.{alias.name}" for alias in node.names} & paths.keys() or {base}
+        graph[name] = found & paths.keys() - {name}
+    return graph
+
+
+def cycle(graph: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other in a ring, the first of them again at the end; none: an empty list."""
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1][::-1]
+    return []
+
+
+def functions() -> Iterator[tuple[str, bool, ast.FunctionDef]]:
+    """(module:function, whether it is a kernel or launches one, its node)"""
+    for package in OURS:
+        for path in modules(package):
+            kernel = path.relative_to(ROOT).as_posix().startswith(KERNELS)
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef):
+                    yield f"{dotted(path)}:{node.name}", kernel, node
+
+
+def test_no_modules_import_each_other_in_a_ring() -> None:
+    assert cycle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) in (["b", "c", "b"], ["c", "b", "c"])
+    assert cycle({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    graph = import_graph()
+    assert cycle({name: graph[name] - IN_RINGS for name in graph.keys() - IN_RINGS}) == []
+
+
+def test_no_folder_holds_more_modules_than_can_be_surveyed() -> None:
+    folders = [path.parent for package in OURS for path in modules(package) if path.name != "__init__.py"]
+    assert {str(folder.relative_to(ROOT)) for folder in folders if folders.count(folder) > MODULES_A_FOLDER} == set()
+
+
+def test_functions_are_short() -> None:
+    lengths = {name: (node.end_lineno or 0) - node.lineno + 1 for name, kernel, node in functions() if not kernel}
+    assert {name: lines for name, lines in lengths.items() if lines > LINES and name not in LONG} == {}
+
+
+def test_functions_take_few_arguments() -> None:
+    counts = {name: len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs) for name, kernel, node in functions() if not kernel}
+    assert {name: count for name, count in counts.items() if count > ARGUMENTS} == {}
 
 
 def test_nothing_unpickles_or_evaluates() -> None:
@@ -73,11 +156,8 @@ def test_light_modules_import_nothing_heavy() -> None:
     names = []
     for package in OURS:
         for path in modules(package):
-            dotted = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            if path.name == "__init__.py":
-                names.append(dotted.removesuffix(".__init__"))
-            elif package != "efficientnerf" and path.name != "__main__.py":
-                names.append(dotted)
+            if path.name == "__init__.py" or (package != "efficientnerf" and path.name != "__main__.py"):
+                names.append(dotted(path))
     script = f"""
 import importlib, sys
 guilty = []
