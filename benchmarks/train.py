@@ -104,7 +104,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
 
 def test_views(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
     """Cameras, their images, and by how much both are subsampled."""
-    from stages.evaluate import thinned, thinned_camera, truth_of
+    from stages.evaluate import ground_truth, subsample, subsample_camera
     from stages.io import scene
 
     s = scene.load(poses)
@@ -112,7 +112,7 @@ def test_views(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]
     out = []
     for view in views[:: max(1, len(views) // count)][:count]:
         stride = -(-max(view.camera.width, view.camera.height) // side)
-        out.append((thinned_camera(view.camera, stride), thinned(truth_of(poses, view, s.background).colour, stride), stride))
+        out.append((subsample_camera(view.camera, stride), subsample(ground_truth(poses, view, s.background).colour, stride), stride))
     return out
 
 

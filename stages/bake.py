@@ -95,7 +95,7 @@ def run(job: Job) -> None:
     from stages.baking.memory import refuse_more_than_fits
     from stages.baking.refinement import optimised
     from stages.baking.resolution import budget_of
-    from stages.evaluate import behind_of
+    from stages.evaluate import constant_background
     from stages.io import scene
     from stages.io.field_file import load_renderer
     from stages.train import pixels_of, use_all_cores
@@ -127,7 +127,7 @@ def run(job: Job) -> None:
     job.say(f"{resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
     points = 0 if m.settings.discretise == resolution and space is m.space else settings.samples_per_voxel
     facts = metadata_of(s, settings, m)
-    plain = behind_of(s)
+    plain = constant_background(s)
     if plain is None:
         targets = Targets(pixels, None, seen.chosen, seen.before, seen.behind)
     else:

@@ -1,13 +1,13 @@
-"""The evaluate stage: PSNR, SSIM and, where asked for, LPIPS of the network and of the baked asset on the views that training never saw.
+"""The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field and of the baked asset on the test views.
 
-    metrics.json       network and asset: means over the views; views[]: the figures of each
-    contact_sheet.png  truth, network and asset with their errors
+    metrics.json       "network" (the field) and "asset": means over the views; "views": the metrics of each
+    contact_sheet.png  ground truth, field and asset, with their errors
 
-The network is slow to draw, so that only some views are drawn with it, and of these every n-th pixel along each side, through its own centre.
-Its PSNR is then an unbiased estimate of that at full size; against photographs averaged down it would be held down by their soft edges. (Its SSIM
-is that of the thinned pictures.) The asset is measured on every held-back view at the full working size. On photographs the asset lies between
-what the network puts before and behind its box; in-box figures leave out the pixels where the network sees less than half of the light in the
-box. On a constant background, in-box figures are over the pixels that the photograph's alpha covers.
+The field is slow to render. Only some views are rendered with it, and of these every n-th pixel along each side, through the pixel's own centre: the
+PSNR is an unbiased estimate of that at full size, which a comparison with downscaled photographs would not be. (SSIM is that of the subsampled
+images.) The asset is measured on every test view at the full working size. In unbounded scenes the asset is composited between what the field shows
+before and behind its box, and in-box metrics leave out the pixels where less than half of the field's opacity lies in the box. On a constant background, in-box
+metrics are over the pixels that the photograph's alpha covers.
 """
 
 from __future__ import annotations
@@ -35,12 +35,10 @@ if TYPE_CHECKING:
     from efficientnerf.evaluation.lpips import Lpips
 
 FORMAT = 1
-NETWORK_SIDE = 400  # pixels: the longest side of what the network draws where evaluate.field_image_scale does not say
-PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal images get this
+MAX_FIELD_IMAGE_SIZE = 400  # pixels: the longest side of the field's renders where evaluate.field_image_scale is not given
+MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
 SHEET_ROWS = 8
-SHEET_SIDE = 320
-
-
+THUMBNAIL = 320  # pixels, longest side
 NETWORKS = ("alex", "vgg")  # of LPIPS
 
 
@@ -50,7 +48,7 @@ class EvaluateSettings:
 
     field_views: PositiveInt | Literal["all"] = setting(4, "Number of test views that the field is rendered for, spread evenly.", advanced=True)
     field_image_scale: Annotated[float, Meta(ge=0.01, le=1.0)] | Auto = setting(
-        "auto", f"Scale of the pixel grid on which the field is rendered; auto: at most {NETWORK_SIDE} along the longest side.", advanced=True
+        "auto", f"Scale of the pixel grid on which the field is rendered; auto: at most {MAX_FIELD_IMAGE_SIZE} along the longest side.", advanced=True
     )
     field_background_rays: PositiveInt = setting(
         500_000, "Total number of rays through the field for the background of the asset's other views, in unbounded scenes.", advanced=True
@@ -62,12 +60,12 @@ class EvaluateSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
-    """A photograph to compare with.
+class GroundTruth:
+    """The image that a render is compared with.
 
     colour  (H, W, 3) float32, on the scene's background
-    mask    (H, W) bool, pixels that count, or None
-    inside  (H, W) bool, pixels that show the subject, where the photograph says so, or None
+    mask    (H, W) bool, pixels that are compared; None: all
+    inside  (H, W) bool, pixels that the image's alpha covers; None without alpha
     """
 
     colour: np.ndarray
@@ -90,23 +88,23 @@ def run(job: Job) -> None:
 
 
 def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
-    """Measure each view once; figures and thumbnails are kept in job.work, so that a kill costs at most one view.
+    """Write the metrics and the contact sheet. Metrics and thumbnails of each view are kept in job.work, so that a kill costs at most one view.
 
     tree        with the interface of a NerfTree
-    load_field  gives a FieldRenderer; called only where one is needed
+    load_field  returns a FieldRenderer; called only where one is needed
     """
     from stages.io.scene import load
 
     settings: EvaluateSettings = job.settings
     scene = load(job.inputs[PosesOutputs.stage])
-    views, split = held_back(scene)
+    views, split = evaluation_views(scene)
     if split == "train":
-        job.warn("no view was held back from training: the figures below are of views that training saw")
-    drawn = set(spread(len(views), None if settings.field_views == "all" else settings.field_views))
+        job.warn("the scene has no test or validation views: the metrics are of views that training saw")
+    rendered = set(evenly_spaced(len(views), None if settings.field_views == "all" else settings.field_views))
     longest = max(max(view.camera.width, view.camera.height) for view in views)
     scale = given(settings.field_image_scale)
-    stride = max(1, math.ceil(longest / NETWORK_SIDE if scale is None else 1.0 / scale - 1e-6))
-    rest = background_stride([view for k, view in enumerate(views) if k not in drawn], settings.field_background_rays)
+    stride = max(1, math.ceil(longest / MAX_FIELD_IMAGE_SIZE if scale is None else 1.0 / scale - 1e-6))
+    rest = background_stride([view for k, view in enumerate(views) if k not in rendered], settings.field_background_rays)
     wanted = {"off": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
     perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in wanted}
     field: Any = None
@@ -116,22 +114,23 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
         job.progress(k, len(views), f"view {view.name}")
         done = job.work / f"view_{k:05d}.json"
         if not done.exists():
-            needs_field = k in drawn or behind_of(scene) is None
+            needs_field = k in rendered or constant_background(scene) is None
             field = field or (load_field() if needs_field else None)
-            thinning = stride if k in drawn else rest
-            measured, pictures = measure(tree, field, scene, view, job, drawn=k in drawn, stride=thinning, perceptual=perceptual)
-            if k in drawn:
-                _keep_pictures(pictures, job.work, k)
+            measured, images = evaluate_view(
+                tree, field, scene, view, job, with_field=k in rendered, stride=stride if k in rendered else rest, perceptual=perceptual
+            )
+            if k in rendered:
+                _save_thumbnails(images, job.work, k)
             write_json(done, measured)
         figures.append(json.loads(done.read_text(encoding="utf-8")))
     job.progress(len(views), len(views))
-    metrics = summary(figures, split=split, stride=stride, background=rest if behind_of(scene) is None else None, perceptual=tuple(perceptual))
+    metrics = summary(figures, split=split, stride=stride, background=rest if constant_background(scene) is None else None, perceptual=tuple(perceptual))
     write_json(EvaluateOutputs(job.out).metrics, metrics)
-    _write_sheet(metrics, sorted(drawn), job)
+    _write_sheet(metrics, sorted(rendered), job)
 
 
-def held_back(scene: Scene) -> tuple[tuple[View, ...], str]:
-    """The views to report on and their split: test, else val, else train."""
+def evaluation_views(scene: Scene) -> tuple[tuple[View, ...], str]:
+    """The views to report on and their split: test, else val, else train. Raises ValueError where the scene has no views."""
     from stages.io.scene import views_of
 
     for split in ("test", "val", "train"):
@@ -141,37 +140,40 @@ def held_back(scene: Scene) -> tuple[tuple[View, ...], str]:
     raise ValueError("the scene holds no views")
 
 
-def spread(count: int, wanted: int | None) -> list[int]:
-    """Indices of `wanted` of `count` things, evenly spread; None: all."""
+def evenly_spaced(count: int, wanted: int | None) -> list[int]:
+    """`wanted` of the indices below `count`; None: all."""
     if wanted is None or wanted >= count:
         return list(range(count))
     return [int((k + 0.5) * count / wanted) for k in range(wanted)]
 
 
-def background_stride(views: Sequence[View], pixels: int) -> int:
-    """The thinning at which all of the views together have about so many pixels at most."""
+def background_stride(views: Sequence[View], rays: int) -> int:
+    """The stride at which the views together have at most about this many rays."""
     total = sum(view.camera.width * view.camera.height for view in views)
-    return max(1, math.ceil(math.sqrt(total / pixels)))
+    return max(1, math.ceil(math.sqrt(total / rays)))
 
 
-def truth_of(folder: Path, view: View, background: tuple[float, float, float] | None) -> Truth:
-    """The photograph of a view at working size."""
+def ground_truth(folder: Path, view: View, background: tuple[float, float, float] | None) -> GroundTruth:
+    """The image of a view at working size.
+
+    background  what images with alpha are composited on; None: alpha below one half masks
+    """
     from stages.io.scene import read_image, read_mask
 
     pixels = read_image(folder, view).astype(np.float32) / 255.0
     mask = read_mask(folder, view)
     if pixels.shape[2] == 3:
-        return Truth(pixels, mask, None)
+        return GroundTruth(pixels, mask, None)
     alpha = pixels[..., 3]
     if background is None:
         covered = alpha >= 0.5
-        return Truth(pixels[..., :3], covered if mask is None else mask & covered, None)
+        return GroundTruth(pixels[..., :3], covered if mask is None else mask & covered, None)
     colour = pixels[..., :3] * alpha[..., None] + (1.0 - alpha[..., None]) * np.asarray(background, np.float32)
-    return Truth(colour, mask, alpha > 0)
+    return GroundTruth(colour, mask, alpha > 0)
 
 
-def thinned_camera(camera: Camera, stride: int) -> Camera:
-    """The camera whose pixels look through the centres of every stride-th pixel of another, beginning at the offset of `thinned`."""
+def subsample_camera(camera: Camera, stride: int) -> Camera:
+    """The camera whose pixel centres are those of the pixels that `subsample` keeps."""
     first = (stride - 1) // 2
     params = []
     for name, value in zip(MODELS[camera.model], camera.params, strict=True):
@@ -184,14 +186,14 @@ def thinned_camera(camera: Camera, stride: int) -> Camera:
     return replace(camera, width=width, height=height, params=tuple(params))
 
 
-def thinned(values: np.ndarray, stride: int) -> np.ndarray:
-    """Every stride-th row and column, (H, W, ...) -> (H', W', ...); the first is the middle of its group."""
+def subsample(values: np.ndarray, stride: int) -> np.ndarray:
+    """Every stride-th row and column, beginning in the middle of the first stride; (H, W, ...) -> (H', W', ...)."""
     first = (stride - 1) // 2
     return values[first::stride, first::stride]
 
 
-def thickened(values: np.ndarray, stride: int, width: int, height: int) -> np.ndarray:
-    """The inverse of `thinned`, bilinear between the pixels that are known; beyond the outermost they are repeated."""
+def upsample(values: np.ndarray, stride: int, width: int, height: int) -> np.ndarray:
+    """The inverse of `subsample`: bilinear, clamped at the border; (H', W', ...) -> (height, width, ...)."""
     import cv2
 
     values = np.ascontiguousarray(values, np.float32)
@@ -202,43 +204,43 @@ def thickened(values: np.ndarray, stride: int, width: int, height: int) -> np.nd
     return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def measure(
-    tree: Any, field: Any, scene: Scene, view: View, job: Job, *, drawn: bool, stride: int, perceptual: Mapping[str, Lpips] | None = None
+def evaluate_view(
+    tree: Any, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int, perceptual: Mapping[str, Lpips] | None = None
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """The figures of one view, and, where the network is drawn, its pictures: truth, network, its error, asset, its error.
+    """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
-    drawn       whether the network is measured; else it is asked only for the background of the asset, and not at all on a constant one
-    stride      thinning of what the network draws
-    perceptual  LPIPS by the names of their figures
+    with_field  whether the field is measured; else it renders the asset's background alone, and nothing where that is constant
+    stride      of the pixels that the field renders
+    perceptual  LPIPS networks by the name of their metric
     """
     from stages.pictures.plots import eight_bits, error_picture
 
-    truth = truth_of(job.inputs[PosesOutputs.stage], view, scene.background)
-    plain = behind_of(scene)
-    figures: dict[str, Any] = {"name": view.name, "network": None}
-    pictures: list[np.ndarray] = []
+    truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
+    background = constant_background(scene)
+    metrics: dict[str, Any] = {"name": view.name, "network": None}
+    images: list[np.ndarray] = []
     rendering = None
-    if drawn or plain is None:
-        rendering = field.render(thinned_camera(view.camera, stride), progress=lambda *_: job.safe_point())
-    if drawn and rendering is not None:
-        small = Truth(thinned(truth.colour, stride), *(None if m is None else thinned(m, stride) for m in (truth.mask, truth.inside)))
-        inside = small.inside if plain is not None else rendering.inside_opacity >= 0.5
-        network = _clean(rendering.colour, job, f"{view.name}: the network")
-        figures["network"] = {**compare(network, small, inside), "width": network.shape[1], "height": network.shape[0], **shares(rendering.counts)}
-        figures["network"] |= perceived(perceptual or {}, network, small)
-        pictures += [eight_bits(small.colour), eight_bits(network), error_picture(network, small.colour)]
-    asset, inside = asset_picture(tree, scene, view, rendering, stride)
-    asset = _clean(asset, job, f"{view.name}: the asset")
-    figures["asset"] = {**compare(asset, truth, truth.inside if inside is None else inside), "width": view.camera.width, "height": view.camera.height}
-    figures["asset"] |= perceived(perceptual or {}, asset, truth)
-    if plain is None:
-        figures["asset"]["background_scale"] = 1.0 / stride
-    if figures["asset"]["psnr"] is None:
+    if with_field or background is None:
+        rendering = field.render(subsample_camera(view.camera, stride), progress=lambda *_: job.safe_point())
+    if with_field and rendering is not None:
+        small = GroundTruth(subsample(truth.colour, stride), *(None if m is None else subsample(m, stride) for m in (truth.mask, truth.inside)))
+        inside = small.inside if background is not None else rendering.inside_opacity >= 0.5
+        render = _clipped(rendering.colour, job, f"{view.name}: the field")
+        metrics["network"] = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0], **sample_shares(rendering.counts)}
+        metrics["network"] |= lpips_metrics(perceptual or {}, render, small)
+        images += [eight_bits(small.colour), eight_bits(render), error_picture(render, small.colour)]
+    asset, inside = render_asset(tree, scene, view, rendering, stride)
+    asset = _clipped(asset, job, f"{view.name}: the asset")
+    metrics["asset"] = {**compare(asset, truth, truth.inside if inside is None else inside), "width": view.camera.width, "height": view.camera.height}
+    metrics["asset"] |= lpips_metrics(perceptual or {}, asset, truth)
+    if background is None:
+        metrics["asset"]["background_scale"] = 1.0 / stride
+    if metrics["asset"]["psnr"] is None:
         job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
-    return figures, [*pictures, eight_bits(asset), error_picture(asset, truth.colour)]
+    return metrics, [*images, eight_bits(asset), error_picture(asset, truth.colour)]
 
 
-def perceived(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: Truth) -> dict[str, float | None]:
+def lpips_metrics(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:
     """LPIPS by name; None for images too small for the networks."""
     from efficientnerf.evaluation.lpips import SMALLEST
 
@@ -246,55 +248,55 @@ def perceived(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: Truth) 
     return {name: metric(image, truth.colour, truth.mask) if large else None for name, metric in perceptual.items()}
 
 
-def behind_of(scene: Scene) -> tuple[float, float, float] | None:
-    """The constant colour behind the asset, where all that the pictures show lies in it; None where the network knows what lies beyond."""
+def constant_background(scene: Scene) -> tuple[float, float, float] | None:
+    """The colour behind the asset in bounded and forward-facing scenes; None where the field shows what lies beyond the box."""
     from efficientnerf.model import UNSEEN
 
     return scene.background if scene.background is not None or scene.forward is None else (UNSEEN, UNSEEN, UNSEEN)
 
 
-SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
+SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 
-def shares(counts: Any) -> dict[str, float]:
-    """Valid and pivotal samples over rays x N_c (equations 5 and 12), counted between near and far, and fine samples a ray."""
+def sample_shares(counts: Any) -> dict[str, float]:
+    """Valid and pivotal samples over rays x N_c (EfficientNeRF, equations 5 and 12), counted between near and far; fine samples a ray."""
     return {"valid_share": counts.valid_share, "pivotal_share": counts.pivotal_share, "fine_per_ray": counts.fine / max(counts.rays, 1)}
 
 
-def asset_picture(tree: Any, scene: Scene, view: View, rendering: Any, stride: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """What the asset shows of a view (H, W, 3), and which pixels lie in its box (photographs only).
+def render_asset(tree: Any, scene: Scene, view: View, rendering: Any, stride: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """The asset's render of a view (H, W, 3), and which pixels lie in its box (unbounded scenes only).
 
-    On photographs: before + (1 - before's alpha) (asset + (1 - asset's alpha) behind), with the network's before and behind.
+    In unbounded scenes: before + (1 - before's alpha) (asset + (1 - asset's alpha) behind), where the field gives before and behind.
     """
-    if (plain := behind_of(scene)) is not None:
-        return tree.render(view.camera, background=plain).colour, None
-    seen = tree.render(view.camera)
+    if (background := constant_background(scene)) is not None:
+        return tree.render(view.camera, background=background).colour, None
+    output = tree.render(view.camera)
     size = (stride, view.camera.width, view.camera.height)
-    before, behind = thickened(rendering.before, *size), thickened(rendering.behind, *size)
-    middle = seen.colour + (1.0 - seen.opacity[..., None]) * behind
-    return before[..., :3] + (1.0 - before[..., 3:]) * middle, thickened(rendering.inside_opacity, *size) >= 0.5
+    before, behind = upsample(rendering.before, *size), upsample(rendering.behind, *size)
+    middle = output.colour + (1.0 - output.opacity[..., None]) * behind
+    return before[..., :3] + (1.0 - before[..., 3:]) * middle, upsample(rendering.inside_opacity, *size) >= 0.5
 
 
-def compare(image: np.ndarray, truth: Truth, inside: np.ndarray | None) -> dict[str, float | None]:
-    """psnr, ssim and psnr_in_box, None where nothing can be compared (no pixel, or fewer than an SSIM window)."""
+def compare(image: np.ndarray, truth: GroundTruth, inside: np.ndarray | None) -> dict[str, float | None]:
+    """psnr, ssim and psnr_in_box; None where no pixel, or no whole SSIM window, can be compared."""
     from efficientnerf.evaluation.metrics import psnr, ssim
 
     used = np.ones(image.shape[:2], bool) if truth.mask is None else truth.mask
     boxed = None if inside is None else used & inside
     windows = used[5:-5, 5:-5]
     return {
-        "psnr": min(PSNR_CAP, psnr(image, truth.colour, truth.mask)) if used.any() else None,
+        "psnr": min(MAX_PSNR, psnr(image, truth.colour, truth.mask)) if used.any() else None,
         "ssim": ssim(image, truth.colour, truth.mask) if windows.any() else None,
-        "psnr_in_box": min(PSNR_CAP, psnr(image, truth.colour, boxed)) if boxed is not None and boxed.any() else None,
+        "psnr_in_box": min(MAX_PSNR, psnr(image, truth.colour, boxed)) if boxed is not None and boxed.any() else None,
     }
 
 
 def summary(figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, perceptual: Sequence[str] = ()) -> dict[str, Any]:
-    """metrics.json: the means over the views (of PSNR in decibels, as published), how they were taken, and the figures of each."""
+    """The document of metrics.json: means over the views (of PSNR in decibels, as published), how they were taken, and the metrics of each view."""
     drawn = [view["network"] for view in figures if view["network"] is not None]
     assets = [view["asset"] for view in figures]
     same = [view["asset"] for view in figures if view["network"] is not None]
-    network: dict[str, Any] = {**_means(drawn), **_means(drawn, perceptual), **_means(drawn, SHARES), "views": len(drawn), "scale": 1.0 / stride}
+    network: dict[str, Any] = {**_means(drawn), **_means(drawn, perceptual), **_means(drawn, SAMPLE_SHARES), "views": len(drawn), "scale": 1.0 / stride}
     asset: dict[str, Any] = {**_means(assets), **_means(assets, perceptual), "views": len(assets), "scale": 1.0, "on_network_views": _means(same)}
     if background is not None:
         asset["background_scale"] = {"network_views": 1.0 / stride, "other_views": 1.0 / background}
@@ -309,20 +311,20 @@ def _means(figures: Sequence[dict[str, Any]], names: Sequence[str] = ("psnr", "s
     return means
 
 
-def _clean(image: np.ndarray, job: Job, what: str) -> np.ndarray:
-    """Clipped to 0-1; what is not a number counts as black and is told."""
+def _clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
+    """Clipped to 0-1; pixels that are not finite count as black, with a warning."""
     bad = int((~np.isfinite(image)).any(axis=-1).sum())
     if bad:
-        job.warn(f"{what} is not a number at {bad} pixels; they count as black")
+        job.warn(f"{what} is not finite at {bad} pixels; they count as black")
     return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
 
 
-def _keep_pictures(pictures: Sequence[np.ndarray], folder: Path, k: int) -> None:
+def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> None:
     from stages.io.png import write_png
     from stages.pictures.plots import thumbnail_of
 
-    for column, picture in enumerate(pictures):
-        write_png(np.asarray(thumbnail_of(picture, SHEET_SIDE)), folder / f"picture_{k:05d}_{column}.png")
+    for column, image in enumerate(images):
+        write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), folder / f"picture_{k:05d}_{column}.png")
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
@@ -333,14 +335,14 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
         psnr = "no PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"
         return psnr if found["ssim"] is None else f"{psnr}, SSIM {found['ssim']:.3f}"
 
-    shown = [drawn[k] for k in spread(len(drawn), SHEET_ROWS)]
+    shown = [drawn[k] for k in evenly_spaced(len(drawn), SHEET_ROWS)]
     rows = [[read_png(job.work / f"picture_{k:05d}_{column}.png") for column in range(5)] for k in shown]
     labels = []
     for k in shown:
         view = metrics["views"][k]
-        labels.append([view["name"], f"network {figure(view['network'])}", "error of the network", f"asset {figure(view['asset'])}", "error of the asset"])
-    title = f"{metrics['split']} views: network {figure(metrics['network'])}; asset {figure(metrics['asset'])}; errors are white from 0.25"
-    contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=SHEET_SIDE, title=title)
+        labels.append([view["name"], f"field {figure(view['network'])}", "error of the field", f"asset {figure(view['asset'])}", "error of the asset"])
+    title = f"{metrics['split']} views: field {figure(metrics['network'])}; asset {figure(metrics['asset'])}; errors are white from 0.25"
+    contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
 STAGE = Stage(name="evaluate", version=1, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)

@@ -213,8 +213,8 @@ def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, s
     place = {index: new for new, index in enumerate(kept)}
     points = capture.points
     if points is not None:
-        observers = tuple(tuple(place[photo] for photo in seen if photo in place) for seen in points.observers)
-        points = SparsePoints(points.xyz, points.rgb, points.error, observers)
+        tracks = tuple(tuple(place[photo] for photo in track if photo in place) for track in points.tracks)
+        points = SparsePoints(points.xyz, points.rgb, points.error, tracks)
     return replace(capture, photos=tuple(capture.photos[index] for index in kept), points=points, rejected=(*capture.rejected, *failed))
 
 

@@ -221,7 +221,7 @@ def anchors_of(folder: Path, s: Scene) -> SparseDepthRays | None:
     points = scene.read_points(folder)
     loop = np.array([view.split == "train" for view in s.views])
     centres = np.array([view.camera.centre for view in s.views])
-    pairs = [(n, view) for n, seen in enumerate(points.observers) if len(seen) >= FEWEST_OBSERVERS for view in seen if loop[view]]
+    pairs = [(n, view) for n, seen in enumerate(points.tracks) if len(seen) >= FEWEST_OBSERVERS for view in seen if loop[view]]
     if not pairs:
         return None
     which, view = np.array(pairs, np.int64).T
@@ -343,14 +343,14 @@ def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int
     if view is None or settings.preview_every == "off" or step == 0 or step % settings.preview_every:
         return None
     from efficientnerf.evaluation.metrics import psnr
-    from stages.evaluate import thinned, thinned_camera, truth_of
+    from stages.evaluate import ground_truth, subsample, subsample_camera
     from stages.io.png import write_png
     from stages.pictures.plots import eight_bits
 
     target = job.work / f"preview_{step:06d}.png"
     stride = max(1, math.ceil(max(view.camera.width, view.camera.height) / PREVIEW_SIDE))
-    truth = thinned(truth_of(folder, view, renderer.model.background).colour, stride)
-    picture = np.clip(renderer.render(thinned_camera(view.camera, stride)).colour, 0, 1)
+    truth = subsample(ground_truth(folder, view, renderer.model.background).colour, stride)
+    picture = np.clip(renderer.render(subsample_camera(view.camera, stride)).colour, 0, 1)
     write_png(eight_bits(np.concatenate([truth, picture], axis=1)), target)
     return round(float(psnr(picture, truth)), 2)
 

@@ -147,16 +147,14 @@ def _tangents(cameras: Sequence[Camera]) -> tuple[float, float]:
     return float(across), float(down)
 
 
-def content_depths(
-    photos: Sequence[Photo], placed: Sequence[Camera], scale: float, points: np.ndarray | None, observers: Sequence[Sequence[int]]
-) -> np.ndarray:
-    """(C, 2) nearest and farthest depth of what each photo shows, training frame: as the source states it, else of the sparse points it sees.
+def content_depths(photos: Sequence[Photo], placed: Sequence[Camera], scale: float, points: np.ndarray | None, tracks: Sequence[Sequence[int]]) -> np.ndarray:
+    """(C, 2) nearest and farthest depth of what each photo shows, training frame: as the source states it, else of the sparse points it observes.
 
     points     (N, 3) in the training frame, or None
-    observers  for each point, the photos that saw it
+    tracks     for each point, the photos that observe it
     """
     seen: list[list[int]] = [[] for _ in placed]
-    for point, views in enumerate(observers):
+    for point, views in enumerate(tracks):
         for view in views:
             seen[view].append(point)
     rows = np.full((len(placed), 2), np.nan)

@@ -97,8 +97,8 @@ def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choi
     usual = "contracted" if capture.background is None else "box"
     if choice in ("box", "contracted") or (choice == "auto" and (capture.kind != "llff" or capture.background is not None)):
         return (usual, None, "usual for this kind of source") if choice == "auto" else (choice, None, "given")
-    points, observers = (None, ()) if capture.points is None else (world.points(capture.points.xyz), capture.points.observers)
-    found = forward_of(placed, content_depths(capture.photos, placed, world.scale, points, observers))
+    points, tracks = (None, ()) if capture.points is None else (world.points(capture.points.xyz), capture.points.tracks)
+    found = forward_of(placed, content_depths(capture.photos, placed, world.scale, points, tracks))
     if isinstance(found, Forward):
         return "ndc", found, "given" if choice == "ndc" else "all cameras look the same way"
     if choice == "ndc":
@@ -239,9 +239,9 @@ def near_far(capture: Capture, placed: Sequence[Camera], world: Similarity, boun
     corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     seen: list[list[int]] = [[] for _ in placed]
     if capture.points is not None:
-        for point, observers in enumerate(capture.points.observers):
-            for observer in observers:
-                seen[observer].append(point)
+        for point, track in enumerate(capture.points.tracks):
+            for index in track:
+                seen[index].append(point)
     points = None if capture.points is None else world.points(capture.points.xyz)
     rows = []
     for photo, camera, mine in zip(capture.photos, placed, seen, strict=True):

@@ -54,7 +54,7 @@ def box_of_points(points: SparsePoints, cameras: Sequence[Camera], converging: b
         return _box_of_path(points.xyz, centres)
     share = in_view(points.xyz, cameras).mean(0)
     keep = share >= IN_VIEW * np.quantile(share, 0.95)
-    count = np.array([len(observers) for observers in points.observers]) if points.observers else np.full(len(points.xyz), 3)
+    count = np.array([len(track) for track in points.tracks]) if points.tracks else np.full(len(points.xyz), 3)
     keep &= count >= min(3, int(np.quantile(count, 0.9)))
     if np.isfinite(points.error).any():
         keep &= ~(points.error > 3 * np.nanmedian(points.error))

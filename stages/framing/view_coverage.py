@@ -30,21 +30,21 @@ if TYPE_CHECKING:
 MOST_SHARE = 4  # a fourth of the cameras is not few
 
 
-def cells_below_min_views(space: Space, cameras: Sequence[Camera], observers: int, side: int) -> np.ndarray:
+def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: int, side: int) -> np.ndarray:
     """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those whose centre lies in the box, and in the pictures of fewer than
-    `observers` cameras. No more are asked for than a quarter of the cameras (rounded up), and none of a single camera."""
+    `min_views` cameras. No more are asked for than a quarter of the cameras (rounded up), and none of a single camera."""
     centre = (np.arange(side) + 0.5) / side * (2 * space.reach) - space.reach  # contraction leaves the box as it is
     inside = np.flatnonzero(np.abs(centre) <= 1)
     out = np.zeros((side, side, side), bool)
     unit = np.stack(np.meshgrid(*(centre[inside],) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    few = ~has_min_views(unit * space.half + space.centre, cameras, observers)
+    few = ~has_min_views(unit * space.half + space.centre, cameras, min_views)
     out[np.ix_(inside, inside, inside)] = few.reshape((len(inside),) * 3)
     return out
 
 
-def has_min_views(points: np.ndarray, cameras: Sequence[Camera], observers: int) -> np.ndarray:
+def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int) -> np.ndarray:
     """(N,) bool: which points (N, 3) of the world lie in the pictures of as many cameras; see `cells_below_min_views` for how many."""
-    needed = min(observers, -(-len(cameras) // MOST_SHARE))
+    needed = min(min_views, -(-len(cameras) // MOST_SHARE))
     count = np.zeros(len(points), np.int32)
     open_still = np.arange(len(points) if needed > 1 else 0)
     for n in spread_order(len(cameras)):

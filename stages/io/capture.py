@@ -39,13 +39,13 @@ class SparsePoints:
     xyz        (N, 3) float64, the capture's frame
     rgb        (N, 3) uint8, sRGB
     error      (N,)   float64 mean reprojection error, pixels (nan where unknown)
-    observers  N tuples of indices into the capture's photos (empty where unknown)
+    tracks     of each point the indices of the photos that observe it (empty where unknown)
     """
 
     xyz: np.ndarray
     rgb: np.ndarray
     error: np.ndarray
-    observers: tuple[tuple[int, ...], ...]
+    tracks: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)

@@ -234,22 +234,22 @@ def read_mask(folder: Path, view: View) -> np.ndarray | None:
 
 
 def save_points(points: SparsePoints, folder: Path) -> None:
-    """Write folder/points.safetensors; `points` in the training frame, observers as indices into the scene's views."""
+    """Write folder/points.safetensors; `points` in the training frame, tracks as indices into the scene's views."""
     from safetensors.numpy import save_file
 
-    counts = np.array([len(seen) for seen in points.observers], np.int64)
+    counts = np.array([len(track) for track in points.tracks], np.int64)
     tensors = {
         "xyz": np.ascontiguousarray(points.xyz, np.float64),
         "rgb": np.ascontiguousarray(points.rgb, np.uint8),
         "error": np.ascontiguousarray(points.error, np.float64),
         "observer_counts": counts,
-        "observers": np.array([view for seen in points.observers for view in seen], np.int64),
+        "observers": np.array([view for track in points.tracks for view in track], np.int64),
     }
     save_file(tensors, str(PosesOutputs(folder).points))
 
 
 def read_points(folder: Path) -> SparsePoints:
-    """The sparse points in the training frame; observers are indices into the scene's views."""
+    """The sparse points in the training frame; tracks are indices into the scene's views."""
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
@@ -257,8 +257,8 @@ def read_points(folder: Path) -> SparsePoints:
     try:
         tensors = load_file(str(path))
         ends = np.cumsum(tensors["observer_counts"])
-        observers = tuple(tuple(seen.tolist()) for seen in np.split(tensors["observers"], ends[:-1])) if len(ends) else ()
-        return SparsePoints(tensors["xyz"], tensors["rgb"], tensors["error"], observers)
+        tracks = tuple(tuple(track.tolist()) for track in np.split(tensors["observers"], ends[:-1])) if len(ends) else ()
+        return SparsePoints(tensors["xyz"], tensors["rgb"], tensors["error"], tracks)
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise BadInput(f"{path}: not readable as sparse points ({error}). Run the poses stage again.") from error
 

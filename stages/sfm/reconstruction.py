@@ -175,7 +175,7 @@ def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
         xyz=np.array([point.xyz for point in ordered], np.float64).reshape(-1, 3),
         rgb=np.array([point.color for point in ordered], np.uint8).reshape(-1, 3),
         error=np.array([point.error for point in ordered], np.float64),
-        observers=tuple(tuple(sorted({index[element.image_id] for element in point.track.elements})) for point in ordered),
+        tracks=tuple(tuple(sorted({index[element.image_id] for element in point.track.elements})) for point in ordered),
     )
 
 
@@ -187,8 +187,8 @@ def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
     centres = np.array([photo.camera.centre for photo in photos])
     step = max(1, len(points.xyz) // 2000)
     widest = []
-    for xyz, observers in zip(points.xyz[::step], points.observers[::step], strict=True):
-        towards = centres[list(observers)] - xyz
+    for xyz, track in zip(points.xyz[::step], points.tracks[::step], strict=True):
+        towards = centres[list(track)] - xyz
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         widest.append(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1, 1))))
     return float(np.median(widest))

@@ -22,7 +22,7 @@ from stages import bake, train
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
 from stages.baking import memory, refinement, resolution
-from stages.evaluate import truth_of
+from stages.evaluate import ground_truth
 from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from tests.efficientnerf.balls import settings
@@ -153,7 +153,7 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
     run(made)
     raw = NerfTree.load(made.out / BakeOutputs.asset).render(view.camera, background=white).colour
     fitted = NerfTree.load(undisturbed[1].out / BakeOutputs.asset).render(view.camera, background=white).colour
-    truth = truth_of(inputs["poses"], view, white).colour
+    truth = ground_truth(inputs["poses"], view, white).colour
     assert np.sqrt(((field - raw) ** 2).mean()) < 0.08
     assert ((fitted - truth) ** 2).mean() < 0.5 * ((raw - truth) ** 2).mean()
 

@@ -16,7 +16,7 @@ from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
-from stages.evaluate import EvaluateSettings, background_stride, evaluate, spread, thickened, thinned, thinned_camera
+from stages.evaluate import EvaluateSettings, background_stride, evaluate, evenly_spaced, subsample, subsample_camera, upsample
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.exporters.frames import frame_from_rendering
 from stages.io.png import write_png
@@ -109,7 +109,7 @@ def test_the_network_is_bounded_in_views_and_scale_and_the_asset_is_not(tmp_path
     assert [view["network"] is not None for view in metrics["views"]] == [False, True, False, False, True, False]
     assert (metrics["network"]["views"], metrics["network"]["scale"], metrics["asset"]["views"]) == (2, 0.5, 6)
     assert {call[1:] for call in field.calls} == {(30, 22)}
-    assert metrics["views"][1]["network"]["psnr"] > 50, "thinning takes nothing from a perfect network"
+    assert metrics["views"][1]["network"]["psnr"] > 50, "subsampling takes nothing from a perfect field"
     assert metrics["views"][1]["asset"]["width"] == WIDTH
 
 
@@ -127,7 +127,7 @@ def test_on_photographs_the_asset_lies_over_the_networks_background(tmp_path: Pa
     field = BallField(TREE)
     evaluate(TREE, lambda: field, job)
     metrics = figures_of(job)
-    assert metrics["asset"]["psnr"] > 40, "surroundings are smooth: enlarging them loses little"
+    assert metrics["asset"]["psnr"] > 40, "surroundings are smooth: upsampling them loses little"
     assert metrics["asset"]["psnr_in_box"] > 45
     assert metrics["asset"]["background_scale"] == {"network_views": 1.0, "other_views": 0.5}
     assert [width for _, width, _ in field.calls] == [30, WIDTH, 30, WIDTH]
@@ -182,7 +182,7 @@ def test_a_mask_that_hides_everything_leaves_the_view_out_of_the_means(tmp_path:
     assert any("v0.png" in event["text"] for event in events if event["event"] == "warning")
 
 
-def test_a_network_of_nans_is_told_and_measured_as_black(tmp_path: Path) -> None:
+def test_a_field_of_nans_counts_as_black_with_a_warning(tmp_path: Path) -> None:
     class Broken(BallField):
         def render(self, camera: Camera, progress: Any = None) -> Any:
             return replace(super().render(camera), colour=np.full((camera.height, camera.width, 3), np.nan, np.float32))
@@ -191,7 +191,7 @@ def test_a_network_of_nans_is_told_and_measured_as_black(tmp_path: Path) -> None
     job = job_in(tmp_path, make_scene(tmp_path / "poses", "t"), report=events.append)
     evaluate(TREE, lambda: Broken(TREE, background=WHITE), job)
     assert 0 < figures_of(job)["network"]["psnr"] < 10
-    assert any("not a number" in event["text"] for event in events if event["event"] == "warning")
+    assert any("not finite" in event["text"] for event in events if event["event"] == "warning")
 
 
 @pytest.mark.parametrize("moment", [1, 2, 4])
@@ -222,12 +222,12 @@ def test_the_field_is_not_loaded_where_nothing_needs_it(tmp_path: Path) -> None:
 
 
 def test_spread_is_even_and_complete() -> None:
-    assert spread(10, None) == spread(10, 12) == list(range(10))
-    assert spread(10, 2) == [2, 7]
-    assert spread(9, 1) == [4]
+    assert evenly_spaced(10, None) == evenly_spaced(10, 12) == list(range(10))
+    assert evenly_spaced(10, 2) == [2, 7]
+    assert evenly_spaced(9, 1) == [4]
     for count in range(1, 30):
         for wanted in range(1, count):
-            chosen = spread(count, wanted)
+            chosen = evenly_spaced(count, wanted)
             assert len(set(chosen)) == wanted
             assert 0 <= chosen[0] <= chosen[-1] < count
 
@@ -242,18 +242,18 @@ def test_background_stride_bounds_the_pixels() -> None:
 
 @pytest.mark.parametrize("stride", [1, 2, 3, 4])
 @pytest.mark.parametrize("model", [("SIMPLE_RADIAL", (70.0, 31.0, 20.0, 0.1)), ("OPENCV_FISHEYE", (70.0, 72.0, 31.0, 20.0, 0.1, 0.01, 0.0, 0.0))])
-def test_a_thinned_camera_sees_along_the_rays_of_the_pixels_that_are_kept(stride: int, model: tuple[str, tuple[float, ...]]) -> None:
+def test_a_subsampled_camera_has_the_rays_of_the_pixels_that_are_kept(stride: int, model: tuple[str, tuple[float, ...]]) -> None:
     camera = Camera("a", 61, 44, *model, pose_on_sphere((0.0, 0.0, 0.0), 3.0, 10.0, 20.0))
-    small = thinned_camera(camera, stride)
-    expected = thinned(rays(camera)[1].reshape(44, 61, 3), stride)
+    small = subsample_camera(camera, stride)
+    expected = subsample(rays(camera)[1].reshape(44, 61, 3), stride)
     np.testing.assert_allclose(rays(small)[1].reshape(small.height, small.width, 3), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3, 4])
-def test_thickened_gives_back_what_was_kept_and_straight_lines_between(stride: int) -> None:
+def test_upsampling_gives_back_what_was_kept_and_straight_lines_between(stride: int) -> None:
     y, x = np.mgrid[0:40, 0:50].astype(np.float32)
     ramp = np.stack([x, y, x + 2 * y, np.ones_like(x)], -1)
-    again = thickened(thinned(ramp, stride), stride, 50, 40)
-    np.testing.assert_allclose(thinned(again, stride), thinned(ramp, stride), atol=1e-4)
+    again = upsample(subsample(ramp, stride), stride, 50, 40)
+    np.testing.assert_allclose(subsample(again, stride), subsample(ramp, stride), atol=1e-4)
     inner = slice(stride, -stride)
     np.testing.assert_allclose(again[inner, inner], ramp[inner, inner], atol=0.2)  # OpenCV knows 32 places between two pixels

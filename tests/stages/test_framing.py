@@ -48,8 +48,8 @@ def capture_of(cameras: list[Camera], xyz: np.ndarray | None = None, *, moved: S
     if xyz is not None:
         seen = scene_bounds.in_view(xyz, cameras)
         count = len(xyz)
-        observers = tuple(tuple(int(i) for i in np.flatnonzero(seen[:, k])) for k in range(count))
-        points = SparsePoints(moved.points(xyz), np.zeros((count, 3), np.uint8), np.ones(count), observers)
+        tracks = tuple(tuple(int(i) for i in np.flatnonzero(seen[:, k])) for k in range(count))
+        points = SparsePoints(moved.points(xyz), np.zeros((count, 3), np.uint8), np.ones(count), tracks)
     photos = tuple(Photo(moved.camera(camera), PLAIN) for camera in cameras)
     return Capture("photographs", photos, None, points=points, **more)  # type: ignore[arg-type]
 

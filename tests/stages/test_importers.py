@@ -69,7 +69,7 @@ def test_colmap_lenses(model: str, write: object, tmp_path: Path) -> None:
     assert_same_rays(capture, made)
     assert capture.photos[0].camera.params == LENSES[model]
     assert capture.points is not None
-    assert capture.points.observers[0] == tuple(range(6))
+    assert capture.points.tracks[0] == tuple(range(6))
     assert capture.points.rgb[0].tolist() == [200, 100, 50]
     assert capture.reprojection_error == pytest.approx(0.5)
 

@@ -324,7 +324,7 @@ def test_colmap_names_absent_images(tmp_path: Path) -> None:
     assert len(capture.photos) == 5
     assert any("1 of 6 images that it lists are missing: img_0.png" in warning for warning in capture.warnings)
     assert capture.points is not None
-    assert capture.points.observers[0] == (0, 1, 2, 3, 4)
+    assert capture.points.tracks[0] == (0, 1, 2, 3, 4)
     refusal(folder, "--strict", strict=True)
     for path in (folder / "images").iterdir():
         path.unlink()

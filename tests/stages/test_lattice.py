@@ -24,7 +24,7 @@ from stages.io.scene import load as load_scene
 from stages.training.hash_resolution import LARGEST, MOST, with_auto_sizes
 from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import ORBIT, SIMILARITY, job, poses
-from tests.stages.test_forward import depths, row
+from tests.stages.test_forward_facing import depths, row
 
 
 def forward_facing(side: int) -> Scene:

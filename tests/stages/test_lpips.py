@@ -11,7 +11,7 @@ import torch
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
 from stages import lpips_weights
-from stages.evaluate import Truth, perceived, summary
+from stages.evaluate import GroundTruth, lpips_metrics, summary
 from stages.lpips_weights import BACKBONES, load_lpips
 
 
@@ -109,10 +109,10 @@ def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:
 def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
     metrics = {"lpips_alex": load_lpips("alex", written(tmp_path / "weights", "alex"))}
     image, truth = (a.astype(np.float32) for a in images())
-    figures = perceived(metrics, image, Truth(truth, None, None))
+    figures = lpips_metrics(metrics, image, GroundTruth(truth, None, None))
     assert figures["lpips_alex"] is not None
     assert figures["lpips_alex"] > 0
-    assert perceived(metrics, image[:50], Truth(truth[:50], None, None)) == {"lpips_alex": None}
+    assert lpips_metrics(metrics, image[:50], GroundTruth(truth[:50], None, None)) == {"lpips_alex": None}
     some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, **figures}
     views = [{"name": "a", "network": {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0}, "asset": {**some, "lpips_alex": None}}]
     found = summary(views, split="test", stride=1, background=None, perceptual=("lpips_alex",))

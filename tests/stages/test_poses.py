@@ -123,7 +123,7 @@ def test_a_truncated_image_is_named_and_left_out(tmp_path: Path) -> None:
     made, warnings = run(source, tmp_path / "a")
     assert [view.name for view in made.views] == [f"images/img_{i}.png" for i in (0, 1, 3, 4, 5)]
     assert any("1 of 6 images cannot be used: images/img_2.png cannot be decoded" in warning for warning in warnings)
-    assert scene.read_points(tmp_path / "a/poses").observers[0] == (0, 1, 2, 3, 4)
+    assert scene.read_points(tmp_path / "a/poses").tracks[0] == (0, 1, 2, 3, 4)
     report = json.loads((tmp_path / "a/poses/report.json").read_text())
     assert report["rejected"][0]["name"] == "images/img_2.png"
     with pytest.raises(BadInput, match="--strict"):
@@ -301,7 +301,7 @@ def test_real_photographs_with_colmap_cameras(tmp_path: Path) -> None:
     points = scene.read_points(tmp_path / "poses")
     assert len(points.xyz) == 11384
     view = made.views[0]
-    pixels, depth = project(view.camera, points.xyz[[0 in seen for seen in points.observers]])
+    pixels, depth = project(view.camera, points.xyz[[0 in seen for seen in points.tracks]])
     assert ((pixels >= 0) & (pixels <= (view.camera.width, view.camera.height))).all()
     assert view.near < np.quantile(depth, 0.01)
     assert np.quantile(depth, 0.99) < view.far

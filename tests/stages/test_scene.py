@@ -143,14 +143,14 @@ def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
 
 
 def test_points_come_back_as_they_were(tmp_path: Path) -> None:
-    for observers in [((0, 2), (), (5,)), ()]:
-        count = len(observers)
-        points = SparsePoints(np.ones((count, 3)), np.full((count, 3), 7, np.uint8), np.full(count, np.nan), observers)
+    for tracks in [((0, 2), (), (5,)), ()]:
+        count = len(tracks)
+        points = SparsePoints(np.ones((count, 3)), np.full((count, 3), 7, np.uint8), np.full(count, np.nan), tracks)
         scene.save_points(points, tmp_path)
         again = scene.read_points(tmp_path)
         np.testing.assert_array_equal(again.xyz, points.xyz)
         np.testing.assert_array_equal(again.rgb, points.rgb)
-        assert again.observers == observers
+        assert again.tracks == tracks
     (tmp_path / "points.safetensors").write_bytes(b"nothing")
     with pytest.raises(BadInput, match=r"points\.safetensors"):
         scene.read_points(tmp_path)

@@ -190,7 +190,7 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
 
     from efficientnerf.evaluation.metrics import psnr, ssim
     from efficientnerf.rendering.render import SampleCounts
-    from stages.evaluate import held_back, spread, truth_of
+    from stages.evaluate import evaluation_views, evenly_spaced, ground_truth
     from stages.io import scene
     from stages.io.field_file import load_renderer
     from stages.train import use_all_cores
@@ -201,12 +201,12 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
         return dict(found)
     use_all_cores()
     s = scene.load(run.folder("poses"))
-    views, split = held_back(s)
+    views, split = evaluation_views(s)
     renderer = load_renderer(run.folder("train"), device)
     decibels, similarities, counts = [], [], SampleCounts()
-    for view in [views[k] for k in spread(len(views), _count(settings["evaluate"]["field_views"]))]:
+    for view in [views[k] for k in evenly_spaced(len(views), _count(settings["evaluate"]["field_views"]))]:
         rendering = renderer.render(view.camera)
-        truth = truth_of(run.folder("poses"), view, s.background).colour
+        truth = ground_truth(run.folder("poses"), view, s.background).colour
         picture = np.clip(rendering.colour, 0, 1)
         decibels.append(psnr(picture, truth))
         similarities.append(ssim(picture, truth))
@@ -225,7 +225,7 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
 
 
 def _count(field_views: int | str) -> int | None:
-    """evaluate.field_views for `spread`."""
+    """evaluate.field_views for `evenly_spaced`."""
     return None if isinstance(field_views, str) else field_views
 
 
@@ -257,19 +257,19 @@ def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
 
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.evaluation.metrics import psnr, ssim
-    from stages.evaluate import held_back, spread, truth_of
+    from stages.evaluate import evaluation_views, evenly_spaced, ground_truth
     from stages.io import scene
 
     tree = NerfTree.load(BakeOutputs.of_run(run.path).asset).to(device)
     s = scene.load(run.folder("poses"))
-    views, _ = held_back(s)
-    drawn = [views[k] for k in spread(len(views), wanted)]
+    views, _ = evaluation_views(s)
+    drawn = [views[k] for k in evenly_spaced(len(views), wanted)]
     _frame_seconds(tree, drawn[0].camera, s.background)  # compiled, and in memory
     decibels, similarities, seconds = [], [], []
     for view in drawn:
         picture = tree.render(view.camera, background=s.background).colour
         seconds.append(_frame_seconds(tree, view.camera, s.background))
-        truth = truth_of(run.folder("poses"), view, s.background).colour
+        truth = ground_truth(run.folder("poses"), view, s.background).colour
         decibels.append(psnr(np.clip(picture, 0, 1), truth))
         similarities.append(ssim(np.clip(picture, 0, 1), truth))
     size = BakeOutputs.of_run(run.path).asset.stat().st_size

@@ -133,8 +133,8 @@ def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> 
 
 
 def _sparse(points: Points, ids: dict[int, int]) -> SparsePoints:
-    observers = tuple(tuple(sorted(ids[number] for number in seen if number in ids)) for seen in points.observers)
-    return SparsePoints(points.xyz, points.rgb, points.error, observers)
+    tracks = tuple(tuple(sorted(ids[number] for number in track if number in ids)) for track in points.tracks)
+    return SparsePoints(points.xyz, points.rgb, points.error, tracks)
 
 
 def _mean_error(points: SparsePoints | None) -> float | None:

@@ -60,12 +60,12 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class Points:
-    """points3D.bin|txt. observers: per point the ids of the images that see it, sorted, each once."""
+    """points3D.bin|txt. tracks: of each point the ids of the images that observe it, sorted, each once."""
 
     xyz: np.ndarray
     rgb: np.ndarray
     error: np.ndarray
-    observers: tuple[tuple[int, ...], ...]
+    tracks: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -203,16 +203,16 @@ def _points_bin(path: Path) -> Points:
     file = _Bytes(path)
     count = file.count(51, "points")
     xyz, rgb, error = np.empty((count, 3)), np.empty((count, 3), np.uint8), np.empty(count)
-    observers = []
+    tracks = []
     for i in range(count):
         _, x, y, z, r, g, b, off = file.take("<Q3d3Bd")
         xyz[i], rgb[i], error[i] = (x, y, z), (r, g, b), off
         length = file.count(8, "observations of a point")
         track = struct.unpack_from(f"<{2 * length}I", file.data, file.at)
         file.skip(8 * length)
-        observers.append(tuple(sorted(set(track[::2]))))
+        tracks.append(tuple(sorted(set(track[::2]))))
     file.finish()
-    return _finite(path, Points(xyz, rgb, error, tuple(observers)))
+    return _finite(path, Points(xyz, rgb, error, tuple(tracks)))
 
 
 def _finite(path: Path, points: Points) -> Points:
@@ -298,7 +298,7 @@ def _images_txt(path: Path) -> dict[int, PosedImage]:
 
 
 def _points_txt(path: Path) -> Points:
-    xyz, rgb, error, observers = [], [], [], []
+    xyz, rgb, error, tracks = [], [], [], []
     for line, text in _lines(path):
         words = text.split()
         if not words or words[0].startswith("#"):
@@ -313,7 +313,7 @@ def _points_txt(path: Path) -> Points:
         xyz.append(numbers[:3])
         rgb.append(colour)
         error.append(numbers[6])
-        observers.append(tuple(sorted({_integer(path, line, word) for word in words[8::2]})))
+        tracks.append(tuple(sorted({_integer(path, line, word) for word in words[8::2]})))
     _check_count(path, "points", len(xyz))
-    points = Points(np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3), np.array(error, np.float64), tuple(observers))
+    points = Points(np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3), np.array(error, np.float64), tuple(tracks))
     return _finite(path, points)

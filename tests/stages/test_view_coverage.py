@@ -51,8 +51,8 @@ def aimed(at: np.ndarray, count: int) -> list[Camera]:
 
 
 @pytest.mark.parametrize("side", [24, 17])
-@pytest.mark.parametrize("observers", [2, 3])
-def test_it_is_the_voxels_in_the_box_that_few_cameras_project_into_their_pictures(side: int, observers: int) -> None:
+@pytest.mark.parametrize("min_views", [2, 3])
+def test_it_is_the_voxels_in_the_box_that_few_cameras_project_into_their_pictures(side: int, min_views: int) -> None:
     cameras = [narrow(camera, 1.8) for camera in balls.cameras(12)]
     world, inside = centres(side)
     expected = np.zeros_like(inside)
@@ -61,17 +61,17 @@ def test_it_is_the_voxels_in_the_box_that_few_cameras_project_into_their_picture
         for camera in cameras:
             pixel, depth = project(camera, world[tuple(at)][None])
             views += int(depth[0] > 0 and 0 <= pixel[0, 0] <= camera.width and 0 <= pixel[0, 1] <= camera.height)
-        expected[tuple(at)] = views < observers
+        expected[tuple(at)] = views < min_views
     assert 0.05 < expected[inside].mean() < 0.95
-    np.testing.assert_array_equal(cells_below_min_views(SPACE, cameras, observers, side), expected)
+    np.testing.assert_array_equal(cells_below_min_views(SPACE, cameras, min_views, side), expected)
 
 
-@pytest.mark.parametrize(("watching", "observers", "closed"), [(0, 2, True), (1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
-def test_a_place_that_enough_cameras_see_is_open_and_one_that_fewer_see_is_not(watching: int, observers: int, closed: bool) -> None:
+@pytest.mark.parametrize(("watching", "min_views", "closed"), [(0, 2, True), (1, 2, True), (2, 2, False), (2, 3, True), (3, 3, False)])
+def test_a_place_that_enough_cameras_see_is_open_and_one_that_fewer_see_is_not(watching: int, min_views: int, closed: bool) -> None:
     """Twelve cameras look at the middle; a place beside it is seen by those alone that look there."""
     beside = np.array([0.85, 0.8, 1.05])
     cameras = [*aimed(np.zeros(3), 12), *aimed(beside, watching)]
-    found = cells_below_min_views(SPACE, cameras, observers, SIDE)
+    found = cells_below_min_views(SPACE, cameras, min_views, SIDE)
     world, inside = centres()
     (lump,) = np.argwhere(inside)[[np.argmin(np.linalg.norm(world[inside] - beside, axis=-1))]]
     (middle,) = np.argwhere(inside)[[np.argmin(np.linalg.norm(world[inside], axis=-1))]]
@@ -125,10 +125,10 @@ def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_pa
         assert not closed[at[:, 0], at[:, 1], at[:, 2]].any()
 
 
-@pytest.mark.parametrize("observers", [2, 0])
-def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, observers: int) -> None:
+@pytest.mark.parametrize("min_views", [2, 0])
+def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, min_views: int) -> None:
     s = narrow_scene(tmp_path / "poses")
-    trained = job(tmp_path / "train", balls.settings(iterations=30, min_views=observers or "off"), poses=tmp_path / "poses")
+    trained = job(tmp_path / "train", balls.settings(iterations=30, min_views=min_views or "off"), poses=tmp_path / "poses")
     train.run(trained)
     made = job(
         tmp_path / "bake",
@@ -141,7 +141,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, obs
     centre = tree.bounds_min + (voxel_coordinates(tree) + 0.5) * tree.voxel
     few = ~has_min_views(centre, [view.camera for view in views_of(s, "train")], 2)
     assert len(few) > 1000
-    assert few.any() == (observers == 0)
+    assert few.any() == (min_views == 0)
 
 
 def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_the_box(tmp_path: Path) -> None:

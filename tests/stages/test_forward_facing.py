@@ -130,8 +130,8 @@ def test_depths_come_from_sparse_points_where_the_source_states_none() -> None:
     cameras = row()
     points = in_pictures(cameras, NEAR, FAR)
     photos = [Photo(camera, Path("a.png")) for camera in cameras]
-    observers = [(k // 200,) for k in range(len(points))]
-    found = content_depths(photos, cameras, 1.0, points, observers)
+    tracks = [(k // 200,) for k in range(len(points))]
+    found = content_depths(photos, cameras, 1.0, points, tracks)
     assert (found[:, 0] >= NEAR).all()
     assert (found[:, 0] < 1.3 * NEAR).all()
     assert (found[:, 1] > 0.8 * FAR).all()
