@@ -57,11 +57,11 @@ def expected(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, 
 
 
 def passes(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, bfloat16: bool, offset: float = 0.0) -> list[np.ndarray]:
-    prepared = mlp.pack_weights(weights, bfloat16)
+    packed = mlp.pack_weights(weights, bfloat16)
     out = np.full((features.shape[1], len(weights[-1])), np.nan, np.float32)
-    kept = mlp.forward(features, prepared, offset, out, keep=True)
-    pull, of_weights = mlp.backward(grad, features, prepared, kept, [w.shape for w in weights])
-    return [out, pull, *of_weights]
+    activations = mlp.forward(features, packed, offset, out, keep=True)
+    grad_inputs, grad_weights = mlp.backward(grad, features, packed, activations, [w.shape for w in weights])
+    return [out, grad_inputs, *grad_weights]
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
@@ -79,7 +79,7 @@ def test_passes_are_those_of_autograd(shape: tuple[int, int, int, int], bfloat16
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_nothing_beside_the_outputs_is_written_and_none_left_out(bfloat16: bool) -> None:
+def test_all_outputs_and_nothing_else_are_written(bfloat16: bool) -> None:
     rng = np.random.default_rng(1)
     for inputs, width, layers, outputs in SHAPES:
         weights = weights_of(inputs, width, layers, outputs, rng)
@@ -88,14 +88,14 @@ def test_nothing_beside_the_outputs_is_written_and_none_left_out(bfloat16: bool)
             around = np.full((samples + 2 * outputs + 32, outputs), 7, np.float32)
             out = around[outputs : outputs + samples]
             out[:] = np.nan
-            prepared = mlp.pack_weights(weights, bfloat16)
-            assert mlp.forward(features, prepared, 0.5, out, keep=False).size == 0
+            packed = mlp.pack_weights(weights, bfloat16)
+            assert mlp.forward(features, packed, 0.5, out, keep=False).size == 0
             assert (around[:outputs] == 7).all()
             assert (around[outputs + samples :] == 7).all()
-            kept = np.full((samples, outputs), np.nan, np.float32)
-            mlp.forward(features, prepared, 0.5, kept, keep=True)
+            activations = np.full((samples, outputs), np.nan, np.float32)
+            mlp.forward(features, packed, 0.5, activations, keep=True)
             assert np.isfinite(out).all()
-            assert np.array_equal(out, kept)
+            assert np.array_equal(out, activations)
 
 
 def test_the_offset_is_added_to_the_first_output_alone() -> None:
@@ -106,67 +106,67 @@ def test_the_offset_is_added_to_the_first_output_alone() -> None:
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_what_is_no_number_stays_none(bfloat16: bool) -> None:
-    """A loss that is lost must show, and not be hidden by a ReLU or a rounding."""
+def test_nan_stays_nan(bfloat16: bool) -> None:
+    """A diverged loss must show, and not be hidden by a ReLU or a rounding."""
     rng = np.random.default_rng(4)
     weights, features, grad = weights_of(8, 16, 2, 5, rng), rng.normal(size=(8, 100)).astype(np.float32), np.ones((100, 5), np.float32)
     features[3, 70] = np.nan
     grad[20, 2] = np.nan
-    out, pull, *of_weights = passes(features, weights, grad, bfloat16)
+    out, grad_inputs, *grad_weights = passes(features, weights, grad, bfloat16)
     assert np.isnan(out[70]).all()
     assert np.isfinite(np.delete(out, 70, axis=0)).all()
-    assert np.isnan(pull[:, 20]).all()
-    assert all(np.isnan(w).any() for w in of_weights)
+    assert np.isnan(grad_inputs[:, 20]).all()
+    assert all(np.isnan(w).any() for w in grad_weights)
 
 
 @numba.njit
-def _narrow(x, out):  # type: ignore[no-untyped-def]
-    tiles.narrowed(pointer(x), 0, x.shape[1], x.shape[1], pointer(out), out.shape[0], out.shape[1])
+def _copy_rows(x, out):  # type: ignore[no-untyped-def]
+    tiles.copy_rows(tiles.Rows(pointer(x), 0, x.shape[1]), x.shape[1], pointer(out), out.shape[0], out.shape[1])
 
 
 @numba.njit
-def _pair(x, out):  # type: ignore[no-untyped-def]
-    tiles.pairs_of_rows(pointer(x), 0, x.shape[1], x.shape[1], pointer(out), out.shape[0], out.shape[1])
+def _pack_row_pairs(x, out):  # type: ignore[no-untyped-def]
+    tiles.pack_row_pairs(tiles.Rows(pointer(x), 0, x.shape[1]), x.shape[1], pointer(out), out.shape[0], out.shape[1])
 
 
 @numba.njit
-def _turn(x, out):  # type: ignore[no-untyped-def]
-    tiles.turn(pointer(x), 0, x.shape[1], pointer(out), 0, out.shape[1])
+def _transpose(x, out):  # type: ignore[no-untyped-def]
+    tiles.transpose16(pointer(x), 0, x.shape[1], pointer(out), 0, out.shape[1])
 
 
-def test_narrowing_rounds_as_torch_does() -> None:
+def test_conversion_to_bfloat16_rounds_as_torch_does() -> None:
     special = torch.tensor([0.0, -0.0, 1.0, float("inf"), -float("inf"), float("nan"), 3.3895e38, 2.0**-126, -1.0039062, 1.0117188])
     x = torch.cat([special, torch.randn(998, generator=torch.Generator().manual_seed(0))]).reshape(21, 48)
     x.view(torch.int32)[20, 46:] = torch.tensor([0x7FFFFFFF, -1], dtype=torch.int32)  # none, whose bits a rounding would carry over into numbers
     out = np.full(x.shape, 7, np.int16)
-    _narrow(x.numpy(), out)
+    _copy_rows(x.numpy(), out)
     torch.testing.assert_close(torch.from_numpy(out).view(torch.bfloat16), x.bfloat16(), rtol=0, atol=0, equal_nan=True)
     paired = np.empty((10, 48), np.int32)
-    _pair(x.numpy(), paired)
+    _pack_row_pairs(x.numpy(), paired)
     assert np.array_equal(paired.view(np.int16).reshape(10, 48, 2), np.stack([out[:20:2], out[1:20:2]], axis=2))
     again = np.empty((10, 48), np.int32)
-    _pair(out, again)
+    _pack_row_pairs(out, again)
     assert np.array_equal(again, paired)
 
 
-def test_rows_are_filled_with_zeros() -> None:
+def test_rows_are_padded_with_zeros() -> None:
     x = np.arange(1, 1 + 8 * 5, dtype=np.float32).reshape(8, 5)
     expected = np.pad(x[:4], ((0, 0), (0, 11)))
     wide = np.full((4, 16), 7, np.float32)  # whole vectors reach into the rows after these
-    _narrow(x, wide)
+    _copy_rows(x, wide)
     assert np.array_equal(wide, expected)
     narrow = np.full((4, 16), 7, np.int16)
-    _narrow(x, narrow)
+    _copy_rows(x, narrow)
     assert np.array_equal(narrow, torch.from_numpy(expected).bfloat16().view(torch.int16).numpy())
     paired = np.full((2, 16), 7, np.int32)
-    _pair(x, paired)
+    _pack_row_pairs(x, paired)
     assert np.array_equal(paired.view(np.int16).reshape(2, 16, 2), np.stack([narrow[::2], narrow[1::2]], axis=2))
 
 
-def test_turning() -> None:
+def test_transpose() -> None:
     x = np.arange(16 * 20, dtype=np.float32).reshape(16, 20)
     out = np.zeros((16, 30), np.float32)
-    _turn(x, out)
+    _transpose(x, out)
     assert np.array_equal(out[:, :16], x[:, :16].T)
     assert not out[:, 16:].any()
 
@@ -185,7 +185,7 @@ np.savez(sys.argv[1], *passes(features, weights, grad, True))
 """
 
 
-def test_a_processor_without_wide_registers_says_the_same(tmp_path: Path) -> None:
+def test_a_processor_without_wide_registers_gives_the_same(tmp_path: Path) -> None:
     """Compiled for the oldest there is of this kind: pairs are multiplied in float32, and tiles are small."""
     environment = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", PROGRAM, str(tmp_path / "out.npz")], cwd=ROOT, env=environment, check=True)

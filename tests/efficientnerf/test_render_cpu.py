@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
-from efficientnerf.backends.numba.simd import apart, exp2_minus, interpolated, logistic, pointer, quarters, together
+from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, sigmoid, split16, trilinear4, unpack4
 from efficientnerf.backends.numba.tree import blocks as cpu_blocks
 from efficientnerf.backends.numba.tree import march
 from efficientnerf.backends.numba.tree.blocks import Pool, View, fill, grid_of, paint
@@ -51,18 +51,18 @@ def test_the_kernels_harmonics_are_those_of_the_project(degree: int) -> None:
 
 @numba.njit
 def logistics(a, b, c, d):  # type: ignore[no-untyped-def]
-    return apart(logistic(together(a, b, c, d)))
+    return unpack4(sigmoid(pack4(a, b, c, d)))
 
 
 @numba.njit
 def powers(a, b, c, d):  # type: ignore[no-untyped-def]
-    return apart(exp2_minus(together(a, b, c, d)))
+    return unpack4(exp2_neg4(pack4(a, b, c, d)))
 
 
 def test_the_kernels_exponential_and_logistic() -> None:
     x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 402), [0.0, np.inf]]).astype(np.float32)
-    np.testing.assert_allclose([march._exp2_minus(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
-    assert march._exp2_minus(np.float32(0)) == 1
+    np.testing.assert_allclose([march._exp2_neg(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
+    assert march._exp2_neg(np.float32(0)) == 1
     np.testing.assert_allclose([powers(*v) for v in x.reshape(-1, 4)], np.exp2(-x.astype(np.float64)).reshape(-1, 4), atol=2e-7)
     assert powers(*np.zeros(4, np.float32)) == (1, 1, 1, 1)
     y = np.concatenate([-x, x, np.linspace(-20, 20, 2000).astype(np.float32)])
@@ -73,10 +73,10 @@ def test_the_kernels_exponential_and_logistic() -> None:
 @numba.njit
 def between(values, starts, x, y, z):  # type: ignore[no-untyped-def]
     """Of a cube of three voxels a side with four numbers each."""
-    four = together(x[0], x[1], x[2], x[3]), together(y[0], y[1], y[2], y[3]), together(z[0], z[1], z[2], z[3])
-    first, mean = interpolated(pointer(values), starts[0], starts[1], starts[2], starts[3], 12, 36, four[0], four[1], four[2])
-    a, b, c, d = quarters(mean)
-    return apart(first), (apart(a), apart(b), apart(c), apart(d))
+    four = pack4(x[0], x[1], x[2], x[3]), pack4(y[0], y[1], y[2], y[3]), pack4(z[0], z[1], z[2], z[3])
+    first, mean = trilinear4(pointer(values), starts[0], starts[1], starts[2], starts[3], 12, 36, four[0], four[1], four[2])
+    a, b, c, d = split16(mean)
+    return unpack4(first), (unpack4(a), unpack4(b), unpack4(c), unpack4(d))
 
 
 def test_four_points_are_interpolated_at_once_over_what_is_there() -> None:
@@ -359,11 +359,11 @@ def test_a_camera_inside_and_one_that_looks_away() -> None:
     np.testing.assert_allclose(seen.depth[11, 13], np.log(2) / 40, rtol=0.05)
     away = inside.world_from_camera.copy()
     away[:3, 3] += 30 * away[:3, 2]
-    nothing = tree.render(replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
-    assert not nothing.opacity.any()
-    assert np.isinf(nothing.depth).all()
-    assert not nothing.normal.any()
-    np.testing.assert_allclose(nothing.colour, np.broadcast_to(np.float32([0.2, 0.4, 0.6]), nothing.colour.shape))
+    zeros16 = tree.render(replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
+    assert not zeros16.opacity.any()
+    assert np.isinf(zeros16.depth).all()
+    assert not zeros16.normal.any()
+    np.testing.assert_allclose(zeros16.colour, np.broadcast_to(np.float32([0.2, 0.4, 0.6]), zeros16.colour.shape))
 
 
 def test_normals_are_those_of_the_tree_where_half_of_the_light_is_gone() -> None:

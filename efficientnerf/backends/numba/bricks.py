@@ -12,12 +12,12 @@ from efficientnerf.backends.numba.runtime import numba
 
 @numba.njit(cache=True, error_model="numpy")
 def threshold_and_dilate(
-    cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], brick: int, grown: int, row_of: np.ndarray, into: np.ndarray
+    cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], brick: int, dilate: int, row_of: np.ndarray, into: np.ndarray
 ) -> None:
-    """Set `into` for each voxel whose weight exceeds `threshold`, and for those up to `grown` away along each axis, inside the grid.
+    """Set `into` for each voxel whose weight exceeds `threshold`, and for those up to `dilate` voxels away along each axis, inside the grid.
 
-    cells     flat coarse cells (x slowest) of the rows of `greatest` (., brick^3)
-    row_of    (cells of the grid,) int32: row of `into` (B, brick^3) bool, -1 where there is none; every cell that is reached has one
+    cells     flat indices (x slowest) of the coarse cells that the rows of `greatest` (., brick^3) belong to
+    row_of    (coarse cells,) int32: row of `into` (B, brick^3) bool, or -1; every cell that is reached must have one
     """
     for row in range(len(cells)):
         cell = cells[row]
@@ -26,16 +26,16 @@ def threshold_and_dilate(
             if not greatest[row, local] > threshold:
                 continue
             i, j, k = a * brick + local // (brick * brick), b * brick + local // brick % brick, c * brick + local % brick
-            for x in range(max(0, i - grown), min(shape[0] * brick, i + grown + 1)):
-                for y in range(max(0, j - grown), min(shape[1] * brick, j + grown + 1)):
-                    for z in range(max(0, k - grown), min(shape[2] * brick, k + grown + 1)):
+            for x in range(max(0, i - dilate), min(shape[0] * brick, i + dilate + 1)):
+                for y in range(max(0, j - dilate), min(shape[1] * brick, j + dilate + 1)):
+                    for z in range(max(0, k - dilate), min(shape[2] * brick, k + dilate + 1)):
                         owner = row_of[(x // brick * shape[1] + y // brick) * shape[2] + z // brick]
                         into[owner, (x % brick * brick + y % brick) * brick + z % brick] = True
 
 
 @numba.njit(cache=True, error_model="numpy")
 def flat_indices(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int], brick: int, flat: np.ndarray) -> None:
-    """Flat numbers in the grid (x slowest) of the voxels set in `into` (B, brick^3) bool, whose rows are the flat `cells`, to `flat` (N,)."""
+    """Flat indices in the grid (x slowest) of the voxels set in `into` (B, brick^3) bool, whose rows belong to `cells`, to `flat` (N,)."""
     n = 0
     for row in range(len(cells)):
         cell = cells[row]
@@ -52,11 +52,11 @@ def resample_weights(
     cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], to_shape: tuple[int, int, int], ratio: float, brick: int,
     row_of: np.ndarray, into: np.ndarray, rows: int,
 ) -> int:  # fmt: skip
-    """Raise `into` to the weights above `threshold` of the finer voxels whose centres lie in each coarser one; returns how many rows are in use.
+    """Raise the voxels of a coarser grid to the weights above `threshold` of the finer voxels whose centres they hold; returns the number of rows in use.
 
     ratio   side of a finer voxel over that of a coarser one
-    row_of  (coarse cells of the coarser grid,) int32: row of `into`, -1 where none was needed so far
-    into    (., brick^3) float32, zeros; where it has no rows left only `row_of` and the count go on
+    row_of  (cells of the coarser grid,) int32: row of `into`, or -1; rows are assigned as needed, from `rows` on
+    into    (., brick^3) float32, zeros; where it has too few rows, only `row_of` and the count are updated
     """
     for row in range(len(cells)):
         cell = cells[row]

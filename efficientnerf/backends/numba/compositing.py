@@ -18,7 +18,7 @@ BLOCK = 64  # rays per task
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def activate_density(x, exponential):  # type: ignore[no-untyped-def]
-    """Density and its derivative."""
+    """Density of a raw density, and its derivative; exponential, or softplus(x - 1)."""
     one = np.float32(1)
     if exponential:
         if x > np.float32(LARGEST_LOGIT):
@@ -32,20 +32,25 @@ def activate_density(x, exponential):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def composite(raw, length, first, harmonics, background, exponential, colour, opacity, distortion, weight, rgb):  # type: ignore[no-untyped-def]
-    """`efficientnerf.rendering.compositing.composite`, forward."""
+    """`efficientnerf.rendering.compositing.composite`, forward.
+
+    raw, length, first     packed samples: (N, 1 + 3K), (N,), (R + 1,)
+    harmonics, background  (R, K), (R, 3)
+    written                colour (R, 3), opacity (R,), distortion (R,), weight (N,), rgb (N, 3)
+    """
     terms = harmonics.shape[1]
     one = np.float32(1)
     rays = len(first) - 1
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
-            light = one
+            transmittance = one
             c0 = c1 = c2 = np.float32(0)
-            at = spread = near_weight = near_moment = np.float32(0)
+            at = distortion_sum = front_weight = front_moment = np.float32(0)
             for n in range(first[r], first[r + 1]):
                 density, _ = activate_density(raw[n, 0], exponential)
                 alpha = one - np.exp(-density * length[n])
-                w = light * alpha
-                light *= one - alpha
+                w = transmittance * alpha
+                transmittance *= one - alpha
                 for channel in range(3):
                     total = np.float32(0)
                     for k in range(terms):
@@ -56,24 +61,24 @@ def composite(raw, length, first, harmonics, background, exponential, colour, op
                 c2 += w * rgb[n, 2]
                 weight[n] = w
                 middle = at + np.float32(0.5) * length[n]
-                spread += np.float32(2) * w * (middle * near_weight - near_moment) + w * w * length[n] / np.float32(3)
-                near_weight += w
-                near_moment += w * middle
+                distortion_sum += np.float32(2) * w * (middle * front_weight - front_moment) + w * w * length[n] / np.float32(3)
+                front_weight += w
+                front_moment += w * middle
                 at += length[n]
-            distortion[r] = spread
-            colour[r, 0] = c0 + light * background[r, 0]
-            colour[r, 1] = c1 + light * background[r, 1]
-            colour[r, 2] = c2 + light * background[r, 2]
-            opacity[r] = one - light
+            distortion[r] = distortion_sum
+            colour[r, 0] = c0 + transmittance * background[r, 0]
+            colour[r, 1] = c1 + transmittance * background[r, 1]
+            colour[r, 2] = c2 + transmittance * background[r, 2]
+            opacity[r] = one - transmittance
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _pull(g0, g1, g2, rgb, gs, w, length, middle, near_weight, near_moment, all_weight, all_moment):  # type: ignore[no-untyped-def]
-    """Gradient with respect to a sample's weight: of the colours, and of the distortion, 2 sum_j w_j |s - s_j| + 2/3 w l."""
+def _weight_grad(g0, g1, g2, rgb, g_distortion, w, length, middle, front_weight, front_moment, all_weight, all_moment):  # type: ignore[no-untyped-def]
+    """Gradient with respect to a sample's weight: of the colours, and of the distortion loss, 2 sum_j w_j |s - s_j| + 2/3 w l."""
     two = np.float32(2)
-    far_weight, far_moment = all_weight - near_weight - w, all_moment - near_moment - w * middle
-    spread = two * (middle * near_weight - near_moment + far_moment - middle * far_weight) + two / np.float32(3) * w * length
-    return g0 * rgb[0] + g1 * rgb[1] + g2 * rgb[2] + gs * spread
+    back_weight, back_moment = all_weight - front_weight - w, all_moment - front_moment - w * middle
+    distortion = two * (middle * front_weight - front_moment + back_moment - middle * back_weight) + two / np.float32(3) * w * length
+    return g0 * rgb[0] + g1 * rgb[1] + g2 * rgb[2] + g_distortion * distortion
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -88,37 +93,39 @@ def composite_backward(  # type: ignore[no-untyped-def]
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
             g0, g1, g2 = grad_colour[r, 0], grad_colour[r, 1], grad_colour[r, 2]
-            behind = g0 * background[r, 0] + g1 * background[r, 1] + g2 * background[r, 2] - grad_opacity[r]
-            # What lies behind sample n contributes `rest`: the background's share and the samples', front to back from the total.
-            light = one
+            g_transmittance = g0 * background[r, 0] + g1 * background[r, 1] + g2 * background[r, 2] - grad_opacity[r]
+            # `rest` is what the background and the samples behind sample n contribute: the total, less the samples' up to n, front to back.
+            transmittance = one
             rest = np.float32(0)
             at = all_weight = all_moment = np.float32(0)
-            gs = grad_distortion[r]
+            g_distortion = grad_distortion[r]
             for n in range(first[r], first[r + 1]):
-                light -= weight[n]
+                transmittance -= weight[n]
                 all_weight += weight[n]
                 all_moment += weight[n] * (at + np.float32(0.5) * length[n])
                 at += length[n]
-            at = near_weight = near_moment = np.float32(0)
+            at = front_weight = front_moment = np.float32(0)
             for n in range(first[r], first[r + 1]):
                 middle = at + np.float32(0.5) * length[n]
-                pull = _pull(g0, g1, g2, rgb[n], gs, weight[n], length[n], middle, near_weight, near_moment, all_weight, all_moment)
-                rest += weight[n] * (grad_weight[n] + pull)
-                near_weight += weight[n]
-                near_moment += weight[n] * middle
+                weight_grad = _weight_grad(g0, g1, g2, rgb[n], g_distortion, weight[n], length[n], middle, front_weight, front_moment, all_weight, all_moment)
+                rest += weight[n] * (grad_weight[n] + weight_grad)
+                front_weight += weight[n]
+                front_moment += weight[n] * middle
                 at += length[n]
-            light = max(light, np.float32(0))
-            rest += light * behind
-            grad_background[r, 0], grad_background[r, 1], grad_background[r, 2] = light * g0, light * g1, light * g2
+            transmittance = max(transmittance, np.float32(0))
+            rest += transmittance * g_transmittance
+            grad_background[r, 0], grad_background[r, 1], grad_background[r, 2] = transmittance * g0, transmittance * g1, transmittance * g2
             before = one
-            at = near_weight = near_moment = np.float32(0)
+            at = front_weight = front_moment = np.float32(0)
             for n in range(first[r], first[r + 1]):
                 density, slope = activate_density(raw[n, 0], exponential)
                 w = weight[n]
                 middle = at + np.float32(0.5) * length[n]
-                own = grad_weight[n] + _pull(g0, g1, g2, rgb[n], gs, w, length[n], middle, near_weight, near_moment, all_weight, all_moment)
-                near_weight += w
-                near_moment += w * middle
+                own = grad_weight[n] + _weight_grad(
+                    g0, g1, g2, rgb[n], g_distortion, w, length[n], middle, front_weight, front_moment, all_weight, all_moment
+                )
+                front_weight += w
+                front_moment += w * middle
                 at += length[n]
                 rest -= w * own
                 after = before * np.exp(-density * length[n])

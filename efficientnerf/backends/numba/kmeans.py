@@ -1,6 +1,6 @@
-"""Nearest of many vectors, and sums per cluster (numba, all cores): what k-means needs.
+"""k-means on the CPU (numba, all cores): assignment, sums of clusters, and the distances of k-means++.
 
-Each sum is taken in one order whatever the number of threads, without fastmath: the same vectors give the same palettes.
+Each sum is taken in one order on any number of threads, without fastmath: the same vectors give the same palettes.
 
 n vectors of D numbers, P centroids.
 """
@@ -11,16 +11,16 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 
-LANES = 64
+LANES = 64  # vectors that are compared together
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def nearest_centroids(vectors_t, centroids, found, distance):  # type: ignore[no-untyped-def]
+def nearest_centroids(vectors_t, centroids, index, distance):  # type: ignore[no-untyped-def]
     """Index of the nearest centroid of each vector, the first of equals, and the squared distance to it.
 
-    vectors_t  (D, n) float32, transposed: the inner loops run over neighbouring vectors, and are a processor's vectors
+    vectors_t  (D, n) float32, transposed: the inner loops run over vectors, and are vectorised
     centroids  (P, D) float32
-    found      (n,) int32, written
+    index      (n,) int32, written
     distance   (n,) float32, written
     """
     size, count = vectors_t.shape
@@ -36,28 +36,28 @@ def nearest_centroids(vectors_t, centroids, found, distance):  # type: ignore[no
                 x = centroids[p, d]
                 row = vectors_t[d, begin : begin + lanes]
                 for lane in range(lanes):
-                    away = row[lane] - x
-                    squared[lane] += away * away
+                    difference = row[lane] - x
+                    squared[lane] += difference * difference
             for lane in range(lanes):
                 nearer = squared[lane] < least[lane]
                 least[lane] = squared[lane] if nearer else least[lane]
                 best[lane] = np.int32(p) if nearer else best[lane]
         for lane in range(lanes):
-            found[begin + lane], distance[begin + lane] = best[lane], least[lane]
+            index[begin + lane], distance[begin + lane] = best[lane], least[lane]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def sum_clusters(vectors, found, total, count):  # type: ignore[no-untyped-def]
-    """Adds each vector to the sum of its cluster, in order: total (P, D) float64, count (P,) int64."""
+def sum_clusters(vectors, index, total, count):  # type: ignore[no-untyped-def]
+    """Add each vector to the sum of its cluster `index` (n,), in order: total (P, D) float64, count (P,) int64."""
     for n in range(vectors.shape[0]):
-        count[found[n]] += 1
+        count[index[n]] += 1
         for d in range(vectors.shape[1]):
-            total[found[n], d] += vectors[n, d]
+            total[index[n], d] += vectors[n, d]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-def]
-    """Lowers distance (n,) to the squared distance from `centroid` (D,) to each of vectors_t (D, n) where that is less."""
+    """Lower distance (n,) to the squared distance from `centroid` (D,) to each of vectors_t (D, n) where that is less."""
     size, count = vectors_t.shape
     for block in numba.prange((count + 16 * LANES - 1) // (16 * LANES)):
         begin = block * 16 * LANES
@@ -67,7 +67,7 @@ def lower_distances(vectors_t, centroid, distance):  # type: ignore[no-untyped-d
             x = centroid[d]
             row = vectors_t[d, begin : begin + lanes]
             for lane in range(lanes):
-                away = row[lane] - x
-                squared[lane] += away * away
+                difference = row[lane] - x
+                squared[lane] += difference * difference
         for lane in range(lanes):
             distance[begin + lane] = min(distance[begin + lane], squared[lane])

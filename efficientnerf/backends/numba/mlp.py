@@ -1,14 +1,13 @@
-"""A small ReLU network on the CPU, all layers of a block of samples in one go (numba, all cores): forward, and the gradients of weights and features.
+"""A fully fused ReLU MLP on the CPU (numba, all cores): forward, and the gradients of weights and inputs.
 
-Mueller et al. 2021, "Real-time neural radiance caching", keep a block's activations in a GPU's shared memory; here they stay in a core's own caches, and
-sums of products in its registers (`efficientnerf.backends.numba.tiles`). What torch would do with the same layers one after the other goes through memory
-between any two, and its threads wait for each other after each.
+All layers of a block of samples are evaluated before the next block (Mueller et al. 2021, "Real-time neural radiance caching", whose activations stay in a
+GPU's shared memory): activations stay in a core's caches and sums in registers (`efficientnerf.backends.numba.tiles`).
 
-Samples are cut into the same chunks and blocks however many threads there are, and sums over chunks are taken in their order: the bytes do not depend on
-the number of threads.
+Samples are split into the same chunks and blocks on any number of threads, and sums over chunks are taken in order: results do not depend on the number of
+threads.
 
-Numbers inside are float32, or bfloat16 with sums in float32; weights, gradients and whatever comes in or goes out are float32. Widths are filled up with
-zeros to whole vectors: I inputs, L layers of H, and O outputs have K, W and V columns.
+Inside, numbers are float32, or bfloat16 with float32 accumulators; weights, inputs, outputs and gradients are float32. Widths are padded with zeros to whole
+vectors: I inputs, L hidden layers of H, and O outputs become K, W and V columns. N samples.
 """
 
 from __future__ import annotations
@@ -19,18 +18,31 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tiles import LANES, ROWS, narrowed, pairs_of_rows, product, product_added, product_masked, product_relu, put_narrowed, turn
+from efficientnerf.backends.numba.tiles import (
+    LANES,
+    ROWS,
+    Matrix,
+    Rows,
+    copy16,
+    copy_rows,
+    pack_row_pairs,
+    product,
+    product_added,
+    product_masked,
+    product_relu,
+    transpose16,
+)
 
-BLOCK = 64  # samples that go through all layers together: 8 KiB of bfloat16 a layer of 64
-CHUNK = 2048  # samples, at least, that share sums of gradients
-CHUNKS = 32  # at most, so that sums of gradients stay small beside the activations
+BLOCK = 64  # samples that pass all layers together: 8 KiB of bfloat16 for a layer of 64
+CHUNK = 2048  # samples per partial sum of the weights' gradients, at least
+MAX_CHUNKS = 32  # bounds the memory of the partial sums
 
 
-class Weights(NamedTuple):
-    """Of a network, as `product` wants them: what stands along the sum in rows, in pairs where numbers are bfloat16.
+class PackedWeights(NamedTuple):
+    """Weights in the layouts that `product` reads: the dimension of the sum along rows, as int32 pairs where numbers are bfloat16.
 
-    first, middle, last                 (K', W), (L - 1, W', W), (W', V) for the way forward
-    first_back, middle_back, last_back  (W', K), (L - 1, W', W), (V', W) for the way back
+    first, middle, last                 (K', W), (L - 1, W', W), (W', V) for the forward pass; K' = K / elements per word, and so on
+    first_back, middle_back, last_back  (W', K), (L - 1, W', W), (V', W) for the backward pass
     """
 
     first: np.ndarray
@@ -41,39 +53,42 @@ class Weights(NamedTuple):
     last_back: np.ndarray
 
 
-def _up(count: int, step: int = LANES) -> int:
+def _round_up(count: int, step: int = LANES) -> int:
     return -(-count // step) * step
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _put_weight(weight, per, forward, back):  # type: ignore[no-untyped-def]
-    """weight (O, I) for both ways; `per` numbers are in a word."""
+def _pack_weight(weight, per_word, forward, back):  # type: ignore[no-untyped-def]
+    """weight (O, I) into the layouts of both passes."""
     outputs, inputs = weight.shape
-    filled = np.zeros((per * len(back), back.shape[1]), np.float32)
-    filled[:outputs, :inputs] = weight
-    pairs_of_rows(pointer(filled), 0, back.shape[1], back.shape[1], pointer(back), len(back), back.shape[1])
-    turned = np.zeros((per * len(forward), forward.shape[1]), np.float32)
-    turned[:inputs, :outputs] = weight.T
-    pairs_of_rows(pointer(turned), 0, forward.shape[1], forward.shape[1], pointer(forward), len(forward), forward.shape[1])
+    padded = np.zeros((per_word * len(back), back.shape[1]), np.float32)
+    padded[:outputs, :inputs] = weight
+    pack_row_pairs(Rows(pointer(padded), 0, back.shape[1]), back.shape[1], pointer(back), len(back), back.shape[1])
+    transposed = np.zeros((per_word * len(forward), forward.shape[1]), np.float32)
+    transposed[:inputs, :outputs] = weight.T
+    pack_row_pairs(Rows(pointer(transposed), 0, forward.shape[1]), forward.shape[1], pointer(forward), len(forward), forward.shape[1])
 
 
-def pack_weights(weights: list[np.ndarray], bfloat16: bool) -> Weights:
-    """Weights (O, I) float32 of all layers, of which there are two at least."""
-    word, per = (np.int32, 2) if bfloat16 else (np.float32, 1)
+def pack_weights(weights: list[np.ndarray], bfloat16: bool) -> PackedWeights:
+    """Packed weights of layers (O, I) float32, of which there are at least two."""
+    word, per_word = (np.int32, 2) if bfloat16 else (np.float32, 1)
     inputs, hidden, outputs = weights[0].shape[1], len(weights[0]), len(weights[-1])
-    k, w, v, middle = _up(inputs), _up(hidden, LANES * per), _up(outputs), len(weights) - 2
-    shapes = ((_up(inputs, 2) // per, w), (middle, w // per, w), (w // per, v), (w // per, k), (middle, w // per, w), (v // per, w))
-    made = Weights(*(np.empty(shape, word) for shape in shapes))
-    _put_weight(weights[0], per, made.first, made.first_back)
-    for weight, forward, back in zip(weights[1:-1], made.middle, made.middle_back, strict=True):
-        _put_weight(weight, per, forward, back)
-    _put_weight(weights[-1], per, made.last, made.last_back)
-    return made
+    k, w, v, middle = _round_up(inputs), _round_up(hidden, LANES * per_word), _round_up(outputs), len(weights) - 2
+    shapes = (
+        (_round_up(inputs, 2) // per_word, w), (middle, w // per_word, w), (w // per_word, v),
+        (w // per_word, k), (middle, w // per_word, w), (v // per_word, w),
+    )  # fmt: skip
+    packed = PackedWeights(*(np.empty(shape, word) for shape in shapes))
+    _pack_weight(weights[0], per_word, packed.first, packed.first_back)
+    for weight, forward, back in zip(weights[1:-1], packed.middle, packed.middle_back, strict=True):
+        _pack_weight(weight, per_word, forward, back)
+    _pack_weight(weights[-1], per_word, packed.last, packed.last_back)
+    return packed
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _corner(x, row, column, height, width, out):  # type: ignore[no-untyped-def]
-    """x[row : row + height, column : column + width], the top left of out; the rest zeros."""
+def _copy_block(x, row, column, height, width, out):  # type: ignore[no-untyped-def]
+    """x[row : row + height, column : column + width] into the top left of out; zeros elsewhere."""
     out[:] = 0
     for i in range(height):
         for j in range(width):
@@ -81,135 +96,161 @@ def _corner(x, row, column, height, width, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _forward(features, first, middle, last, offset, half, chunk, kept, out):  # type: ignore[no-untyped-def]
-    """kept  (L, N up to whole blocks, W) for the way back; (L, 0, W) keeps nothing."""
-    (inputs, samples), outputs = features.shape, out.shape[1]
-    layers, width, wide = len(middle) + 1, first.shape[1], last.shape[1]
-    per = 2 if half.itemsize == 2 else 1
-    filled, words, keep = len(first), len(last), kept.shape[1] > 0
-    p_features, p_first, p_middle, p_last, p_out = pointer(features), pointer(first), pointer(middle), pointer(last), pointer(out)
+def _forward(inputs, first, middle, last, offset, element, chunk, activations, out):  # type: ignore[no-untyped-def]
+    """activations  (L, N rounded up to blocks, W) of the hidden layers, for the backward pass; (L, 0, W) keeps none
+    element      an empty array of the activations' type
+    """
+    (features, samples), outputs = inputs.shape, out.shape[1]
+    layers, width, padded_outputs = len(middle) + 1, first.shape[1], last.shape[1]
+    per_word = 2 if element.itemsize == 2 else 1
+    input_words, words, keep = len(first), len(last), activations.shape[1] > 0
+    p_inputs, p_first, p_middle, p_last, p_out = pointer(inputs), pointer(first), pointer(middle), pointer(last), pointer(out)
     for task in numba.prange((samples + chunk - 1) // chunk):
-        columns, x = np.empty((filled * per, BLOCK), np.float32), np.empty((filled, BLOCK), first.dtype)
-        scratch, shown = np.empty((2, BLOCK, width), half.dtype), np.empty((BLOCK, wide), np.float32)
-        p_columns, p_x, p_shown, p_y = pointer(columns), pointer(x), pointer(shown), pointer(kept) if keep else pointer(scratch)
+        block_inputs, x = np.empty((input_words * per_word, BLOCK), np.float32), np.empty((input_words, BLOCK), first.dtype)
+        scratch, block_out = np.empty((2, BLOCK, width), element.dtype), np.empty((BLOCK, padded_outputs), np.float32)
+        p_block_inputs, p_x, p_block_out = pointer(block_inputs), pointer(x), pointer(block_out)
+        p_y = pointer(activations) if keep else pointer(scratch)
         for begin in range(task * chunk, min(samples, (task + 1) * chunk), BLOCK):
             count = min(BLOCK, samples - begin)
-            if count == BLOCK and inputs == filled * per:
-                pairs_of_rows(p_features, begin, samples, BLOCK, p_x, filled, BLOCK)
+            if count == BLOCK and features == input_words * per_word:
+                pack_row_pairs(Rows(p_inputs, begin, samples), BLOCK, p_x, input_words, BLOCK)
             else:
-                _corner(features, 0, begin, inputs, count, columns)
-                pairs_of_rows(p_columns, 0, BLOCK, BLOCK, p_x, filled, BLOCK)
+                _copy_block(inputs, 0, begin, features, count, block_inputs)
+                pack_row_pairs(Rows(p_block_inputs, 0, BLOCK), BLOCK, p_x, input_words, BLOCK)
             at = begin * width if keep else 0
-            product_relu(p_x, 0, 1, BLOCK, p_first, 0, width, filled, p_y, at, width, BLOCK, width)
+            product_relu(Matrix(p_x, 0, 1, BLOCK), Rows(p_first, 0, width), Rows(p_y, at, width), input_words, BLOCK, width)
             for layer in range(layers - 1):
-                to = at + kept.shape[1] * width if keep else BLOCK * width - at
-                product_relu(p_y, at // per, words, 1, p_middle, layer * words * width, width, words, p_y, to, width, BLOCK, width)
+                to = at + activations.shape[1] * width if keep else BLOCK * width - at
+                weight = Rows(p_middle, layer * words * width, width)
+                product_relu(Matrix(p_y, at // per_word, words, 1), weight, Rows(p_y, to, width), words, BLOCK, width)
                 at = to
-            product(p_y, at // per, words, 1, p_last, 0, wide, words, p_shown, 0, wide, BLOCK, wide)
-            # Whole vectors reach into the next row, which is written next, if it is one of this block's.
+            last_rows, out_rows = Rows(p_last, 0, padded_outputs), Rows(p_block_out, 0, padded_outputs)
+            product(Matrix(p_y, at // per_word, words, 1), last_rows, out_rows, words, BLOCK, padded_outputs)
+            # Whole vectors reach into the next row, which is written after this one if it belongs to the block.
             for n in range(count):
-                shown[n, 0] += offset
-            for n in range(count - wide // outputs):
-                for column in range(0, wide, LANES):
-                    put_narrowed(p_shown, n * wide + column, LANES, p_out, (begin + n) * outputs + column)
-            for n in range(max(0, count - wide // outputs), count):
+                block_out[n, 0] += offset
+            for n in range(count - padded_outputs // outputs):
+                for column in range(0, padded_outputs, LANES):
+                    copy16(p_block_out, n * padded_outputs + column, LANES, p_out, (begin + n) * outputs + column)
+            for n in range(max(0, count - padded_outputs // outputs), count):
                 for column in range(outputs):
-                    out[begin + n, column] = shown[n, column]
+                    out[begin + n, column] = block_out[n, column]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _through(p_above, at, p_above_pairs, outputs, p_kept, there, p_below_pairs, p_weight, weight, p_of_weight, place, p_pull, to, width, per):  # type: ignore[no-untyped-def]
-    """Back through a layer of `width` inputs: adds to the gradient of its weights, and hands on the pull on what the ReLU below it gave."""
-    pairs, words = BLOCK // per, outputs // per
-    pairs_of_rows(p_kept, there, width, width, p_below_pairs, pairs, width)
-    product_added(p_above_pairs, 0, 1, outputs, p_below_pairs, 0, width, pairs, p_of_weight, place, width, outputs, width)
-    product_masked(p_above, at // per, words, 1, p_weight, weight, width, words, p_pull, to, width, BLOCK, width, p_kept, there)
+def _layer_backward(grad_out, grad_out_pairs, activations, activation_pairs, weight, grad_weight, grad_in, per_word):  # type: ignore[no-untyped-def]
+    """Adds the gradient of a layer's weights to `grad_weight`, and writes that of its inputs, the ReLU's `activations`, to `grad_in`.
+
+    All are Rows, but grad_out_pairs and activation_pairs: pointers to the gradient of the outputs as pairs of samples, and to scratch.
+    """
+    pairs, outputs, width = BLOCK // per_word, grad_out.row, grad_in.row
+    words = outputs // per_word
+    pack_row_pairs(activations, width, activation_pairs, pairs, width)
+    product_added(Matrix(grad_out_pairs, 0, 1, outputs), Rows(activation_pairs, 0, width), grad_weight, pairs, outputs, width)
+    grad_words = Matrix(grad_out.data, grad_out.start // per_word, words, 1)
+    product_masked(grad_words, weight, grad_in, words, BLOCK, width, activations.data, activations.start)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _to_features(p_pull, at, words, p_across, p_first, deep, p_to, place, row, inputs):  # type: ignore[no-untyped-def]
-    """The pull on features, whose samples are neighbours, from that on the first layer's outputs, whose outputs are."""
+def _grad_inputs(grad, words, transposed, weight, out, features):  # type: ignore[no-untyped-def]
+    """Gradient of the inputs, by feature, from that of the first layer's outputs, by sample; `transposed` is scratch."""
     for i in range(0, words, LANES):
         for n in range(0, BLOCK, LANES):
-            turn(p_pull, at + n * words + i, words, p_across, i * BLOCK + n, BLOCK)
-    product(p_first, 0, 1, deep, p_across, 0, BLOCK, words, p_to, place, row, inputs, BLOCK)
+            transpose16(grad.data, grad.start + n * words + i, words, transposed, i * BLOCK + n, BLOCK)
+    product(Matrix(weight.data, weight.start, 1, weight.row), Rows(transposed, 0, BLOCK), out, words, features, BLOCK)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _backward(grad, features, first_back, middle_back, last_back, half, chunk, kept, of_first, of_middle, of_last, of_features):  # type: ignore[no-untyped-def]
-    """of_first (C, I up to ROWS, W), of_middle (C, L - 1, W, W), of_last (C, V, W): of the weights, turned in the first, for each chunk."""
-    (inputs, samples), outputs = features.shape, grad.shape[1]
-    layers, width, wide, deep = len(middle_back) + 1, last_back.shape[1], of_last.shape[1], first_back.shape[1]
-    per = 2 if half.itemsize == 2 else 1
-    words, pairs, filled, ahead = width // per, BLOCK // per, of_first.shape[1], kept.shape[1] * width
-    p_grad, p_features, p_kept, p_to = pointer(grad), pointer(features), pointer(kept), pointer(of_features)
+def _backward(grad, inputs, first_back, middle_back, last_back, element, chunk, activations, grad_first, grad_middle, grad_last, grad_inputs):  # type: ignore[no-untyped-def]
+    """grad_first (C, I rounded up to ROWS, W), grad_middle (C, L - 1, W, W), grad_last (C, V, W): of the weights for each chunk, the first transposed."""
+    (features, samples), outputs = inputs.shape, grad.shape[1]
+    layers, width, padded_outputs, padded_inputs = len(middle_back) + 1, last_back.shape[1], grad_last.shape[1], first_back.shape[1]
+    per_word = 2 if element.itemsize == 2 else 1
+    words, pairs, rows, layer_stride = width // per_word, BLOCK // per_word, grad_first.shape[1], activations.shape[1] * width
+    p_grad, p_inputs, p_activations, p_grad_inputs = pointer(grad), pointer(inputs), pointer(activations), pointer(grad_inputs)
     p_first, p_middle, p_last = pointer(first_back), pointer(middle_back), pointer(last_back)
-    p_of_first, p_of_middle, p_of_last = pointer(of_first), pointer(of_middle), pointer(of_last)
+    p_grad_first, p_grad_middle, p_grad_last = pointer(grad_first), pointer(grad_middle), pointer(grad_last)
     for task in numba.prange((samples + chunk - 1) // chunk):
-        columns, x = np.empty((filled, BLOCK), np.float32), np.empty((filled, BLOCK), half.dtype)
-        given, above, above_pairs = np.empty((BLOCK, wide), np.float32), np.empty((BLOCK, wide), half.dtype), np.empty((pairs, wide), first_back.dtype)
-        pull, across = np.empty((2, BLOCK, width), half.dtype), np.empty((words, BLOCK), first_back.dtype)
-        pull_pairs, layer_pairs = np.empty((pairs, width), first_back.dtype), np.empty((pairs, width), first_back.dtype)
-        p_columns, p_x, p_given, p_above, p_pull, p_across = pointer(columns), pointer(x), pointer(given), pointer(above), pointer(pull), pointer(across)
-        p_above_pairs, p_pairs, p_layer = pointer(above_pairs), pointer(pull_pairs), pointer(layer_pairs)
-        of_first[task], of_middle[task], of_last[task] = 0, 0, 0
+        block_inputs, x = np.empty((rows, BLOCK), np.float32), np.empty((rows, BLOCK), element.dtype)
+        block_grad, out_grad = np.empty((BLOCK, padded_outputs), np.float32), np.empty((BLOCK, padded_outputs), element.dtype)
+        out_grad_pairs = np.empty((pairs, padded_outputs), first_back.dtype)
+        hidden_grad, transposed = np.empty((2, BLOCK, width), element.dtype), np.empty((words, BLOCK), first_back.dtype)
+        hidden_grad_pairs, activation_pairs = np.empty((pairs, width), first_back.dtype), np.empty((pairs, width), first_back.dtype)
+        p_block_inputs, p_x, p_block_grad, p_out_grad = pointer(block_inputs), pointer(x), pointer(block_grad), pointer(out_grad)
+        p_out_grad_pairs, p_hidden, p_transposed = pointer(out_grad_pairs), pointer(hidden_grad), pointer(transposed)
+        p_hidden_pairs, p_activation_pairs = pointer(hidden_grad_pairs), pointer(activation_pairs)
+        grad_first[task], grad_middle[task], grad_last[task] = 0, 0, 0
         for begin in range(task * chunk, min(samples, (task + 1) * chunk), BLOCK):
             count = min(BLOCK, samples - begin)
-            # Whole vectors reach beyond a row of the gradient, and beyond the last one there is nothing to be read.
-            p_from, start, row = p_grad, begin * outputs, outputs
-            if begin + BLOCK + wide // outputs >= samples:
-                _corner(grad, begin, 0, count, outputs, given)
-                p_from, start, row = p_given, 0, wide
-            narrowed(p_from, start, row, outputs, p_above, BLOCK, wide)
-            pairs_of_rows(p_from, start, row, outputs, p_above_pairs, pairs, wide)
-            there, at, place = (layers - 1) * ahead + begin * width, 0, task * wide * width
-            _through(p_above, 0, p_above_pairs, wide, p_kept, there, p_layer, p_last, 0, p_of_last, place, p_pull, at, width, per)
-            pairs_of_rows(p_pull, at, width, width, p_pairs, pairs, width)
+            # Whole vectors reach beyond a row of the gradient, and beyond the last one nothing may be read.
+            grad_rows = Rows(p_grad, begin * outputs, outputs)
+            if begin + BLOCK + padded_outputs // outputs >= samples:
+                _copy_block(grad, begin, 0, count, outputs, block_grad)
+                grad_rows = Rows(p_block_grad, 0, padded_outputs)
+            copy_rows(grad_rows, outputs, p_out_grad, BLOCK, padded_outputs)
+            pack_row_pairs(grad_rows, outputs, p_out_grad_pairs, pairs, padded_outputs)
+            at = 0
+            _layer_backward(
+                Rows(p_out_grad, 0, padded_outputs), p_out_grad_pairs, Rows(p_activations, (layers - 1) * layer_stride + begin * width, width),
+                p_activation_pairs, Rows(p_last, 0, width), Rows(p_grad_last, task * padded_outputs * width, width), Rows(p_hidden, at, width), per_word,
+            )  # fmt: skip
+            pack_row_pairs(Rows(p_hidden, at, width), width, p_hidden_pairs, pairs, width)
             for layer in range(layers - 2, -1, -1):
-                there, to = layer * ahead + begin * width, BLOCK * width - at
-                place, weight = (task * (layers - 1) + layer) * width * width, layer * words * width
-                _through(p_pull, at, p_pairs, width, p_kept, there, p_layer, p_middle, weight, p_of_middle, place, p_pull, to, width, per)
+                to = BLOCK * width - at
+                _layer_backward(
+                    Rows(p_hidden, at, width), p_hidden_pairs, Rows(p_activations, layer * layer_stride + begin * width, width), p_activation_pairs,
+                    Rows(p_middle, layer * words * width, width), Rows(p_grad_middle, (task * (layers - 1) + layer) * width * width, width),
+                    Rows(p_hidden, to, width), per_word,
+                )  # fmt: skip
                 at = to
-                pairs_of_rows(p_pull, at, width, width, p_pairs, pairs, width)
-            p_from, start, row = p_features, begin, samples
-            whole = count == BLOCK and inputs == filled
+                pack_row_pairs(Rows(p_hidden, at, width), width, p_hidden_pairs, pairs, width)
+            input_rows = Rows(p_inputs, begin, samples)
+            whole = count == BLOCK and features == rows
             if not whole:
-                _corner(features, 0, begin, inputs, count, columns)
-                p_from, start, row = p_columns, 0, BLOCK
-            narrowed(p_from, start, row, BLOCK, p_x, filled, BLOCK)
-            product_added(p_x, 0, pairs, 1, p_pairs, 0, width, pairs, p_of_first, task * filled * width, width, filled, width)
+                _copy_block(inputs, 0, begin, features, count, block_inputs)
+                input_rows = Rows(p_block_inputs, 0, BLOCK)
+            copy_rows(input_rows, BLOCK, p_x, rows, BLOCK)
+            product_added(Matrix(p_x, 0, pairs, 1), Rows(p_hidden_pairs, 0, width), Rows(p_grad_first, task * rows * width, width), pairs, rows, width)
+            hidden_words, first_rows = Rows(p_hidden, at // per_word, words), Rows(p_first, 0, padded_inputs)
             if whole:
-                _to_features(p_pull, at // per, words, p_across, p_first, deep, p_to, begin, samples, filled)
+                _grad_inputs(hidden_words, words, p_transposed, first_rows, Rows(p_grad_inputs, begin, samples), rows)
                 continue
-            _to_features(p_pull, at // per, words, p_across, p_first, deep, p_columns, 0, BLOCK, filled)
-            for i in range(inputs):
+            _grad_inputs(hidden_words, words, p_transposed, first_rows, Rows(p_block_inputs, 0, BLOCK), rows)
+            for i in range(features):
                 for n in range(count):
-                    of_features[i, begin + n] = columns[i, n]
+                    grad_inputs[i, begin + n] = block_inputs[i, n]
 
 
 def _chunk(samples: int) -> int:
-    return _up(max(CHUNK, -(-samples // CHUNKS)), BLOCK)
+    return _round_up(max(CHUNK, -(-samples // MAX_CHUNKS)), BLOCK)
 
 
-def forward(features: np.ndarray, weights: Weights, offset: float, out: np.ndarray, *, keep: bool) -> np.ndarray:
-    """out (N, O): the last layer's outputs for features (I, N), `offset` added to the first; returns what `backward` needs, if that is kept."""
-    half = np.empty(0, np.int16 if weights.first.dtype == np.int32 else np.float32)
-    samples = features.shape[1]
-    kept = np.empty((len(weights.middle) + 1, _up(samples, BLOCK) if keep else 0, weights.first.shape[1]), half.dtype)
-    _forward(features, weights.first, weights.middle, weights.last, np.float32(offset), half, _chunk(samples), kept, out)
-    return kept
+def forward(inputs: np.ndarray, weights: PackedWeights, offset: float, out: np.ndarray, *, keep: bool) -> np.ndarray:
+    """Outputs of the last layer for inputs (I, N) float32, into out (N, O).
+
+    offset   added to the first output
+    keep     whether `backward` follows
+    returns  the activations that `backward` needs; empty without `keep`
+    """
+    element = np.empty(0, np.int16 if weights.first.dtype == np.int32 else np.float32)
+    samples = inputs.shape[1]
+    activations = np.empty((len(weights.middle) + 1, _round_up(samples, BLOCK) if keep else 0, weights.first.shape[1]), element.dtype)
+    _forward(inputs, weights.first, weights.middle, weights.last, np.float32(offset), element, _chunk(samples), activations, out)
+    return activations
 
 
-def backward(grad: np.ndarray, features: np.ndarray, weights: Weights, kept: np.ndarray, shapes: list[tuple[int, int]]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Gradients of features (I, N) and of weights (O, I) from that of the outputs (N, O)."""
-    half = np.empty(0, kept.dtype)
-    samples, chunk = features.shape[1], _chunk(features.shape[1])
-    chunks, width = -(-samples // chunk), kept.shape[2]
-    of_first = np.empty((chunks, _up(len(features), ROWS), width), np.float32)
-    of_middle = np.empty((chunks, len(weights.middle), width, width), np.float32)
-    of_last = np.empty((chunks, weights.last.shape[1], width), np.float32)
-    of_features = np.empty_like(features)
+def backward(
+    grad: np.ndarray, inputs: np.ndarray, weights: PackedWeights, activations: np.ndarray, shapes: list[tuple[int, int]]
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Gradients of the inputs (I, N) and of the weights, of `shapes` (O, I), from that of the outputs (N, O)."""
+    element = np.empty(0, activations.dtype)
+    samples, chunk = inputs.shape[1], _chunk(inputs.shape[1])
+    chunks, width = -(-samples // chunk), activations.shape[2]
+    grad_first = np.empty((chunks, _round_up(len(inputs), ROWS), width), np.float32)
+    grad_middle = np.empty((chunks, len(weights.middle), width, width), np.float32)
+    grad_last = np.empty((chunks, weights.last.shape[1], width), np.float32)
+    grad_inputs = np.empty_like(inputs)
     back = weights.first_back, weights.middle_back, weights.last_back
-    _backward(grad, features, *back, half, chunk, kept, of_first, of_middle, of_last, of_features)
-    sums = [of_first.sum(axis=0).T, *of_middle.sum(axis=0), of_last.sum(axis=0)]
-    return of_features, [np.ascontiguousarray(total[:outputs, :inputs]) for total, (outputs, inputs) in zip(sums, shapes, strict=True)]
+    _backward(grad, inputs, *back, element, chunk, activations, grad_first, grad_middle, grad_last, grad_inputs)
+    sums = [grad_first.sum(axis=0).T, *grad_middle.sum(axis=0), grad_last.sum(axis=0)]
+    return grad_inputs, [np.ascontiguousarray(total[:outputs, :columns]) for total, (outputs, columns) in zip(sums, shapes, strict=True)]

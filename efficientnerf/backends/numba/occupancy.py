@@ -12,9 +12,9 @@ BLOCK = 1024  # samples per task
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def update_occupancy(point, raw, exponential, values):  # type: ignore[no-untyped-def]
-    """Raise `values` (D, D, D) to the density of samples at `point` (N, 3) in grid coordinates, which is `raw` (N,) activated; closed voxels stay closed.
+    """Raise `values` (D, D, D) to the density of samples at `point` (N, 3) in grid coordinates, `raw` (N,) activated; masked cells (-inf) stay masked.
 
-    All cores find voxels and densities, then one takes the largest.
+    All cores compute voxels and densities, then one takes the maxima.
     """
     side, count = values.shape[0], len(raw)
     cell, density = np.empty(count, np.int32), np.empty(count, np.float32)

@@ -9,9 +9,12 @@ from efficientnerf.backends.numba.runtime import numba
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def ray_directions(lookup, begin, knots, stride, pixel, width, rotation, view, out):  # type: ignore[no-untyped-def]
-    """Directions in the world of pixels of several views: rotation[view] applied to what lies between the knots of the view's lens.
+    """World directions of pixels of several views into out (N, 3): rotation[view] of a direction interpolated in the view's lens table.
 
-    begin, knots, width  of each view: where its table begins, how many knots a row of it has, and pixels a row
+    lookup               (., 3) camera-frame directions at knots `stride` pixels apart, the tables of all lenses end to end
+    begin, knots, width  of each view: start of its table, knots per row, and pixels per row
+    pixel, view          (N,) row-major pixel and its view
+    rotation             (V, 3, 3) world from camera
     """
     one = np.float32(1)
     for n in numba.prange(len(view)):

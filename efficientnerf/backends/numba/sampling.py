@@ -1,9 +1,10 @@
 """Valid and pivotal samples of rays (EfficientNeRF, sections 3.3 and 3.4) on the CPU (numba, all cores).
 
-The reference is `efficientnerf.sampling.samples`. Rays are split into fixed blocks and each ray belongs to one thread, so results depend neither on timing
-nor on the number of threads.
+The reference is `efficientnerf.sampling.samples`. Rays are split into fixed blocks and each ray belongs to one thread: results depend neither on timing nor
+on the number of threads.
 
-R rays, N samples.
+R rays, N samples, D density voxels a side. The space is given by the centre (3,) and half the size (3,) of its box, float32, and whether it is contracted;
+in unit coordinates the box is [-1, 1]^3.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba import intervals
-from efficientnerf.backends.numba.intervals import RAYS
+from efficientnerf.backends.numba.intervals import LANES
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.geometry.spaces import FARTHEST
@@ -19,14 +20,26 @@ from efficientnerf.geometry.spaces import FARTHEST
 BLOCK = 64  # rays per task
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _unit_to_grid(x, y, z, contracted):  # type: ignore[no-untyped-def]
+    """Grid coordinates, [0, 1]^3, of a point in unit coordinates; contraction: Barron et al. 2022, "mip-NeRF 360", equation 10, with the maximum norm."""
+    one, two = np.float32(1), np.float32(2)
+    if contracted:
+        norm = max(max(abs(x), abs(y)), max(abs(z), one))
+        factor = (two - one / norm) / norm
+        x, y, z = x * factor, y * factor, z * factor
+    shift, scale = two if contracted else one, np.float32(0.25) if contracted else np.float32(0.5)
+    return (x + shift) * scale, (y + shift) * scale, (z + shift) * scale
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _enter(ox, oy, oz, dx, dy, dz, near, far, centre, half, contracted, state, lane):  # type: ignore[no-untyped-def]
-    """A ray into a lane of the state of `next_intervals`."""
-    ux, uy, uz = (ox - centre[0]) / half[0], (oy - centre[1]) / half[1], (oz - centre[2]) / half[2]
-    vx, vy, vz = dx / half[0], dy / half[1], dz / half[2]
+def _init_lane(origins, directions, near, far, centre, half, contracted, r, state, lane):  # type: ignore[no-untyped-def]
+    """Write ray r, clipped to the box of a bounded space, to a lane of the state of `next_intervals`."""
+    ux, uy, uz = (origins[r, 0] - centre[0]) / half[0], (origins[r, 1] - centre[1]) / half[1], (origins[r, 2] - centre[2]) / half[2]
+    vx, vy, vz = directions[r, 0] / half[0], directions[r, 1] / half[1], directions[r, 2] / half[2]
     tiny = np.float32(1e-12)
     one = np.float32(1)
-    t, leave = near, far
+    t, t_exit = near[r], far[r]
     if not contracted:
         sx = vx if abs(vx) >= tiny else tiny
         sy = vy if abs(vy) >= tiny else tiny
@@ -34,52 +47,50 @@ def _enter(ox, oy, oz, dx, dy, dz, near, far, centre, half, contracted, state, l
         ax, bx = (-one - ux) / sx, (one - ux) / sx
         ay, by = (-one - uy) / sy, (one - uy) / sy
         az, bz = (-one - uz) / sz, (one - uz) / sz
-        t = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), near))
-        leave = min(min(max(ax, bx), max(ay, by)), min(max(az, bz), far))
+        t = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), near[r]))
+        t_exit = min(min(max(ax, bx), max(ay, by)), min(max(az, bz), far[r]))
     state[intervals.UX, lane], state[intervals.UY, lane], state[intervals.UZ, lane] = ux, uy, uz
     state[intervals.VX, lane], state[intervals.VY, lane], state[intervals.VZ, lane] = vx, vy, vz
-    state[intervals.T, lane], state[intervals.LEAVE, lane] = t, leave
+    state[intervals.T, lane], state[intervals.T_EXIT, lane] = t, t_exit
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def _find_valid(  # type: ignore[no-untyped-def]
-    origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, whole, counts, tried, leave, begins
+    origins, directions, near, far, offset, centre, half, contracted, step, max_intervals, voxels, threshold, unpruned, counts, visited, t_exit, starts
 ):
-    """Sixteen rays side by side, a lane each, until the last of them is at its end."""
-    least, never, side, grid = np.float32(FARTHEST), np.float32(-np.inf), voxels.shape[0], pointer(voxels)
-    for block in numba.prange((len(origins) + RAYS - 1) // RAYS):
-        begin, end = block * RAYS, min(len(origins), (block + 1) * RAYS)
-        state = np.zeros((intervals.ROWS, RAYS), np.float32)  # lanes without a ray are at their end
+    """March rays in groups of one per SIMD lane; writes the starts (R, max_intervals) of valid intervals, and of each ray how many are valid and visited."""
+    farthest, never, side, grid = np.float32(FARTHEST), np.float32(-np.inf), voxels.shape[0], pointer(voxels)
+    for block in numba.prange((len(origins) + LANES - 1) // LANES):
+        begin, end = block * LANES, min(len(origins), (block + 1) * LANES)
+        state = np.zeros((intervals.ROWS, LANES), np.float32)  # a lane without a ray is past its exit
         for r in range(begin, end):
-            _enter(
-                origins[r, 0], origins[r, 1], origins[r, 2], directions[r, 0], directions[r, 1], directions[r, 2], near[r], far[r],
-                centre, half, contracted, state, r - begin,
-            )  # fmt: skip
-            state[intervals.OFFSET, r - begin], state[intervals.LIMIT, r - begin] = offset[r], never if r < whole else threshold
-        lanes = pointer(state)
-        for _ in range(slots):
+            _init_lane(origins, directions, near, far, centre, half, contracted, r, state, r - begin)
+            state[intervals.OFFSET, r - begin], state[intervals.THRESHOLD, r - begin] = offset[r], never if r < unpruned else threshold
+        p_state = pointer(state)
+        for _ in range(max_intervals):
             if contracted:
-                found = intervals.next_intervals_contracted(lanes, grid, side, step, least)
+                masks = intervals.next_intervals_contracted(p_state, grid, side, step, farthest)
             else:
-                found = intervals.next_intervals_in_box(lanes, grid, side, step, least)
-            if found == 0:
+                masks = intervals.next_intervals_bounded(p_state, grid, side, step, farthest)
+            if masks == 0:
                 break
-            found >>= RAYS
-            while found != 0:
-                lane = intervals.lowest_bit(found)
-                found &= found - 1
+            valid = masks >> LANES
+            while valid != 0:
+                lane = intervals.lowest_bit(valid)
+                valid &= valid - 1
                 r = begin + lane
-                begins[r, counts[r]] = state[intervals.BEGAN, lane]
+                starts[r, counts[r]] = state[intervals.START, lane]
                 counts[r] += 1
         for r in range(begin, end):
-            tried[r], leave[r] = np.int64(state[intervals.TRIED, r - begin]), state[intervals.LEAVE, r - begin]
+            visited[r], t_exit[r] = np.int64(state[intervals.VISITED, r - begin]), state[intervals.T_EXIT, r - begin]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _write_valid(origins, directions, offset, centre, half, contracted, step, leave, begins, first, start, extent, length, point):  # type: ignore[no-untyped-def]
-    one, two = np.float32(1), np.float32(2)
-    scale = np.float32(0.25) if contracted else np.float32(0.5)
-    shift = two if contracted else one
+def _write_valid(  # type: ignore[no-untyped-def]
+    origins, directions, offset, centre, half, contracted, step, t_exit, starts, first, start, extent, length, point
+):
+    """Pack the intervals that `_find_valid` found."""
+    one = np.float32(1)
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
             if first[r + 1] == first[r]:
@@ -87,71 +98,67 @@ def _write_valid(origins, directions, offset, centre, half, contracted, step, le
             ux, uy, uz = (origins[r, 0] - centre[0]) / half[0], (origins[r, 1] - centre[1]) / half[1], (origins[r, 2] - centre[2]) / half[2]
             vx, vy, vz = directions[r, 0] / half[0], directions[r, 1] / half[1], directions[r, 2] / half[2]
             for n in range(first[r], first[r + 1]):
-                t = begins[r, n - first[r]]
-                stretch = one
+                t = starts[r, n - first[r]]
+                growth = one
                 if contracted:
-                    reach = max(max(abs(ux + t * vx), abs(uy + t * vy)), max(abs(uz + t * vz), one))
-                    stretch = reach * reach
-                size = min(step * stretch, leave[r] - t)
+                    norm = max(max(abs(ux + t * vx), abs(uy + t * vy)), max(abs(uz + t * vz), one))
+                    growth = norm * norm
+                size = min(step * growth, t_exit[r] - t)
                 at = t + offset[r] * size
-                px, py, pz = ux + at * vx, uy + at * vy, uz + at * vz
-                if contracted:
-                    m = max(max(abs(px), abs(py)), max(abs(pz), one))
-                    f = (two - one / m) / m
-                    px, py, pz = px * f, py * f, pz * f
-                start[n], extent[n], length[n] = t, size, size / stretch
-                point[n, 0], point[n, 1], point[n, 2] = (px + shift) * scale, (py + shift) * scale, (pz + shift) * scale
+                start[n], extent[n], length[n] = t, size, size / growth
+                point[n, 0], point[n, 1], point[n, 2] = _unit_to_grid(ux + at * vx, uy + at * vy, uz + at * vz, contracted)
 
 
-def valid_samples(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, threshold, whole=0):  # type: ignore[no-untyped-def]
-    """`efficientnerf.sampling.samples.valid_samples` on float32 arrays: (first, start, extent, length, point, tried)."""
+def valid_samples(  # type: ignore[no-untyped-def]
+    origins, directions, near, far, offset, centre, half, contracted, step, max_intervals, voxels, threshold, unpruned=0
+):
+    """`efficientnerf.sampling.samples.valid_samples` on float32 arrays: (first, start, extent, length, point, number of intervals visited)."""
     rays = len(origins)
-    counts, tried, leave = np.zeros(rays, np.int64), np.zeros(rays, np.int64), np.empty(rays, np.float32)
-    begins = np.empty((rays, slots), np.float32)  # of a row only as much is touched as the ray has valid samples
+    counts, visited, t_exit = np.zeros(rays, np.int64), np.zeros(rays, np.int64), np.empty(rays, np.float32)
+    starts = np.empty((rays, max_intervals), np.float32)  # pages of a row are touched only as far as the ray has valid samples
     step = np.float32(step)
-    limits = (np.float32(threshold), whole)
-    _find_valid(origins, directions, near, far, offset, centre, half, contracted, step, slots, voxels, *limits, counts, tried, leave, begins)
+    _find_valid(
+        origins, directions, near, far, offset, centre, half, contracted, step, max_intervals, voxels, np.float32(threshold), unpruned,
+        counts, visited, t_exit, starts,
+    )  # fmt: skip
     first = np.zeros(rays + 1, np.int64)
     np.cumsum(counts, out=first[1:])
     n = int(first[-1])
     start, extent, length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
-    _write_valid(origins, directions, offset, centre, half, contracted, step, leave, begins, first, start, extent, length, point)
-    return first, start, extent, length, point, int(tried.sum())
+    _write_valid(origins, directions, offset, centre, half, contracted, step, t_exit, starts, first, start, extent, length, point)
+    return first, start, extent, length, point, int(visited.sum())
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def select_pivots(weight, first, threshold, most, out):  # type: ignore[no-untyped-def]
-    """`efficientnerf.sampling.samples.select_pivots`: out (N,) bool."""
+def select_pivots(weight, first, threshold, max_pivots, out):  # type: ignore[no-untyped-def]
+    """`efficientnerf.sampling.samples.select_pivots` into out (N,) bool."""
     rays = len(first) - 1
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
-            lo, hi = first[r], first[r + 1]
+            begin, end = first[r], first[r + 1]
             count = 0
-            for n in range(lo, hi):
+            for n in range(begin, end):
                 out[n] = weight[n] > threshold
                 count += out[n]
-            if count <= most:
+            if count <= max_pivots:
                 continue
-            least = np.sort(weight[lo:hi])[hi - lo - most]  # the lightest weight that stays
-            heavier = 0
-            for n in range(lo, hi):
-                heavier += weight[n] > least
-            for n in range(lo, hi):
-                stays = weight[n] > least
-                if weight[n] == least and heavier < most:
-                    stays = True
-                    heavier += 1
-                out[n] = out[n] and stays
+            cutoff = np.sort(weight[begin:end])[end - begin - max_pivots]  # the lowest weight that may stay
+            selected = 0
+            for n in range(begin, end):
+                selected += weight[n] > cutoff
+            for n in range(begin, end):
+                keep = weight[n] > cutoff
+                if weight[n] == cutoff and selected < max_pivots:
+                    keep = True
+                    selected += 1
+                out[n] = out[n] and keep
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _pivotal(  # type: ignore[no-untyped-def]
+def _write_pivotal(  # type: ignore[no-untyped-def]
     origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot,
     fine_first, fine_start, fine_extent, fine_length, point,
 ):  # fmt: skip
-    one, two = np.float32(1), np.float32(2)
-    scale = np.float32(0.25) if contracted else np.float32(0.5)
-    shift = two if contracted else one
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(len(origins), (block + 1) * BLOCK)):
             n = fine_first[r]
@@ -162,25 +169,23 @@ def _pivotal(  # type: ignore[no-untyped-def]
                 for s in range(per_pivot):
                     begin = start[i] + np.float32(s) * size
                     at = begin + offset[r] * size
-                    px = (origins[r, 0] + at * directions[r, 0] - centre[0]) / half[0]
-                    py = (origins[r, 1] + at * directions[r, 1] - centre[1]) / half[1]
-                    pz = (origins[r, 2] + at * directions[r, 2] - centre[2]) / half[2]
-                    if contracted:
-                        m = max(max(abs(px), abs(py)), max(abs(pz), one))
-                        f = (two - one / m) / m
-                        px, py, pz = px * f, py * f, pz * f
+                    x = (origins[r, 0] + at * directions[r, 0] - centre[0]) / half[0]
+                    y = (origins[r, 1] + at * directions[r, 1] - centre[1]) / half[1]
+                    z = (origins[r, 2] + at * directions[r, 2] - centre[2]) / half[2]
                     fine_start[n], fine_extent[n], fine_length[n] = begin, size, part
-                    point[n, 0], point[n, 1], point[n, 2] = (px + shift) * scale, (py + shift) * scale, (pz + shift) * scale
+                    point[n, 0], point[n, 1], point[n, 2] = _unit_to_grid(x, y, z, contracted)
                     n += 1
 
 
-def pivotal_samples(origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot):  # type: ignore[no-untyped-def]
+def pivotal_samples(  # type: ignore[no-untyped-def]
+    origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot
+):
     """`efficientnerf.sampling.samples.pivotal_samples` on arrays: (first, start, extent, length, point)."""
     total = np.concatenate([np.zeros(1, np.int64), np.cumsum(pivotal, dtype=np.int64)])
     fine_first = total[first] * per_pivot
     n = int(fine_first[-1])
     fine_start, fine_extent, fine_length, point = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32), np.empty((n, 3), np.float32)
-    _pivotal(
+    _write_pivotal(
         origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot,
         fine_first, fine_start, fine_extent, fine_length, point,
     )  # fmt: skip

@@ -1,7 +1,9 @@
-"""Addresses, and four or sixteen float32 side by side, inside numba kernels: what numba's arrays and scalars cost too much for.
+"""SIMD vectors of float32 and raw pointers inside numba kernels.
 
-numba neither packs the arithmetic of neighbouring numbers by itself nor has a type for them, but LLVM has one on every processor, and cuts what is wider
-than a processor's registers.
+numba has no vector type and does not vectorise across neighbouring scalars by itself. These types and intrinsics map to LLVM vectors, which LLVM legalises
+to the registers of the processor: a vector wider than a register becomes several.
+
+A name's suffix is the number of lanes.
 """
 
 from __future__ import annotations
@@ -16,82 +18,81 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
-# 2^-f = 1 + f (c_0 + f (c_1 + ...)) for f from 0 to 1, to 6e-8: least largest error among those that are 1 at 0.
-EXP2 = (-0.69314442, 0.24018671, -0.05531669, 0.00922838, -0.00095403)
+# Minimax polynomial of 2^-f = 1 + f (c_0 + f (c_1 + ...)) on [0, 1], exact at 0: maximum error 6e-8.
+EXP2_COEFFICIENTS = (-0.69314442, 0.24018671, -0.05531669, 0.00922838, -0.00095403)
 
-_LANES = ir.VectorType(ir.FloatType(), 4)
-_ALL = ir.VectorType(ir.FloatType(), 16)
-_FUSED = ("contract", "reassoc", "nsz")
+_VECTOR4 = ir.VectorType(ir.FloatType(), 4)
+_VECTOR16 = ir.VectorType(ir.FloatType(), 16)
+_FASTMATH = ("contract", "reassoc", "nsz")
 
 
-class Four(types.Type):
-    """numba's type of four float32."""
+class Float32x4(types.Type):
+    """Type of a vector of four float32."""
 
     def __init__(self) -> None:
         super().__init__(name="Four")
 
 
-class Sixteen(types.Type):
-    """numba's type of sixteen float32: four Fours, one after the other."""
+class Float32x16(types.Type):
+    """Type of a vector of sixteen float32: four Float32x4 end to end."""
 
     def __init__(self) -> None:
         super().__init__(name="Sixteen")
 
 
-four, sixteen = Four(), Sixteen()
+float32x4, float32x16 = Float32x4(), Float32x16()
 
 
-@register_model(Four)
-class _FourModel(models.PrimitiveModel):
+@register_model(Float32x4)
+class _Float32x4Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _LANES)
+        super().__init__(manager, kind, _VECTOR4)
 
 
-@register_model(Sixteen)
-class _SixteenModel(models.PrimitiveModel):
+@register_model(Float32x16)
+class _Float32x16Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _ALL)
+        super().__init__(manager, kind, _VECTOR16)
 
 
-def _arithmetic(operation: Any, name: str) -> None:
-    """Lets kernels write an operation on two Fours, or a Four and a float32, as on numbers."""
+def _overload_arithmetic(operation: Any, name: str) -> None:
+    """An operator on two Float32x4, or on a Float32x4 and a float32."""
 
     @intrinsic
-    def each(typing_context: Any, a: Any, b: Any) -> Any:
+    def elementwise(typing_context: Any, a: Any, b: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            one, other = (arg if isinstance(kind, Four) else spread(builder, arg, 4) for kind, arg in zip(signature.args, args, strict=True))
-            return getattr(builder, name)(one, other, flags=_FUSED)
+            left, right = (arg if isinstance(kind, Float32x4) else splat(builder, arg, 4) for kind, arg in zip(signature.args, args, strict=True))
+            return getattr(builder, name)(left, right, flags=_FASTMATH)
 
-        return four(a, b), codegen
+        return float32x4(a, b), codegen
 
     @overload(operation)
     def implementation(a, b):  # type: ignore[no-untyped-def]
-        if {a, b} <= {four, types.float32} and four in {a, b}:
-            return lambda a, b: each(a, b)
+        if {a, b} <= {float32x4, types.float32} and float32x4 in {a, b}:
+            return lambda a, b: elementwise(a, b)
         return None
 
 
 for _operation, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
-    _arithmetic(_operation, _name)
+    _overload_arithmetic(_operation, _name)
 
 
 @intrinsic
-def one_over_root(typing_context: Any, value: Any) -> Any:
-    """1 / sqrt(x) of each of four."""
+def rsqrt4(typing_context: Any, value: Any) -> Any:
+    """1 / sqrt(x), elementwise."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        root = builder.module.declare_intrinsic("llvm.sqrt.v4f32", (), ir.FunctionType(_LANES, [_LANES]))
-        return builder.fdiv(_constant(_LANES, 1), builder.call(root, [args[0]]))
+        root = builder.module.declare_intrinsic("llvm.sqrt.v4f32", (), ir.FunctionType(_VECTOR4, [_VECTOR4]))
+        return builder.fdiv(_constant(_VECTOR4, 1), builder.call(root, [args[0]]))
 
-    return four(four), codegen
+    return float32x4(float32x4), codegen
 
 
 @intrinsic
 def pointer(typing_context: Any, array: Any) -> Any:
-    """Where the elements of a contiguous array begin: p[n] is its n-th in C order, neither checked nor counted from the end.
+    """Pointer to the first element of a contiguous array: p[n] is its n-th element in C order, without bounds checks and without wraparound.
 
-    Every function that an array is handed to, or that takes it out of a tuple, counts one more reference to it and later one less, at a cost of several
-    look-ups. An address has no references; whoever takes it keeps the array while it is in use.
+    Passing an array to a function, or taking it out of a tuple, costs a reference count up and down. A pointer has none: the caller keeps the array alive.
     """
     if not isinstance(array, types.Array) or array.layout != "C":
         raise TypeError(f"pointer of {array}: expected a contiguous array")
@@ -103,249 +104,251 @@ def pointer(typing_context: Any, array: Any) -> Any:
 
 
 @intrinsic
-def ones(typing_context: Any, bits: Any) -> Any:
-    """How many bits of an int64 are set."""
+def popcount(typing_context: Any, bits: Any) -> Any:
+    """Number of set bits of an int64."""
     return types.int64(types.int64), lambda context, builder, signature, args: builder.ctpop(args[0])
 
 
 @intrinsic
-def four_at(typing_context: Any, address: Any, index: Any) -> Any:
-    """p[index], p[index + 1], p[index + 2], p[index + 3] of a pointer to float32."""
+def load4(typing_context: Any, address: Any, index: Any) -> Any:
+    """p[index : index + 4] of a pointer to float32."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return _load(builder, args[0], args[1])
 
-    return four(types.CPointer(types.float32), types.int64), codegen
+    return float32x4(types.CPointer(types.float32), types.int64), codegen
 
 
 @intrinsic
-def scaled(typing_context: Any, factor: Any, value: Any) -> Any:
-    """A float32 times each of four."""
+def scale4(typing_context: Any, factor: Any, value: Any) -> Any:
+    """factor * value for a float32 and a Float32x4."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fmul(spread(builder, args[0], 4), args[1], flags=_FUSED)
+        return builder.fmul(splat(builder, args[0], 4), args[1], flags=_FASTMATH)
 
-    return four(types.float32, four), codegen
+    return float32x4(types.float32, float32x4), codegen
 
 
 @intrinsic
-def plus_scaled(typing_context: Any, total: Any, factor: Any, value: Any) -> Any:
-    """Four plus a float32 times four others, each to its own."""
+def add_scaled4(typing_context: Any, total: Any, factor: Any, value: Any) -> Any:
+    """total + factor * value for a float32 factor."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        product = builder.fmul(spread(builder, args[1], 4), args[2], flags=_FUSED)
-        return builder.fadd(args[0], product, flags=_FUSED)
+        product = builder.fmul(splat(builder, args[1], 4), args[2], flags=_FASTMATH)
+        return builder.fadd(args[0], product, flags=_FASTMATH)
 
-    return four(four, types.float32, four), codegen
+    return float32x4(float32x4, types.float32, float32x4), codegen
 
 
 @intrinsic
-def apart(typing_context: Any, value: Any) -> Any:
-    """The four as a tuple."""
+def unpack4(typing_context: Any, value: Any) -> Any:
+    """The lanes as a tuple."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         lanes = [builder.extract_element(args[0], ir.Constant(ir.IntType(32), n)) for n in range(4)]
         return context.make_tuple(builder, signature.return_type, lanes)
 
-    return types.UniTuple(types.float32, 4)(four), codegen
+    return types.UniTuple(types.float32, 4)(float32x4), codegen
 
 
 @intrinsic
-def together(typing_context: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Four float32 as four."""
+def pack4(typing_context: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """A vector of four scalars."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = ir.Constant(_LANES, ir.Undefined)
-        for n, one in enumerate(args):
-            value = builder.insert_element(value, one, ir.Constant(ir.IntType(32), n))
+        value = ir.Constant(_VECTOR4, ir.Undefined)
+        for n, scalar in enumerate(args):
+            value = builder.insert_element(value, scalar, ir.Constant(ir.IntType(32), n))
         return value
 
-    return four(types.float32, types.float32, types.float32, types.float32), codegen
+    return float32x4(types.float32, types.float32, types.float32, types.float32), codegen
 
 
 @intrinsic
-def put_four(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
-    """Four into p[index], p[index + 1], p[index + 2], p[index + 3] of a pointer to float32."""
+def store4(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
+    """p[index : index + 4] = value for a pointer to float32."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = builder.bitcast(builder.gep(args[0], [args[1]]), _LANES.as_pointer())
-        builder.store(args[2], place, align=4)
+        target = builder.bitcast(builder.gep(args[0], [args[1]]), _VECTOR4.as_pointer())
+        builder.store(args[2], target, align=4)
         return context.get_dummy_value()
 
-    return types.void(types.CPointer(types.float32), types.int64, four), codegen
+    return types.void(types.CPointer(types.float32), types.int64, float32x4), codegen
 
 
-def put(out, n, value):  # type: ignore[no-untyped-def]
-    """A number, or four, into the n-th place for such of an array or a pointer: kernels that take both write by it."""
+def store(out, n, value):  # type: ignore[no-untyped-def]
+    """out[n] = value, for kernels that work on scalars and on Float32x4; element n of the latter lies at 4 n."""
     raise NotImplementedError("inside kernels only")
 
 
-@overload(put)
-def _put(out, n, value):  # type: ignore[no-untyped-def]
-    def one(out, n, value):  # type: ignore[no-untyped-def]
+@overload(store)
+def _store(out, n, value):  # type: ignore[no-untyped-def]
+    def scalar(out, n, value):  # type: ignore[no-untyped-def]
         out[n] = value
 
-    return (lambda out, n, value: put_four(out, 4 * n, value)) if value == four else one
+    return (lambda out, n, value: store4(out, 4 * n, value)) if value == float32x4 else scalar
 
 
-def alike(value, other):  # type: ignore[no-untyped-def]
-    """A number, or four times that number where `other` is a Four."""
+def broadcast_like(value, other):  # type: ignore[no-untyped-def]
+    """The scalar `value`, or a Float32x4 of it where `other` is one."""
     raise NotImplementedError("inside kernels only")
 
 
-@overload(alike)
-def _alike(value, other):  # type: ignore[no-untyped-def]
-    return (lambda value, other: together(value, value, value, value)) if other == four else (lambda value, other: value)
+@overload(broadcast_like)
+def _broadcast_like(value, other):  # type: ignore[no-untyped-def]
+    return (lambda value, other: pack4(value, value, value, value)) if other == float32x4 else (lambda value, other: value)
 
 
 @intrinsic
-def logistic(typing_context: Any, value: Any) -> Any:
-    """1 / (1 + exp(-x)) of each of four or sixteen, to 3e-6."""
+def sigmoid(typing_context: Any, value: Any) -> Any:
+    """Logistic function 1 / (1 + exp(-x)) of a Float32x4 or Float32x16, to 3e-6."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        def all_of(x: float) -> Any:
+        def constant(x: float) -> Any:
             return _constant(args[0].type, x)
 
-        # exp(-x) = 2^-y = 2^(127 - n) 2^-f where y + 127 is n and a fraction f; n is positive, so that cutting off finds it.
-        y = _plus(builder, _times(builder, args[0], all_of(math.log2(math.e))), all_of(127))
+        # exp(-x) = 2^-y = 2^(127 - n) 2^-f with y + 127 = n + f, 0 <= f < 1. n is positive, so truncation finds it.
+        y = _add(builder, _mul(builder, args[0], constant(math.log2(math.e))), constant(127))
         for bound, order in ((1.0, "<"), (253.0, ">")):
-            y = builder.select(builder.fcmp_ordered(order, y, all_of(bound)), all_of(bound), y)
-        return builder.fdiv(all_of(1), _plus(builder, _power(builder, y, 254), all_of(1)))
+            y = builder.select(builder.fcmp_ordered(order, y, constant(bound)), constant(bound), y)
+        return builder.fdiv(constant(1), _add(builder, _exp2(builder, y, 254), constant(1)))
 
     return value(value), codegen
 
 
 @intrinsic
-def exp2_minus(typing_context: Any, value: Any) -> Any:
-    """2^-x of each of four x >= 0."""
+def exp2_neg4(typing_context: Any, value: Any) -> Any:
+    """2^-x of a Float32x4 for x >= 0."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bound = _constant(_LANES, 126)
-        return _power(builder, builder.select(builder.fcmp_ordered(">", args[0], bound), bound, args[0]), 127)
+        bound = _constant(_VECTOR4, 126)
+        return _exp2(builder, builder.select(builder.fcmp_ordered(">", args[0], bound), bound, args[0]), 127)
 
-    return four(four), codegen
+    return float32x4(float32x4), codegen
 
 
 @intrinsic
-def interpolated(typing_context: Any, address: Any, a: Any, b: Any, c: Any, d: Any, j: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
-    """Trilinear interpolation at four points at once, each of four numbers: the first number of each point, as four; and all, as sixteen, point after point.
+def trilinear4(typing_context: Any, address: Any, a: Any, b: Any, c: Any, d: Any, j: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
+    """Trilinear interpolation of four channels at four points at once: (channel 0 of each point, Float32x4; all channels point by point, Float32x16).
 
-    address     of float32
-    a, b, c, d  where, for each point, the first of its eight neighbours' four numbers lie; the next along z lie 4 on, along y j, and along x i
-    x, y, z     four fractions each, of the points
+    address     of float32; the four channels of a voxel are adjacent
+    a, b, c, d  offset of the lowest of the eight neighbours of each point
+    j, i        strides of y and x; that of z is 4
+    x, y, z     fractions of the points between their neighbours
 
-    No-numbers are left out of the sixteen, and the others' weights divided by their sum; where there is nothing else the result is zero. The first four,
-    which must be numbers, do not wait for that division.
+    Of the second result, NaN neighbours are left out and the remaining weights normalised; 0 where all eight are NaN. The first, whose channel must not be
+    NaN, does not depend on that division.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         values, starts, (row, layer), fractions = args[0], args[1:5], args[5:7], args[7:]
-        sides = [(builder.fsub(_constant(_LANES, 1), f), f) for f in fractions]
-        sums, shares = [], []
+        sides = [(builder.fsub(_constant(_VECTOR4, 1), f), f) for f in fractions]
+        sums, weights = [], []
         for p in range(2):
             for q in range(2):
-                edge = _times(builder, sides[0][p], sides[1][q])
+                edge = _mul(builder, sides[0][p], sides[1][q])
                 for r in range(2):
-                    weight = _each_four_times(builder, _times(builder, edge, sides[2][r]))
+                    weight = _repeat_lanes(builder, _mul(builder, edge, sides[2][r]))
                     ahead = ir.Constant(ir.IntType(64), 4 * r)
                     for use, stride in ((p, layer), (q, row)):
                         ahead = builder.add(ahead, stride) if use else ahead
-                    value = _joined(builder, [_load(builder, values, builder.add(start, ahead)) for start in starts])
-                    there = builder.fcmp_ordered("ord", value, value)
-                    sums.append(_times(builder, weight, builder.select(there, value, _constant(_ALL, 0))))
-                    shares.append(builder.select(there, weight, _constant(_ALL, 0)))
-        total, share = _sum(builder, sums), _sum(builder, shares)
-        some = builder.fcmp_ordered(">", share, _constant(_ALL, 0))
-        mean = builder.fdiv(total, builder.select(some, share, _constant(_ALL, 1)))
-        return context.make_tuple(builder, signature.return_type, [_chosen(builder, total, total, (0, 4, 8, 12)), mean])
+                    value = _concat(builder, [_load(builder, values, builder.add(start, ahead)) for start in starts])
+                    valid = builder.fcmp_ordered("ord", value, value)
+                    sums.append(_mul(builder, weight, builder.select(valid, value, _constant(_VECTOR16, 0))))
+                    weights.append(builder.select(valid, weight, _constant(_VECTOR16, 0)))
+        total, total_weight = _tree_sum(builder, sums), _tree_sum(builder, weights)
+        some = builder.fcmp_ordered(">", total_weight, _constant(_VECTOR16, 0))
+        mean = builder.fdiv(total, builder.select(some, total_weight, _constant(_VECTOR16, 1)))
+        return context.make_tuple(builder, signature.return_type, [_shuffle(builder, total, total, (0, 4, 8, 12)), mean])
 
     index = types.int64
-    both = types.Tuple((four, sixteen))
-    return both(types.CPointer(types.float32), index, index, index, index, index, index, four, four, four), codegen
+    result = types.Tuple((float32x4, float32x16))
+    return result(types.CPointer(types.float32), index, index, index, index, index, index, float32x4, float32x4, float32x4), codegen
 
 
 @intrinsic
-def nothing(typing_context: Any) -> Any:
-    """Sixteen zeros."""
-    return sixteen(), lambda context, builder, signature, args: _constant(_ALL, 0)
+def zeros16(typing_context: Any) -> Any:
+    """A Float32x16 of zeros."""
+    return float32x16(), lambda context, builder, signature, args: _constant(_VECTOR16, 0)
 
 
 @intrinsic
-def plus_each_scaled(typing_context: Any, total: Any, factor: Any, address: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Sixteen plus four factors times the four numbers each that lie at p[a], p[b], p[c] and p[d]."""
+def add_scaled_gathered16(typing_context: Any, total: Any, factor: Any, address: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """total + the four-number groups at p[a], p[b], p[c], p[d], each times its lane of `factor` (Float32x4)."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = _joined(builder, [_load(builder, args[2], start) for start in args[3:]])
-        return _plus(builder, args[0], _times(builder, _each_four_times(builder, args[1]), value))
+        value = _concat(builder, [_load(builder, args[2], start) for start in args[3:]])
+        return _add(builder, args[0], _mul(builder, _repeat_lanes(builder, args[1]), value))
 
     index = types.int64
-    return sixteen(sixteen, four, types.CPointer(types.float32), index, index, index, index), codegen
+    return float32x16(float32x16, float32x4, types.CPointer(types.float32), index, index, index, index), codegen
 
 
 @intrinsic
-def quarters(typing_context: Any, value: Any) -> Any:
-    """Sixteen as a tuple of four Fours."""
+def split16(typing_context: Any, value: Any) -> Any:
+    """A Float32x16 as a tuple of four Float32x4."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        parts = [_chosen(builder, args[0], args[0], range(4 * n, 4 * n + 4)) for n in range(4)]
+        parts = [_shuffle(builder, args[0], args[0], range(4 * n, 4 * n + 4)) for n in range(4)]
         return context.make_tuple(builder, signature.return_type, parts)
 
-    return types.UniTuple(four, 4)(sixteen), codegen
+    return types.UniTuple(float32x4, 4)(float32x16), codegen
 
 
-def spread(builder: Any, value: Any, lanes: int) -> Any:
-    """A number in all lanes of a vector."""
-    one = builder.insert_element(ir.Constant(ir.VectorType(value.type, lanes), ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(ir.IntType(32), lanes), None))
+def splat(builder: Any, value: Any, lanes: int) -> Any:
+    """A vector with a scalar in all lanes."""
+    first = builder.insert_element(ir.Constant(ir.VectorType(value.type, lanes), ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), lanes), None))
 
 
-def _times(builder: Any, x: Any, y: Any) -> Any:
-    return builder.fmul(x, y, flags=_FUSED)
+def _mul(builder: Any, x: Any, y: Any) -> Any:
+    return builder.fmul(x, y, flags=_FASTMATH)
 
 
-def _plus(builder: Any, x: Any, y: Any) -> Any:
-    return builder.fadd(x, y, flags=_FUSED)
+def _add(builder: Any, x: Any, y: Any) -> Any:
+    return builder.fadd(x, y, flags=_FASTMATH)
 
 
-def _sum(builder: Any, values: list[Any]) -> Any:
-    """Of an even number of vectors, in pairs: no sum waits for all others."""
+def _tree_sum(builder: Any, values: list[Any]) -> Any:
+    """Sum of a power of two of vectors, pairwise: short dependency chains."""
     while len(values) > 1:
-        values = [builder.fadd(one, other, flags=("contract", "nsz")) for one, other in zip(values[::2], values[1::2], strict=True)]
+        values = [builder.fadd(left, right, flags=("contract", "nsz")) for left, right in zip(values[::2], values[1::2], strict=True)]
     return values[0]
 
 
 def _constant(kind: Any, x: float) -> Any:
-    """A number in all lanes."""
+    """A constant vector with one value in all lanes."""
     return ir.Constant(kind, [float(np.float32(x)) if isinstance(kind.element, ir.FloatType) else int(x)] * kind.count)
 
 
-def _power(builder: Any, y: Any, most: int) -> Any:
-    """2^(most - 127 - y) for 0 <= y < most."""
+def _exp2(builder: Any, y: Any, bias: int) -> Any:
+    """2^(bias - 127 - y) for 0 <= y < bias."""
     whole = ir.VectorType(ir.IntType(32), y.type.count)
     n = builder.fptosi(y, whole)
     f = builder.fsub(y, builder.sitofp(n, y.type))
-    power = _constant(y.type, EXP2[-1])
-    for coefficient in (*EXP2[-2::-1], 1.0):
-        power = _plus(builder, _times(builder, power, f), _constant(y.type, coefficient))
-    exponent = builder.shl(builder.sub(_constant(whole, most), n), _constant(whole, 23))
-    return _times(builder, power, builder.bitcast(exponent, y.type))
+    power = _constant(y.type, EXP2_COEFFICIENTS[-1])
+    for coefficient in (*EXP2_COEFFICIENTS[-2::-1], 1.0):
+        power = _add(builder, _mul(builder, power, f), _constant(y.type, coefficient))
+    exponent = builder.shl(builder.sub(_constant(whole, bias), n), _constant(whole, 23))
+    return _mul(builder, power, builder.bitcast(exponent, y.type))
 
 
-def _chosen(builder: Any, one: Any, other: Any, lanes: Iterable[int]) -> Any:
-    """Lanes of two vectors, one after the other."""
-    places = list(lanes)
-    return builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(ir.IntType(32), len(places)), places))
+def _shuffle(builder: Any, left: Any, right: Any, lanes: Iterable[int]) -> Any:
+    """Lanes of two vectors, numbered through."""
+    indices = list(lanes)
+    return builder.shuffle_vector(left, right, ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices))
 
 
-def _each_four_times(builder: Any, value: Any) -> Any:
-    return _chosen(builder, value, value, [n // 4 for n in range(16)])
+def _repeat_lanes(builder: Any, value: Any) -> Any:
+    """A Float32x16 with each lane of a Float32x4 four times."""
+    return _shuffle(builder, value, value, [n // 4 for n in range(16)])
 
 
-def _joined(builder: Any, parts: list[Any]) -> Any:
-    """Four Fours as sixteen."""
-    low, high = (_chosen(builder, parts[n], parts[n + 1], range(8)) for n in (0, 2))
-    return _chosen(builder, low, high, range(16))
+def _concat(builder: Any, parts: list[Any]) -> Any:
+    """Four Float32x4 end to end as a Float32x16."""
+    low, high = (_shuffle(builder, parts[n], parts[n + 1], range(8)) for n in (0, 2))
+    return _shuffle(builder, low, high, range(16))
 
 
 def _load(builder: Any, address: Any, index: Any) -> Any:
-    return builder.load(builder.bitcast(builder.gep(address, [index]), _LANES.as_pointer()), align=4)
+    return builder.load(builder.bitcast(builder.gep(address, [index]), _VECTOR4.as_pointer()), align=4)

@@ -20,20 +20,20 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import (
-    alike,
-    apart,
-    four_at,
-    nothing,
-    one_over_root,
-    ones,
-    plus_each_scaled,
-    plus_scaled,
+    add_scaled4,
+    add_scaled_gathered16,
+    broadcast_like,
+    load4,
+    pack4,
     pointer,
-    put,
-    put_four,
-    quarters,
-    scaled,
-    together,
+    popcount,
+    rsqrt4,
+    scale4,
+    split16,
+    store,
+    store4,
+    unpack4,
+    zeros16,
 )  # fmt: skip
 from efficientnerf.rendering import harmonics
 
@@ -151,35 +151,35 @@ def basis_into(x, y, z, degree, out):  # type: ignore[no-untyped-def]
     """`efficientnerf.rendering.harmonics.basis` of one direction into (K,), or of four, given as Fours, into (K, 4)."""
     two, three, four, seven = np.float32(2), np.float32(3), np.float32(4), np.float32(7)
     xx, yy, zz = x * x, y * y, z * z
-    put(out, 0, alike(_C0, x))
+    store(out, 0, broadcast_like(_C0, x))
     if degree > 0:
-        put(out, 1, y * -_C1)
-        put(out, 2, z * _C1)
-        put(out, 3, x * -_C1)
+        store(out, 1, y * -_C1)
+        store(out, 2, z * _C1)
+        store(out, 3, x * -_C1)
     if degree > 1:
-        put(out, 4, x * y * _C2[0])
-        put(out, 5, y * z * _C2[1])
-        put(out, 6, (zz * two - xx - yy) * _C2[2])
-        put(out, 7, x * z * _C2[3])
-        put(out, 8, (xx - yy) * _C2[4])
+        store(out, 4, x * y * _C2[0])
+        store(out, 5, y * z * _C2[1])
+        store(out, 6, (zz * two - xx - yy) * _C2[2])
+        store(out, 7, x * z * _C2[3])
+        store(out, 8, (xx - yy) * _C2[4])
     if degree > 2:
-        put(out, 9, y * (xx * three - yy) * _C3[0])
-        put(out, 10, x * y * z * _C3[1])
-        put(out, 11, y * (zz * four - xx - yy) * _C3[2])
-        put(out, 12, z * (zz * two - xx * three - yy * three) * _C3[3])
-        put(out, 13, x * (zz * four - xx - yy) * _C3[4])
-        put(out, 14, z * (xx - yy) * _C3[5])
-        put(out, 15, x * (xx - yy * three) * _C3[6])
+        store(out, 9, y * (xx * three - yy) * _C3[0])
+        store(out, 10, x * y * z * _C3[1])
+        store(out, 11, y * (zz * four - xx - yy) * _C3[2])
+        store(out, 12, z * (zz * two - xx * three - yy * three) * _C3[3])
+        store(out, 13, x * (zz * four - xx - yy) * _C3[4])
+        store(out, 14, z * (xx - yy) * _C3[5])
+        store(out, 15, x * (xx - yy * three) * _C3[6])
     if degree > 3:
-        put(out, 16, x * y * (xx - yy) * _C4[0])
-        put(out, 17, y * z * (xx * three - yy) * _C4[1])
-        put(out, 18, x * y * (zz * seven - _ONE) * _C4[2])
-        put(out, 19, y * z * (zz * seven - three) * _C4[3])
-        put(out, 20, (zz * (zz * np.float32(35) - np.float32(30)) + three) * _C4[4])
-        put(out, 21, x * z * (zz * seven - three) * _C4[5])
-        put(out, 22, (xx - yy) * (zz * seven - _ONE) * _C4[6])
-        put(out, 23, x * z * (xx - yy * three) * _C4[7])
-        put(out, 24, (xx * (xx - yy * three) - yy * (xx * three - yy)) * _C4[8])
+        store(out, 16, x * y * (xx - yy) * _C4[0])
+        store(out, 17, y * z * (xx * three - yy) * _C4[1])
+        store(out, 18, x * y * (zz * seven - _ONE) * _C4[2])
+        store(out, 19, y * z * (zz * seven - three) * _C4[3])
+        store(out, 20, (zz * (zz * np.float32(35) - np.float32(30)) + three) * _C4[4])
+        store(out, 21, x * z * (zz * seven - three) * _C4[5])
+        store(out, 22, (xx - yy) * (zz * seven - _ONE) * _C4[6])
+        store(out, 23, x * z * (xx - yy * three) * _C4[7])
+        store(out, 24, (xx * (xx - yy * three) - yy * (xx * three - yy)) * _C4[8])
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -197,7 +197,7 @@ def _voxel(owner, n, grid):  # type: ignore[no-untyped-def]
     """Which stored voxel the n-th of a brick is, or -1."""
     at = 2 * (owner * grid.spans + (n >> 6))
     bits, bit = grid.stored[at], np.int64(1) << (n & 63)
-    number = grid.stored[at + 1] + ones(bits & (bit - 1))
+    number = grid.stored[at + 1] + popcount(bits & (bit - 1))
     return np.int32(number if bits & bit != 0 else -1)
 
 
@@ -229,11 +229,11 @@ def sum_of_harmonics(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-de
         table, base, code = grid.base_table, 3 * n, n * grid.groups
         r, g, b = y * table[3 * np.int64(grid.base[base])], y * table[3 * np.int64(grid.base[base + 1]) + 1], y * table[3 * np.int64(grid.base[base + 2]) + 2]
         if grid.terms > 1:
-            total = scaled(basis[lanes + lane], four_at(grid.palette, 4 * np.int64(grid.codes[code + grid.column[0]])))
+            total = scale4(basis[lanes + lane], load4(grid.palette, 4 * np.int64(grid.codes[code + grid.column[0]])))
             for k in range(1, grid.terms - 1):
                 e = k * grid.entries + np.int64(grid.codes[code + grid.column[k]])
-                total = plus_scaled(total, basis[(k + 1) * lanes + lane], four_at(grid.palette, 4 * e))
-            _, red, green, blue = apart(total)
+                total = add_scaled4(total, basis[(k + 1) * lanes + lane], load4(grid.palette, 4 * e))
+            _, red, green, blue = unpack4(total)
             r, g, b = r + red, g + green, b + blue
     else:
         e = 3 * grid.terms * n
@@ -249,14 +249,14 @@ def sum_of_harmonics(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-de
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
 def _coded_sums(a, b, c, d, grid, basis):  # type: ignore[no-untyped-def]
     """What codes give four stored voxels above the base: (0, red, green, blue) each, as sixteen; `basis` (K, 4) is of their directions."""
-    codes, total = grid.codes, nothing()
+    codes, total = grid.codes, zeros16()
     for k in range(grid.terms - 1):
         e, g = k * grid.entries, grid.column[k]
-        total = plus_each_scaled(
-            total, four_at(basis, 4 * k + 4), grid.palette, 4 * (e + np.int64(codes[a * grid.groups + g])), 4 * (e + np.int64(codes[b * grid.groups + g])),
+        total = add_scaled_gathered16(
+            total, load4(basis, 4 * k + 4), grid.palette, 4 * (e + np.int64(codes[a * grid.groups + g])), 4 * (e + np.int64(codes[b * grid.groups + g])),
             4 * (e + np.int64(codes[c * grid.groups + g])), 4 * (e + np.int64(codes[d * grid.groups + g])),
         )  # fmt: skip
-    return quarters(total)
+    return split16(total)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
@@ -264,13 +264,13 @@ def _coded_base(n, grid, scale, y):  # type: ignore[no-untyped-def]
     """Density, and red, green and blue that the base adds; y is the first harmonic."""
     table, base = grid.base_table, 3 * n
     r, g, b = table[3 * np.int64(grid.base[base])], table[3 * np.int64(grid.base[base + 1]) + 1], table[3 * np.int64(grid.base[base + 2]) + 2]
-    return together(grid.density[n] * scale, y * r, y * g, y * b)
+    return pack4(grid.density[n] * scale, y * r, y * g, y * b)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
 def _plain(n, grid, scale, basis, lane):  # type: ignore[no-untyped-def]
     r, g, b = sum_of_harmonics(n, grid, basis, lane, 4)
-    return together(grid.density[n] * scale, r, g, b)
+    return pack4(grid.density[n] * scale, r, g, b)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -301,23 +301,23 @@ def _paint(owner, grid, view, steps, stored, basis, painted):  # type: ignore[no
     x, y, z = _toward(place[3 * owner] * brick + 0.5, place[3 * owner + 1] * brick + 0.5, place[3 * owner + 2] * brick + 0.5, view.toward)
     for n in range(0, count, 4):
         i, j, k, l = stored[n], stored[n + 1], stored[n + 2], stored[n + 3]
-        dx = together(steps[3 * i], steps[3 * j], steps[3 * k], steps[3 * l]) + np.float32(x)
-        dy = together(steps[3 * i + 1], steps[3 * j + 1], steps[3 * k + 1], steps[3 * l + 1]) + np.float32(y)
-        dz = together(steps[3 * i + 2], steps[3 * j + 2], steps[3 * k + 2], steps[3 * l + 2]) + np.float32(z)
-        share = one_over_root(dx * dx + dy * dy + dz * dz)
+        dx = pack4(steps[3 * i], steps[3 * j], steps[3 * k], steps[3 * l]) + np.float32(x)
+        dy = pack4(steps[3 * i + 1], steps[3 * j + 1], steps[3 * k + 1], steps[3 * l + 1]) + np.float32(y)
+        dz = pack4(steps[3 * i + 2], steps[3 * j + 2], steps[3 * k + 2], steps[3 * l + 2]) + np.float32(z)
+        share = rsqrt4(dx * dx + dy * dy + dz * dz)
         basis_into(dx * share, dy * share, dz * share, view.degree, basis)
         a, b, c, d = np.int64(index[first + i]), np.int64(index[first + j]), np.int64(index[first + k]), np.int64(index[first + l])
         if grid.coded:
             one, two, three, four = _coded_sums(a, b, c, d, grid, basis)
-            put_four(painted, 4 * a, one + _coded_base(a, grid, view.scale, basis[0]))
-            put_four(painted, 4 * b, two + _coded_base(b, grid, view.scale, basis[0]))
-            put_four(painted, 4 * c, three + _coded_base(c, grid, view.scale, basis[0]))
-            put_four(painted, 4 * d, four + _coded_base(d, grid, view.scale, basis[0]))
+            store4(painted, 4 * a, one + _coded_base(a, grid, view.scale, basis[0]))
+            store4(painted, 4 * b, two + _coded_base(b, grid, view.scale, basis[0]))
+            store4(painted, 4 * c, three + _coded_base(c, grid, view.scale, basis[0]))
+            store4(painted, 4 * d, four + _coded_base(d, grid, view.scale, basis[0]))
         else:
-            put_four(painted, 4 * a, _plain(a, grid, view.scale, basis, 0))
-            put_four(painted, 4 * b, _plain(b, grid, view.scale, basis, 1))
-            put_four(painted, 4 * c, _plain(c, grid, view.scale, basis, 2))
-            put_four(painted, 4 * d, _plain(d, grid, view.scale, basis, 3))
+            store4(painted, 4 * a, _plain(a, grid, view.scale, basis, 0))
+            store4(painted, 4 * b, _plain(b, grid, view.scale, basis, 1))
+            store4(painted, 4 * c, _plain(c, grid, view.scale, basis, 2))
+            store4(painted, 4 * d, _plain(d, grid, view.scale, basis, 3))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -373,7 +373,7 @@ def fill(owner, grid, view, pool):  # type: ignore[no-untyped-def]
         pool.kind[slot] = COLOURS
         for n in range(voxels):
             voxel = np.int64(pool.voxels[n])
-            put_four(pool.values, begin + 4 * n, four_at(pool.painted, 4 * (voxel if voxel >= 0 else pool.absent)))
+            store4(pool.values, begin + 4 * n, load4(pool.painted, 4 * (voxel if voxel >= 0 else pool.absent)))
     else:
         pool.kind[slot] = EXACT
         for n in range(voxels):

@@ -18,16 +18,16 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import (
-    EXP2,
-    apart,
-    exp2_minus,
-    four_at,
-    interpolated,
-    logistic,
-    plus_scaled,
-    put_four,
-    quarters,
-    together,
+    EXP2_COEFFICIENTS,
+    add_scaled4,
+    exp2_neg4,
+    load4,
+    pack4,
+    sigmoid,
+    split16,
+    store4,
+    trilinear4,
+    unpack4,
 )  # fmt: skip
 from efficientnerf.backends.numba.tree.blocks import COLOURS, EXACT, LOOSE, QUEUE, basis_into, fill, sum_of_harmonics
 
@@ -39,11 +39,11 @@ ROUNDING = 1e-3  # of a step: a skip that is computed in float32 ends so much ea
 
 _HALF, _ONE = np.float32(0.5), np.float32(1)
 LOG2E = math.log2(math.e)
-_EXP2 = tuple(np.float32(c) for c in EXP2)
+_EXP2 = tuple(np.float32(c) for c in EXP2_COEFFICIENTS)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=LOOSE)
-def _exp2_minus(x):  # type: ignore[no-untyped-def]
+def _exp2_neg(x):  # type: ignore[no-untyped-def]
     """2^-x for float32 x >= 0."""
     y = min(x, np.float32(126))
     whole = np.int32(y)
@@ -93,7 +93,7 @@ def _exact(words, at, j, i, fx, fy, fz, grid, basis):  # type: ignore[no-untyped
             green += weight[n] * g
             blue += weight[n] * b
     share = _ONE / total if total > 0 else np.float32(0)
-    return together(np.float32(0), red * share, green * share, blue * share)
+    return pack4(np.float32(0), red * share, green * share, blue * share)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -206,22 +206,22 @@ def _composite(count, grid, pool, bench):  # type: ignore[no-untyped-def]
     side, spent = grid.brick + 2, np.float32(SPENT)
     for n in range(count, QUEUE):
         at[n] = pool.blocks * pool.size
-    sigma, mix = interpolated(
-        pool.values, at[0], at[1], at[2], at[3], 4 * side, 4 * side * side, together(x[0], x[1], x[2], x[3]), together(y[0], y[1], y[2], y[3]),
-        together(z[0], z[1], z[2], z[3]),
+    sigma, mix = trilinear4(
+        pool.values, at[0], at[1], at[2], at[3], 4 * side, 4 * side * side, pack4(x[0], x[1], x[2], x[3]), pack4(y[0], y[1], y[2], y[3]),
+        pack4(z[0], z[1], z[2], z[3]),
     )  # fmt: skip
-    e0, e1, e2, e3 = apart(exp2_minus(sigma))
-    c0, c1, c2, c3 = quarters(logistic(mix))
+    e0, e1, e2, e3 = unpack4(exp2_neg4(sigma))
+    c0, c1, c2, c3 = split16(sigmoid(mix))
     # A ray that is spent ends at once, wherever its samples are cut into groups.
     l0 = state[LIGHT]
     l1 = l0 * e0
     l2 = l1 * e1 if l1 >= spent else l1
     l3 = l2 * e2 if l2 >= spent else l2
     l4 = l3 * e3 if l3 >= spent else l3
-    total = plus_scaled(plus_scaled(four_at(state, TOTAL), l0 - l1, c0), l1 - l2, c1)
-    put_four(state, TOTAL, plus_scaled(plus_scaled(total, l2 - l3, c2), l3 - l4, c3))
+    total = add_scaled4(add_scaled4(load4(state, TOTAL), l0 - l1, c0), l1 - l2, c1)
+    store4(state, TOTAL, add_scaled4(add_scaled4(total, l2 - l3, c2), l3 - l4, c3))
     if l4 <= _HALF and l0 > _HALF:
-        s0, s1, s2, s3 = apart(sigma)
+        s0, s1, s2, s3 = unpack4(sigma)
         first = min(_crossing(l0, l1, s0, along[0]), _crossing(l1, l2, s1, along[1]))
         state[HIT] = min(first, _crossing(l2, l3, s2, along[2]), _crossing(l3, l4, s3, along[3]))
     used = np.float32(min(count, 1 + (l1 >= spent) + (l2 >= spent) + (l3 >= spent)))
@@ -240,15 +240,15 @@ def _composite_exactly(count, grid, view, pool, bench, look_x, look_y, look_z): 
         state[MIXED] += _ONE
         fx, fy, fz = bench.x[n], bench.y[n], bench.z[n]
         sigma = _trilinear(pool.values, at[n], j, i, fx, fy, fz)
-        left = light * _exp2_minus(sigma)
+        left = light * _exp2_neg(sigma)
         owed = state[OWED] + light - left
         if owed > np.float32(FAINT):
             if state[LOOKED] == 0:
                 basis_into(look_x, look_y, look_z, view.degree, bench.basis)
                 state[LOOKED] = _ONE
             state[LOOKUPS] += _ONE
-            colour = logistic(_exact(pool.words, at[n], j, i, fx, fy, fz, grid, bench.basis))
-            put_four(state, TOTAL, plus_scaled(four_at(state, TOTAL), owed, colour))
+            colour = sigmoid(_exact(pool.words, at[n], j, i, fx, fy, fz, grid, bench.basis))
+            store4(state, TOTAL, add_scaled4(load4(state, TOTAL), owed, colour))
             owed = np.float32(0)
         state[OWED] = owed
         state[HIT] = min(state[HIT], _crossing(light, left, sigma, bench.along[n]))
