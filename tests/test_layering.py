@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -135,6 +136,13 @@ def test_functions_are_short() -> None:
 def test_functions_take_few_arguments() -> None:
     counts = {name: len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs) for name, kernel, node in functions() if not kernel}
     assert {name: count for name, count in counts.items() if count > ARGUMENTS} == {}
+
+
+def test_tests_import_no_other_test_module() -> None:
+    """What several of them need lies in modules of its own; this covers programs that tests start as well."""
+    pattern = re.compile(r"^\s*(?:from|import)\s+tests[\w.]*\.(?:test_\w+|conftest)", re.MULTILINE)
+    found = {str(path.relative_to(ROOT)): pattern.findall(path.read_text(encoding="utf-8")) for path in modules("tests")}
+    assert {path: names for path, names in found.items() if names} == {}
 
 
 def test_nothing_unpickles_or_evaluates() -> None:

@@ -17,14 +17,10 @@ import torch
 from efficientnerf.backends.numba import mlp, tiles
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.fields import hash
+from tests.efficientnerf.networks import passes, weights_of
 
 ROOT = Path(__file__).resolve().parents[2]
 SHAPES = [(24, 64, 2, 28), (24, 32, 1, 1), (6, 8, 1, 13), (2, 40, 3, 4), (10, 20, 4, 49), (34, 100, 2, 16)]  # inputs, width, hidden layers, outputs
-
-
-def weights_of(inputs: int, width: int, layers: int, outputs: int, rng: np.random.Generator) -> list[np.ndarray]:
-    shapes = [(width, inputs), *[(width, width)] * (layers - 1), (outputs, width)]
-    return [(rng.normal(size=shape) * np.sqrt(2 / shape[1])).astype(np.float32) for shape in shapes]
 
 
 class Rounding(torch.autograd.Function):
@@ -54,14 +50,6 @@ def expected(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, 
     out = y @ narrow(parameters[-1]).t()
     out.backward(narrow(torch.tensor(grad, dtype=torch.float64)))
     return [out.detach(), x.grad, *(w.grad for w in parameters)]  # type: ignore[list-item]
-
-
-def passes(features: np.ndarray, weights: list[np.ndarray], grad: np.ndarray, bfloat16: bool, offset: float = 0.0) -> list[np.ndarray]:
-    packed = mlp.pack_weights(weights, bfloat16)
-    out = np.full((features.shape[1], len(weights[-1])), np.nan, np.float32)
-    activations = mlp.forward(features, packed, offset, out, keep=True)
-    grad_inputs, grad_weights = mlp.backward(grad, features, packed, activations, [w.shape for w in weights])
-    return [out, grad_inputs, *grad_weights]
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
@@ -175,7 +163,7 @@ PROGRAM = """
 import sys
 import numpy as np
 from efficientnerf.backends.numba import tiles
-from tests.efficientnerf.test_cpu_mlp import passes, weights_of
+from tests.efficientnerf.networks import passes, weights_of
 
 assert not tiles.DOTS and tiles.VECTORS == 1
 rng = np.random.default_rng(5)

@@ -10,7 +10,7 @@ from torch import Tensor
 from efficientnerf.backends.numba import adam
 from efficientnerf.fields.hash import HashField, encode_reference
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.test_kernels import RATES, gradients
+from tests.efficientnerf.steps import RATES, gradients
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.hash_grid")
 cuda_adam = pytest.importorskip("efficientnerf.backends.triton.adam")

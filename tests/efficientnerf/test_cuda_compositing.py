@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from efficientnerf.rendering import compositing
+from tests.efficientnerf.bundles import Bundle, bundle, in_float32
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.test_compositing import Bundle, bundle, in_float32
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.compositing")
 

@@ -11,8 +11,8 @@ import torch
 from efficientnerf.geometry.spaces import BoundedSpace, space_from
 from efficientnerf.sampling import samples as sampling
 from efficientnerf.sampling.samples import Samples
+from tests.efficientnerf.coarse_rays import BOUNDS, STEP, Rays, coarse_samples_of, make_rays, voxels_of
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.test_sampling import BOUNDS, STEP, Rays, coarse_samples_of, make_rays, voxels_of
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.sampling")
 

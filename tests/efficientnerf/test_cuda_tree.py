@@ -13,8 +13,7 @@ from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering.render import render_tree_reference
 from tests import reference
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.test_render import TREES, looking, tensors
-from tests.efficientnerf.trees import LOW, random_tree, rays_at, uniform_tree
+from tests.efficientnerf.trees import LOW, TREES, looking, random_tree, rays_at, tensors, uniform_tree
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.tree")
 

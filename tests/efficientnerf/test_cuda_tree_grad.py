@@ -18,9 +18,9 @@ from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.test_ndc_tree import camera_at, wall
-from tests.efficientnerf.test_optimising import ball_tree, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.refinements import ball_tree, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+from tests.efficientnerf.walls import camera_at, wall
 
 kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
 device = pytest.importorskip("efficientnerf.asset.refinement_device")

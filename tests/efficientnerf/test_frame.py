@@ -10,7 +10,7 @@ import pytest
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.isosurface import NoSurface, points, surface
 from efficientnerf.surface.mesh import topology
-from tests.efficientnerf.test_ndc_tree import DEPTH, NEAR, wall
+from tests.efficientnerf.walls import DEPTH, NEAR, wall
 
 SLANT = 0.3
 

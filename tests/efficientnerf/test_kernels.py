@@ -16,14 +16,9 @@ from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.training.loop import BETA1, Adam
 from efficientnerf.training.pixels import Pixels
 from tests import reference
+from tests.efficientnerf.steps import RATES, gradients
 
 ROOT = Path(__file__).resolve().parents[2]
-RATES = [0.01, 0.02, 0.015, 0.01]
-
-
-def gradients(shape: tuple[int, ...] = (50, 2)) -> list[torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    return [torch.randn(shape, generator=generator) * 10.0 ** -(2 * n) for n in range(len(RATES))]
 
 
 def stepped(name: str, grads: list[torch.Tensor]) -> nn.Parameter:

@@ -18,10 +18,9 @@ from efficientnerf.rendering.render import render_tree_reference
 from efficientnerf.surface.isosurface import surface
 from tests import reference
 from tests.efficientnerf.nerftree_reader import Tree
-from tests.efficientnerf.test_ndc_tree import camera_at, wall
-from tests.efficientnerf.test_optimising import gradients, gradients_by_autograd, seen_at_random
-from tests.efficientnerf.test_render import TREES, looking, tensors
-from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tensors, uniform_tree
+from tests.efficientnerf.walls import camera_at, wall
 
 
 def nearest(brick: int, degree: int = 1, **more: object) -> NerfTree:

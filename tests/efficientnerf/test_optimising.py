@@ -8,7 +8,6 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
-import torch
 
 from efficientnerf.asset import refinement
 from efficientnerf.asset.bake import voxel_coordinates, with_voxels
@@ -16,46 +15,11 @@ from efficientnerf.asset.refinement import Targets, error, greatest_weights, gri
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
-from efficientnerf.rendering.render import render_tree_reference
 from tests.efficientnerf.balls import BOUNDS, pixels
+from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
 TREES = [(1, 0), (3, 1), (4, 2), (2, 3)]
-
-
-def seen_at_random(count: int, matte: float, dtype: Any = np.float64) -> RayTargets:
-    rng = np.random.default_rng(5)
-    shapes: tuple[Any, ...] = ((count, 3), (count, 3), count, count)
-    return RayTargets(*(rng.random(shape).astype(dtype) for shape in shapes), matte)
-
-
-def loss_by_torch(colour: torch.Tensor, opacity: torch.Tensor, seen: RayTargets) -> torch.Tensor:
-    truth, behind, gain, matte = (torch.from_numpy(a).double() for a in (seen.colour, seen.background, seen.transmittance, seen.opacity))
-    off = gain[:, None] * (colour + (1 - opacity)[:, None] * behind) - truth
-    return (off**2).sum(dim=1) + seen.opacity_weight * (opacity - matte) ** 2
-
-
-def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets) -> tuple[np.ndarray, ...]:
-    """What `gradients` gives, by torch's reference in float64."""
-    density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
-    loss = loss_by_torch(*render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
-    loss.sum().backward()
-    assert density.grad is not None
-    assert sh.grad is not None
-    return loss.detach().numpy(), density.grad.numpy(), sh.grad.numpy()
-
-
-def gradients(
-    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets, dtype: Any = np.float64, stop: float = 0.0
-) -> tuple[np.ndarray, ...]:
-    """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels."""
-    start, along, bases = in_voxels(tree, origins, directions)
-    density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
-    records = SampleRecords(dtype)
-    loss, counts = kernels.forward_backward(grid_of(tree), start, along, bases.astype(dtype), density, sh, seen, records, stop=stop)
-    by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)
-    kernels.sum_gradients(records, counts, bases.astype(dtype), by_density, by_sh)
-    return loss, by_density, by_sh.reshape(tree.sh.shape)
 
 
 @pytest.mark.parametrize("matte", [0.0, 0.7])
@@ -127,13 +91,6 @@ def test_records_grow_until_all_samples_fit() -> None:
     kernels.sum_gradients(records, counts, bases, by_density, by_sh)
     expected = gradients(tree, origins, directions, seen, np.float32, kernels.STOP)
     np.testing.assert_array_equal(by_density, expected[1])
-
-
-def ball_tree(side: int = 20) -> NerfTree:
-    """Fog of one grey all over the box of the ball's pictures."""
-    tree = uniform_tree((side // 4,) * 3, voxel=2 / side, sigma=0.5, logit=0.0)
-    sh = np.zeros((len(tree.density_values), 4, 3), np.float32)
-    return replace(tree, bounds_min=BOUNDS[0], harmonics=sh, background=(1.0, 1.0, 1.0))
 
 
 def fitted(tree: NerfTree, targets: Targets, steps: int, **more: Any) -> tuple[NerfTree, list[float]]:

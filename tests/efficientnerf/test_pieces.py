@@ -11,7 +11,7 @@ from efficientnerf.asset.bake import voxel_coordinates
 from efficientnerf.asset.components import small_components
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.ndc import Ndc
-from tests.efficientnerf.test_ndc_tree import looking_along_y
+from tests.efficientnerf.walls import looking_along_y
 
 SHAPE = (12, 12, 12)
 

@@ -8,24 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.tree import LOOKUPS, NerfTree, Rendering
+from efficientnerf.asset.tree import LOOKUPS, Rendering
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.rendering.render import FieldRenderer, render_tree_reference
 from tests import reference
 from tests.efficientnerf.balls import pose, untrained
-from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
-
-TREES = [(1, 0), (3, 1), (4, 2), (5, 3), (2, 4)]
-
-
-def looking(tree: NerfTree, side: int = 20) -> Camera:
-    at = pose(0.7, 0.4)
-    at[:3, 3] += (tree.bounds_min + tree.bounds_max) / 2
-    return Camera("view", side, side + 3, "SIMPLE_PINHOLE", (1.5 * side, side / 2, side / 2), at)
-
-
-def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
-    return [torch.from_numpy(a) for a in arrays]
+from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tensors, uniform_tree
 
 
 @pytest.mark.parametrize(("brick", "degree"), TREES)

@@ -5,56 +5,25 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 
 from efficientnerf.backends import dispatch
-from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace, Space, space_from
+from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace, space_from
 from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.sampling import samples
 from efficientnerf.sampling.samples import Samples
 from tests import reference
+from tests.efficientnerf.coarse_rays import BOUNDS, SIDE, STEP, Rays, coarse_samples_of, make_rays, voxels_of
 
-BOUNDS = np.array([[-1.0, -0.5, -0.25], [1.0, 0.5, 0.75]])
-STEP, SIDE = 0.11, 6
 FINDERS = {"torch": samples.valid_samples, "kernel": dispatch.valid_samples}
 DIVIDERS = {"torch": samples.pivotal_samples, "kernel": dispatch.pivotal_samples}
 
 
-class Rays(NamedTuple):
-    origins: torch.Tensor
-    directions: torch.Tensor
-    near: torch.Tensor
-    far: torch.Tensor
-    offset: torch.Tensor
-
-
-def make_rays(kind: str, count: int = 60) -> Rays:
-    rng = np.random.default_rng(len(kind))
-    target = rng.uniform(BOUNDS[0], BOUNDS[1], (count, 3))
-    away = rng.normal(size=(count, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    origins, directions = target + 3 * away, -away
-    if kind == "inside":
-        origins = target
-    elif kind == "missing":
-        directions = away
-    elif kind == "parallel":  # to an axis, some through the box and some beside it
-        directions = np.eye(3)[np.arange(count) % 3] * rng.choice([-1.0, 1.0], (count, 1))
-        origins = np.where(directions == 0, target * rng.choice([1.0, 3.0], (count, 1)), -2 * directions)
-    near, far = np.full(count, 0.05), rng.uniform(2.5, 6.0, count)
-    return Rays(*(torch.from_numpy(a.astype(np.float32)) for a in (origins, directions, near, far, rng.random(count))))
-
-
 def double(rays: Rays) -> Rays:
     return Rays(*(t.double() for t in rays))
-
-
-def voxels_of(seed: int = 0) -> torch.Tensor:
-    return torch.from_numpy(np.random.default_rng(seed).random((SIDE, SIDE, SIDE)).astype(np.float32))
 
 
 @pytest.mark.parametrize("kind", ["outside", "inside", "missing", "parallel"])
@@ -186,12 +155,6 @@ def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[.
     found = choose(torch.from_numpy(weight), torch.from_numpy(first), float(np.float32(0.3)), most)
     assert found.dtype == torch.bool
     assert np.array_equal(found.numpy(), expected)
-
-
-def coarse_samples_of(rays: Rays, contracted: bool) -> tuple[Space, Samples, torch.Tensor]:
-    space = space_from(BOUNDS, contracted=contracted)
-    coarse = samples.valid_samples(space, *rays, STEP, 60, voxels_of().to(rays.origins.dtype), 0.4)
-    return space, coarse, torch.rand(len(coarse.start), generator=torch.Generator().manual_seed(0)) < 0.5
 
 
 @pytest.mark.parametrize("divider", DIVIDERS)

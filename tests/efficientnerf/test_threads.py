@@ -16,7 +16,7 @@ import numpy as np
 
 from efficientnerf.training.loop import state_of, train, trainer
 from tests.efficientnerf.balls import pixels, untrained
-from tests.efficientnerf.test_cpu_mlp import passes, weights_of
+from tests.efficientnerf.networks import passes, weights_of
 from tests.efficientnerf.trees import random_tree, rays_at
 
 print(numba.get_num_threads())

@@ -5,8 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.cameras import Camera
+from tests.efficientnerf.balls import pose
 
 LOW = np.array([-0.7, 0.2, -1.1])
 
@@ -42,3 +45,16 @@ def rays_at(tree: NerfTree, count: int = 60, seed: int = 0) -> tuple[np.ndarray,
     directions = np.where((kind == 2)[:, None], axis, directions / np.linalg.norm(directions, axis=1, keepdims=True))
     origins = target - directions * np.where(kind == 1, 0.0, 4.0)[:, None]
     return np.where((kind == 3)[:, None], target + 3 * directions, origins), directions
+
+
+TREES = [(1, 0), (3, 1), (4, 2), (5, 3), (2, 4)]
+
+
+def looking(tree: NerfTree, side: int = 20) -> Camera:
+    at = pose(0.7, 0.4)
+    at[:3, 3] += (tree.bounds_min + tree.bounds_max) / 2
+    return Camera("view", side, side + 3, "SIMPLE_PINHOLE", (1.5 * side, side / 2, side / 2), at)
+
+
+def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
+    return [torch.from_numpy(a) for a in arrays]

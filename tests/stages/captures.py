@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from efficientnerf.geometry.cameras import MODELS, Camera, opengl_from_pose, project
+from efficientnerf.geometry.cameras import MODELS, Camera, opengl_from_pose, project, rays
+from stages.io.capture import Capture
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 40.0
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -188,3 +189,23 @@ WRITERS: dict[str, tuple[str, Callable[..., Path]]] = {
     "colmap txt": ("colmap", colmap_txt),
 }
 assert set(_NUMBERS) == set(MODELS)
+
+
+LENSES = {
+    "PINHOLE": (40.0, 42.0, 15.0, 13.0),
+    "SIMPLE_RADIAL": (40.0, 16.0, 12.0, -0.1),
+    "RADIAL": (40.0, 16.0, 12.0, -0.1, 0.02),
+    "OPENCV": (40.0, 41.0, 16.0, 12.0, -0.1, 0.02, 0.003, -0.002),
+    "FULL_OPENCV": (40.0, 41.0, 16.0, 12.0, 0.1, 0.02, 0.003, -0.002, 0.01, 0.2, 0.01, 0.001),
+    "OPENCV_FISHEYE": (30.0, 31.0, 16.0, 12.0, 0.05, -0.01, 0.001, 0.0),
+}
+
+
+def assert_same_rays(capture: Capture, truth: list[Camera]) -> None:
+    by_name = {Path(photo.camera.name).name: photo for photo in capture.photos}
+    assert set(by_name) == {camera.name for camera in truth}
+    for camera in truth:
+        photo = by_name[camera.name]
+        assert (photo.camera.width, photo.camera.height) == (camera.width, camera.height)
+        for found, expected in zip(rays(photo.camera), rays(camera), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-6)

@@ -24,8 +24,7 @@ from stages.io.png import write_png
 from stages.io.scene import Scene, View, load, save
 from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import ORBIT, SIMILARITY, job, poses
-from tests.stages.test_forward_facing import depths, row
-from tests.stages.test_lattice import forward_facing
+from tests.stages.forward_facing import depths, forward_facing, row
 
 QUICK: dict[str, Any] = {"resolution": 64, "visibility_rays": 4000, "weight_threshold": 0.0, "max_mib": 8, "samples_per_voxel": 4, "refine_steps": 0}
 

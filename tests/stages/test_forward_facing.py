@@ -15,26 +15,9 @@ from stages.framing.forward_facing import content_depths, forward_of, mean_pose
 from stages.framing.framing import frame
 from stages.io import importers
 from stages.io.capture import Capture, Photo
-from tests.efficientnerf.test_ndc_tree import wall
+from tests.efficientnerf.walls import wall
 from tests.stages import captures
-from tests.stages.test_framing import looking, some_rotation
-
-NEAR, FAR = 3.0, 40.0
-
-
-def row(count: int = 9, *, spread: float = 1.0, tilt: float = 0.1, focal: float = 1.2) -> list[Camera]:
-    """Cameras in a plane about the origin that look along +y, each a little elsewhere."""
-    rng = np.random.default_rng(0)
-    made = []
-    for k in range(count):
-        centre = rng.uniform(-1, 1, 3) * [spread, 0.05 * spread, 0.5 * spread]
-        aim = centre + [0, 5, 0] + rng.uniform(-1, 1, 3) * 5 * tilt
-        made.append(looking(centre, aim, focal=focal, name=f"{k:03d}.png"))
-    return made
-
-
-def depths(cameras: list[Camera], near: float = NEAR, far: float = FAR) -> np.ndarray:
-    return np.array([[near, far]] * len(cameras))
+from tests.stages.forward_facing import FAR, NEAR, depths, looking, row, some_rotation
 
 
 def in_pictures(cameras: list[Camera], near: float, far: float) -> np.ndarray:

@@ -14,20 +14,9 @@ from pipeline.errors import BadInput
 from stages.framing import scene_bounds
 from stages.framing.framing import Framing, estimated_up, frame, heading_of, rotation_to_z
 from stages.io.capture import Capture, Photo, SparsePoints
+from tests.stages.forward_facing import looking, some_rotation
 
 PLAIN = Path("a.png")
-
-
-def looking(centre: np.ndarray, target: np.ndarray, *, roll: float = 0.0, focal: float = 1.2, name: str = "a") -> Camera:
-    """A camera of 100 x 75 pixels at `centre` that looks at `target`, level in a world with z up but for `roll` radians."""
-    forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    turned = np.cos(roll) * right + np.sin(roll) * down
-    pose = np.eye(4)
-    pose[:3] = np.stack([turned, np.cross(forward, turned), forward, centre], -1)
-    return Camera(name, 100, 75, "SIMPLE_PINHOLE", (100 * focal, 50.0, 37.5), pose)
 
 
 def ring(count: int, radius: float, height: float, target: np.ndarray, *, arc: float = 360.0, start: float = 0.0, roll: float = 0.0) -> list[Camera]:
@@ -52,11 +41,6 @@ def capture_of(cameras: list[Camera], xyz: np.ndarray | None = None, *, moved: S
         points = SparsePoints(moved.points(xyz), np.zeros((count, 3), np.uint8), np.ones(count), tracks)
     photos = tuple(Photo(moved.camera(camera), PLAIN) for camera in cameras)
     return Capture("photographs", photos, None, points=points, **more)  # type: ignore[arg-type]
-
-
-def some_rotation(seed: int) -> np.ndarray:
-    q = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    return q * np.sign(np.linalg.det(q))
 
 
 def scene_points(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -8,37 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import Camera, opengl_from_pose, project, quarter_turned, rays
+from efficientnerf.geometry.cameras import opengl_from_pose, project, quarter_turned
 from stages.io import importers
 from stages.io.capture import Capture
 from stages.io.importers import colmap_model
 from stages.io.importers.description import describe_source
 from tests.stages import captures
-from tests.stages.captures import HEIGHT, SHARED, WIDTH, WRITERS, Settings
-
-LENSES = {
-    "PINHOLE": (40.0, 42.0, 15.0, 13.0),
-    "SIMPLE_RADIAL": (40.0, 16.0, 12.0, -0.1),
-    "RADIAL": (40.0, 16.0, 12.0, -0.1, 0.02),
-    "OPENCV": (40.0, 41.0, 16.0, 12.0, -0.1, 0.02, 0.003, -0.002),
-    "FULL_OPENCV": (40.0, 41.0, 16.0, 12.0, 0.1, 0.02, 0.003, -0.002, 0.01, 0.2, 0.01, 0.001),
-    "OPENCV_FISHEYE": (30.0, 31.0, 16.0, 12.0, 0.05, -0.01, 0.001, 0.0),
-}
+from tests.stages.captures import HEIGHT, LENSES, SHARED, WIDTH, WRITERS, Settings, assert_same_rays
 
 
 def read(folder: Path, **settings: object) -> Capture:
     chosen = Settings(**settings)  # type: ignore[arg-type]
     return importers.IMPORTERS[importers.detect(folder)].read(folder, chosen)
-
-
-def assert_same_rays(capture: Capture, truth: list[Camera]) -> None:
-    by_name = {Path(photo.camera.name).name: photo for photo in capture.photos}
-    assert set(by_name) == {camera.name for camera in truth}
-    for camera in truth:
-        photo = by_name[camera.name]
-        assert (photo.camera.width, photo.camera.height) == (camera.width, camera.height)
-        for found, expected in zip(rays(photo.camera), rays(camera), strict=True):
-            np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("how", WRITERS)

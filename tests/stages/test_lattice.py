@@ -17,29 +17,12 @@ from pipeline.errors import UsageError
 from pipeline.stage import settings_from
 from stages import train
 from stages.baking.resolution import ndc_pixel
-from stages.framing.forward_facing import forward_of
 from stages.io.field_file import load_renderer, space_of
-from stages.io.scene import Scene, View
 from stages.io.scene import load as load_scene
 from stages.training.hash_resolution import LARGEST, MOST, with_auto_sizes
 from tests.efficientnerf.balls import BOUNDS, settings
-from tests.stages.balls import ORBIT, SIMILARITY, job, poses
-from tests.stages.test_forward_facing import depths, row
-
-
-def forward_facing(side: int) -> Scene:
-    """A capture of nine cameras in a plane, pictures of `side` pixels."""
-    cameras = [_resized(camera, side) for camera in row()]
-    found = forward_of(cameras, depths(cameras))
-    assert not isinstance(found, str), found
-    views = tuple(View(f"images/{c.name}", None, "train", c, c, 3.0, 40.0) for c in cameras)
-    return Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found)
-
-
-def _resized(camera, side: int):  # type: ignore[no-untyped-def]
-    scale = side / camera.width
-    height = round(camera.height * scale)
-    return dataclasses.replace(camera, width=side, height=height, params=tuple(p * scale for p in camera.params))
+from tests.stages.balls import job, poses
+from tests.stages.forward_facing import forward_facing
 
 
 def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:

@@ -18,7 +18,7 @@ from stages.io.capture import SparsePoints
 from stages.io.exporters import cameras
 from stages.io.scene import Orbit, Scene, View
 from tests.stages import captures
-from tests.stages.test_importers import LENSES, assert_same_rays
+from tests.stages.captures import LENSES, assert_same_rays
 
 
 def scene_of(model: str = "SIMPLE_PINHOLE") -> Scene:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pytest
 from msgspec import Meta
@@ -14,26 +13,9 @@ from msgspec import Meta
 from efficientnerf.settings import PositiveInt, setting
 from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
+from tests.workflows.command import Result
 from workflows import asset
 from workflows.cli.main import main
-
-
-@dataclass(frozen=True)
-class Result:
-    """What a call of the command line gave."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def objects(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in self.out.splitlines()]
-
-    @property
-    def object(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.out)
-        return found
 
 
 @pytest.fixture

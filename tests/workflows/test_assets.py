@@ -10,7 +10,7 @@ import pytest
 
 from efficientnerf.asset.format import WRITERS, describe, load, save
 from tests.efficientnerf.trees import random_tree
-from tests.workflows.conftest import Result
+from tests.workflows.command import Result
 from workflows.cli.assets import LAYOUTS
 
 Enerf = Callable[..., Result]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.workflows.conftest import Result
+from tests.workflows.command import Result
 
 Enerf = Callable[..., Result]
 SIZE = (48, 36)

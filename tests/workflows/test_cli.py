@@ -6,14 +6,11 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.workflows.conftest import Result
-
-Enerf = Callable[..., Result]
+from tests.workflows.command import Enerf, Result
 
 
 def recorded(run: Path) -> dict[str, dict[str, object]]:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import NerfTree
-from tests.workflows.conftest import Result
+from tests.workflows.command import Result
 
 Enerf = Callable[..., Result]
 SCALE = 0.5

@@ -10,8 +10,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from pipeline.run import Run
-from tests.workflows.conftest import Result
-from tests.workflows.test_cli import Enerf
+from tests.workflows.command import Enerf, Result
 from workflows.report.page import page
 
 
