@@ -1,9 +1,9 @@
 """Four kinds of scenes: what is in them, and where the cameras of each split stand.
 
-    object   an object with alpha: bounded
-    court    an object in a court with surroundings out to 40 units: unbounded
-    window   a street seen from one side, from 2 to 60 units away: forward-facing
-    gloss    mirrors, highlights and wires thinner than a pixel, with alpha: bounded
+object   an object with alpha: bounded
+court    an object in a court with surroundings out to 40 units: unbounded
+window   a street seen from one side, from 2 to 60 units away: forward-facing
+gloss    mirrors, highlights and wires thinner than a pixel, with alpha: bounded
 """
 
 from __future__ import annotations

@@ -118,9 +118,7 @@ class Capsule:
         a, axis = np.array(self.a), np.array(self.b) - np.array(self.a)
         offset, long = origins - a, float(axis @ axis)
         along_d, along_o = directions @ axis, offset @ axis
-        t = _first_root(
-            long - along_d**2, long * (offset * directions).sum(-1) - along_o * along_d, long * ((offset**2).sum(-1) - self.radius**2) - along_o**2
-        )
+        t = _first_root(long - along_d**2, long * (offset * directions).sum(-1) - along_o * along_d, long * ((offset**2).sum(-1) - self.radius**2) - along_o**2)
         with np.errstate(invalid="ignore"):
             at = along_o + t * along_d
             best = np.where(np.isfinite(t) & (at > 0) & (at < long), t, np.inf)

@@ -15,6 +15,7 @@ from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.files import write_atomically
 from pipeline.stage import settings_from
 from stages.artifacts import TrainOutputs
+from stages.renamed_settings import updated
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -122,7 +123,13 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
         ndc = None if about.get("ndc") is None else Ndc.from_json(about["ndc"])
         space = space_from(np.asarray(about["bounds"], np.float64).reshape(2, 3), contracted=bool(about["contracted"]), ndc=ndc)
         span = (float(about["near"]), float(about["far"]))
-        m = model(space, settings_from(TrainSettings, about["settings"]), None if background is None else tuple(background), device, span)
+        m = model(
+            space,
+            settings_from(TrainSettings, updated("train", TrainSettings, about["settings"])),
+            None if background is None else tuple(background),
+            device,
+            span,
+        )
         restore(m, tensors)
         return FieldRenderer(m, *span)
     except (UsageError, KeyError, TypeError, ValueError) as error:

@@ -12,7 +12,7 @@ from pipeline.run import NAME, Run
 from pipeline.stage import Stage
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, read_config, read_preset, seconds_of, table_of
-from workflows.cli.target import open_run, resume_command
+from workflows.cli.target import check_names, open_run, resume_command
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,7 @@ def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
     if preset is not None:
         settings.put_table(read_preset(preset).table, f"preset {preset}")
     elif standing is not None:
+        check_names(standing)
         dropped = settings.put_recorded(standing.settings)
         if dropped:
             warnings.append(f"settings that this version does not have are left out: {', '.join(dropped)}")

@@ -16,6 +16,7 @@ from typing import Any
 
 from pipeline.errors import BadInput, UnknownSetting, UsageError
 from pipeline.stage import settings_dict, settings_from
+from stages.renamed_settings import moved, updated
 from stages.settings import SettingInfo, describe_settings
 
 Table = Mapping[str, Mapping[str, Any]]
@@ -115,6 +116,8 @@ class Settings:
     def _info(self, stage: str, name: str, origin: str) -> SettingInfo:
         if stage not in self.about:
             raise UnknownSetting(f"{origin}: no stage {stage!r}.{nearest(stage, self.about)} Stages: {', '.join(self.about)}.")
+        if name not in self.about[stage] and (sentence := moved(stage, name)) is not None:
+            raise UnknownSetting(f"{origin}: {sentence}")
         if name not in self.about[stage]:
             known = [f"{stage}.{entry}" for entry in self.about[stage]]
             close = nearest(f"{stage}.{name}", known) or nearest(name, [f"{s}.{n}" for s in self.about for n in self.about[s]])
@@ -143,10 +146,10 @@ class Settings:
                 self.put(stage, name, [value], origin)
 
     def put_recorded(self, table: Table) -> list[str]:
-        """Take over what a run recorded; returns the names that this version no longer has, or no longer admits."""
+        """Take over what a run recorded, under names of today; returns those that this version no longer has, or no longer admits."""
         dropped = []
         for stage, entries in table.items():
-            for name, value in entries.items():
+            for name, value in (updated(stage, self.types[stage], entries) if stage in self.types else entries).items():
                 try:
                     self.put(stage, name, [value], "run.json")
                 except UsageError:

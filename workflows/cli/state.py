@@ -22,9 +22,10 @@ def status(run_folder: Path, as_json: bool) -> None:
     from pipeline.decide import survey
     from workflows import asset
     from workflows.cli.progress import duration, size, write_json
-    from workflows.cli.target import open_run
+    from workflows.cli.target import check_names, open_run
 
     run = open_run(run_folder)
+    check_names(run)
     stages: list[dict[str, Any]] = []
     for decision in survey(asset.STAGES, run):
         made = decision.manifest
@@ -121,10 +122,11 @@ def report(run_folder: Path, as_json: bool) -> None:
     from pipeline.decide import survey
     from workflows import asset
     from workflows.cli.progress import write_json
-    from workflows.cli.target import open_run
+    from workflows.cli.target import check_names, open_run
     from workflows.report.page import write_report
 
     run = open_run(run_folder)
+    check_names(run)
     path = write_report(run, survey(asset.STAGES, run))
     if as_json:
         write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), "exit_code": 0})

@@ -121,9 +121,7 @@ def composite_backward(  # type: ignore[no-untyped-def]
                 density, slope = activate_density(raw[n, 0], exponential)
                 w = weight[n]
                 middle = at + np.float32(0.5) * length[n]
-                own = grad_weight[n] + _weight_grad(
-                    g0, g1, g2, rgb[n], g_distortion, w, length[n], middle, front_weight, front_moment, all_weight, all_moment
-                )
+                own = grad_weight[n] + _weight_grad(g0, g1, g2, rgb[n], g_distortion, w, length[n], middle, front_weight, front_moment, all_weight, all_moment)
                 front_weight += w
                 front_moment += w * middle
                 at += length[n]

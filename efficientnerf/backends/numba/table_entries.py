@@ -75,9 +75,7 @@ def prefetch(typing_context: Any, address: Any, index: Any) -> Any:
 
 
 @intrinsic
-def adam_line(
-    typing_context: Any, value: Any, grad: Any, first: Any, second: Any, n: Any, beta1: Any, beta2: Any, scale1: Any, scale2: Any, eps: Any
-) -> Any:
+def adam_line(typing_context: Any, value: Any, grad: Any, first: Any, second: Any, n: Any, beta1: Any, beta2: Any, scale1: Any, scale2: Any, eps: Any) -> Any:
     """Adam on those of the sixteen values from n on whose gradient is not zero, and clear the gradient; reads nothing else where all gradients are zero."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
