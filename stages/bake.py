@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import Pixels
     from stages.baking.resolution import Choice
-    from stages.framing.forward_facing import Forward
+    from stages.framing.forward_facing import ForwardFacing
     from stages.io.scene import Scene
 
 
@@ -192,7 +192,7 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
     }
 
 
-def spiral_of(forward: Forward) -> dict[str, Any]:
+def spiral_of(forward: ForwardFacing) -> dict[str, Any]:
     """What a camera path before a forward-facing scene has to know; see FORMAT.md."""
     return {
         "radii": [float(x) for x in forward.radii],

@@ -75,7 +75,7 @@ class PosesSettings:
 
 def run(job: Job) -> None:
     """Write scene.json, images/, masks/, points.safetensors, contact_sheet.png and report.json. Raises BadInput."""
-    from stages.framing import framing
+    from stages.framing import training_frame
     from stages.io import working_images
     from stages.pictures.contact_sheet import write_contact_sheet
 
@@ -92,7 +92,7 @@ def run(job: Job) -> None:
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].renders)
     capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
-    framed = framing.frame(capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space)
+    framed = training_frame.find_training_frame(capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space)
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = tuple(
@@ -105,7 +105,7 @@ def run(job: Job) -> None:
             near=float(near),
             far=float(far),
         )
-        for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far, strict=True)
+        for photo, files, split, (near, far) in zip(capture.photos, written, splits, framed.near_far_planes, strict=True)
     )
     if capture.points is not None:
         save_points(replace(capture.points, xyz=world.points(capture.points.xyz)), job.out)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from stages.framing.forward_facing import Forward
+    from stages.framing.forward_facing import ForwardFacing
     from stages.io.scene import Scene
 
 LEAST = 32  # voxels along the longest side
@@ -70,7 +70,7 @@ def budget_of(s: Scene, given: int | None) -> int:
     return int(np.clip(NDC_BYTES * across * down / 2**20, MIB, NDC_MIB))
 
 
-def ndc_pixel(s: Scene, forward: Forward) -> float:
+def ndc_pixel(s: Scene, forward: ForwardFacing) -> float:
     """How wide a pixel of the median camera is in normalised device coordinates, at any depth."""
     return forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
 

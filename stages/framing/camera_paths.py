@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.ndc import Ndc
 
-WIDEST_FIT = 50.0  # degrees: beyond it a picture is all perspective, so the camera steps back instead
-ROOM = 1.1  # air around what is shown
-STRAYS = 0.005  # share of the occupied cells that may leave the picture: specks at the edge of the box do not decide how large the subject is
-FIT_POINTS = 4000
+MAX_FITTED_FOV = 50.0  # degrees: beyond it a picture is all perspective, so the camera steps back instead
+FIT_MARGIN = 1.1  # air around what is shown
+OUTLIER_FRACTION = 0.005  # share of the occupied cells that may leave the picture: specks at the edge of the box do not decide how large the subject is
+MAX_FITTED_POINTS = 4000
 SPIRAL_TURNS = 2
-SPIRAL_VIEW = 0.95  # of the field of view that all pictures cover: what a spiral shows, so that it seldom leaves them
-LARGEST_FILE = 64 << 20
-LARGEST_SIDE = 16384
-LARGEST_COUNT = 100_000
+SPIRAL_FOV_RATIO = 0.95  # of the field of view that all pictures cover: what a spiral shows, so that it seldom leaves them
+MAX_FILE = 64 << 20
+MAX_SIZE = 16384
+MAX_CAMERAS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def occupied_points(tree: NerfTree) -> np.ndarray:
     cells = np.argwhere(tree.brick_index >= 0)
     if not len(cells) and tree.ndc is None:
         return np.stack(np.meshgrid(*np.stack([tree.bounds_min, tree.bounds_max]).T, indexing="ij"), -1).reshape(-1, 3)
-    cells = cells[:: max(1, len(cells) // FIT_POINTS)]
+    cells = cells[:: max(1, len(cells) // MAX_FITTED_POINTS)]
     points = np.asarray(tree.bounds_min) + (cells + 0.5) * (tree.brick * tree.voxel)
     if tree.ndc is None:
         return points
@@ -137,7 +137,7 @@ def occupied_points(tree: NerfTree) -> np.ndarray:
     return np.asarray(tree.ndc.world(near))
 
 
-def extent_seen(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> tuple[float, float]:
+def fitted_field_of_view(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> tuple[float, float]:
     """Tangents of half the vertical field of view in which all poses see the points (N, 3), but for a few strays, and of how far below the middle of their
     view its middle has to lie for that; infinite and 0 where they stand among the points.
 
@@ -151,7 +151,7 @@ def extent_seen(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) 
     x, y = local[..., 0] / depth, local[..., 1] / depth
 
     def most(tangents: np.ndarray) -> float:
-        return float(np.sort(np.where(near, np.inf, tangents).max(axis=0))[math.ceil((1.0 - STRAYS) * len(points)) - 1])
+        return float(np.sort(np.where(near, np.inf, tangents).max(axis=0))[math.ceil((1.0 - OUTLIER_FRACTION) * len(points)) - 1])
 
     above, below = most(-y), most(y)
     if not math.isfinite(above + below):
@@ -186,10 +186,10 @@ def turntable_cameras(
     distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
     orbit = Orbit(orbit.centre, distance, orbit.elevation if elevation is None else elevation, orbit.forward_facing, orbit.heading)
     points = occupied_points(tree)
-    widest = math.tan(math.radians(WIDEST_FIT / 2))
+    widest = math.tan(math.radians(MAX_FITTED_FOV / 2))
 
     def needed(poses: list[np.ndarray]) -> float:
-        return ROOM * extent_seen(poses, points, width / height)[0]
+        return FIT_MARGIN * fitted_field_of_view(poses, points, width / height)[0]
 
     poses = turntable_poses(orbit, frames, sway=sway)
     # Captures from one side show nothing of what lies beyond their pictures, so there the camera stays and the asset may leave the picture.
@@ -199,8 +199,8 @@ def turntable_cameras(
                 break
             orbit = Orbit(orbit.centre, 1.1 * orbit.radius, orbit.elevation, orbit.forward_facing, orbit.heading)
             poses = turntable_poses(orbit, frames, sway=sway)
-    half, drop = extent_seen(poses, points, width / height)
-    half, drop = (min(widest, ROOM * half), drop) if fov is None else (math.tan(math.radians(fov / 2)), 0.0)
+    half, drop = fitted_field_of_view(poses, points, width / height)
+    half, drop = (min(widest, FIT_MARGIN * half), drop) if fov is None else (math.tan(math.radians(fov / 2)), 0.0)
     focal = 0.5 * height / half
     lens = (focal, width / 2, height / 2 - focal * drop)
     return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
@@ -217,7 +217,7 @@ def _spiral_cameras(tree: NerfTree, ndc: Ndc, frames: int, width: int, height: i
         raise BadInput(f"asset: its spiral cannot be read ({error}). Bake it again.") from error
     if len(radii) != 3 or not np.isfinite([*radii, focus, across, down]).all() or min(focus, across, down) <= 0:
         raise BadInput(f"asset: its spiral is {str(given)[:200]}; expected three radii, a positive focus and two positive tangents. Bake it again.")
-    half = SPIRAL_VIEW * min(down, across * height / width) if fov is None else math.tan(math.radians(fov / 2))
+    half = SPIRAL_FOV_RATIO * min(down, across * height / width) if fov is None else math.tan(math.radians(fov / 2))
     focal = 0.5 * height / half
     poses = spiral_poses(ndc.world_from_camera, radii, focus, frames)
     return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]
@@ -232,7 +232,7 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
 
     BadInput says what is wrong with the file.
     """
-    document = read_json(path, "Expected a camera path as nerfstudio's viewer exports it.", limit=LARGEST_FILE)
+    document = read_json(path, "Expected a camera path as nerfstudio's viewer exports it.", limit=MAX_FILE)
     if not isinstance(document, dict) or not isinstance(document.get("camera_path"), list):
         hint = " It looks like a data set: `enerf run` reads those." if isinstance(document, dict) and "frames" in document else ""
         raise BadInput(f"{path}: no list `camera_path`; expected a camera path as nerfstudio's viewer exports it.{hint}")
@@ -240,8 +240,8 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
     if kind != "perspective":
         raise BadInput(f"{path}: camera_type {str(kind)[:40]!r}; only perspective paths can be drawn.")
     entries = document["camera_path"]
-    if not 1 <= len(entries) <= LARGEST_COUNT:
-        raise BadInput(f"{path}: camera_path holds {len(entries)} cameras; expected 1 to {LARGEST_COUNT}.")
+    if not 1 <= len(entries) <= MAX_CAMERAS:
+        raise BadInput(f"{path}: camera_path holds {len(entries)} cameras; expected 1 to {MAX_CAMERAS}.")
     size = _size(document, path, width, height)
     cameras = []
     for k, entry in enumerate(entries):
@@ -261,7 +261,7 @@ def _size(document: dict[str, Any], path: Path, width: int | None, height: int |
         return width, height
     found = []
     for name in ("render_width", "render_height"):
-        value = _number(document.get(name), f"{path}: {name}", f"a whole number from 1 to {LARGEST_SIDE}", 0.0, LARGEST_SIDE + 1.0)
+        value = _number(document.get(name), f"{path}: {name}", f"a whole number from 1 to {MAX_SIZE}", 0.0, MAX_SIZE + 1.0)
         if value != int(value):
             raise BadInput(f"{path}: {name} is {value:g}; expected a whole number.")
         found.append(int(value))

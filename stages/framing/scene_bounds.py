@@ -1,4 +1,4 @@
-"""The box of interest of a capture: round its sparse points, its silhouettes, or the volume that its cameras see together."""
+"""Scene bounds of a capture: of its sparse points, of its visual hull, or of the volume that its cameras' frusta share."""
 
 from __future__ import annotations
 
@@ -10,76 +10,75 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, Similarity, project, resized
 from stages.io.capture import Capture, Photo, SparsePoints
 
-FEWEST_POINTS = 50  # sparse points that make a box
-IN_VIEW = 0.65  # of the best seen points' share of cameras: what fewer than this see is surroundings
-MOST_CAMERAS = 48  # that are asked; more, spread evenly over the capture, would change nothing
-SILHOUETTE = 160  # px, longest side at which alpha is read
-GRID = 32  # voxels to a side of the region searched
+MIN_POINTS = 50  # sparse points
+MIN_VIEW_RATIO = 0.65  # views of a point over those of the points with most: below, it belongs to the surroundings
+MAX_CAMERAS = 48  # evenly spaced over the capture
+SILHOUETTE_SIZE = 160  # px, longest side at which alpha is read
+GRID_SIZE = 32  # voxels along a side of the region searched
 
 
-def box_of_interest(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool) -> tuple[np.ndarray, np.ndarray, str]:
-    """Corners of an axis-aligned box in the turned frame, and a word on how it was found.
+def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool) -> tuple[np.ndarray, np.ndarray, str]:
+    """Corners of an axis-aligned box in the turned frame, and how it was found, in words.
 
     turned      the rotation from the capture's frame to one with z up
     focus       what the cameras look at, in the turned frame
     converging  whether their axes meet there
     """
     photos = [photo for photo in capture.photos if photo.split in (None, "train")] or list(capture.photos)
-    photos = photos[:: -(-len(photos) // MOST_CAMERAS)]
+    photos = photos[:: -(-len(photos) // MAX_CAMERAS)]
     cameras = [turned.camera(photo.camera) for photo in photos]
     ranges = [(photo.near, photo.far) for photo in photos]
-    cut_out = capture.background is not None  # without surroundings, the silhouettes say more than any points
-    for way in ("silhouettes", "sparse points") if cut_out else ("sparse points", "silhouettes"):
+    bounded = capture.background is not None  # silhouettes are more exact than points, where there are no surroundings
+    for way in ("silhouettes", "sparse points") if bounded else ("sparse points", "silhouettes"):
         if way == "silhouettes":
-            # A wide region to start from: parts of the subject that leave the picture in close views are cut by the other views.
-            found = box_of_silhouettes(photos, cameras, *box_seen_together(cameras, ranges, focus, converging, least=0.5))
-        elif capture.points is not None and len(capture.points.xyz) >= FEWEST_POINTS:
-            found = box_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, converging)
+            # A wide region to start from: parts of the subject outside of close views are cut by the others.
+            found = bounds_of_visual_hull(photos, cameras, *bounds_of_frusta(cameras, ranges, focus, converging, least=0.5))
+        elif capture.points is not None and len(capture.points.xyz) >= MIN_POINTS:
+            found = bounds_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, converging)
         else:
             found = None
         if found is not None:
             return *found, way
-    return *box_seen_together(cameras, ranges, focus, converging), "volume seen together"
+    return *bounds_of_frusta(cameras, ranges, focus, converging), "camera frusta"
 
 
-def box_of_points(points: SparsePoints, cameras: Sequence[Camera], converging: bool) -> tuple[np.ndarray, np.ndarray] | None:
+def bounds_of_points(points: SparsePoints, cameras: Sequence[Camera], converging: bool) -> tuple[np.ndarray, np.ndarray] | None:
     """A box round the points that most cameras have in view; None if too few remain.
 
-    What lies behind a subject is seen from one side only, and what is seen by few is not what the photographs are of. Where the cameras look the
-    same way they all see the background: there, depth is limited instead, as far as the parallax still carries. Where they pass
-    through the scene, as along a street, no part of it is seen by most, and the box holds all of it that is near their path.
+    Points with few views are background. In forward-facing captures all cameras have the background in view: there, depth is limited instead. Where
+    the cameras pass through the scene, as along a street, no point is in view of most, and the box holds what is near their path.
     """
     centres = np.array([camera.centre for camera in cameras])
-    if not converging and _passes_through(points.xyz, cameras, centres):
-        return _box_of_path(points.xyz, centres)
+    if not converging and _cameras_pass_through(points.xyz, cameras, centres):
+        return _bounds_of_path(points.xyz, centres)
     share = in_view(points.xyz, cameras).mean(0)
-    keep = share >= IN_VIEW * np.quantile(share, 0.95)
+    keep = share >= MIN_VIEW_RATIO * np.quantile(share, 0.95)
     count = np.array([len(track) for track in points.tracks]) if points.tracks else np.full(len(points.xyz), 3)
     keep &= count >= min(3, int(np.quantile(count, 0.9)))
     if np.isfinite(points.error).any():
         keep &= ~(points.error > 3 * np.nanmedian(points.error))
     depth = np.median([project(camera, points.xyz)[1] for camera in cameras], axis=0)
     keep &= depth > 0
-    if keep.sum() < FEWEST_POINTS:
+    if keep.sum() < MIN_POINTS:
         return None
     if not converging:
         keep &= depth < 2.5 * np.median(depth[keep])
     kept = points.xyz[keep]
-    kept = kept[~isolated(kept)]
-    if len(kept) < FEWEST_POINTS:
+    kept = kept[~outliers(kept)]
+    if len(kept) < MIN_POINTS:
         return None
     return np.quantile(kept, 0.002, axis=0), np.quantile(kept, 0.998, axis=0)
 
 
-def _passes_through(xyz: np.ndarray, cameras: Sequence[Camera], centres: np.ndarray) -> bool:
-    """Whether cameras come nearer to what others see than they come to each other: usual depth below the extent of the path."""
+def _cameras_pass_through(xyz: np.ndarray, cameras: Sequence[Camera], centres: np.ndarray) -> bool:
+    """Whether the cameras' path is longer than the usual depth of their content."""
     depths = [depth[inside] for inside, depth in ((in_view(xyz, [camera])[0], project(camera, xyz)[1]) for camera in cameras) if inside.any()]
     extent = np.linalg.norm(np.quantile(centres, 0.9, axis=0) - np.quantile(centres, 0.1, axis=0))
     return bool(depths) and float(np.median([np.quantile(depth, 0.25) for depth in depths])) < float(extent)
 
 
-def _box_of_path(xyz: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A box round the path and the points that lie to its side, as far from it as half of the points do, times two."""
+def _bounds_of_path(xyz: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A box round the path and the points within twice the median distance from it."""
     from scipy.spatial import cKDTree
 
     distance = cKDTree(centres).query(xyz)[0]
@@ -88,8 +87,8 @@ def _box_of_path(xyz: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.n
     return both.min(0), both.max(0)
 
 
-def isolated(xyz: np.ndarray, *, neighbours: int = 5, factor: float = 4.0) -> np.ndarray:
-    """(N,) bool: points much farther from their neighbours than points usually are."""
+def outliers(xyz: np.ndarray, *, neighbours: int = 5, factor: float = 4.0) -> np.ndarray:
+    """(N,) bool: points whose distance to their neighbours is more than `factor` times the median."""
     from scipy.spatial import cKDTree
 
     count = min(neighbours, len(xyz) - 1)
@@ -100,7 +99,7 @@ def isolated(xyz: np.ndarray, *, neighbours: int = 5, factor: float = 4.0) -> np
 
 
 def in_view(xyz: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """(C, N) bool: which cameras have which points inside their picture."""
+    """(C, N) bool: which points project into the images of which cameras."""
     rows = []
     for camera in cameras:
         pixels, depth = project(camera, xyz)
@@ -110,7 +109,7 @@ def in_view(xyz: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     return np.array(rows).reshape(len(cameras), len(xyz))
 
 
-def box_seen_together(
+def bounds_of_frusta(
     cameras: Sequence[Camera],
     ranges: Sequence[tuple[float | None, float | None]],
     focus: np.ndarray,
@@ -119,22 +118,21 @@ def box_seen_together(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A box round the volume that most cameras have in view.
 
-    least   the share of the cameras, or of as many as agree anywhere
-    ranges  near and far of each camera where the source states them: nothing nearer or farther counts. Far surroundings would fill the
-            box; it ends where four fifths of the range in 1 / depth, that is of the parallax, are inside.
+    least   share of the cameras, relative to the largest share found anywhere
+    ranges  near and far plane of each camera where the source states them; the far fifth of the range in inverse depth is left out
     """
     centres = np.array([camera.centre for camera in cameras])
     reach = float(np.linalg.norm(focus - centres, axis=1).max())
     limits = [_depth_limits(near, far) for near, far in ranges]
     if converging:
-        # Cameras that look at one point from around it show as much of the subject behind that point as before it.
+        # Converging cameras show as much of the subject behind the focus point as in front of it.
         ahead = [float((focus - camera.centre) @ camera.forward) for camera in cameras]
         limits = [(near, max(far, 2 * at - near)) if np.isfinite(far) and at > near else (near, far) for (near, far), at in zip(limits, ahead, strict=True)]
     deepest = max((far for _, far in limits if np.isfinite(far)), default=0.0)
     reach = max(reach, deepest) if not converging else reach
     low, high = focus - reach, focus + reach
-    for _ in range(2):  # the second pass looks closely at what the first one found
-        xyz, step = grid(low, high)
+    for _ in range(2):  # the second pass refines the first
+        xyz, step = voxel_centres(low, high)
         seen = in_view(xyz, cameras)
         for row, camera, (near, far) in zip(seen, cameras, limits, strict=True):
             depth = (xyz - camera.centre) @ camera.forward
@@ -153,19 +151,18 @@ def _depth_limits(near: float | None, far: float | None) -> tuple[float, float]:
     return 0.0, np.inf
 
 
-def box_of_silhouettes(photos: Sequence[Photo], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """A box round the visual hull: what no photograph shows as transparent; None unless half of the photos have an
-    alpha channel that leaves something out.
+def bounds_of_visual_hull(photos: Sequence[Photo], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """A box round the visual hull; None unless half of the photos have an alpha channel with transparent pixels.
 
-    A voxel is left out where its whole projection is transparent in more than a few photographs (one in fifty may have a damaged alpha
-    channel), so that thin parts stay, or where less than half of the photographs have it in view.
+    A voxel is carved where its whole projection is transparent in more than one in fifty photographs (whose alpha channel may be damaged), or where
+    less than half of the photographs have it in view.
     """
-    masks = [(camera, alpha_of(photo)) for camera, photo in zip(cameras, photos, strict=True)]
+    masks = [(camera, silhouette(photo)) for camera, photo in zip(cameras, photos, strict=True)]
     views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in masks if mask is not None]
     if len(views) < max(3, len(photos) / 2):
         return None
-    for _ in range(3):  # each pass looks closer at what the one before has left
-        kept, step = grid(low, high)
+    for _ in range(3):  # each pass refines the one before
+        kept, step = voxel_centres(low, high)
         against, seen = np.zeros(len(kept), int), np.zeros(len(kept), int)
         for camera, mask in views:
             inside, transparent = _transparent(camera, mask, kept, float(np.linalg.norm(step)) / 2)
@@ -180,7 +177,7 @@ def box_of_silhouettes(photos: Sequence[Photo], cameras: Sequence[Camera], low: 
 
 
 def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool twice: balls of this radius whose centre lies in the picture, and those of them whose image has no opaque pixel."""
+    """(N,) bool twice: balls of this radius whose centre projects into the image, and those of them whose projection has no opaque pixel."""
     import cv2
 
     pixels, depth = project(camera, xyz)
@@ -188,14 +185,14 @@ def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: floa
         reach = np.ceil(radius * camera.intrinsics["fx"] / depth) + 1  # px
         column, row = np.floor(pixels[:, 0]), np.floor(pixels[:, 1])
         inside = (depth > radius) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    # Distance to the nearest opaque pixel, once per picture, answers for every ball.
-    away = cv2.distanceTransform(np.where(mask, np.uint8(0), np.uint8(1)), cv2.DIST_C, 3) if mask.any() else np.full(mask.shape, np.inf)
+    # One distance transform of the image serves all balls.
+    distance = cv2.distanceTransform(np.where(mask, np.uint8(0), np.uint8(1)), cv2.DIST_C, 3) if mask.any() else np.full(mask.shape, np.inf)
     out = np.zeros(len(xyz), bool)
-    out[inside] = away[row[inside].astype(int), column[inside].astype(int)] > reach[inside]
+    out[inside] = distance[row[inside].astype(int), column[inside].astype(int)] > reach[inside]
     return inside, out
 
 
-def alpha_of(photo: Photo) -> np.ndarray | None:
+def silhouette(photo: Photo) -> np.ndarray | None:
     """(h, w) bool, upright, longest side at most SILHOUETTE: whether any pixel below is not wholly transparent; None without an alpha channel
     or where nothing is transparent."""
     from stages.io.photo import UnreadableImage, alpha_channel
@@ -206,7 +203,7 @@ def alpha_of(photo: Photo) -> np.ndarray | None:
         return None
     if alpha is None or not (alpha == 0).any():
         return None
-    factor = -(-max(alpha.shape) // SILHOUETTE)
+    factor = -(-max(alpha.shape) // SILHOUETTE_SIZE)
     height, width = -(-alpha.shape[0] // factor) * factor, -(-alpha.shape[1] // factor) * factor
     if (height, width) != alpha.shape and factor > 1:
         # Whole blocks only: the last ones are filled up with transparent pixels, which moves nothing by more than a pixel.
@@ -214,8 +211,8 @@ def alpha_of(photo: Photo) -> np.ndarray | None:
     return np.asarray(alpha.reshape(height // factor, factor, width // factor, factor).max((1, 3)) > 0)
 
 
-def grid(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def voxel_centres(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(GRID^3, 3) voxel centres of a box and the (3,) sides of a voxel."""
-    step = (high - low) / GRID
-    axes = [low[d] + (np.arange(GRID) + 0.5) * step[d] for d in range(3)]
+    step = (high - low) / GRID_SIZE
+    axes = [low[d] + (np.arange(GRID_SIZE) + 0.5) * step[d] for d in range(3)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), step

@@ -23,7 +23,7 @@ from efficientnerf.geometry.ndc import Ndc
 from pipeline.errors import BadInput
 from pipeline.files import write_json
 from stages.artifacts import PosesOutputs
-from stages.framing.forward_facing import SPACES, Forward
+from stages.framing.forward_facing import SPACES, ForwardFacing
 from stages.io.capture import SparsePoints
 from stages.io.json_file import read_json
 
@@ -96,7 +96,7 @@ class Scene:
     points: bool = False
     metric: bool = False
     space: str = "auto"
-    forward: Forward | None = None
+    forward: ForwardFacing | None = None
 
     def __post_init__(self) -> None:
         if self.space not in SPACES or (self.space == "ndc") != (self.forward is not None):
@@ -312,7 +312,7 @@ def _report_warnings(folder: Path) -> list[str]:
     return [str(sentence) for sentence in found]
 
 
-def _forward_to_json(forward: Forward) -> dict[str, Any]:
+def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:
     return {
         **forward.ndc.to_json(),
         "bounds": forward.bounds.tolist(),
@@ -336,7 +336,7 @@ def _space_from_json(document: _Reader, path: Path) -> dict[str, Any]:
         raise BadInput(f"{path}: forward: {error}. Run the poses stage again.") from error
     bounds, tangents = reader.numbers("bounds", (2, 3)), reader.numbers("tangents", (2,))
     radii = _triple(reader.numbers("radii", (3,)))
-    forward = Forward(ndc, bounds, reader.number("far"), radii, reader.number("focus"), (float(tangents[0]), float(tangents[1])))
+    forward = ForwardFacing(ndc, bounds, reader.number("far"), radii, reader.number("focus"), (float(tangents[0]), float(tangents[1])))
     if min([forward.far - ndc.near, forward.focus, *tangents, *(bounds[1] - bounds[0])]) <= 0:
         raise BadInput(f"{path}: forward: no box before the reference camera. Run the poses stage again.")
     return {"space": space, "forward": forward}

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
-from stages.framing.forward_facing import forward_of
+from stages.framing.forward_facing import detect_forward_facing
 from stages.io.scene import Scene, View
 from tests.efficientnerf.balls import BOUNDS
 from tests.stages.balls import ORBIT, SIMILARITY
@@ -33,7 +33,7 @@ def some_rotation(seed: int) -> np.ndarray:
 def forward_facing(side: int) -> Scene:
     """A capture of nine cameras in a plane, pictures of `side` pixels."""
     cameras = [_resized(camera, side) for camera in row()]
-    found = forward_of(cameras, depths(cameras))
+    found = detect_forward_facing(cameras, depths(cameras))
     assert not isinstance(found, str), found
     views = tuple(View(f"images/{c.name}", None, "train", c, c, 3.0, 40.0) for c in cameras)
     return Scene("llff", views, BOUNDS, None, SIMILARITY, ORBIT, metric=False, space="ndc", forward=found)

@@ -18,7 +18,7 @@ from stages.artifacts import BakeOutputs
 from stages.bake import BakeSettings
 from stages.baking.refinement import WEIGHED_NDC
 from stages.baking.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
-from stages.framing.forward_facing import forward_of
+from stages.framing.forward_facing import detect_forward_facing
 from stages.io.field_file import load_renderer
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, load, save
@@ -34,7 +34,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A painted wall before nine cameras, and a network that has seen a little of it."""
     folder = tmp_path_factory.mktemp("ndc")
     cameras = [dataclasses.replace(c, width=32, height=24, params=tuple(p * 32 / c.width for p in c.params)) for c in row()]
-    found = forward_of(cameras, depths(cameras))
+    found = detect_forward_facing(cameras, depths(cameras))
     assert not isinstance(found, str), found
     (folder / "poses" / "images").mkdir(parents=True)
     for camera in cameras:

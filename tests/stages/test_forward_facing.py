@@ -11,8 +11,8 @@ import pytest
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
 from stages.framing.camera_paths import spiral_poses, turntable_cameras
-from stages.framing.forward_facing import content_depths, forward_of, mean_pose
-from stages.framing.framing import frame
+from stages.framing.forward_facing import content_depths, detect_forward_facing, mean_pose
+from stages.framing.training_frame import find_training_frame
 from stages.io import importers
 from stages.io.capture import Capture, Photo
 from tests.efficientnerf.walls import wall
@@ -35,7 +35,7 @@ def in_pictures(cameras: list[Camera], near: float, far: float) -> np.ndarray:
 
 def test_all_that_the_pictures_show_lies_in_the_box() -> None:
     cameras = row()
-    found = forward_of(cameras, depths(cameras))
+    found = detect_forward_facing(cameras, depths(cameras))
     assert not isinstance(found, str), found
     at = found.ndc.points(in_pictures(cameras, NEAR, 1e6))
     assert (at >= found.bounds[0]).all()
@@ -50,7 +50,7 @@ def test_all_that_the_pictures_show_lies_in_the_box() -> None:
 
 def test_a_voxel_is_a_pixel_wide_and_a_pixel_of_parallax_deep() -> None:
     cameras = row(spread=1.0)
-    found = forward_of(cameras, depths(cameras))
+    found = detect_forward_facing(cameras, depths(cameras))
     assert not isinstance(found, str), found
     centres = np.array([camera.centre for camera in cameras])
     baseline = np.ptp((centres - mean_pose(cameras)[:3, 3]) @ mean_pose(cameras)[:3, :2], axis=0).max()
@@ -63,18 +63,18 @@ def test_a_voxel_is_a_pixel_wide_and_a_pixel_of_parallax_deep() -> None:
 
 
 REFUSED = {
-    "a ring": (captures.cameras(8), None, "look up to"),
-    "a fan": ([looking(np.zeros(3), np.array([np.sin(a), np.cos(a), 0])) for a in np.radians([-50, -20, 0, 20, 50])], None, "look up to 50"),
-    "wide lenses": (row(focal=0.2), None, "pictures reach"),
-    "one camera is in the midst of it": ([*row(), looking(np.array([0, 6.0, 0]), np.array([0, 9.0, 0]))], None, "does not lie before all"),
-    "no depths": (row(), np.full((9, 2), np.nan), "nothing says"),
+    "a ring": (captures.cameras(8), None, "view axes deviate"),
+    "a fan": ([looking(np.zeros(3), np.array([np.sin(a), np.cos(a), 0])) for a in np.radians([-50, -20, 0, 20, 50])], None, "deviate by up to 50"),
+    "wide lenses": (row(focal=0.2), None, "rays deviate"),
+    "one camera is in the midst of it": ([*row(), looking(np.array([0, 6.0, 0]), np.array([0, 9.0, 0]))], None, "does not lie in front of all"),
+    "no depths": (row(), np.full((9, 2), np.nan), "unknown"),
 }
 
 
 @pytest.mark.parametrize("which", REFUSED)
 def test_what_is_not_forward_facing_says_why(which: str) -> None:
     cameras, known, reason = REFUSED[which]
-    found = forward_of(cameras, depths(cameras) if known is None else known)
+    found = detect_forward_facing(cameras, depths(cameras) if known is None else known)
     assert isinstance(found, str)
     assert reason in found
 
@@ -87,19 +87,19 @@ def capture(cameras: list[Camera], kind: str = "llff", **more: object) -> Captur
 
 def test_the_space_follows_the_kind_of_source_and_the_setting() -> None:
     forward, ring = row(), captures.cameras(8)
-    assert frame(capture(forward)).space == "ndc"
-    assert frame(capture(ring)).space == "contracted"
-    assert frame(capture(forward, "colmap")).space == "contracted"
-    assert frame(capture(forward, "colmap"), space="ndc").space == "ndc"
-    assert frame(capture(forward), space="box").space == "box"
-    assert frame(capture(forward), space="contracted").forward is None
-    assert frame(replace(capture(forward), background=(1.0, 1.0, 1.0))).space == "box"
-    with pytest.raises(BadInput, match=r"poses\.space ndc: the cameras look up to"):
-        frame(capture(ring), space="ndc")
+    assert find_training_frame(capture(forward)).space == "ndc"
+    assert find_training_frame(capture(ring)).space == "contracted"
+    assert find_training_frame(capture(forward, "colmap")).space == "contracted"
+    assert find_training_frame(capture(forward, "colmap"), space="ndc").space == "ndc"
+    assert find_training_frame(capture(forward), space="box").space == "box"
+    assert find_training_frame(capture(forward), space="contracted").forward is None
+    assert find_training_frame(replace(capture(forward), background=(1.0, 1.0, 1.0))).space == "box"
+    with pytest.raises(BadInput, match=r"poses\.space ndc: the view axes deviate"):
+        find_training_frame(capture(ring), space="ndc")
 
 
 def test_the_reference_camera_is_in_the_training_frame() -> None:
-    found = frame(capture(row()))
+    found = find_training_frame(capture(row()))
     assert found.forward is not None
     there = [found.world_from_capture.camera(photo.camera) for photo in capture(row()).photos]
     np.testing.assert_allclose(found.forward.ndc.world_from_camera, mean_pose(there), atol=1e-9)
@@ -157,7 +157,7 @@ def test_llff_captures_from_all_around_are_centred_on_what_they_look_at(tmp_path
     cameras = [Similarity(1.0, turn, np.zeros(3)).camera(camera) for camera in around()]
     folder = captures.llff(tmp_path / "a", cameras)
     read = importers.IMPORTERS["llff"].read(folder, captures.Settings())
-    found = frame(read)
+    found = find_training_frame(read)
     assert found.space == "contracted"
     assert found.forward is None
     subject = turn @ np.array([10.0, -3.0, 2.0])
@@ -171,7 +171,7 @@ def test_llff_captures_from_all_around_are_centred_on_what_they_look_at(tmp_path
     assert (found.bounds[1] - found.bounds[0]).max() < 6 * unit  # not the whole of near to far
     assert not found.orbit.forward_facing
     assert found.orbit.radius == pytest.approx(4.3 * unit, rel=0.1)
-    assert (found.near_far[:, 0] < found.near_far[:, 1]).all()
+    assert (found.near_far_planes[:, 0] < found.near_far_planes[:, 1]).all()
 
 
 def test_the_turntable_of_a_forward_facing_asset_is_its_spiral() -> None:

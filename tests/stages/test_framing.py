@@ -12,7 +12,7 @@ from PIL import Image
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
-from stages.framing.framing import Framing, estimated_up, frame, heading_of, rotation_to_z
+from stages.framing.training_frame import TrainingFrame, estimated_up, find_training_frame, mean_azimuth, rotation_to_z
 from stages.io.capture import Capture, Photo, SparsePoints
 from tests.stages.forward_facing import looking, some_rotation
 
@@ -52,20 +52,20 @@ def scene_points(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return subject, wall
 
 
-def check_laws(capture: Capture, framing: Framing) -> None:
+def check_laws(capture: Capture, framed: TrainingFrame) -> None:
     """What holds for every framing."""
-    np.testing.assert_allclose(framing.bounds[0], -framing.bounds[1], atol=1e-12)
-    assert framing.bounds[1].max() == pytest.approx(1.0)
-    assert (framing.bounds[1] > 0).all()
-    rotation = framing.world_from_capture.rotation
+    np.testing.assert_allclose(framed.bounds[0], -framed.bounds[1], atol=1e-12)
+    assert framed.bounds[1].max() == pytest.approx(1.0)
+    assert (framed.bounds[1] > 0).all()
+    rotation = framed.world_from_capture.rotation
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
-    assert framing.near_far.shape == (len(capture.photos), 2)
-    assert (framing.near_far[:, 0] > 0).all()
-    assert (framing.near_far[:, 1] > framing.near_far[:, 0]).all()
-    centre = np.array(framing.orbit.centre)
-    assert (centre >= framing.bounds[0] - 1e-12).all()
-    assert (centre <= framing.bounds[1] + 1e-12).all()
+    assert framed.near_far_planes.shape == (len(capture.photos), 2)
+    assert (framed.near_far_planes[:, 0] > 0).all()
+    assert (framed.near_far_planes[:, 1] > framed.near_far_planes[:, 0]).all()
+    centre = np.array(framed.orbit.centre)
+    assert (centre >= framed.bounds[0] - 1e-12).all()
+    assert (centre <= framed.bounds[1] + 1e-12).all()
 
 
 # -------------------------------------------------------------------------------------------------------------------- up
@@ -104,12 +104,12 @@ def test_rotation_to_z(up: list[float]) -> None:
 def test_stated_up_keeps_the_axes() -> None:
     subject, _ = scene_points()
     capture = capture_of(ring(12, 2, 1, np.zeros(3), arc=100), subject, up=np.array([0.0, 0.0, 1.0]))
-    framing = frame(capture)
-    np.testing.assert_array_equal(framing.world_from_capture.rotation, np.eye(3))
-    assert frame(capture, up="-y").facts["up"] == [0.0, -1.0, 0.0]
-    np.testing.assert_allclose(frame(capture, up="-y").world_from_capture.rotation @ [0, -1, 0], [0, 0, 1], atol=1e-12)
+    framed = find_training_frame(capture)
+    np.testing.assert_array_equal(framed.world_from_capture.rotation, np.eye(3))
+    assert find_training_frame(capture, up="-y").facts["up"] == [0.0, -1.0, 0.0]
+    np.testing.assert_allclose(find_training_frame(capture, up="-y").world_from_capture.rotation @ [0, -1, 0], [0, 0, 1], atol=1e-12)
     with pytest.raises(BadInput, match="up axis 'w'"):
-        frame(capture, up="w")
+        find_training_frame(capture, up="w")
 
 
 # ------------------------------------------------------------------------------------------------------------------- box
@@ -122,15 +122,15 @@ def test_box_holds_the_subject_and_not_the_room(seed: int, arc: float) -> None:
     cameras = ring(30, 1.6, 0.8, np.array([0, 0, 0.2]), arc=arc)
     moved = Similarity(2.5, some_rotation(seed), np.array([4.0, -1.0, 2.0]))
     capture = capture_of(cameras, np.concatenate([subject, wall]), moved=moved)
-    framing = frame(capture)
-    check_laws(capture, framing)
-    inside = framing.world_from_capture.points(moved.points(subject))
-    assert (np.abs(inside) <= framing.bounds[1] * 1.01).mean() > 0.99
-    half = framing.bounds[1] / framing.world_from_capture.scale / 2.5
+    framed = find_training_frame(capture)
+    check_laws(capture, framed)
+    inside = framed.world_from_capture.points(moved.points(subject))
+    assert (np.abs(inside) <= framed.bounds[1] * 1.01).mean() > 0.99
+    half = framed.bounds[1] / framed.world_from_capture.scale / 2.5
     assert half.max() < 0.5  # the block's half diagonal is 0.36, the room's radius 5
-    assert framing.orbit.forward_facing == (arc < 180)
-    assert framing.orbit.elevation == pytest.approx(26, abs=8)
-    upward = framing.world_from_capture.rotation @ moved.rotation[:, 2]
+    assert framed.orbit.forward_facing == (arc < 180)
+    assert framed.orbit.elevation == pytest.approx(26, abs=8)
+    upward = framed.world_from_capture.rotation @ moved.rotation[:, 2]
     assert upward[2] > np.cos(np.radians(2.0))
 
 
@@ -138,7 +138,7 @@ def test_a_few_stray_points_change_little() -> None:
     subject, _ = scene_points()
     cameras = ring(30, 1.6, 0.8, np.array([0, 0, 0.2]))
     stray = np.array([[0.0, 0.0, 0.8], [0.5, 0.5, -0.5], [-0.6, 0.1, 0.2]])
-    clean, dirty = (frame(capture_of(cameras, xyz)) for xyz in (subject, np.concatenate([subject, stray])))
+    clean, dirty = (find_training_frame(capture_of(cameras, xyz)) for xyz in (subject, np.concatenate([subject, stray])))
     assert dirty.world_from_capture.scale == pytest.approx(clean.world_from_capture.scale, rel=0.05)
 
 
@@ -148,16 +148,16 @@ def test_forward_facing_capture_turns_its_cameras_to_the_front() -> None:
     far = rng.uniform([60, -20, -15], [90, 20, 15], (40, 3))
     cameras = [looking(np.array([0.0, y, z]), np.array([3.5, y, z])) for y in np.linspace(-0.4, 0.4, 5) for z in (-0.2, 0.2)]
     capture = capture_of(cameras, np.concatenate([wall, far]))
-    framing = frame(capture)
-    check_laws(capture, framing)
-    assert framing.orbit.forward_facing
-    assert framing.orbit.heading == pytest.approx(-90, abs=2)
-    placed = framing.world_from_capture.camera(cameras[0])
+    framed = find_training_frame(capture)
+    check_laws(capture, framed)
+    assert framed.orbit.forward_facing
+    assert framed.orbit.heading == pytest.approx(-90, abs=2)
+    placed = framed.world_from_capture.camera(cameras[0])
     np.testing.assert_allclose(placed.forward, [0, 1, 0], atol=0.03)
-    assert (framing.bounds[1] / framing.world_from_capture.scale).max() < 3  # the far points are not in it
-    depths = [3.0 * framing.world_from_capture.scale, 90 * framing.world_from_capture.scale]
-    assert framing.near_far[0, 0] < depths[0]
-    assert framing.near_far[0, 1] > depths[1]
+    assert (framed.bounds[1] / framed.world_from_capture.scale).max() < 3  # the far points are not in it
+    depths = [3.0 * framed.world_from_capture.scale, 90 * framed.world_from_capture.scale]
+    assert framed.near_far_planes[0, 0] < depths[0]
+    assert framed.near_far_planes[0, 1] > depths[1]
 
 
 def test_path_through_a_street_is_boxed_as_a_whole() -> None:
@@ -166,23 +166,23 @@ def test_path_through_a_street_is_boxed_as_a_whole() -> None:
     facades = np.stack([rng.uniform(0, 30, 1500), 2 * side, rng.uniform(0, 3, 1500)], -1)
     cameras = [looking(np.array([x, 0.0, 1.5]), np.array([x + 5, 0.0, 1.5])) for x in np.arange(0, 20, 1.0)]
     capture = capture_of(cameras, facades)
-    framing = frame(capture)
-    check_laws(capture, framing)
-    centres = np.array([framing.world_from_capture.camera(camera).centre for camera in cameras])
-    assert (np.abs(centres) <= framing.bounds[1]).all()
+    framed = find_training_frame(capture)
+    check_laws(capture, framed)
+    centres = np.array([framed.world_from_capture.camera(camera).centre for camera in cameras])
+    assert (np.abs(centres) <= framed.bounds[1]).all()
 
 
 def test_given_box_wins_and_is_kept_exactly() -> None:
     subject, wall = scene_points()
     capture = capture_of(ring(20, 1.6, 0.8, np.zeros(3)), np.concatenate([subject, wall]), up=np.array([0.0, 0.0, 1.0]))
-    framing = frame(capture, box=(-1.0, -0.5, 0.0, 1.0, 0.5, 0.25))
-    check_laws(capture, framing)
-    np.testing.assert_allclose(framing.world_from_capture.inverse().points(framing.bounds), [[-1, -0.5, 0], [1, 0.5, 0.25]], atol=1e-12)
-    stated = frame(Capture(capture.kind, capture.photos, None, up=capture.up, bounds=np.array([[-1.0, -1, -1], [1, 1, 1]])))
+    framed = find_training_frame(capture, box=(-1.0, -0.5, 0.0, 1.0, 0.5, 0.25))
+    check_laws(capture, framed)
+    np.testing.assert_allclose(framed.world_from_capture.inverse().points(framed.bounds), [[-1, -0.5, 0], [1, 0.5, 0.25]], atol=1e-12)
+    stated = find_training_frame(Capture(capture.kind, capture.photos, None, up=capture.up, bounds=np.array([[-1.0, -1, -1], [1, 1, 1]])))
     np.testing.assert_allclose(stated.bounds, [[-1, -1, -1], [1, 1, 1]], atol=1e-12)
     for wrong in ((0, 0, 0, 1, 1), (0, 0, 0, 1, 1, 0), (0, 0, 0, 1, 1, np.nan)):
         with pytest.raises(BadInput, match="crop box"):
-            frame(capture, box=wrong)
+            find_training_frame(capture, box=wrong)
 
 
 @pytest.mark.parametrize("with_alpha", [True, False])
@@ -201,26 +201,26 @@ def test_box_without_points(tmp_path: Path, with_alpha: bool) -> None:
         Image.fromarray(rgba).save(tmp_path / f"{index}.png")
         photos.append(Photo(camera, tmp_path / f"{index}.png", split="train"))
     capture = Capture("blender", tuple(photos), (1.0, 1.0, 1.0), up=np.array([0.0, 0.0, 1.0]))
-    framing = frame(capture)
-    check_laws(capture, framing)
-    corners = framing.world_from_capture.inverse().points(framing.bounds)
+    framed = find_training_frame(capture)
+    check_laws(capture, framed)
+    corners = framed.world_from_capture.inverse().points(framed.bounds)
     assert (corners[0] <= ball - 0.4).all()
     assert (corners[1] >= ball + 0.4).all()
-    half = framing.bounds[1] / framing.world_from_capture.scale
+    half = framed.bounds[1] / framed.world_from_capture.scale
     assert half.max() < (0.65 if with_alpha else 2.0)
     # depths: the whole box, nothing else
-    for camera, (near, far) in zip(cameras, framing.near_far, strict=True):
-        corner_depth = (framing.bounds[1] - framing.world_from_capture.camera(camera).centre) @ framing.world_from_capture.camera(camera).forward
+    for camera, (near, far) in zip(cameras, framed.near_far_planes, strict=True):
+        corner_depth = (framed.bounds[1] - framed.world_from_capture.camera(camera).centre) @ framed.world_from_capture.camera(camera).forward
         assert near - 1e-9 <= corner_depth <= far + 1e-9
 
 
 def test_heading() -> None:
     angles = np.radians([170, 180, -170, -160])
-    heading, one_side = heading_of(np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1))
+    heading, one_side = mean_azimuth(np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1))
     assert abs(heading) == pytest.approx(175)
     assert one_side
     around = np.radians(np.arange(10, 370, 30))
-    heading, one_side = heading_of(np.stack([np.cos(around), np.sin(around), 0 * around], -1))
+    heading, one_side = mean_azimuth(np.stack([np.cos(around), np.sin(around), 0 * around], -1))
     assert heading == pytest.approx(10)
     assert not one_side
 
@@ -229,7 +229,7 @@ def test_one_camera_and_cameras_in_one_place_are_framed() -> None:
     one = looking(np.array([0.0, -2.0, 1.0]), np.zeros(3))
     for cameras in ([one], [one, one, one]):
         capture = capture_of(cameras)
-        check_laws(capture, frame(capture))
+        check_laws(capture, find_training_frame(capture))
 
 
 def test_cameras_that_look_outwards_are_framed() -> None:
@@ -237,7 +237,7 @@ def test_cameras_that_look_outwards_are_framed() -> None:
     room = np.random.default_rng(0).uniform([-3, -3, -1], [3, 3, 1], (800, 3))
     for xyz in (None, room):
         capture = capture_of(cameras, xyz)
-        check_laws(capture, frame(capture))
+        check_laws(capture, find_training_frame(capture))
 
 
 # ------------------------------------------------------------------------------------------------------------- real captures
@@ -265,28 +265,28 @@ def test_chair_lies_in_its_box() -> None:
     from efficientnerf.geometry.cameras import rays
 
     capture = replace(real("chair_200", "blender"), background=(1.0, 1.0, 1.0))
-    framing = frame(capture)
-    check_laws(capture, framing)
-    np.testing.assert_array_equal(framing.world_from_capture.rotation, np.eye(3))
-    assert not framing.orbit.forward_facing
-    assert (framing.bounds[1] / framing.world_from_capture.scale).max() < 1.5
+    framed = find_training_frame(capture)
+    check_laws(capture, framed)
+    np.testing.assert_array_equal(framed.world_from_capture.rotation, np.eye(3))
+    assert not framed.orbit.forward_facing
+    assert (framed.bounds[1] / framed.world_from_capture.scale).max() < 1.5
     for photo in capture.photos[::9]:
         with Image.open(photo.image) as image:
             alpha = np.asarray(image.convert("RGBA"))[..., 3]
-        origins, directions = rays(framing.world_from_capture.camera(photo.camera))
+        origins, directions = rays(framed.world_from_capture.camera(photo.camera))
         opaque = alpha.ravel() > 127
-        assert entry(origins, directions, framing.bounds)[opaque].all()
+        assert entry(origins, directions, framed.bounds)[opaque].all()
 
 
 def test_fern_and_door_are_framed() -> None:
     fern = real("fern_8", "llff")
-    framing = frame(fern)
-    check_laws(fern, framing)
-    assert framing.orbit.forward_facing
+    framed = find_training_frame(fern)
+    check_laws(fern, framed)
+    assert framed.orbit.forward_facing
     door = real("lund_door_colmap", "colmap")
-    framing = frame(door)
-    check_laws(door, framing)
-    assert framing.facts["bounds_from"] == "sparse points"
+    framed = find_training_frame(door)
+    check_laws(door, framed)
+    assert framed.facts["bounds_from"] == "sparse points"
     assert door.points is not None
-    inside = np.abs(framing.world_from_capture.points(door.points.xyz)) <= framing.bounds[1]
+    inside = np.abs(framed.world_from_capture.points(door.points.xyz)) <= framed.bounds[1]
     assert inside.all(1).mean() > 0.9

@@ -158,12 +158,12 @@ def test_still_life_lies_in_the_box(ten: tuple[list[str], Path, Capture]) -> Non
     """The things on the table, by the true mesh brought into the frame of the cameras found."""
     import trimesh
 
-    from stages.framing.framing import frame
+    from stages.framing.training_frame import find_training_frame
 
     names, _, capture = ten
     truth = true_centres(TRUTH)
-    framing = frame(capture)
-    found = np.array([framing.world_from_capture.camera(photo.camera).centre for photo in capture.photos])
+    training_frame = find_training_frame(capture)
+    found = np.array([training_frame.world_from_capture.camera(photo.camera).centre for photo in capture.photos])
     true = np.array([truth[name] for name in names])
     u, s, vt = np.linalg.svd((found - found.mean(0)).T @ (true - true.mean(0)))
     sign = np.array([1.0, 1.0, np.linalg.det(u @ vt)])
@@ -172,8 +172,8 @@ def test_still_life_lies_in_the_box(ten: tuple[list[str], Path, Capture]) -> Non
     vertices = np.asarray(mesh.vertices)
     things = vertices[vertices[:, 2] > 0.02]
     placed = scale * (things - true.mean(0)) @ rotation.T + found.mean(0)
-    assert (np.abs(placed) <= framing.bounds[1]).all(1).mean() > 0.99
-    volume = np.prod(framing.bounds[1] / scale * 2)
+    assert (np.abs(placed) <= training_frame.bounds[1]).all(1).mean() > 0.99
+    volume = np.prod(training_frame.bounds[1] / scale * 2)
     assert volume < 10 * np.prod(np.ptp(vertices, axis=0))
     assert rotation[2, 2] > np.cos(np.radians(3.0))  # up
 

@@ -17,7 +17,7 @@ from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
 from stages import bake, train
 from stages.artifacts import BakeOutputs
-from stages.framing.view_coverage import cells_below_min_views, has_min_views, spread_order
+from stages.framing.view_coverage import bit_reversed_order, cells_below_min_views, has_min_views
 from stages.io.field_file import load_renderer, space_of
 from stages.io.scene import Scene, views_of
 from stages.io.scene import load as load_scene
@@ -94,7 +94,7 @@ def test_no_more_are_asked_for_than_a_quarter_of_the_cameras(count: int, needed:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
 def test_cameras_are_asked_once_each_far_ones_first(count: int) -> None:
-    order = spread_order(count)
+    order = bit_reversed_order(count)
     assert sorted(order) == list(range(count))
     assert count < 3 or abs(order[1] - order[0]) >= count // 2
 

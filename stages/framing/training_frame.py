@@ -1,7 +1,7 @@
-"""Where is up, what is the subject, how far does it reach: from a capture's own frame to the training frame.
+"""From a capture's own frame to the training frame: up axis, scene bounds, orbit, near and far planes, space.
 
-Everything is estimated from the cameras, and from the sparse points or alpha channels where there are any. The constants here are
-fractions of what is measured; none has a unit.
+All of it is estimated from the cameras, and from the sparse points or alpha channels where there are any. The constants are ratios of measured
+lengths.
 """
 
 from __future__ import annotations
@@ -14,47 +14,46 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, Similarity, project
 from pipeline.errors import BadInput
 from stages.framing import scene_bounds
-from stages.framing.forward_facing import Forward, content_depths, forward_of
+from stages.framing.forward_facing import ForwardFacing, content_depths, detect_forward_facing
 from stages.io.capture import Capture
 from stages.io.scene import Orbit
 
 UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
-PARALLEL = 0.03  # below this mean squared sine to the common direction (about 10 degrees) view axes do not meet in a point
-FRONT = -90.0  # azimuth, degrees, to which a capture without axes of its own turns its cameras: looking along +y, as front views do
+MIN_CONVERGENCE = 0.03  # mean squared sine of the angles between view axes and their mean (10 degrees), below which they do not meet in a point
+FRONT_AZIMUTH = -90.0  # degrees, of the mean camera in captures whose frame means nothing: it looks along +y, as front views do
 
 
 @dataclass(frozen=True, eq=False)
-class Framing:
+class TrainingFrame:
     """The training frame of a capture.
 
-    world_from_capture  the similarity that leads there
-    bounds              (2, 3) the box of interest in the training frame, centred on the origin, largest half extent 1
-    orbit               how the cameras stand around the subject, training frame
-    near_far            (C, 2) per photo, along the view axis, training frame
+    world_from_capture  similarity from the capture's frame
+    bounds              (2, 3) scene bounds in the training frame, centred on the origin, largest half extent 1
+    orbit               of the cameras round the subject, training frame
+    near_far_planes     (C, 2) of each photo, along the view axis, training frame
     space               "box", "contracted" or "ndc"
-    forward             the reference camera and its box, with ndc alone
-    facts               how it was found, for the report
+    forward             the forward-facing scene, for ndc alone
+    facts               how each was found, for the report
     """
 
     world_from_capture: Similarity
     bounds: np.ndarray
     orbit: Orbit
-    near_far: np.ndarray
+    near_far_planes: np.ndarray
     space: str
-    forward: Forward | None
+    forward: ForwardFacing | None
     facts: dict[str, object]
 
 
-def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto") -> Framing:
-    """Choose the training frame and the box of interest.
+def find_training_frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto") -> TrainingFrame:
+    """Choose the training frame and the scene bounds.
 
     up      "auto", or an axis of the capture's frame ("z", "-y", ...) that points up
     box     six numbers in the capture's frame, x y z of one corner and of the opposite one; None: estimated
-    margin  room left on every side of the sparse points, as a fraction of their longest side: what they miss (bare rims) does not depend on
-            the direction. Other boxes get none: silhouettes bound the subject from outside
-    space   "auto", or what the space of the field shall be
+    margin  added on each side of the bounds of sparse points, as a fraction of their longest side; silhouettes already bound the subject from outside
+    space   "auto", "box", "contracted" or "ndc"
 
-    Raises BadInput for an empty box or an unknown axis, and for ndc where the cameras do not all look the same way.
+    Raises BadInput for an empty box or an unknown axis, and for ndc where the capture is not forward-facing.
     """
     cameras = [photo.camera for photo in capture.photos]
     if not cameras:
@@ -62,17 +61,17 @@ def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = N
     upward, from_axes = up_vector(capture, up)
     turn = rotation_to_z(upward)
     stated = _corners(box) if box is not None else None if capture.bounds is None else _corners(np.asarray(capture.bounds).ravel())
-    focus, converging = focus_of(capture)
+    focus, converging = focus_point(capture)
     if not from_axes and stated is None:
-        turn = _facing_front(turn, cameras, focus)
+        turn = _turned_to_front(turn, cameras, focus)
     if stated is not None:
         corners = stated @ turn.T
         low, high, how = corners.min(0), corners.max(0), "given" if box is not None else "stated by the source"
     else:
         turned = Similarity(1.0, turn, np.zeros(3))
-        low, high, how = scene_bounds.box_of_interest(capture, turned, turned.points(focus), converging)
-        room = margin * (high - low).max() if how == "sparse points" else 0.0
-        low, high = low - room, high + room
+        low, high, how = scene_bounds.find_scene_bounds(capture, turned, turned.points(focus), converging)
+        padding = margin * (high - low).max() if how == "sparse points" else 0.0
+        low, high = low - padding, high + padding
     centre, half = (low + high) / 2, (high - low) / 2
     half = np.maximum(half, 0.02 * half.max())  # a flat subject gets some thickness
     scale = 1.0 / half.max()
@@ -89,18 +88,18 @@ def frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = N
     }
     space, forward, facts["space_from"] = space_of(capture, placed, world, space)
     facts["space"] = space
-    return Framing(world, bounds, orbit, near_far(capture, placed, world, bounds), space, forward, facts)
+    return TrainingFrame(world, bounds, orbit, near_far_planes(capture, placed, world, bounds), space, forward, facts)
 
 
-def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choice: str) -> tuple[str, Forward | None, str]:
-    """The space of the field, the forward-facing capture where it is ndc, and how it was chosen."""
+def space_of(capture: Capture, placed: Sequence[Camera], world: Similarity, choice: str) -> tuple[str, ForwardFacing | None, str]:
+    """The space of the field, the forward-facing scene where it is ndc, and how it was chosen."""
     usual = "contracted" if capture.background is None else "box"
     if choice in ("box", "contracted") or (choice == "auto" and (capture.kind != "llff" or capture.background is not None)):
         return (usual, None, "usual for this kind of source") if choice == "auto" else (choice, None, "given")
     points, tracks = (None, ()) if capture.points is None else (world.points(capture.points.xyz), capture.points.tracks)
-    found = forward_of(placed, content_depths(capture.photos, placed, world.scale, points, tracks))
-    if isinstance(found, Forward):
-        return "ndc", found, "given" if choice == "ndc" else "all cameras look the same way"
+    found = detect_forward_facing(placed, content_depths(capture.photos, placed, world.scale, points, tracks))
+    if isinstance(found, ForwardFacing):
+        return "ndc", found, "given" if choice == "ndc" else "the capture is forward-facing"
     if choice == "ndc":
         raise BadInput(f"poses.space ndc: {found}. Choose contracted or box, or leave it out.")
     return usual, None, found
@@ -147,7 +146,7 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
     return np.array([[1 - x * x * k, -x * y * k, -x], [-x * y * k, 1 - y * y * k, -y], [x, y, z]])
 
 
-def focus_of(capture: Capture) -> tuple[np.ndarray, bool]:
+def focus_point(capture: Capture) -> tuple[np.ndarray, bool]:
     """The point that the cameras look at, in the capture's frame, and whether their axes meet there.
 
     Least squares over the view axes, reweighted so that cameras that look elsewhere do not count. Where the axes are parallel, or meet
@@ -161,7 +160,7 @@ def focus_of(capture: Capture) -> tuple[np.ndarray, bool]:
     weight = np.ones(len(cameras))
     point = centres.mean(0)
     scatter = np.linalg.eigvalsh(across.mean(0))[0]
-    if scatter > PARALLEL:
+    if scatter > MIN_CONVERGENCE:
         for _ in range(20):
             matrix = (weight[:, None, None] * across).sum(0)
             point = np.linalg.solve(matrix, (weight[:, None, None] * across @ centres[:, :, None]).sum(0)[:, 0])
@@ -175,10 +174,10 @@ def focus_of(capture: Capture) -> tuple[np.ndarray, bool]:
     middle = int(np.argmin(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     if np.linalg.norm(mean_forward) < 0.3:  # looking outwards, all round
         return centres.mean(0), False
-    return centres[middle] + forward[middle] * _middle_depth(capture, centres), False
+    return centres[middle] + forward[middle] * _typical_depth(capture, centres), False
 
 
-def _middle_depth(capture: Capture, centres: np.ndarray) -> float:
+def _typical_depth(capture: Capture, centres: np.ndarray) -> float:
     if capture.points is not None and len(capture.points.xyz):
         depths = np.concatenate([project(photo.camera, capture.points.xyz)[1] for photo in capture.photos[:: max(1, len(capture.photos) // 20)]])
         if (depths > 0).any():
@@ -190,14 +189,14 @@ def _middle_depth(capture: Capture, centres: np.ndarray) -> float:
     return float(4 * np.linalg.norm(centres - centres.mean(0), axis=1).mean()) or 1.0
 
 
-def _facing_front(turn: np.ndarray, cameras: Sequence[Camera], focus: np.ndarray) -> np.ndarray:
+def _turned_to_front(turn: np.ndarray, cameras: Sequence[Camera], focus: np.ndarray) -> np.ndarray:
     """`turn`, followed by the rotation about z that brings the middle of the cameras to the front."""
-    heading, _ = heading_of(np.array([camera.centre - focus for camera in cameras]) @ turn.T)
-    angle = np.radians(FRONT - heading)
+    heading, _ = mean_azimuth(np.array([camera.centre - focus for camera in cameras]) @ turn.T)
+    angle = np.radians(FRONT_AZIMUTH - heading)
     return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]) @ turn
 
 
-def heading_of(offsets: np.ndarray) -> tuple[float, bool]:
+def mean_azimuth(offsets: np.ndarray) -> tuple[float, bool]:
     """Azimuth of the middle of the cameras, degrees, and whether they keep to one side.
 
     offsets  (C, 3) from the subject to the cameras, z up
@@ -220,7 +219,7 @@ def orbit_of(cameras: Sequence[Camera], centre: np.ndarray) -> Orbit:
     offsets = np.array([camera.centre for camera in cameras]) - centre
     distance = np.linalg.norm(offsets, axis=1)
     elevation = np.degrees(np.arcsin(np.clip(offsets[:, 2] / np.maximum(distance, 1e-12), -1, 1)))
-    heading, one_side = heading_of(offsets)
+    heading, one_side = mean_azimuth(offsets)
     return Orbit(
         centre=(float(centre[0]), float(centre[1]), float(centre[2])),
         radius=float(np.median(distance)),
@@ -230,7 +229,7 @@ def orbit_of(cameras: Sequence[Camera], centre: np.ndarray) -> Orbit:
     )
 
 
-def near_far(capture: Capture, placed: Sequence[Camera], world: Similarity, bounds: np.ndarray) -> np.ndarray:
+def near_far_planes(capture: Capture, placed: Sequence[Camera], world: Similarity, bounds: np.ndarray) -> np.ndarray:
     """(C, 2) depth range of each photo in the training frame.
 
     A constant background: the depths of the box. Surroundings: from half of the nearest sparse point it sees (or the near it states) to
