@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import tomllib
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -210,13 +209,13 @@ def training_rates(device: str, steps: int, side: int, views: int, **settings: A
 
 def paper_rates(device: str, steps: int, side: int, views: int, **changes: Any) -> dict[str, Any]:
     """`training_rates` of the rows of table 5, and of uniform sampling, with the settings of the preset paper-n4 but for a short warm-up."""
+    from workflows.cli.resolve import read_preset
     from workflows.paper.tables import IMPORTANCE, LARGE, NERF
 
     rows: dict[str, dict[str, Any]] = {
         "nerf": NERF, "uniform": {**NERF, "sampling": "uniform"}, "sh": {"sampling": "hierarchical", **IMPORTANCE, **LARGE},
         "light": {"sampling": "hierarchical", **IMPORTANCE}, "valid": {"sampling": "valid", **IMPORTANCE}, "n4": {},
     }  # fmt: skip
-    path = Path(__file__).resolve().parents[1] / "workflows" / "presets" / "paper-n4.toml"
-    preset = tomllib.loads(path.read_text(encoding="utf-8"))["train"]
+    preset = read_preset("paper-n4").table["train"]
     short = {"occupancy_warmup_steps": steps // 4, "precrop_steps": 0, "occupancy_beta": 0.5}  # with the paper's 0.1 so few steps prune little
     return {name: training_rates(device, steps, side, views, **{**preset, **short, **row, **changes}) for name, row in rows.items()}

@@ -36,28 +36,47 @@ def settings_page() -> str:
         "# Settings",
         "",
         "Any of these can be given to `enerf run` as `--set stage.name=value`, or in a TOML file to `--config`. The order is: defaults, preset,",
-        "file, `--set`, dedicated options. The columns of the presets are empty where a preset keeps the default.",
+        "file, `--set`, dedicated options. `auto` leaves a value to be chosen, `off` switches something off.",
+        "",
+        "| setting | default | may be | meaning |",
+        "|---|---|---|---|",
+    ]
+    described = {stage.name: describe_settings(stage.settings) for stage in STAGES}
+    lines += [row(stage, info) for stage, infos in described.items() for info in infos if not info.advanced]
+    lines += presets_section()
+    lines += ["", "## Advanced"]
+    for stage, infos in described.items():
+        if any(info.advanced for info in infos):
+            lines += ["", f"### {stage}", "", "| setting | default | may be | meaning |", "|---|---|---|---|"]
+            lines += [row(stage, info) for info in infos if info.advanced]
+    return "\n".join(lines) + "\n"
+
+
+def row(stage: str, info: SettingInfo) -> str:
+    return "| " + " | ".join(cell(column) for column in (f"`{stage}.{info.name}`", f"`{shown(info.default)}`", limits(info), meaning(info))) + " |"
+
+
+def presets_section() -> list[str]:
+    """The presets, and the values that they change."""
+    lines = [
         "",
         "## Presets",
         "",
+        'A preset is a TOML file in `workflows/presets`. With `inherits = "NAME"` it begins with the values of another preset, and changes some.',
+        "",
     ]
     presets = [read_preset(name) for name in preset_names()]
-    lines += [f"- **{preset.name}**: {preset.description}" for preset in presets]
+    for preset in presets:
+        values = [f"`{stage}.{name}={shown(value)}`" for stage, own in preset.own.items() for name, value in own.items()]
+        lines.append(f"- **{preset.name}**: {preset.description}" + (f" As `{preset.inherits}`, but with {', '.join(values)}." if preset.inherits else ""))
+    columns = [preset for preset in presets if preset.inherits is None and preset.own]
+    lines += ["", "Values that presets change:", "", "| setting |" + "".join(f" {preset.name} |" for preset in columns), "|---|" + "---|" * len(columns)]
     for stage in STAGES:
-        described = describe_settings(stage.settings)
-        lines += ["", f"## {stage.name}", ""]
-        if not described:
-            lines.append("No settings.")
-            continue
-        changing = [preset for preset in presets if preset.table.get(stage.name)]
-        lines.append("| setting | default | may be | meaning |" + "".join(f" {preset.name} |" for preset in changing))
-        lines.append("|---|---|---|---|" + "---|" * len(changing))
-        for info in described:
-            values = [preset.table[stage.name].get(info.name) for preset in changing]
-            columns = [f"`{info.name}`", f"`{shown(info.default)}`", limits(info), meaning(info)]
-            columns += ["" if value is None else f"`{shown(value)}`" for value in values]
-            lines.append("| " + " | ".join(cell(column) for column in columns) + " |")
-    return "\n".join(lines) + "\n"
+        for info in describe_settings(stage.settings):
+            values = ["" if (value := preset.own.get(stage.name, {}).get(info.name)) is None else f"`{shown(value)}`" for preset in columns]
+            if any(values):
+                lines.append(f"| `{stage.name}.{info.name}` | " + " | ".join(values) + " |")
+    return lines
 
 
 def commands_page() -> str:

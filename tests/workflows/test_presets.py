@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from pipeline.errors import UsageError
+from stages.settings import describe_settings
 from workflows import asset
 from workflows.cli.resolve import Settings, preset_names, read_preset, table_of
 
@@ -21,7 +25,7 @@ PAPER = ["paper-n1", "paper-n2", "paper-n3", "paper-n4"]
 
 
 def test_these_are_there() -> None:
-    assert preset_names() == ["high", "nerf", *PAPER, "preview", "standard", "tiny"]
+    assert preset_names() == ["high", "nerf", "paper", *PAPER, "preview", "standard", "tiny"]
 
 
 def test_the_papers_presets_are_the_papers() -> None:
@@ -47,6 +51,39 @@ def test_the_papers_presets_are_the_papers() -> None:
         assert (train.lr_final_ratio, train.lr_decay_steps) == (0.1, 500_000)
         assert (bake.resolution // bake.brick_size, bake.brick_size) == (384, 4)
     assert samples == [(64, 2), (64, 3), (96, 4), (128, 5)]
+
+
+def test_a_preset_inherits_and_changes(tmp_path: Path) -> None:
+    (tmp_path / "base.toml").write_text('description = "Base."\n[train]\niterations = 3\nseed = 1\n[mesh]\nmax_faces = 100\n', encoding="utf-8")
+    (tmp_path / "middle.toml").write_text('description = "Middle."\ninherits = "base"\n[train]\nseed = 2\n', encoding="utf-8")
+    (tmp_path / "heir.toml").write_text('description = "Heir."\ninherits = "middle"\n[train]\niterations = 5\n', encoding="utf-8")
+    heir = read_preset("heir", tmp_path)
+    assert heir.table == {"train": {"iterations": 5, "seed": 2}, "mesh": {"max_faces": 100}}
+    assert (heir.inherits, heir.own) == ("middle", {"train": {"iterations": 5}})
+    assert read_preset("base", tmp_path).inherits is None
+
+
+def test_a_preset_cannot_inherit_from_itself_or_from_none(tmp_path: Path) -> None:
+    for name, parent in (("a", "b"), ("b", "c"), ("c", "b"), ("self", "self"), ("orphan", "nobody")):
+        (tmp_path / f"{name}.toml").write_text(f'description = "."\ninherits = "{parent}"\n', encoding="utf-8")
+    with pytest.raises(UsageError, match=r"cannot inherit from itself \(a -> b -> c -> b\)"):
+        read_preset("a", tmp_path)
+    with pytest.raises(UsageError, match=r"cannot inherit from itself \(self -> self\)"):
+        read_preset("self", tmp_path)
+    with pytest.raises(UsageError, match=r"preset orphan: inherits 'nobody': no such preset\."):
+        read_preset("orphan", tmp_path)
+
+
+def test_an_heir_says_only_what_its_parent_does_not() -> None:
+    for preset in map(read_preset, preset_names()):
+        if preset.inherits is not None:
+            parent = read_preset(preset.inherits).table
+            assert not [f"{stage}.{name}" for stage, own in preset.own.items() for name, value in own.items() if parent.get(stage, {}).get(name) == value]
+
+
+def test_the_settings_of_first_rank_are_few() -> None:
+    common = [info for stage in asset.STAGES for info in describe_settings(stage.settings) if not info.advanced]
+    assert 20 <= len(common) <= 30
 
 
 @pytest.mark.parametrize("name", preset_names())

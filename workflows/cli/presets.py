@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from workflows.cli.options import common_options, json_option
 
+if TYPE_CHECKING:
+    from stages.settings import SettingInfo
 
-@click.command(short_help="List presets, and every setting with its default and meaning.")
+
+@click.command(short_help="List presets and settings with their defaults and meaning.")
 @click.argument("stages", nargs=-1, metavar="[STAGE]...")
 @click.option("--preset", metavar="NAME", help="Show the values of this preset in place of the defaults.")
 @json_option
 @common_options
 def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
-    """List the presets, and the settings of all stages, or of STAGE..., with their defaults and meaning."""
+    """List the presets, and the settings that most users want, with their defaults and meaning; of STAGE... all settings, the advanced ones apart."""
     from pipeline.errors import UsageError
     from stages.settings import describe_settings
     from workflows import asset
     from workflows.cli.progress import write_json
-    from workflows.cli.resolve import Settings, meaning, nearest, preset_names, read_preset, shown, table_of
+    from workflows.cli.resolve import Settings, nearest, preset_names, read_preset, table_of
 
     types = {stage.name: stage.settings for stage in asset.STAGES}
     for name in stages:
@@ -31,22 +34,39 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
         settings.put_table(read_preset(preset).table, f"preset {preset}")
     values = table_of(settings.resolved())
     known = [read_preset(name) for name in preset_names()]
+    described = {stage: describe_settings(types[stage]) for stage in stages or types}
     if as_json:
-        described: dict[str, Any] = {
-            stage: [
-                {"name": info.name, "value": values[stage][info.name], "type": info.type_name, "choices": info.choices, "minimum": info.minimum}
-                | {"maximum": info.maximum, "unit": info.unit, "meaning": info.doc}
-                for info in describe_settings(types[stage])
-            ]
-            for stage in stages or types
-        }
-        write_json({"presets": [{"name": each.name, "description": each.description, "settings": each.table} for each in known], "stages": described}, indent=1)
+        listed = [{"name": each.name, "description": each.description, "inherits": each.inherits, "settings": each.table} for each in known]
+        write_json({"presets": listed, "stages": {stage: _facts(infos, values[stage]) for stage, infos in described.items()}}, indent=1)
         return
     for each in known:
         click.echo(f"{each.name:<10} {each.description}")
-    for stage in stages or types:
-        click.echo(f"\n[{stage}]")
-        for info in describe_settings(types[stage]):
-            value = shown(values[stage][info.name])
-            choices = f" One of: {', '.join(shown(choice) for choice in info.choices)}." if info.choices and info.listed else ""
-            click.echo(f"{info.name + ' = ' + value:<36} {meaning(info)}{choices}")
+    for stage, infos in described.items():
+        common, advanced = ([info for info in infos if info.advanced == rank] for rank in (False, True))
+        if common or stages:
+            click.echo(f"\n[{stage}]")
+        _list(common, values[stage])
+        if stages and advanced:
+            click.echo(f"\n[{stage}] advanced")
+            _list(advanced, values[stage])
+    if not stages:
+        count = sum(info.advanced for infos in described.values() for info in infos)
+        click.echo(f"\n{count} advanced settings are listed by stage: enerf presets {' '.join(types)}")
+
+
+def _facts(infos: list[SettingInfo], values: dict[str, Any]) -> list[dict[str, Any]]:
+    """Settings as JSON holds them."""
+    return [
+        {"name": info.name, "value": values[info.name], "type": info.type_name, "choices": info.choices, "minimum": info.minimum, "maximum": info.maximum}
+        | {"unit": info.unit, "advanced": info.advanced, "meaning": info.doc}
+        for info in infos
+    ]
+
+
+def _list(infos: list[SettingInfo], values: dict[str, Any]) -> None:
+    """A line for each setting."""
+    from workflows.cli.resolve import meaning, shown
+
+    for info in infos:
+        choices = f" One of: {', '.join(shown(choice) for choice in info.choices)}." if info.choices and info.listed else ""
+        click.echo(f"{info.name + ' = ' + shown(values[info.name]):<36} {meaning(info)}{choices}")

@@ -27,8 +27,17 @@ CONFIG_OPTIONS = ("preset", "device", "seed")
 
 @dataclass(frozen=True)
 class Preset:
+    """A preset, read.
+
+    inherits  the preset that it changes, or None
+    own       what its file says
+    table     `own` over the table of the preset that it inherits from
+    """
+
     name: str
     description: str
+    inherits: str | None
+    own: Table
     table: Table
 
 
@@ -46,15 +55,28 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" Nearest: {found[0]}." if found else ""
 
 
-def preset_names() -> list[str]:
-    return sorted(path.stem for path in PRESETS_FOLDER.glob("*.toml"))
+def preset_names(folder: Path | None = None) -> list[str]:
+    """Names of the presets in a folder; None: those that are shipped."""
+    return sorted(path.stem for path in (folder or PRESETS_FOLDER).glob("*.toml"))
 
 
-def read_preset(name: str) -> Preset:
-    if name not in preset_names():
-        raise UsageError(f"--preset {name}: no such preset.{nearest(name, preset_names())} There are: {', '.join(preset_names())}.")
-    table = tomllib.loads((PRESETS_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
-    return Preset(name, table.pop("description"), table)
+def read_preset(name: str, folder: Path | None = None) -> Preset:
+    """A preset with what it inherits. Raises UsageError for one that is not there and for one that inherits from itself."""
+    return _read_preset(name, folder or PRESETS_FOLDER, ())
+
+
+def _read_preset(name: str, folder: Path, heirs: tuple[str, ...]) -> Preset:
+    """heirs: the presets that led here, each of which inherits from the one after it."""
+    origin = f"preset {heirs[-1]}: inherits {name!r}" if heirs else f"--preset {name}"
+    if name not in preset_names(folder):
+        raise UsageError(f"{origin}: no such preset.{nearest(name, preset_names(folder))} There are: {', '.join(preset_names(folder))}.")
+    if name in heirs:
+        raise UsageError(f"{origin}: a preset cannot inherit from itself ({' -> '.join((*heirs, name))}).")
+    own = tomllib.loads((folder / f"{name}.toml").read_text(encoding="utf-8"))
+    description, inherits = own.pop("description"), own.pop("inherits", None)
+    parent = {} if inherits is None else _read_preset(inherits, folder, (*heirs, name)).table
+    merged = {stage: {**parent.get(stage, {}), **own.get(stage, {})} for stage in {**parent, **own}}
+    return Preset(name, description, inherits, own, merged)
 
 
 def read_config(path: Path) -> Config:
