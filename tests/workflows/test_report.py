@@ -93,7 +93,7 @@ def test_names_and_reasons_are_text_not_markup(tmp_path: Path) -> None:
     assert "<b>chairs" not in text
     assert "blur &amp; fog" in text
     assert "21.26" in text
-    assert "on 1 held-back view)" in text
+    assert "on 1 test view)" in text
 
 
 def test_a_damaged_run_gets_a_page_too(tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ def make(number: str, request: Request) -> dict[str, Path]:
         from stages.pictures.plots import curve
 
         written["plot"] = request.out / f"table_{number}.png"
-        curve(written["plot"], result.curves, x_label="seconds of training", y_label="PSNR of held-back views / dB", title=f"Table {number}")
+        curve(written["plot"], result.curves, x_label="seconds of training", y_label="PSNR of test views / dB", title=f"Table {number}")
     return written
 
 

@@ -43,13 +43,13 @@ class Row:
 class Figures:
     """What a row's run came to; seconds are of training steps alone, evaluation excluded, as in the paper.
 
-    psnr             of the network, mean over the held-back views that were drawn, decibels; ssim likewise
+    psnr             of the network, mean over the test views that were rendered, decibels; ssim likewise
     step             seconds of a step, mean over the run
     steady           seconds of a step, median over the last fifth of the run
     hours            of all steps
     coarse, fine     samples of a training ray that went through the coarse and the fine network, over the last fifth
-    valid, pivotal   shares over rays x N_c of the held-back views (equations 5 and 12)
-    curve            (seconds of training, PSNR of a held-back view)
+    valid, pivotal   shares over rays x N_c of the test views (equations 5 and 12)
+    curve            (seconds of training, PSNR of a validation view)
     tree             figures of the baked tree, where wanted: psnr, ssim, frames a second, size of a frame
     """
 
@@ -185,7 +185,7 @@ def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], device: str) -> dict[str, Any]:
-    """PSNR, SSIM and shares of the network on held-back views; kept beside the run, and measured anew when the field or the views change."""
+    """PSNR, SSIM and shares of the network on test views; kept beside the run, and measured anew when the field or the views change."""
     import numpy as np
 
     from efficientnerf.evaluation.metrics import psnr, ssim

@@ -84,5 +84,11 @@ def quality_in_words(found: dict[str, Any] | None) -> str | None:
         if isinstance(part, dict) and isinstance(part.get("psnr"), (int, float)) and isinstance(part.get("ssim"), (int, float)):
             parts.append(f"{name} {part['psnr']:.2f} dB PSNR, {part['ssim']:.3f} SSIM")
     views = found.get("views")
-    count = f" (on {len(views)} held-back view{'s' if len(views) != 1 else ''})" if isinstance(views, list) and views else ""
+    count = f" (on {len(views)} {split_of(found)} view{'s' if len(views) != 1 else ''})" if isinstance(views, list) and views else ""
     return "; ".join(parts) + count if parts else None
+
+
+def split_of(found: dict[str, Any] | None) -> str:
+    """The split that was measured on: test, unless the figures say otherwise."""
+    split = (found or {}).get("split", "test")
+    return {"val": "validation", "train": "training"}.get(split, "test") if isinstance(split, str) else "test"
