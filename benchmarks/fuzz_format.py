@@ -31,6 +31,8 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.rendering import render_rays
+
 HERE = Path(__file__).resolve().parent
 GOLDEN = HERE.parent / "tests" / "data" / "golden"
 EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
@@ -175,7 +177,7 @@ def try_file(path: Path) -> str | None:
     if tree.degree <= 2 and max(tree.resolution) <= 64:
         centre = (tree.bounds_min + tree.bounds_max) / 2
         with np.errstate(all="ignore"):
-            tree.render_rays(centre - tree.voxel * np.array([[50.0, 3.0, 2.0]]), np.array([[1.0, 0.0, 0.0]]))
+            render_rays(tree, centre - tree.voxel * np.array([[50.0, 3.0, 2.0]]), np.array([[1.0, 0.0, 0.0]]))
     serialize(tree)
     return None
 

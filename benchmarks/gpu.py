@@ -95,9 +95,9 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
     if part == "kernels":
         return {"copy_gb_per_second": round(gpu_kernels.copy_rate("cuda", 2048, 10)), **gpu_kernels.kernel_rates("cuda", 2**16, 19, 20)}
     if part == "renders":
-        from efficientnerf.asset.tree import NerfTree
+        from efficientnerf.asset import format
 
-        tree = NerfTree.load(given.asset) if given.asset else gpu_kernels.shell(384)
+        tree = format.load(given.asset) if given.asset else gpu_kernels.shell(384)
         return gpu_kernels.frame_rates("cuda", tree, 800, 10, TILES)
     if part == "paper":
         return gpu_kernels.paper_rates("cuda", 300, 400, 40)

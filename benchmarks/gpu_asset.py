@@ -18,11 +18,12 @@ from gpu_kernels import BOUNDS, ball, orbit
 
 from efficientnerf.asset import bake, refinement
 from efficientnerf.asset.refinement import Targets
+from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model
-from efficientnerf.rendering.render import FieldRenderer
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from efficientnerf.training.loop import train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.settings import TrainSettings
@@ -112,7 +113,7 @@ def test_view_psnr(m: Model, trees: list[NerfTree], camera: Camera, device: str)
     truth = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
     renders = {"network": FieldRenderer(m, 1.5, 4.5).render(camera).colour}
     for name, tree in zip(("baked", "refined"), trees, strict=True):
-        renders[name] = tree.to(device).render(camera, background=WHITE).colour
+        renders[name] = render(tree.to(device), camera, background=WHITE).colour
     return {name: decibels(float(((colour - truth) ** 2).mean())) for name, colour in renders.items()}
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.geometry.spaces import BoundedSpace
@@ -149,7 +150,7 @@ def frame_rates(device: str, tree: NerfTree, side: int, repeats: int, variants: 
         timed.append({"tile": list(tile), "warps": warps, "ms": round(took, 4), "frames_per_second": round(1e3 / took, 1)})
     cuda_tree.TILE, cuda_tree.WARPS[row] = usual
     ours = cuda_tree.render_image(on_device, cameras[0]).colour.cpu().numpy()
-    off = np.abs(ours - tree.render(cameras[0]).colour).max(axis=-1)
+    off = np.abs(ours - render(tree, cameras[0]).colour).max(axis=-1)
     return {
         "pixels": [side, side], "voxels": len(tree.density_values), "bytes_on_device": on_device.bytes, "runs": timed,
         "difference_from_cpu": {"mean": float(off.mean()), "share_above_1e-3": float((off > 1e-3).mean()), "largest": float(off.max())},

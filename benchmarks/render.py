@@ -64,11 +64,13 @@ def cameras(tree: Any, width: int, height: int, count: int, fov: float) -> list[
 
 
 def measure(tree: Any, views: list[Any], supersample: int) -> dict[str, Any]:
+    from efficientnerf.asset.rendering import render
+
     """Times of each render, after one that compiles and packs; `processor_ms` is the time of all cores together for one."""
-    first = _seconds(lambda: tree.render(views[0], supersample=supersample))
+    first = _seconds(lambda: render(tree, views[0], supersample=supersample))
     spent = time.process_time()
-    took = [_seconds(lambda view=view: tree.render(view, supersample=supersample)) for view in views]
-    again = [_seconds(lambda view=view: tree.render(view, supersample=supersample)) for view in views]
+    took = [_seconds(lambda view=view: render(tree, view, supersample=supersample)) for view in views]
+    again = [_seconds(lambda view=view: render(tree, view, supersample=supersample)) for view in views]
     spent = time.process_time() - spent
     best = [min(pair) for pair in zip(took, again, strict=True)]
     rays = views[0].width * views[0].height * supersample**2
@@ -106,15 +108,17 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
 
 def memory(tree: Any, view: Any) -> dict[str, float]:
     """Bytes in memory while rendering: the tree, its packed form, the threads' blocks, and the framebuffer."""
+    from efficientnerf.asset.rendering import render
+    from efficientnerf.backends.numba.tree.packed import packed_of
     from efficientnerf.backends.numba.tree.rendering import scratch_bytes
 
     values = vars(tree) | vars(tree.harmonics) if hasattr(tree.harmonics, "__dict__") else vars(tree)
     own = sum(part.nbytes for part in values.values() if hasattr(part, "nbytes") and not isinstance(part, tuple))
-    rendering = tree.render(view)
+    rendering = render(tree, view)
     framebuffer = sum(part.nbytes for part in vars(rendering).values())
-    total = own + tree.packed.nbytes + scratch_bytes(tree) + framebuffer
+    total = own + packed_of(tree).nbytes + scratch_bytes(tree) + framebuffer
     each = round(total / max(1, len(tree.density_values)), 1)
-    return {"tree": own, "packed": tree.packed.nbytes, "blocks": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
+    return {"tree": own, "packed": packed_of(tree).nbytes, "blocks": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
 
 
 def main() -> int:
@@ -135,11 +139,11 @@ def main() -> int:
 
     import numba
 
-    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.asset import format
 
     before = os.getloadavg()
     begin = time.perf_counter()
-    tree = NerfTree.load(given.asset)
+    tree = format.load(given.asset)
     loading = time.perf_counter() - begin
     views = cameras(tree, given.width, given.height, given.frames, given.fov)
     result = {

@@ -67,7 +67,7 @@ def settings_of(preset: str) -> Any:
 
 def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contender:
     from efficientnerf.model import model
-    from efficientnerf.rendering.render import FieldRenderer
+    from efficientnerf.rendering.field_renderer import FieldRenderer
     from efficientnerf.training.loop import train, trainer
     from stages.io import scene
     from stages.io.field_file import space_of

@@ -59,6 +59,9 @@ class EvaluateSettings:
     )
 
 
+RenderTree = Callable[..., Any]  # (camera, background=...) -> Rendering
+
+
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
     """The image that a render is compared with.
@@ -75,7 +78,10 @@ class GroundTruth:
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from efficientnerf.asset.tree import NerfTree
+    from functools import partial
+
+    from efficientnerf.asset import format
+    from efficientnerf.asset.rendering import render
 
     inputs = inputs_of(EvaluateInputs, job.inputs)
 
@@ -84,14 +90,14 @@ def run(job: Job) -> None:
 
         return load_renderer(inputs.train.folder, job.device)
 
-    evaluate(NerfTree.load(inputs.bake.asset).to(job.device), load_field, job)
+    evaluate(partial(render, format.load(inputs.bake.asset).to(job.device)), load_field, job)
 
 
-def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
+def evaluate(render_tree: RenderTree, load_field: Callable[[], Any], job: Job) -> None:
     """Write the metrics and the contact sheet. Metrics and thumbnails of each view are kept in job.work, so that a kill costs at most one view.
 
-    tree        with the interface of a NerfTree
-    load_field  returns a FieldRenderer; called only where one is needed
+    render_tree  as `efficientnerf.asset.rendering.render`, of a tree
+    load_field   returns a FieldRenderer; called only where one is needed
     """
     from stages.io.scene import load
 
@@ -117,7 +123,7 @@ def evaluate(tree: Any, load_field: Callable[[], Any], job: Job) -> None:
             needs_field = k in rendered or constant_background(scene) is None
             field = field or (load_field() if needs_field else None)
             measured, images = evaluate_view(
-                tree, field, scene, view, job, with_field=k in rendered, stride=stride if k in rendered else rest, perceptual=perceptual
+                render_tree, field, scene, view, job, with_field=k in rendered, stride=stride if k in rendered else rest, perceptual=perceptual
             )
             if k in rendered:
                 _save_thumbnails(images, job.work, k)
@@ -205,7 +211,7 @@ def upsample(values: np.ndarray, stride: int, width: int, height: int) -> np.nda
 
 
 def evaluate_view(
-    tree: Any, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int, perceptual: Mapping[str, Lpips] | None = None
+    render_tree: RenderTree, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int, perceptual: Mapping[str, Lpips] | None = None
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
@@ -229,7 +235,7 @@ def evaluate_view(
         metrics["network"] = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0], **sample_shares(rendering.counts)}
         metrics["network"] |= lpips_metrics(perceptual or {}, render, small)
         images += [eight_bits(small.colour), eight_bits(render), error_picture(render, small.colour)]
-    asset, inside = render_asset(tree, scene, view, rendering, stride)
+    asset, inside = render_asset(render_tree, scene, view, rendering, stride)
     asset = _clipped(asset, job, f"{view.name}: the asset")
     metrics["asset"] = {**compare(asset, truth, truth.inside if inside is None else inside), "width": view.camera.width, "height": view.camera.height}
     metrics["asset"] |= lpips_metrics(perceptual or {}, asset, truth)
@@ -263,14 +269,14 @@ def sample_shares(counts: Any) -> dict[str, float]:
     return {"valid_share": counts.valid_share, "pivotal_share": counts.pivotal_share, "fine_per_ray": counts.fine / max(counts.rays, 1)}
 
 
-def render_asset(tree: Any, scene: Scene, view: View, rendering: Any, stride: int) -> tuple[np.ndarray, np.ndarray | None]:
+def render_asset(render_tree: RenderTree, scene: Scene, view: View, rendering: Any, stride: int) -> tuple[np.ndarray, np.ndarray | None]:
     """The asset's render of a view (H, W, 3), and which pixels lie in its box (unbounded scenes only).
 
     In unbounded scenes: before + (1 - before's alpha) (asset + (1 - asset's alpha) behind), where the field gives before and behind.
     """
     if (background := constant_background(scene)) is not None:
-        return tree.render(view.camera, background=background).colour, None
-    output = tree.render(view.camera)
+        return render_tree(view.camera, background=background).colour, None
+    output = render_tree(view.camera)
     size = (stride, view.camera.width, view.camera.height)
     before, behind = upsample(rendering.before, *size), upsample(rendering.behind, *size)
     middle = output.colour + (1.0 - output.opacity[..., None]) * behind

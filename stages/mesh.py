@@ -34,10 +34,11 @@ class MeshSettings:
 def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:
     """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
     from efficientnerf.surface.isosurface import NoSurface, surface
+    from efficientnerf.surface.volume import volume_of
 
     try:
         return surface(
-            tree,
+            volume_of(tree),
             given(settings.density_threshold),
             faces=settings.max_faces,
             min_component=settings.min_component,

@@ -37,10 +37,11 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
     """Points on the tree's surface in the capture's frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
     from efficientnerf.surface.isosurface import NoSurface, points
     from efficientnerf.surface.mesh import PointCloud
+    from efficientnerf.surface.volume import volume_of
 
     try:
         cloud = points(
-            tree,
+            volume_of(tree),
             settings.num_points,
             given(settings.density_threshold),
             min_component=settings.min_component,

@@ -43,7 +43,7 @@ NOWHERE = 1e-9  # scene is 2 across: nearer to a camera than this, a point has n
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.model import model
-    from efficientnerf.rendering.render import FieldRenderer
+    from efficientnerf.rendering.field_renderer import FieldRenderer
     from efficientnerf.training import loop
     from efficientnerf.training.readback import AsyncOccupancy
     from stages.io import field_file, scene

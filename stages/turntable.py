@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -47,10 +48,10 @@ class TurntableSettings:
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.asset import format
 
     inputs = inputs_of(TurntableInputs, job.inputs)
-    draw_turntable(NerfTree.load(inputs.bake.asset).to(job.device), job)
+    draw_turntable(format.load(inputs.bake.asset).to(job.device), job)
 
 
 def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
@@ -62,7 +63,7 @@ def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
     )
 
 
-def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # anything with the interface of a NerfTree
+def draw_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None) -> None:
     """Frames go to job.work one by one, so that a kill costs at most one of them; the video is made of the PNGs, so that it does not depend on where."""
     from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames
 
@@ -74,7 +75,7 @@ def draw_turntable(tree, job: Job) -> None:  # type: ignore[no-untyped-def]  # a
         job.safe_point()
         job.progress(done, total, "frames")
 
-    written = draw_frames(tree, cameras, job.work / "frames", options, each, reuse=True)
+    written = draw_frames(tree, cameras, job.work / "frames", options, each, reuse=True, draw=draw)
     job.say("encoding the video")
     encode_frames([path for path in written if path.suffix == ".png"], TurntableOutputs(job.out).video, options, job.safe_point)
     for path in written:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.tree import Rendering
+from efficientnerf.asset.rendering import Rendering
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
-from efficientnerf.rendering.render import FieldRendering
+from efficientnerf.rendering.field_renderer import FieldRendering
 
 WHITE = (1.0, 1.0, 1.0)
 

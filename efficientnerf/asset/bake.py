@@ -22,7 +22,7 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
-from efficientnerf.rendering.render import split_by_box
+from efficientnerf.rendering.field_renderer import split_by_box
 from efficientnerf.sampling.occupancy import cell_of
 from efficientnerf.training.pixels import Pixels
 

@@ -186,7 +186,7 @@ def grid_of(tree: NerfTree) -> TreeGrid:
 
 def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rays of the world in voxel coordinates, and the harmonics along them (R, K)."""
-    rays = tree.frame_rays(np.asarray(origins, np.float64), np.asarray(directions, np.float64))
+    rays = tree.frame.rays(np.asarray(origins, np.float64), np.asarray(directions, np.float64))
     start = np.ascontiguousarray((rays.origins - tree.bounds_min) / tree.voxel)
     bases = np.ascontiguousarray(basis_numpy(np.asarray(directions, np.float32), tree.degree))
     return start, np.ascontiguousarray(rays.directions, np.float64), bases

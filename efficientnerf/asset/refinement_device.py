@@ -61,7 +61,7 @@ class DeviceFit:
 
 def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
     """Rays of the world (R, 3), unit directions, in voxel coordinates."""
-    rays = tree.frame_rays(origins.double(), directions.double())
+    rays = tree.frame.rays(origins.double(), directions.double())
     start = (rays.origins - constant(tree.bounds_min, rays.origins)) / tree.voxel
     return Rays(start.float().contiguous(), rays.directions.float().contiguous(), directions.float().contiguous())
 

@@ -1,11 +1,14 @@
-"""NerfTree: coarse dense voxels over sparse bricks (EfficientNeRF, section 3.5), as it lies in memory.
+"""NerfTree: coarse dense voxels over sparse bricks (EfficientNeRF, section 3.5), in memory.
+
+Plain data: files are read and written by `efficientnerf.asset.format`, points looked up by `efficientnerf.asset.queries`, images rendered by
+`efficientnerf.asset.rendering`.
 
 The grid has shape * brick voxels a side, cubic, of `voxel` world units. A coarse cell is either empty, and then space in it has no
 density whatever its neighbours hold, or it owns a brick of brick^3 voxels, of which those that matter are stored.
 Values sit at voxel centres and are interpolated linearly between the stored ones, or hold all over their voxels: `lookup` says which.
 
 The grid lies in the tree's *frame*: the world, or the normalised device coordinates of a reference camera (`efficientnerf.geometry.ndc`) where the scene is
-forward-facing. What users ask and are answered is always of the world, densities apart, which are per unit of the frame.
+forward-facing. Arguments and results of those functions are of the world, densities apart, which are per unit of the frame.
 
 B bricks, N stored voxels, K harmonics, R rays.
 """
@@ -14,39 +17,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.geometry.ndc import WORLD, Frame, Ndc
 from efficientnerf.rendering.harmonics import harmonics_count
 
-if TYPE_CHECKING:
-    from efficientnerf.backends.numba.tree.packed import Packed
-    from efficientnerf.backends.triton.tree import DeviceTree
-    from efficientnerf.geometry.cameras import Camera
-    from efficientnerf.geometry.ndc import Ndc, NdcRays
-
-
 LOOKUPS = ("trilinear", "nearest")
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """What a camera (or a bundle of rays) sees of a scene.
-
-    colour   (..., 3) float32, sRGB, premultiplied by the opacity, or over the background that was asked for
-    opacity  (...)    float32, 0 to 1
-    depth    (...)    float32, world units, along the view axis for cameras and along the ray for rays; where half of the light is
-                      absorbed, infinity where less than half ever is
-    normal   (..., 3) float32, unit, world frame, out of the surface; zero where nothing is hit
-    """
-
-    colour: np.ndarray
-    opacity: np.ndarray
-    depth: np.ndarray
-    normal: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +42,11 @@ class NerfTree:
     harmonics    what the voxels' colours are made of, one of two:
                  (N, K, 3) float32, or PaletteHarmonics: codes into palettes, as files of the layout `compact` load
     background   sRGB colour that the training images lay on, or None for photographs with surroundings
-    device       where pictures are drawn, see `to`; not part of the asset
+    device       where it is rendered, see `to`; not part of the asset
     ndc          the reference camera whose normalised device coordinates are the frame, or None: the frame is the world
     lookup       what a point gets: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
                  where that one is not stored (EfficientNeRF, section 4.1, has the field trained on such coordinates)
+    derived      what renderers made of the arrays, by name; made when first rendered, so that arrays changed in place later are not seen
 
     For renderers: `sh` is always there as plain floats, but decoding a palette costs 12 K bytes a voxel and is remembered; a kernel
     that matters reads `harmonics` itself where it is a PaletteHarmonics, whose docstring states what its arrays mean. A kernel for codes
@@ -86,6 +66,7 @@ class NerfTree:
     device: str = "cpu"
     ndc: Ndc | None = None
     lookup: str = "trilinear"
+    derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.lookup not in LOOKUPS:
@@ -128,122 +109,15 @@ class NerfTree:
         """
         return leaps(self.brick_index >= 0)
 
-    @cached_property
-    def packed(self) -> Packed:
-        """The densities and harmonics as the renderer on the CPU reads them; made at the first picture. Values changed in place later are not seen."""
-        from efficientnerf.backends.numba.tree.packed import pack
-
-        return pack(self)
-
-    @cached_property
-    def on_device(self) -> DeviceTree:
-        """The tree as the kernel on `device` reads it; sent at the first picture."""
-        from efficientnerf.backends.triton.tree import device_tree
-
-        return device_tree(self, self.device)
-
     def to(self, device: str) -> NerfTree:
-        """The same tree, drawn on "cpu" or "cuda", the latter where its kernels can be built; points are answered on the CPU."""
+        """The same tree, rendered on "cpu" or "cuda", the latter where its kernels can be built; points are looked up on the CPU."""
         return replace(self, device=device)
 
-    @staticmethod
-    def load(path: str | Path) -> NerfTree:
-        """Read and verify an asset file; `efficientnerf.asset.format.FormatError` where it is not one."""
-        from efficientnerf.asset.format import load
-
-        return load(path)
-
-    def save(self, path: str | Path, layout: str | None = None) -> None:
-        """Write the asset file, whole or not at all: `compact`, `small`, `sparse`, `full` or `full32`; by default the one that loses nothing more."""
-        from efficientnerf.asset.format import save
-
-        save(self, path, layout)
-
-    def render(self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
-        """The picture that a camera in the training frame takes.
-
-        background   sRGB colour to composite over; None leaves the colour premultiplied
-        supersample  rays along each side of a pixel
-        """
-        from efficientnerf.rendering.render import render_tree
-
-        return render_tree(self, camera, background=background, supersample=supersample)
-
-    def render_rays(self, origins: np.ndarray, directions: np.ndarray, *, eye: np.ndarray | None = None, columns: int | None = None) -> Rendering:
-        """What rays see: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray.
-
-        What is known of all rays makes them faster on the CPU, and changes colours by less than 1e-3 (2e-3 in normalised device coordinates):
-
-        eye      (3,) the point that all come from
-        columns  how many make a row, where they are the rows of a picture
-        """
-        from efficientnerf.backends.dispatch import tree_rays
-
-        if self.ndc is None:
-            return Rendering(*tree_rays(self, origins, directions, None, eye, columns))
-        from efficientnerf.backends.numba import ndc as cpu_ndc
-
-        rays = cpu_ndc.warp_rays(self.ndc, origins, directions)
-        colour, opacity, along, normal = tree_rays(self, rays.origins, rays.directions, np.asarray(directions), eye, columns)
-        return Rendering(colour, opacity, *cpu_ndc.unwarp_hits(self.ndc, rays, along, normal))
-
-    def frame_rays(self, origins: Any, directions: Any) -> NdcRays:
-        """World rays (R, 3), unit directions, as rays of the tree's frame: what anything that walks the grid itself has to do first.
-
-        `(result.origins - bounds_min) / voxel` are voxel coordinates and `result.directions` the unit directions there; a step of one voxel is
-        `voxel` units of the frame, which densities are per. Harmonics are looked up along the directions of the world, as they went in.
-        `efficientnerf.geometry.ndc.world_distance` turns distances along the result into those of the world. Numpy arrays and torch tensors alike.
-        """
-        from efficientnerf.geometry.ndc import NdcRays
-
-        if self.ndc is not None:
-            return self.ndc.rays(origins, directions)
-        none = origins[..., 0] * 0
-        return NdcRays(origins, directions, none, none + 1, none)
-
-    def _in_frame(self, points: np.ndarray) -> np.ndarray:
-        return points if self.ndc is None else self.ndc.points(np.asarray(points, np.float64))
-
-    def density(self, points: np.ndarray) -> np.ndarray:
-        """Density at points (N, 3) of the world: (N,) float32, per unit of the frame."""
-        from efficientnerf.backends.numba.tree.rendering import density_at
-
-        return density_at(self, self._in_frame(points))
-
-    def normal(self, points: np.ndarray) -> np.ndarray:
-        """Unit vectors down the density's gradient at points (N, 3); zero where it is flat."""
-        from efficientnerf.backends.numba.tree.rendering import normal_at
-
-        at = self._in_frame(points)
-        normal = normal_at(self, at)
-        return normal if self.ndc is None else self.ndc.world_normals(at, normal.astype(np.float64)).astype(np.float32)
-
-    def colour(self, points: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
-        """sRGB colour at points (N, 3), seen along unit directions (N, 3), or its view-independent part: (N, 3) float32, 0 to 1.
-
-        Grey where no voxel is stored.
-        """
-        from efficientnerf.backends.numba.tree.rendering import colour_at
-
-        return colour_at(self, self._in_frame(points), directions)
-
-    def density_block(self, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
-        """Density at the voxel centres low <= (i, j, k) < high: float32, zero outside of the grid and where nothing is stored."""
-        low_a, high_a = np.asarray(low), np.asarray(high)
-        if (high_a < low_a).any():
-            raise ValueError(f"density_block from {tuple(low)} to {tuple(high)}: the upper corner lies below the lower one")
-        axes = [np.arange(a, b) for a, b in zip(low_a, high_a, strict=True)]
-        inside = [(a >= 0) & (a < n) for a, n in zip(axes, self.resolution, strict=True)]
-        out = np.zeros(tuple(high_a - low_a), np.float32)
-        i, j, k = (a[m] for a, m in zip(axes, inside, strict=True))
-        if not (len(i) and len(j) and len(k) and len(self.voxel_index)):
-            return out
-        d = self.brick
-        brick = self.brick_index[np.ix_(i // d, j // d, k // d)]
-        local = ((i % d)[:, None, None] * d + (j % d)[:, None]) * d + (k % d)
-        index = np.where(brick >= 0, self.voxel_index[np.maximum(brick, 0), local], -1)
-        out[np.ix_(*inside)] = np.where(index >= 0, self.density_values[np.maximum(index, 0)], 0)
-        return out
+    @property
+    def frame(self) -> Frame:
+        """Where the grid lies. `frame.rays` takes world rays to it: with these `(origins - bounds_min) / voxel` are voxel coordinates; a step of
+        one voxel is `voxel` units of the frame, which densities are per; harmonics are looked up along the directions of the world."""
+        return WORLD if self.ndc is None else self.ndc
 
     def with_values(self, density: np.ndarray, sh: np.ndarray) -> NerfTree:
         """The same voxels with other densities (N,) and coefficients (N, K, 3)."""

@@ -149,7 +149,7 @@ def tree_rays(
 
         given = (origins, directions) if looking is None else (origins, directions, looking)
         there = [torch.from_numpy(np.ascontiguousarray(a, np.float64)).to(tree.device) for a in given]
-        return tuple(part.cpu().numpy() for part in cuda_tree.render_rays(tree.on_device, *there))
+        return tuple(part.cpu().numpy() for part in cuda_tree.render_rays(cuda_tree.device_tree_of(tree), *there))
     if tree.lookup == "nearest":
         from efficientnerf.backends.numba.tree import nearest
 

@@ -165,6 +165,24 @@ class Ndc:
         return world / _where(length > 0, length, _one(length))[..., None]
 
 
+class WorldFrame:
+    """The world as the frame of a tree: the methods that `Ndc` has, doing nothing."""
+
+    def points(self, world: Any) -> Any:
+        return world
+
+    def rays(self, origins: Any, directions: Any) -> NdcRays:
+        zero = origins[..., 0] * 0
+        return NdcRays(origins, directions, zero, zero + 1, zero)
+
+    def world_normals(self, points: Any, normals: Any) -> Any:
+        return normals
+
+
+WORLD = WorldFrame()
+Frame = WorldFrame | Ndc
+
+
 def _is_numpy(value: Any) -> bool:
     return isinstance(value, np.ndarray | np.generic)
 

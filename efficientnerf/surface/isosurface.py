@@ -1,24 +1,33 @@
-"""From a tree to a surface: marching cubes over the density, cleaned, thinned and coloured; and points on it.
+"""From densities to a surface: marching cubes, cleaned, decimated and coloured; and points on it.
 
 Letters: sigma density per world unit, tau the level of the surface, s the voxel's side; V vertices, F faces, R rays, K directions, S samples.
-Everything is in the training frame. A tree is anything with `shape`, `brick`, `voxel`, `bounds_min` and the methods
-`density_block`, `density` and `colour`.
+Everything is in the frame of the volume (`efficientnerf.surface.volume`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from efficientnerf.surface.ndc_frame import FrameTree
-
-from .mesh import Mesh, PointCloud, compact, decimate, face_areas, face_components, face_volumes, sample, separate, smooth, tidy, vertex_normals
+from efficientnerf.surface.mesh import (
+    Mesh,
+    PointCloud,
+    compact,
+    decimate,
+    face_areas,
+    face_components,
+    face_volumes,
+    sample,
+    separate,
+    smooth,
+    tidy,
+    vertex_normals,
+)
+from efficientnerf.surface.volume import NdcVolume, Volume
 
 Progress = Callable[[int, int, str], None]
-Looking = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
+ViewDirections = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 BLOCK = 64  # voxels a side that are in memory at a time
 CHUNK = 1 << 16  # points whose colours are looked up at a time
 
@@ -31,16 +40,16 @@ def _silent(done: int, total: int, text: str) -> None:
     pass
 
 
-def _grid(tree: Any) -> np.ndarray:
-    return np.asarray(tree.shape, np.int64) * int(tree.brick)  # (3,) voxels per axis
+def _grid(volume: Volume) -> np.ndarray:
+    return np.asarray(volume.shape, np.int64) * int(volume.brick)  # (3,) voxels per axis
 
 
-def _pool(tree: Any) -> int:
+def _pool(volume: Volume) -> int:
     """Voxels along a side of the cells in which enclosed space is looked for: two; more where that were over 256 cells a side, for the memory."""
-    return 2 * max(1, -(-int(_grid(tree).max()) // 512))
+    return 2 * max(1, -(-int(_grid(volume).max()) // 512))
 
 
-def automatic_threshold(tree: Any, lines: int = 24) -> float:
+def automatic_threshold(volume: Volume, lines: int = 24) -> float:
     """The density at which the surface is drawn where nobody says: what light entering from outside meets.
 
         tau = min( ln 2 / s,  lower quartile over rays of max_{j <= h} sigma_j ),   h: the voxel where the ray's transmittance falls to 1/2
@@ -53,7 +62,7 @@ def automatic_threshold(tree: Any, lines: int = 24) -> float:
 
     Raises NoSurface where no ray loses half its light.
     """
-    grid, brick, voxel = _grid(tree), int(tree.brick), float(tree.voxel)
+    grid, brick, voxel = _grid(volume), int(volume.brick), float(volume.voxel)
     found, highest = [], 0.0
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
@@ -62,7 +71,7 @@ def automatic_threshold(tree: Any, lines: int = 24) -> float:
                 low, high = np.zeros(3, np.int64), grid.copy()
                 low[first], low[second] = i * brick, j * brick
                 high[first], high[second] = low[first] + brick, low[second] + brick
-                block = np.asarray(tree.density_block(low, high), np.float64)
+                block = np.asarray(volume.density_block(low, high), np.float64)
                 sigma = np.moveaxis(block, axis, -1).reshape(-1, grid[axis])  # (R, S)
                 highest = max(highest, float(sigma.max()))
                 found += [_met_on_the_way(ray, voxel) for ray in (sigma, sigma[:, ::-1])]
@@ -85,7 +94,7 @@ def _met_on_the_way(sigma: np.ndarray, voxel: float) -> np.ndarray:
     return np.maximum.accumulate(sigma[opaque], 1)[np.arange(len(half)), half]
 
 
-def enclosed_cells(tree: Any, threshold: float, viewpoints: np.ndarray) -> np.ndarray:
+def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> np.ndarray:
     """Empty space that nobody outside can see, because everything around it is dense: bool, one value per cell of `_pool`^3 voxels.
 
     viewpoints  (N, 3) places that are outside by definition, besides the boundary of the volume: a camera may stand in a closed room
@@ -94,12 +103,12 @@ def enclosed_cells(tree: Any, threshold: float, viewpoints: np.ndarray) -> np.nd
     """
     from scipy.ndimage import label
 
-    grid, pool = _grid(tree), _pool(tree)
+    grid, pool = _grid(volume), _pool(volume)
     cells = -(-grid // pool)
     dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
     step = pool * 16
     for start in range(0, int(grid[0]), step):
-        sigma = np.asarray(tree.density_block((start, 0, 0), (start + step, *(cells[1:] * pool).tolist())))
+        sigma = np.asarray(volume.density_block((start, 0, 0), (start + step, *(cells[1:] * pool).tolist())))
         pooled = np.any((sigma >= threshold).reshape(step // pool, pool, cells[1], pool, cells[2], pool), axis=(1, 3, 5))
         first = start // pool
         last = min(first + len(pooled), int(cells[0]))
@@ -107,14 +116,14 @@ def enclosed_cells(tree: Any, threshold: float, viewpoints: np.ndarray) -> np.nd
     region = np.empty(dense.shape, np.int32)
     label(~dense, output=region)
     outside = {int(region[0, 0, 0])}
-    at = np.floor((viewpoints - np.asarray(tree.bounds_min)) / (float(tree.voxel) * pool)).astype(np.int64)  # (N, 3)
+    at = np.floor((viewpoints - np.asarray(volume.bounds_min)) / (float(volume.voxel) * pool)).astype(np.int64)  # (N, 3)
     at = at[((at >= 0) & (at < cells)).all(1)] + 1
     outside |= set(region[tuple(at.T)].tolist())
     return (~dense & ~np.isin(region, list(outside)))[1:-1, 1:-1, 1:-1]
 
 
-def _filled_block(tree: Any, low: np.ndarray, high: np.ndarray, threshold: float, enclosed: np.ndarray | None) -> np.ndarray:
-    """`tree.density_block` with infinite density in enclosed space.
+def _filled_block(volume: Volume, low: np.ndarray, high: np.ndarray, threshold: float, enclosed: np.ndarray | None) -> np.ndarray:
+    """`volume.density_block` with infinite density in enclosed space.
 
     What is enclosed grows by a few voxels, as far as nothing dense is in the way: into the corners that its coarse cells left out, and
     into the pinholes, which it stops up. The margin that is read makes the result the same for both blocks that share a plane.
@@ -122,21 +131,21 @@ def _filled_block(tree: Any, low: np.ndarray, high: np.ndarray, threshold: float
     from scipy.ndimage import binary_dilation
 
     if enclosed is None:
-        return np.asarray(tree.density_block(low, high))
-    margin = _pool(tree) + 1
-    axes = [np.arange(a - margin, b + margin) // _pool(tree) for a, b in zip(low, high)]
+        return np.asarray(volume.density_block(low, high))
+    margin = _pool(volume) + 1
+    axes = [np.arange(a - margin, b + margin) // _pool(volume) for a, b in zip(low, high)]
     known = [(axis >= 0) & (axis < count) for axis, count in zip(axes, enclosed.shape)]
     seed = enclosed[np.ix_(*(np.clip(axis, 0, count - 1) for axis, count in zip(axes, enclosed.shape)))]
     seed &= known[0][:, None, None] & known[1][:, None] & known[2]
     if not seed.any():
-        return np.asarray(tree.density_block(low, high))
-    sigma = np.asarray(tree.density_block(low - margin, high + margin))
+        return np.asarray(volume.density_block(low, high))
+    sigma = np.asarray(volume.density_block(low - margin, high + margin))
     filled = binary_dilation(seed, iterations=margin, mask=sigma < threshold)
     return np.where(filled, np.float32(np.inf), sigma)[margin:-margin, margin:-margin, margin:-margin]
 
 
 def isosurface(
-    tree: Any, threshold: float, progress: Progress = _silent, *, enclosed: np.ndarray | None = None, block: int = BLOCK
+    volume: Volume, threshold: float, progress: Progress = _silent, *, enclosed: np.ndarray | None = None, block: int = BLOCK
 ) -> tuple[np.ndarray, np.ndarray]:
     """The closed surface where the density passes `threshold` -> vertices (V, 3) float64, faces (F, 3) int64.
 
@@ -149,7 +158,7 @@ def isosurface(
     """
     from skimage.measure import marching_cubes
 
-    grid = _grid(tree)
+    grid = _grid(volume)
     starts = [np.arange(-1, grid[axis], block) for axis in range(3)]
     total = int(np.prod([len(each) for each in starts]))
     positions, faces, seams, joined, count, done = [], [], [], [], 0, 0
@@ -158,7 +167,7 @@ def isosurface(
             for z in starts[2]:
                 low = np.array([x, y, z])
                 high = np.minimum(low + block, grid)  # the last sample, included
-                opacity = _opacity(_filled_block(tree, low, high + 1, threshold, enclosed), low, threshold)
+                opacity = _opacity(_filled_block(volume, low, high + 1, threshold, enclosed), low, threshold)
                 done += 1
                 progress(done, total, "marching cubes")
                 if opacity.min() > 0.5 or opacity.max() < 0.5:
@@ -180,7 +189,7 @@ def isosurface(
     lattice, triangles = compact(np.concatenate(positions), target[np.concatenate(faces)])
     # Sample i lies at the middle of voxel i. What closes the surface at the boundary must not stand out of the box.
     lattice = np.clip(lattice + 0.5, 0, grid)
-    return np.asarray(tree.bounds_min, np.float64) + lattice * float(tree.voxel), triangles
+    return np.asarray(volume.bounds_min, np.float64) + lattice * float(volume.voxel), triangles
 
 
 def _opacity(sigma: np.ndarray, low: np.ndarray, threshold: float) -> np.ndarray:
@@ -250,23 +259,23 @@ def _crossings(point: np.ndarray, triangles: np.ndarray) -> int:
 
 
 def surface_colours(
-    tree: Any, positions: np.ndarray, normals: np.ndarray, progress: Progress = _silent, looking: Looking | None = None, chunk: int = CHUNK
+    volume: Volume, positions: np.ndarray, normals: np.ndarray, progress: Progress = _silent, view_directions: ViewDirections | None = None, chunk: int = CHUNK
 ) -> np.ndarray:
     """(N, 3) float32 sRGB of surface points, as seen from outside.
 
     Along the inward normal, from one voxel in front of the point to two behind it, colours are weighted as a ray would weigh them: a single
     sample on the surface mixes with the colour of empty voxels. Each is the median over six viewing directions, one head on and five at
-    45 degrees, so that neither a highlight nor a direction that no camera looked along decides; or over those that `looking` gives for
+    45 degrees, so that neither a highlight nor a direction that no camera looked along decides; or over those that `view_directions` gives for
     points and normals.
     """
     colours = np.empty((len(positions), 3), np.float32)
-    steps = np.linspace(-1.0, 2.0, 7) * float(tree.voxel)  # (S,)
+    steps = np.linspace(-1.0, 2.0, 7) * float(volume.voxel)  # (S,)
     for start in range(0, len(positions), chunk):
         part = slice(start, start + chunk)
         progress(start, len(positions), "colours")
         point, normal = positions[part], normals[part]
         samples = point[:, None] - steps[:, None] * normal[:, None]  # (N, S, 3)
-        sigma = np.asarray(tree.density(samples.reshape(-1, 3)), np.float64).reshape(-1, len(steps))
+        sigma = np.asarray(volume.density(samples.reshape(-1, 3)), np.float64).reshape(-1, len(steps))
         depth = np.cumsum(sigma, 1) * (steps[1] - steps[0])
         weight = np.exp(-np.pad(depth, ((0, 0), (1, 0)))[:, :-1]) - np.exp(-depth) + 1e-12 * (sigma + 1e-9)  # (N, S)
         weight /= weight.sum(1, keepdims=True)
@@ -274,16 +283,16 @@ def surface_colours(
         share = np.take_along_axis(weight, best, 1)
         chosen = np.take_along_axis(samples, best[..., None], 1).reshape(-1, 3)
         seen = []
-        for direction in _looking_at(normal) if looking is None else looking(point, normal):
+        for direction in _view_directions(normal) if view_directions is None else view_directions(point, normal):
             along = np.repeat(direction, best.shape[1], 0)
-            found = np.asarray(tree.colour(chosen, along), np.float64).reshape(-1, best.shape[1], 3)
+            found = np.asarray(volume.colour(chosen, along), np.float64).reshape(-1, best.shape[1], 3)
             seen.append((found * share[..., None]).sum(1) / share.sum(1, keepdims=True))
         colours[part] = np.clip(np.median(seen, 0), 0, 1)
     progress(len(positions), len(positions), "colours")
     return colours
 
 
-def _looking_at(normal: np.ndarray) -> list[np.ndarray]:
+def _view_directions(normal: np.ndarray) -> list[np.ndarray]:
     """K unit ray directions (N, 3) each, towards a surface with these outward normals."""
     helper = np.where(np.abs(normal[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     first = np.cross(helper, normal)
@@ -294,13 +303,13 @@ def _looking_at(normal: np.ndarray) -> list[np.ndarray]:
 
 
 def _shape(
-    tree: Any, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
+    volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
-    level = automatic_threshold(tree) if threshold is None else float(threshold)
+    level = automatic_threshold(volume) if threshold is None else float(threshold)
     if not (np.isfinite(level) and level > 0):
         raise NoSurface(f"threshold {level:g}: expected a density above zero")
-    enclosed = enclosed_cells(tree, level, viewpoints)
-    vertices, faces = isosurface(tree, level, progress, enclosed=enclosed if enclosed.any() else None)
+    enclosed = enclosed_cells(volume, level, viewpoints)
+    vertices, faces = isosurface(volume, level, progress, enclosed=enclosed if enclosed.any() else None)
     if not len(faces):
         raise NoSurface(f"the density nowhere reaches {level:.4g} per unit")
     vertices, faces, facts = visible_parts(vertices, faces, min_component, viewpoints)
@@ -312,7 +321,7 @@ _NOBODY = np.zeros((0, 3))
 
 
 def surface(
-    tree: Any,
+    volume: Volume,
     threshold: float | None = None,
     *,
     faces: int = 200_000,
@@ -321,7 +330,7 @@ def surface(
     viewpoints: np.ndarray = _NOBODY,
     progress: Progress = _silent,
 ) -> Mesh:
-    """The tree's surface as a closed, coloured mesh in the training frame.
+    """The volume's surface as a closed, coloured mesh in the training frame.
 
     threshold      density per world unit at which it is drawn; None: `automatic_threshold`
     faces          budget that it is decimated to
@@ -330,35 +339,24 @@ def surface(
     viewpoints     (N, 3) where somebody may look from who is inside the volume: what can be seen from there is not filled
     progress       called with (done, total, text); what it raises stops the work
 
-    Of a forward-facing tree it is the surface in normalised device coordinates (budget, rounds and sizes of pieces count there), in the world.
+    Of an `NdcVolume` it is the surface in normalised device coordinates (budget, rounds and sizes of components count there), in the world.
 
     Raises NoSurface.
     """
-    tree = _interpolated(tree)
-    if (frame := _frame_of(tree)) is not None:
-        tree, viewpoints = frame, _NOBODY  # the cameras stand before the near plane, outside of the volume
-    vertices, triangles, facts = _shape(tree, threshold, min_component, rounds, viewpoints, progress)
+    ndc = volume if isinstance(volume, NdcVolume) else None
+    viewpoints = viewpoints if ndc is None else _NOBODY  # the cameras are before the near plane, outside of the volume
+    vertices, triangles, facts = _shape(volume, threshold, min_component, rounds, viewpoints, progress)
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints)  # crumbs that had hung on by an edge
     normals = vertex_normals(vertices, triangles)
-    colours = surface_colours(tree, vertices, normals, progress, None if frame is None else frame.looking)
+    colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
     mesh = Mesh(vertices, triangles, normals, colours, facts)
-    return mesh if frame is None else frame.mesh(mesh)
-
-
-def _interpolated(tree: Any) -> Any:
-    """The tree with trilinear lookup: a surface lies between voxels, where those that hold its points may not be stored and have no colour."""
-    return replace(tree, lookup="trilinear") if getattr(tree, "lookup", "trilinear") != "trilinear" else tree
-
-
-def _frame_of(tree: Any) -> FrameTree | None:
-    """The tree in its normalised device coordinates, if that is where it lies."""
-    return None if getattr(tree, "ndc", None) is None else FrameTree(tree)
+    return mesh if ndc is None else ndc.mesh(mesh)
 
 
 def points(
-    tree: Any,
+    volume: Volume,
     count: int = 200_000,
     threshold: float | None = None,
     *,
@@ -368,20 +366,19 @@ def points(
     seed: int = 0,
     progress: Progress = _silent,
 ) -> PointCloud:
-    """`count` points spread evenly over the tree's surface (before decimation), with normals and colours. Raises NoSurface.
+    """`count` points spread evenly over the surface (before decimation), with normals and colours. Raises NoSurface.
 
-    The same for the same seed; the other arguments as for `surface`. Of a forward-facing tree they are spread evenly in normalised device
+    The same for the same seed; the other arguments as for `surface`. Of an `NdcVolume` they are spread evenly in normalised device
     coordinates, as pictures show them: sparser in the world the further they are.
     """
-    tree = _interpolated(tree)
-    if (frame := _frame_of(tree)) is not None:
-        tree, viewpoints = frame, _NOBODY
-    vertices, triangles, _ = _shape(tree, threshold, min_component, rounds, viewpoints, progress)
+    ndc = volume if isinstance(volume, NdcVolume) else None
+    viewpoints = viewpoints if ndc is None else _NOBODY
+    vertices, triangles, _ = _shape(volume, threshold, min_component, rounds, viewpoints, progress)
     face, weight = sample(vertices, triangles, count, seed)
     corners = triangles[face]  # (N, 3)
     normals = (vertex_normals(vertices, triangles)[corners] * weight[..., None]).sum(1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), vertex_normals(vertices, triangles)[corners[:, 0]])
     positions = (vertices[corners] * weight[..., None]).sum(1)
-    cloud = PointCloud(positions, normals, surface_colours(tree, positions, normals, progress, None if frame is None else frame.looking))
-    return cloud if frame is None else frame.points(cloud)
+    cloud = PointCloud(positions, normals, surface_colours(volume, positions, normals, progress, None if ndc is None else ndc.view_directions))
+    return cloud if ndc is None else ndc.points(cloud)

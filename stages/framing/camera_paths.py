@@ -16,6 +16,7 @@ from stages.io.json_file import read_json
 from stages.io.scene import Orbit
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.rendering import Rendering
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.ndc import Ndc
 
@@ -327,18 +328,22 @@ Progress = Callable[[int, int], None]
 
 
 def draw_frames(
-    tree: NerfTree, cameras: Sequence[Camera], folder: Path, options: RenderOptions, progress: Progress | None = None, *, reuse: bool = False
+    tree: NerfTree, cameras: Sequence[Camera], folder: Path, options: RenderOptions, progress: Progress | None = None, *, reuse: bool = False,
+    draw: Callable[..., Rendering] | None = None,
 ) -> list[Path]:
     """Draw frame_0000.png ... (and .exr) into a folder; returns the files in order.
 
     progress  called with frames done and their number before each and at the end; may raise to stop
     reuse     keep frames that are there: only for a folder that nothing but this very request has written
+    draw      `efficientnerf.asset.rendering.render`, unless another is given
     """
+    from efficientnerf.asset.rendering import render
     from stages.io.exporters.exr import write_exr
     from stages.io.exporters.frames import background_from_text, frame_from_rendering
     from stages.io.png import write_png
 
     background, similarity = background_from_text(options.background), similarity_of(tree)
+    draw = draw or render
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for k, camera in enumerate(cameras):
@@ -348,7 +353,7 @@ def draw_frames(
         with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
         # The PNG comes last and appears whole: where it stands, the frame is finished.
         if not (reuse and png.exists()):
-            seen = tree.render(camera, supersample=options.supersample)
+            seen = draw(tree, camera, supersample=options.supersample)
             if with_exr:
                 write_exr(exr, colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal, world_from_capture=similarity)
             write_png(frame_from_rendering(seen.colour, seen.opacity, background), png)

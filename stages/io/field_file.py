@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.model import Model
-    from efficientnerf.rendering.render import FieldRenderer
+    from efficientnerf.rendering.field_renderer import FieldRenderer
     from stages.io.scene import Scene
 
 FORMAT = 1
@@ -114,7 +114,7 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     from efficientnerf.geometry.ndc import Ndc
     from efficientnerf.geometry.spaces import space_from
     from efficientnerf.model import model, restore
-    from efficientnerf.rendering.render import FieldRenderer
+    from efficientnerf.rendering.field_renderer import FieldRenderer
 
     path = TrainOutputs(folder).field
     tensors, about = read_tensors(path)

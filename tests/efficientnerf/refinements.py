@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from efficientnerf.rendering.render import render_tree_reference
 
 from efficientnerf.asset.refinement import grid_of, in_voxels
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
-from efficientnerf.rendering.render import render_tree_reference
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import uniform_tree
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.bake import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
+from efficientnerf.asset.queries import density_at, density_block
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import Model, render_rays
@@ -162,7 +163,7 @@ def test_coordinates_of_a_tree_are_those_it_was_built_from() -> None:
     at = voxel_coordinates(tree)
     for n in range(0, len(at), 17):
         low = tuple(int(x) for x in at[n])
-        assert tree.density_block(low, tuple(x + 1 for x in low)).item() == tree.density_values[n]
+        assert density_block(tree, low, tuple(x + 1 for x in low)).item() == tree.density_values[n]
 
 
 def test_values_are_means_over_the_voxel() -> None:
@@ -244,7 +245,7 @@ def test_what_was_trained_on_voxel_centres_is_baked_as_it_is(field: str) -> None
     assert sure.sum() > 1000
     assert sure.mean() > 0.99
     assert said.std() > 0.1 * said.mean() > 0
-    np.testing.assert_allclose(tree.density(at[sure]), said[sure], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(density_at(tree, at[sure]), said[sure], rtol=1e-4, atol=1e-6)
     # Several points of a voxel would say nothing else.
     (few, _), *_ = voxel_values(m, indices[:300], voxel, BOUNDS[0], 5, 0)
     np.testing.assert_allclose(few, density[:300], rtol=1e-4, atol=1e-6)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.tree import NerfTree, Rendering, tree_from_voxels
+from efficientnerf.asset.queries import density_block
+from efficientnerf.asset.rendering import Rendering, render, render_rays, render_reference
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.rendering.render import render_tree_reference
 from tests import reference
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.trees import LOW, TREES, looking, random_tree, rays_at, tensors, uniform_tree
@@ -45,20 +46,20 @@ def agree(ours: Rendering, theirs: Rendering, faces: float = 0.0) -> None:
 def test_rays_see_what_the_torch_function_says(brick: int, degree: int) -> None:
     tree = random_tree(brick, brick=brick, degree=degree)
     origins, directions = rays_at(tree, 240)
-    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
+    colour, opacity = render_reference(tree, *tensors(origins, directions))
     seen = drawn_rays(tree, origins, directions)
     # The kernel stops at 1e-3 of the light, and is in float32.
     np.testing.assert_allclose(seen.opacity, opacity, atol=1.1e-3)
     np.testing.assert_allclose(seen.colour, colour, atol=1.1e-3)
     assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
-    agree(seen, tree.render_rays(origins, directions))
+    agree(seen, render_rays(tree, origins, directions))
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1])
 def test_leaping_changes_no_value(share: float) -> None:
     tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
     origins, directions = rays_at(tree, 240)
-    agree(drawn_rays(tree, origins, directions), tree.render_rays(origins, directions), faces=0.004)
+    agree(drawn_rays(tree, origins, directions), render_rays(tree, origins, directions), faces=0.004)
 
 
 @pytest.mark.parametrize(("model", "params"), [
@@ -69,7 +70,7 @@ def test_cameras_see_what_the_cpu_shows(model: str, params: tuple[float, ...]) -
     tree = random_tree(0, share=0.7, degree=2)
     camera = replace(looking(tree), width=18, model=model, params=params)
     for background in (None, (1.0, 0.5, 0.0)) if model == "PINHOLE" else ((0.2, 0.5, 1.0),):
-        seen, expected = drawn(tree, camera, background=background), tree.render(camera, background=background)
+        seen, expected = drawn(tree, camera, background=background), render(tree, camera, background=background)
         assert seen.colour.shape == (camera.height, camera.width, 3)
         agree(seen, expected, faces=0.01)
         assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
@@ -81,8 +82,8 @@ def test_rays_through_voxels_that_are_not_interpolated(brick: int, degree: int) 
     origins, directions = rays_at(tree, 240)
     seen = drawn_rays(tree, origins, directions)
     assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
-    agree(seen, tree.render_rays(origins, directions), faces=0.02)  # samples at faces of voxels: float32 may see the one on the other side
-    other = tree.render_rays(*rays_at(replace(tree, lookup="trilinear"), 240))
+    agree(seen, render_rays(tree, origins, directions), faces=0.02)  # samples at faces of voxels: float32 may see the one on the other side
+    other = render_rays(tree, *rays_at(replace(tree, lookup="trilinear"), 240))
     assert np.abs(other.colour - drawn_rays(replace(tree, lookup="trilinear"), origins, directions).colour).max() > 0.05
 
 
@@ -90,7 +91,7 @@ def test_pictures_of_voxels_that_are_not_interpolated() -> None:
     tree = random_tree(0, share=0.7, degree=2, lookup="nearest")
     camera = looking(tree)
     for supersample in (1, 2):
-        agree(drawn(tree, camera, supersample=supersample), tree.render(camera, supersample=supersample), faces=0.03)
+        agree(drawn(tree, camera, supersample=supersample), render(tree, camera, supersample=supersample), faces=0.03)
 
 
 def test_supersampling() -> None:
@@ -99,7 +100,7 @@ def test_supersampling() -> None:
     camera = looking(tree, 9)
     for background in ((1.0, 0.5, 0.0),):
         seen = drawn(tree, camera, background=background, supersample=supersample)
-        agree(seen, tree.render(camera, background=background, supersample=supersample), faces=0.01)
+        agree(seen, render(tree, camera, background=background, supersample=supersample), faces=0.01)
         assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
     with pytest.raises(ValueError, match="expected at least 1"):
         drawn(tree, camera, supersample=0)
@@ -153,7 +154,7 @@ def test_bricks_carry_a_border_of_their_neighbours() -> None:
     edge = tree.brick + 2
     for cell in np.argwhere(tree.brick_index >= 0):
         low = cell * tree.brick - 1
-        block = tree.density_block(tuple(low), tuple(low + edge))
+        block = density_block(tree, tuple(low), tuple(low + edge))
         held = on_device.density[tree.brick_index[tuple(cell)]].reshape(edge, edge, edge).float().cpu().numpy()
         np.testing.assert_allclose(held, block, rtol=1e-3)
     assert on_device.bytes > 0
@@ -184,5 +185,5 @@ def test_a_tree_on_the_device_renders_as_on_the_cpu(supersample: int) -> None:
         pytest.skip("no CUDA device")
     tree = random_tree(4, shape=(20, 18, 22), brick=4, degree=2, share=0.3)
     camera = looking(tree, 200)
-    seen = tree.to("cuda").render(camera, background=(1.0, 1.0, 1.0), supersample=supersample)
-    agree(seen, tree.render(camera, background=(1.0, 1.0, 1.0), supersample=supersample), faces=0.01)
+    seen = render(tree.to("cuda"), camera, background=(1.0, 1.0, 1.0), supersample=supersample)
+    agree(seen, render(tree, camera, background=(1.0, 1.0, 1.0), supersample=supersample), faces=0.01)

@@ -21,6 +21,8 @@ from efficientnerf.asset import format
 from efficientnerf.asset.container import HEADER_LIMIT
 from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, save, serialize
 from efficientnerf.asset.metadata import MAJOR, STRUCTURE
+from efficientnerf.asset.queries import colour_at, density_at
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests.efficientnerf import nerftree_reader
 from tests.efficientnerf.hostile import HOSTILE, METADATA, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
@@ -56,9 +58,9 @@ def test_what_is_saved_is_loaded_and_saved_again_to_the_same_bytes(tmp_path: Pat
         assert np.array_equal(found, wanted), name
     for name in ("shape", "brick", "voxel", "background", "metadata", "degree"):
         assert getattr(again, name) == getattr(tree, name), name
-    again.save(tmp_path / "b.nerftree")
+    format.save(again, tmp_path / "b.nerftree")
     assert (tmp_path / "a.nerftree").read_bytes() == (tmp_path / "b.nerftree").read_bytes()
-    assert NerfTree.load(tmp_path / "b.nerftree").voxel == tree.voxel
+    assert format.load(tmp_path / "b.nerftree").voxel == tree.voxel
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.nerftree", "b.nerftree"]
 
 
@@ -76,7 +78,7 @@ def test_bricks_are_written_in_the_order_of_their_cells() -> None:
         harmonics=tree.sh[voxels],
     )
     points = np.random.default_rng(1).uniform(tree.bounds_min, tree.bounds_max, (100, 3))
-    assert np.array_equal(other.density(points), tree.density(points))
+    assert np.array_equal(density_at(other, points), density_at(tree, points))
     assert serialize(other) == serialize(tree)
 
 
@@ -137,9 +139,9 @@ def test_a_reader_written_from_the_text_alone_sees_the_same(tmp_path: Path, bric
     ours, theirs = load(tmp_path / "a.nerftree"), Tree(tmp_path / "a.nerftree")
     points = np.random.default_rng(0).uniform(ours.bounds_min - 0.1, ours.bounds_max + 0.1, (100, 3))
     directions = rays_at(ours, 100)[1]
-    np.testing.assert_allclose(ours.density(points), [theirs.density(p) for p in points], atol=2e-3)
-    np.testing.assert_allclose(ours.colour(points, directions), [theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], atol=1e-3)
-    seen = ours.render_rays(*(a[:12] for a in rays_at(ours, 12)))
+    np.testing.assert_allclose(density_at(ours, points), [theirs.density(p) for p in points], atol=2e-3)
+    np.testing.assert_allclose(colour_at(ours, points, directions), [theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], atol=1e-3)
+    seen = render_rays(ours, *(a[:12] for a in rays_at(ours, 12)))
     for r, (origin, direction) in enumerate(zip(*rays_at(ours, 12), strict=True)):
         colour, opacity = theirs.ray(origin, direction)
         np.testing.assert_allclose(seen.colour[r], colour, atol=1.5e-3)
@@ -163,9 +165,9 @@ def test_golden_files_stay_readable(path: Path, tmp_path: Path) -> None:
     assert hashlib.sha256(path.read_bytes()).hexdigest() == known["sha256"]
     tree = load(path)
     points, directions = np.array(known["points"]), np.array(known["directions"])
-    np.testing.assert_allclose(tree.density(points), known["density"], atol=1e-3)
-    np.testing.assert_allclose(tree.colour(points, directions), known["colour"], atol=1e-4)
-    np.testing.assert_allclose(tree.render_rays(points - 3 * directions, directions).opacity, known["opacity"], atol=1.5e-3)
+    np.testing.assert_allclose(density_at(tree, points), known["density"], atol=1e-3)
+    np.testing.assert_allclose(colour_at(tree, points, directions), known["colour"], atol=1e-4)
+    np.testing.assert_allclose(render_rays(tree, points - 3 * directions, directions).opacity, known["opacity"], atol=1.5e-3)
     assert max(known["opacity"]) > 0.5
     about = describe(path)
     assert {key: about[key] for key in known["describe"]} == known["describe"]

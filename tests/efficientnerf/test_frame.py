@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.surface.isosurface import NoSurface, points, surface
 from efficientnerf.surface.mesh import topology
+from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.walls import DEPTH, NEAR, wall
 
 SLANT = 0.3
@@ -35,7 +37,7 @@ def level_depth(tree: NerfTree, level: float, x: np.ndarray) -> np.ndarray:
 def test_a_wall_s_mesh_lies_where_the_wall_is() -> None:
     tree = marched()
     level = 3.0 / tree.voxel
-    mesh = surface(tree, level, rounds=0, faces=20_000)
+    mesh = surface(volume_of(tree), level, rounds=0, faces=20_000)
     assert topology(mesh.vertices, mesh.faces).watertight
     assert np.isfinite(mesh.vertices).all()
     at = local(tree, mesh.vertices)
@@ -54,18 +56,18 @@ def test_a_wall_s_mesh_lies_where_the_wall_is() -> None:
 
 def test_colours_are_those_that_the_cameras_saw() -> None:
     tree = marched()
-    mesh = surface(tree, 3.0 / tree.voxel, rounds=0, faces=20_000)
+    mesh = surface(volume_of(tree), 3.0 / tree.voxel, rounds=0, faces=20_000)
     at = local(tree, mesh.vertices)
     middle = np.flatnonzero((np.abs(at[:, :2]) < 1.0).all(1) & (at[:, 2] < DEPTH + 3))[:50]
     away = at[middle] @ tree.ndc.world_from_camera[:3, :3].T  # type: ignore[union-attr]
-    seen = tree.render_rays(np.broadcast_to(tree.ndc.world_from_camera[:3, 3], away.shape), away / np.linalg.norm(away, axis=1, keepdims=True))  # type: ignore[union-attr]
+    seen = render_rays(tree, np.broadcast_to(tree.ndc.world_from_camera[:3, 3], away.shape), away / np.linalg.norm(away, axis=1, keepdims=True))  # type: ignore[union-attr]
     np.testing.assert_allclose(mesh.colours[middle], seen.colour / seen.opacity[:, None], atol=0.03)
 
 
 def test_points_lie_on_the_mesh_and_face_the_same_way() -> None:
     tree = marched()
     level = 3.0 / tree.voxel
-    cloud = points(tree, 5000, level, rounds=0)
+    cloud = points(volume_of(tree), 5000, level, rounds=0)
     at, normal = local(tree, cloud.positions), local(tree, cloud.normals + tree.ndc.world_from_camera[:3, 3])  # type: ignore[union-attr]
     np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-6)
     front = (np.abs(at[:, :2]) < 2.0).all(1) & (normal[:, 2] < -0.8)
@@ -77,7 +79,7 @@ def test_the_backdrop_is_left_out() -> None:
     tree = marched()
     beyond = replace(tree, metadata={"spiral": {**tree.metadata["spiral"], "far": DEPTH + 1.5}})
     level = 3.0 / tree.voxel
-    at = local(tree, surface(beyond, level, rounds=0).vertices)
+    at = local(tree, surface(volume_of(beyond), level, rounds=0).vertices)
     assert at[:, 2].max() < DEPTH + 1.5 + 1e-6
     with pytest.raises(NoSurface):
-        surface(replace(tree, metadata={"spiral": {**tree.metadata["spiral"], "far": 3.0}}), level)
+        surface(volume_of(replace(tree, metadata={"spiral": {**tree.metadata["spiral"], "far": 3.0}})), level)

@@ -11,7 +11,7 @@ import torch
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
 from efficientnerf.rendering.compositing import composite
-from efficientnerf.rendering.render import valid_count
+from efficientnerf.rendering.field_renderer import valid_count
 from efficientnerf.sampling import samples as sampling
 from efficientnerf.sampling.samples import IMPORTANCE_FLOOR, Samples, importance_samples, stratified_samples, valid_samples
 from tests.efficientnerf.balls import pixels, untrained

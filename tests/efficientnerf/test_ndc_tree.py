@@ -11,17 +11,17 @@ import torch
 
 from efficientnerf.asset import format
 from efficientnerf.asset.bake import voxel_coordinates
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.queries import colour_at, density_at, normal_at
+from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.geometry.cameras import rays
-from efficientnerf.rendering.render import render_tree_reference
 from tests.efficientnerf.walls import DEPTH, NEAR, camera_at, wall
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.8, -0.5, -0.4), (0.2, 2.5, 0.1)], ids=["reference", "beside and behind", "beyond the near plane"])
 def test_a_wall_is_seen_at_its_depth(place: tuple[float, float, float]) -> None:
     tree = wall()
-    seen = tree.render(camera_at(*place))
+    seen = render(tree, camera_at(*place))
     expected = DEPTH - place[1]
     assert (seen.opacity > 0.99).all()
     # Half of the light is gone 1.2 voxels behind the front, where the density has risen to an integral of ln 2; z = 2 n / (1 - z').
@@ -32,7 +32,7 @@ def test_a_wall_is_seen_at_its_depth(place: tuple[float, float, float]) -> None:
 
 
 def test_a_slanted_wall_has_its_own_normal() -> None:
-    seen = wall(0.5, voxels=192, hard=0.1).render(camera_at(0, 0, 0))
+    seen = render(wall(0.5, voxels=192, hard=0.1), camera_at(0, 0, 0))
     # Surfaces of equal density, behind the front by the same z', are planes that slant more: by as much as they are deeper.
     slant = 0.5 * seen.depth[15, 20] / DEPTH
     expected = np.array([slant, -1, 0]) / np.hypot(slant, 1)
@@ -43,10 +43,10 @@ def test_a_slanted_wall_has_its_own_normal() -> None:
 def test_supersampling_and_a_background_are_heeded() -> None:
     tree = wall()
     camera = camera_at(0, 0, 0)
-    once, often = tree.render(camera), tree.render(camera, supersample=2, background=(0.2, 0.4, 0.6))
+    once, often = render(tree, camera), render(tree, camera, supersample=2, background=(0.2, 0.4, 0.6))
     assert often.colour.shape == once.colour.shape
     np.testing.assert_allclose(often.colour, once.colour, atol=0.02)  # opaque: nothing of the background
-    away = tree.render(camera_at(0, 20.0, 0), background=(0.2, 0.4, 0.6))  # behind the wall
+    away = render(tree, camera_at(0, 20.0, 0), background=(0.2, 0.4, 0.6))  # behind the wall
     np.testing.assert_allclose(away.colour, np.broadcast_to([0.2, 0.4, 0.6], away.colour.shape), atol=1e-6)
     assert np.isinf(away.depth).all()
 
@@ -54,15 +54,15 @@ def test_supersampling_and_a_background_are_heeded() -> None:
 def test_lookups_take_points_of_the_world() -> None:
     tree = wall()
     at = np.array([[0.3, DEPTH - 1.0 + 0.5, 0.2], [0.3, DEPTH - 2.0, 0.2], [0.3, -5.0, 0.2]])  # in the wall, before it, behind the camera
-    density = tree.density(at)
+    density = density_at(tree, at)
     assert density[0] > 0
     assert density[1] == 0
     assert density[2] == 0
-    np.testing.assert_allclose(tree.normal(at[:1])[0], [0, -1, 0], atol=0.05)
+    np.testing.assert_allclose(normal_at(tree, at[:1])[0], [0, -1, 0], atol=0.05)
     towards = np.array([[0.6, 0.8, 0.0]])
-    seen = tree.render_rays(at[:1] - 4 * towards, towards)
-    np.testing.assert_allclose(seen.colour[0] / seen.opacity[0], tree.colour(at[:1], towards)[0], atol=1e-3)
-    assert not np.allclose(tree.colour(at[:1], towards), tree.colour(at[:1], -towards), atol=1e-2)
+    seen = render_rays(tree, at[:1] - 4 * towards, towards)
+    np.testing.assert_allclose(seen.colour[0] / seen.opacity[0], colour_at(tree, at[:1], towards)[0], atol=1e-3)
+    assert not np.allclose(colour_at(tree, at[:1], towards), colour_at(tree, at[:1], -towards), atol=1e-2)
 
 
 def test_the_kernel_is_the_reference() -> None:
@@ -71,8 +71,8 @@ def test_the_kernel_is_the_reference() -> None:
     origins = rng.uniform(-1, 1, (64, 3)) + np.array([0.3, -1.0, 0.2])
     directions = rng.normal(size=(64, 3)) * 0.3 + [0, 1, 0]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    seen = tree.render_rays(origins, directions)
-    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    seen = render_rays(tree, origins, directions)
+    colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
     np.testing.assert_allclose(seen.opacity, opacity.numpy(), atol=1e-3)
     np.testing.assert_allclose(seen.colour, colour.numpy(), atol=1e-3)
 
@@ -92,12 +92,12 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
     assert (away > rendering._nearest_painted(tree)).mean() == pytest.approx(0 if place == "close" else 1, abs=0.1)
     y, x = np.mgrid[: camera.height, : camera.width]
     origins, directions = rays(camera, np.stack([x.ravel(), y.ravel()], -1) + 0.5)
-    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    seen = tree.render(camera)
+    colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    seen = render(tree, camera)
     np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour.numpy(), atol=2e-3)
     np.testing.assert_allclose(seen.opacity.reshape(-1), opacity.numpy(), atol=1e-3)
     # Rays of which nothing is known are summed sample by sample.
-    alone = tree.render_rays(origins, directions)
+    alone = render_rays(tree, origins, directions)
     np.testing.assert_allclose(seen.colour.reshape(-1, 3), alone.colour, atol=2e-3)
     np.testing.assert_allclose(seen.opacity.reshape(-1), alone.opacity, atol=1e-5)
     np.testing.assert_allclose(seen.normal.reshape(-1, 3), np.where(alone.opacity[:, None] >= 0.5, alone.normal, 0), atol=1e-4)
@@ -107,14 +107,14 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
 def test_rays_in_rows_have_to_fill_them() -> None:
     origins, directions = np.zeros((7, 3)), np.tile([0.0, 1.0, 0.0], (7, 1))
     with pytest.raises(ValueError, match="7 rays in rows of 3"):
-        wall(voxels=24).render_rays(origins, directions, columns=3)
+        render_rays(wall(voxels=24), origins, directions, columns=3)
 
 
 def test_frame_rays_are_where_the_grid_is() -> None:
     tree = wall()
     origins, directions = np.array([[0.3, -1.0, 0.2]]), np.array([[0.1, 1.0, -0.05]]) / np.linalg.norm([0.1, 1.0, -0.05])
-    seen = tree.render_rays(origins, directions)
-    warped = tree.frame_rays(origins, directions)
+    seen = render_rays(tree, origins, directions)
+    warped = tree.frame.rays(origins, directions)
     assert tree.ndc is not None
     point = tree.ndc.points(origins + seen.depth[:, None].astype(np.float64) * directions)
     along = point - warped.origins
@@ -123,16 +123,16 @@ def test_frame_rays_are_where_the_grid_is() -> None:
 
 def test_saved_and_loaded_it_draws_the_same(tmp_path: Path) -> None:
     tree = wall(0.3)
-    tree.save(tmp_path / "a.nerftree")
-    again = NerfTree.load(tmp_path / "a.nerftree")
+    format.save(tree, tmp_path / "a.nerftree")
+    again = format.load(tmp_path / "a.nerftree")
     assert again.ndc is not None
     assert tree.ndc is not None
     assert (again.ndc.world_from_camera == tree.ndc.world_from_camera).all()
     assert again.ndc.slopes == tree.ndc.slopes
     assert again.ndc.near == tree.ndc.near
     camera = camera_at(0.1, 0, 0)
-    np.testing.assert_allclose(again.render(camera).colour, tree.render(camera).colour, atol=2e-3)
-    np.testing.assert_allclose(again.render(camera).depth, tree.render(camera).depth, rtol=2e-3)
+    np.testing.assert_allclose(render(again, camera).colour, render(tree, camera).colour, atol=2e-3)
+    np.testing.assert_allclose(render(again, camera).depth, render(tree, camera).depth, rtol=2e-3)
 
 
 REFUSED = {
@@ -159,6 +159,6 @@ def test_a_file_without_a_sound_reference_camera_is_refused(which: str, tmp_path
     text = json.dumps(header).encode()
     (tmp_path / "a.nerftree").write_bytes(len(text).to_bytes(8, "little") + text + data[8 + length :])
     with pytest.raises(format.FormatError, match=message):
-        NerfTree.load(tmp_path / "a.nerftree")
+        format.load(tmp_path / "a.nerftree")
     with pytest.raises(format.FormatError, match=message):
         format.describe(tmp_path / "a.nerftree")

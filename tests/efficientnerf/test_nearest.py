@@ -11,11 +11,14 @@ import pytest
 
 from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
 from efficientnerf.asset.format import describe, load, save
+from efficientnerf.asset.queries import colour_at, density_at, normal_at
 from efficientnerf.asset.refinement import optimiser
+from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.rendering.harmonics import basis_numpy
-from efficientnerf.rendering.render import render_tree_reference
 from efficientnerf.surface.isosurface import surface
+from efficientnerf.surface.volume import volume_of
 from tests import reference
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
@@ -36,11 +39,11 @@ def test_points_get_what_their_voxel_holds(brick: int, degree: int) -> None:
     voxel = lookup(tree, np.floor((points - tree.bounds_min) / tree.voxel).astype(np.int64))
     stored = voxel >= 0
     assert 0.02 < stored.mean() < 0.6
-    assert np.array_equal(tree.density(points), np.where(stored, tree.density_values[voxel], 0))
+    assert np.array_equal(density_at(tree, points), np.where(stored, tree.density_values[voxel], 0))
     logit = np.einsum("nk,nkc->nc", basis_numpy(directions.astype(np.float32), degree), tree.sh[voxel])
-    np.testing.assert_allclose(tree.colour(points, directions), np.where(stored[:, None], 1 / (1 + np.exp(-logit)), 0.5), atol=1e-5)
+    np.testing.assert_allclose(colour_at(tree, points, directions), np.where(stored[:, None], 1 / (1 + np.exp(-logit)), 0.5), atol=1e-5)
     other = replace(tree, lookup="trilinear")
-    assert np.abs(tree.density(points) - other.density(points)).max() > 1
+    assert np.abs(density_at(tree, points) - density_at(other, points)).max() > 1
 
 
 def test_normals_are_those_of_the_voxels_centre() -> None:
@@ -49,9 +52,9 @@ def test_normals_are_those_of_the_voxels_centre() -> None:
     centre = np.floor(rng.uniform(0, tree.resolution, (300, 3))) + 0.5
     away = rng.uniform(-0.49, 0.49, centre.shape)
     at = (tree.bounds_min + part * tree.voxel for part in (centre, centre + away))
-    middle, elsewhere = (tree.normal(points) for points in at)
+    middle, elsewhere = (normal_at(tree, points) for points in at)
     assert np.array_equal(middle, elsewhere)
-    np.testing.assert_allclose(middle, replace(tree, lookup="trilinear").normal(tree.bounds_min + centre * tree.voxel), atol=1e-5)
+    np.testing.assert_allclose(middle, normal_at(replace(tree, lookup="trilinear"), tree.bounds_min + centre * tree.voxel), atol=1e-5)
     assert (np.abs(middle).sum(axis=1) > 0).mean() > 0.2
 
 
@@ -59,12 +62,12 @@ def test_normals_are_those_of_the_voxels_centre() -> None:
 def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
     tree = nearest(brick, degree)
     origins, directions = rays_at(tree, 400)
-    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
-    seen = tree.render_rays(origins, directions)
+    colour, opacity = render_reference(tree, *tensors(origins, directions))
+    seen = render_rays(tree, origins, directions)
     np.testing.assert_allclose(seen.opacity, opacity, atol=1e-3)
     np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
     assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
-    other = replace(tree, lookup="trilinear").render_rays(origins, directions)
+    other = render_rays(replace(tree, lookup="trilinear"), origins, directions)
     assert np.abs(other.colour - seen.colour).max() > 0.05
 
 
@@ -72,9 +75,9 @@ def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
 def test_leaping_changes_no_value(share: float) -> None:
     tree = nearest(2, share=share, shape=(7, 6, 8))
     origins, directions = rays_at(tree, 400)
-    usual, timid = tree.render_rays(origins, directions), replace(tree)
+    usual, timid = render_rays(tree, origins, directions), replace(tree)
     timid.__dict__["leap"] = np.minimum(tree.leap, 1)
-    other = timid.render_rays(origins, directions)
+    other = render_rays(timid, origins, directions)
     for name in ("colour", "opacity", "depth", "normal"):
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
@@ -82,7 +85,7 @@ def test_leaping_changes_no_value(share: float) -> None:
 def test_a_uniform_box_has_its_closed_form_to_its_very_face() -> None:
     tree = replace(uniform_tree(sigma=2.0), lookup="nearest")
     middle = (tree.bounds_min + tree.bounds_max) / 2
-    seen = tree.render_rays((middle - [4, 0, 0])[None], np.array([[1.0, 0, 0]]))
+    seen = render_rays(tree, (middle - [4, 0, 0])[None], np.array([[1.0, 0, 0]]))
     width = float(tree.bounds_max[0] - tree.bounds_min[0])
     assert float(seen.opacity[0]) == pytest.approx(1 - math.exp(-2 * width), abs=1e-3)
     assert float(seen.depth[0]) == pytest.approx(4 - width / 2 + math.log(2) / 2, abs=1e-4)
@@ -94,23 +97,23 @@ def test_pictures_are_their_rays() -> None:
 
     tree = nearest(3, share=0.7)
     camera = looking(tree)
-    picture, flat = tree.render(camera, background=(1.0, 0.5, 0.0)), tree.render_rays(*rays(camera))
+    picture, flat = render(tree, camera, background=(1.0, 0.5, 0.0)), render_rays(tree, *rays(camera))
     over = flat.colour + (1 - flat.opacity[:, None]) * [1.0, 0.5, 0.0]
     np.testing.assert_allclose(picture.colour.reshape(-1, 3), over, atol=1e-6)
     assert np.array_equal(picture.opacity.reshape(-1), flat.opacity)
     assert np.array_equal(np.isinf(picture.depth), picture.opacity < 0.5)
-    assert tree.render(camera, supersample=2).colour.shape == picture.colour.shape
+    assert render(tree, camera, supersample=2).colour.shape == picture.colour.shape
 
 
 def test_in_normalised_device_coordinates_too() -> None:
     tree = replace(wall(), lookup="nearest")
     camera = camera_at(0, 0, 0)
-    seen, other = tree.render(camera), wall().render(camera)
+    seen, other = render(tree, camera), render(wall(), camera)
     np.testing.assert_allclose(seen.opacity, other.opacity, atol=0.01)
     assert not np.array_equal(seen.colour, other.colour)
     from efficientnerf.geometry.cameras import rays
 
-    colour, opacity = render_tree_reference(tree, *tensors(*rays(camera)))
+    colour, opacity = render_reference(tree, *tensors(*rays(camera)))
     np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour, atol=1e-3)
     np.testing.assert_allclose(seen.opacity.reshape(-1), opacity, atol=1e-3)
 
@@ -125,9 +128,9 @@ def test_a_file_keeps_the_lookup_and_the_short_reader_sees_the_same(tmp_path: Pa
     assert "lookup" not in ours.metadata
     points = np.random.default_rng(0).uniform(ours.bounds_min - 0.1, ours.bounds_max + 0.1, (100, 3))
     origins, directions = rays_at(ours, 100)
-    np.testing.assert_allclose(ours.density(points), [theirs.density(p) for p in points], atol=2e-3)
-    np.testing.assert_allclose(ours.colour(points, directions), [theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], atol=1e-3)
-    seen = ours.render_rays(origins[:12], directions[:12])
+    np.testing.assert_allclose(density_at(ours, points), [theirs.density(p) for p in points], atol=2e-3)
+    np.testing.assert_allclose(colour_at(ours, points, directions), [theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], atol=1e-3)
+    seen = render_rays(ours, origins[:12], directions[:12])
     for r in range(12):
         colour, opacity = theirs.ray(origins[r], directions[r])
         np.testing.assert_allclose(seen.colour[r], colour, atol=1.5e-3)
@@ -158,12 +161,12 @@ def test_unknown_lookups_are_refused() -> None:
 
 def test_what_interpolates_refuses() -> None:
     with pytest.raises(ValueError, match="has no packed form"):
-        _ = nearest(3).packed
+        packed_of(nearest(3))
 
 
 def test_a_surface_has_colours_where_no_voxel_is_stored() -> None:
     tree = uniform_tree(sigma=60.0, logit=2.0)
-    wanted, found = (surface(each, 20.0, faces=2000) for each in (tree, replace(tree, lookup="nearest")))
+    wanted, found = (surface(volume_of(each), 20.0, faces=2000) for each in (tree, replace(tree, lookup="nearest")))
     assert np.array_equal(found.vertices, wanted.vertices)
     assert np.array_equal(found.colours, wanted.colours)
 

@@ -11,7 +11,9 @@ import pytest
 
 from efficientnerf.asset import refinement
 from efficientnerf.asset.bake import voxel_coordinates, with_voxels
+from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement import Targets, error, greatest_weights, grid_of, in_voxels, optimise, optimiser
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
@@ -74,7 +76,7 @@ def test_the_pictures_are_those_of_the_renderer() -> None:
     origins, directions = rays_at(tree, 400)
     black = RayTargets(*(np.zeros(shape, np.float32) for shape in ((400, 3), (400, 3))), np.ones(400, np.float32), np.zeros(400, np.float32), 0.0)
     loss = gradients(tree, origins, directions, black, np.float32, kernels.STOP)[0]
-    np.testing.assert_allclose(loss, (tree.render_rays(origins, directions).colour ** 2).sum(axis=1), atol=2e-3)
+    np.testing.assert_allclose(loss, (render_rays(tree, origins, directions).colour ** 2).sum(axis=1), atol=2e-3)
 
 
 def test_records_grow_until_all_samples_fit() -> None:
@@ -105,8 +107,8 @@ def test_fog_becomes_the_ball_of_the_pictures() -> None:
     tree, errors = fitted(ball_tree(), targets, 80)
     assert error(tree, targets, 2000, 0) < 0.05 * error(ball_tree(), targets, 2000, 0)
     assert len(errors) == 80
-    assert tree.density(np.array([[0.6, -0.05, 0.0]]))[0] > 5
-    assert tree.density(np.array([[0.85, 0.8, 0.8]]))[0] < 0.3
+    assert density_at(tree, np.array([[0.6, -0.05, 0.0]]))[0] > 5
+    assert density_at(tree, np.array([[0.85, 0.8, 0.8]]))[0] < 0.3
     assert (tree.density_values >= 0).all()
 
 
@@ -146,7 +148,7 @@ def test_any_background_is_the_mean_over_random_ones() -> None:
     origins, directions, seen = targets.of(index, None)
     loss = gradients(tree, origins, directions, seen, np.float32)[0]
     rng = np.random.default_rng(0)
-    seen_as = tree.render_rays(origins, directions)
+    seen_as = render_rays(tree, origins, directions)
     rgba = some.images[index] / 255
     behind = rng.random((20000, 1, 3))
     truth = rgba[:, :3] * rgba[:, 3:] + behind * (1 - rgba[:, 3:])
@@ -165,7 +167,7 @@ def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> No
     index = np.arange(600, 700)
     origins, directions, seen = targets.of(index, None)
     loss = gradients(tree, origins, directions, seen, np.float32)[0]
-    seen_as = tree.render_rays(origins, directions)
+    seen_as = render_rays(tree, origins, directions)
     behind = np.random.default_rng(0).random((20000, 1, 3))
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - some.images[index] / 255) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
@@ -219,7 +221,7 @@ def weights_by_hand(tree: NerfTree, origins: np.ndarray, directions: np.ndarray,
         begin, end, light = max(faces.min(axis=0).max(), 0.0), faces.max(axis=0).min(), 1.0
         for t in np.arange(begin + 0.25, end, 0.5):
             point = origin + t * along
-            sigma = float(tree.density((tree.bounds_min + point * tree.voxel)[None])[0])
+            sigma = float(density_at(tree, (tree.bounds_min + point * tree.voxel)[None])[0])
             alpha = 1 - np.exp(-sigma * 0.5 * tree.voxel)
             low = np.floor(point - 0.5).astype(int)
             for corner in np.ndindex(2, 2, 2):

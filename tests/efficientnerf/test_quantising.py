@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from efficientnerf.asset import format
 from efficientnerf.asset.format import WRITERS, describe, load, save, serialize
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.quantisation import ENTRIES, clustered, compacted, quantised_density, quantised_harmonics
+from efficientnerf.asset.queries import density_at
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.numba import kmeans
 from tests.efficientnerf.trees import LOW, random_tree, rays_at
@@ -31,7 +34,7 @@ def smooth_tree(size: int = 24, degree: int = 2, sigma: float = 300.0) -> NerfTr
 
 
 def seen(tree: NerfTree) -> np.ndarray:
-    return tree.render_rays(*rays_at(tree, 2000)).colour
+    return render_rays(tree, *rays_at(tree, 2000)).colour
 
 
 # k-means
@@ -141,7 +144,7 @@ def test_a_layout_shows_the_same(tmp_path: Path, layout: str, most: float) -> No
     again = load(tmp_path / "a.nerftree")
     error = np.sqrt(((seen(again) - seen(tree)) ** 2).mean())
     assert error < most, f"{layout}: {error}"
-    again.save(tmp_path / "b.nerftree", layout)
+    format.save(again, tmp_path / "b.nerftree", layout)
     assert (tmp_path / "a.nerftree").read_bytes() == (tmp_path / "b.nerftree").read_bytes()
 
 
@@ -189,7 +192,7 @@ def test_full_bricks_hold_what_was_stored_and_zero_density_beside_it(tmp_path: P
         filled = full.sh[full.voxel_index[brick][~stored[brick]]]
         assert len(inside) == 0 or ((filled >= inside.min(0) - 1e-4) & (filled <= inside.max(0) + 1e-4)).all()
     points = np.random.default_rng(0).uniform(tree.bounds_min, tree.bounds_max, (500, 3))
-    np.testing.assert_allclose(full.density(points), tree.density(points), atol=1e-4)
+    np.testing.assert_allclose(density_at(full, points), density_at(tree, points), atol=1e-4)
 
 
 @pytest.mark.parametrize("layout", WRITERS)

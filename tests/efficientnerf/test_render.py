@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.tree import LOOKUPS, Rendering
+from efficientnerf.asset.rendering import Rendering, render, render_rays, render_reference
+from efficientnerf.asset.tree import LOOKUPS
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.rendering.render import FieldRenderer, render_tree_reference
+from efficientnerf.rendering.field_renderer import FieldRenderer
 from tests import reference
 from tests.efficientnerf.balls import pose, untrained
 from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tensors, uniform_tree
@@ -20,8 +21,8 @@ from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tens
 def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
     tree = random_tree(brick, brick=brick, degree=degree)
     origins, directions = rays_at(tree, 400)
-    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
-    seen = tree.render_rays(origins, directions)
+    colour, opacity = render_reference(tree, *tensors(origins, directions))
+    seen = render_rays(tree, origins, directions)
     # The kernel stops at 1e-3 of the light and is in float32.
     np.testing.assert_allclose(seen.opacity, opacity, atol=1.2e-3)
     np.testing.assert_allclose(seen.colour, colour, atol=1.2e-3)
@@ -34,8 +35,8 @@ def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
 def test_the_torch_function_is_the_loop(brick: int, degree: int, lookup: str) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, lookup=lookup)
     origins, directions = rays_at(tree, 24)
-    colour, opacity = render_tree_reference(tree, *tensors(origins, directions))
-    depth = tree.render_rays(origins, directions).depth
+    colour, opacity = render_reference(tree, *tensors(origins, directions))
+    depth = render_rays(tree, origins, directions).depth
     for r in range(24):
         wanted_colour, wanted_opacity, wanted_depth = reference.tree_ray(tree, origins[r], directions[r])
         np.testing.assert_allclose(colour[r], wanted_colour, atol=1e-6)
@@ -49,8 +50,8 @@ def test_gradients_of_the_torch_function_are_finite_differences() -> None:
     origins, directions = tensors(*rays_at(tree, 5))
     density = torch.from_numpy(tree.density_values).double().requires_grad_()
     sh = torch.from_numpy(tree.sh).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda d, s: render_tree_reference(tree, origins, directions, d, s), (density, sh), fast_mode=True)
-    render_tree_reference(tree, origins, directions, density, sh)[0].sum().backward()
+    assert torch.autograd.gradcheck(lambda d, s: render_reference(tree, origins, directions, d, s), (density, sh), fast_mode=True)
+    render_reference(tree, origins, directions, density, sh)[0].sum().backward()
     assert density.grad is not None
     assert density.grad.abs().sum() > 0
 
@@ -59,11 +60,11 @@ def test_gradients_of_the_torch_function_are_finite_differences() -> None:
 def test_leaping_changes_no_value(share: float) -> None:
     tree = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
     origins, directions = rays_at(tree, 600)
-    usual = tree.render_rays(origins, directions)
+    usual = render_rays(tree, origins, directions)
     for most in (0, 1, 2):
         timid = random_tree(7, shape=(7, 6, 8), brick=2, degree=2, share=share)
         timid.__dict__["leap"] = np.minimum(tree.leap, most)
-        other = timid.render_rays(origins, directions)
+        other = render_rays(timid, origins, directions)
         for name in ("colour", "opacity", "depth", "normal"):
             assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
@@ -73,7 +74,7 @@ def test_a_uniform_box_has_its_closed_form() -> None:
     tree = uniform_tree(sigma=2.0)
     middle = (tree.bounds_min + tree.bounds_max) / 2
     origin = np.array([middle[0] - 0.5, middle[1], middle[2]])  # inside
-    seen = tree.render_rays(origin[None], np.array([[1.0, 0, 0]]))
+    seen = render_rays(tree, origin[None], np.array([[1.0, 0, 0]]))
     # The last half voxel before the face is at half of the density on average and better: three quarters of sigma over it.
     chord = (tree.bounds_max[0] - origin[0]) - 0.125 * tree.voxel
     assert float(seen.opacity[0]) == pytest.approx(1 - math.exp(-2 * chord), abs=2e-3)
@@ -85,7 +86,7 @@ def test_a_uniform_box_has_its_closed_form() -> None:
 def test_one_colour_everywhere_gives_that_colour_however_thin(sigma: float) -> None:
     tree = uniform_tree((24, 24, 24), brick=2, sigma=sigma, logit=0.7)
     origins, directions = rays_at(tree, 80)
-    seen = tree.render_rays(origins, directions)
+    seen = render_rays(tree, origins, directions)
     np.testing.assert_allclose(seen.colour, seen.opacity[:, None] * reference.sigmoid(0.7) * np.ones(3), atol=2e-4)
 
 
@@ -93,7 +94,7 @@ def test_normals_face_the_ray() -> None:
     tree = uniform_tree(sigma=60.0)
     middle = (tree.bounds_min + tree.bounds_max) / 2
     directions = np.concatenate([np.eye(3), -np.eye(3)])
-    seen = tree.render_rays(middle - 3 * directions, directions)
+    seen = render_rays(tree, middle - 3 * directions, directions)
     np.testing.assert_allclose(seen.normal, -directions, atol=1e-3)
     np.testing.assert_allclose(seen.depth, 3 - 0.8, atol=0.05)
 
@@ -103,8 +104,8 @@ def test_pictures_are_their_rays() -> None:
 
     tree = random_tree(0, share=0.7)
     camera = looking(tree)
-    picture = tree.render(camera)
-    flat = tree.render_rays(*rays(camera))
+    picture = render(tree, camera)
+    flat = render_rays(tree, *rays(camera))
     shape = (camera.height, camera.width)
     assert np.array_equal(picture.colour.reshape(-1, 3), flat.colour)
     assert np.array_equal(picture.opacity.reshape(-1), flat.opacity)
@@ -117,7 +118,7 @@ def test_pictures_are_their_rays() -> None:
 def test_a_background_lies_behind() -> None:
     tree = random_tree(0, share=0.7)
     camera = looking(tree)
-    plain, over = tree.render(camera), tree.render(camera, background=(1.0, 0.5, 0.0))
+    plain, over = render(tree, camera), render(tree, camera, background=(1.0, 0.5, 0.0))
     np.testing.assert_allclose(over.colour, plain.colour + (1 - plain.opacity[..., None]) * [1.0, 0.5, 0.0], atol=1e-6)
     assert np.array_equal(over.opacity, plain.opacity)
 
@@ -127,8 +128,8 @@ def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
 
     tree = random_tree(0, share=0.7)
     camera = looking(tree)
-    fine = tree.render(resized(camera, camera.width * 3, camera.height * 3))
-    coarse = tree.render(camera, supersample=3)
+    fine = render(tree, resized(camera, camera.width * 3, camera.height * 3))
+    coarse = render(tree, camera, supersample=3)
 
     def mean(values: np.ndarray) -> np.ndarray:
         return values.reshape(camera.height, 3, camera.width, 3, -1).mean((1, 3))
@@ -136,31 +137,28 @@ def test_supersampling_is_the_mean_of_a_finer_picture() -> None:
     np.testing.assert_allclose(coarse.colour, mean(fine.colour), atol=1e-5)
     np.testing.assert_allclose(coarse.opacity, mean(fine.opacity)[..., 0], atol=1e-5)
     with pytest.raises(ValueError, match="expected at least 1"):
-        tree.render(camera, supersample=0)
+        render(tree, camera, supersample=0)
 
 
 @pytest.mark.parametrize("supersample", [1, 2, 3])
 def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: int) -> None:
     tree = random_tree(4, share=0.7, sigma=20.0)
-    picture = tree.render(looking(tree, 40), supersample=supersample)
+    picture = render(tree, looking(tree, 40), supersample=supersample)
     assert np.array_equal(np.isfinite(picture.depth), picture.opacity >= 0.5)
     length = np.linalg.norm(picture.normal, axis=-1)
     assert ((np.abs(length - 1) < 1e-3) | (length == 0)).all()
 
 
-def test_pictures_do_not_depend_on_how_they_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.rendering import render
-
+def test_renders_do_not_depend_on_how_they_are_cut() -> None:
     tree = random_tree(0, share=0.7)
-    whole = tree.render(looking(tree), supersample=2)
-    monkeypatch.setattr(render, "RAYS_PER_BAND", 100)
-    cut = tree.render(looking(tree), supersample=2)
+    whole = render(tree, looking(tree), supersample=2)
+    cut = render(tree, looking(tree), supersample=2, rays_per_band=100)
     for name in ("colour", "opacity", "depth", "normal"):
         assert np.array_equal(getattr(whole, name), getattr(cut, name)), name
 
 
 def test_a_rendering_of_no_rays() -> None:
-    seen = random_tree(0).render_rays(np.zeros((0, 3)), np.zeros((0, 3)))
+    seen = render_rays(random_tree(0), np.zeros((0, 3)), np.zeros((0, 3)))
     assert isinstance(seen, Rendering)
     assert seen.colour.shape == (0, 3)
 
@@ -171,8 +169,8 @@ def test_the_torch_function_runs_on_the_device() -> None:
         pytest.skip("no CUDA device")
     tree = random_tree(0, share=0.7)
     origins, directions = rays_at(tree, 200)
-    there = render_tree_reference(tree, *(t.float().cuda() for t in tensors(origins, directions)))
-    seen = tree.render_rays(origins, directions)
+    there = render_reference(tree, *(t.float().cuda() for t in tensors(origins, directions)))
+    seen = render_rays(tree, origins, directions)
     np.testing.assert_allclose(there[0].cpu(), seen.colour, atol=2e-3)
 
 
@@ -196,15 +194,12 @@ def test_a_fields_picture_is_what_lies_before_in_and_behind_the_box(contracted: 
     assert np.array_equal(np.isfinite(seen.depth), seen.opacity >= 0.5)
 
 
-def test_a_fields_picture_does_not_depend_on_how_it_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.rendering import render
-
+def test_a_fields_picture_does_not_depend_on_how_it_is_cut() -> None:
     m = untrained()
     camera = Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
     whole = FieldRenderer(m, 0.5, 30.0).render(camera)
-    monkeypatch.setattr(render, "FIELD_RAYS_PER_BLOCK", 11)
     calls: list[tuple[int, int]] = []
-    cut = FieldRenderer(m, 0.5, 30.0).render(camera, lambda done, total: calls.append((done, total)))
+    cut = FieldRenderer(m, 0.5, 30.0, rays_per_block=11).render(camera, lambda done, total: calls.append((done, total)))
     np.testing.assert_allclose(cut.colour, whole.colour, atol=1e-6)
     np.testing.assert_allclose(cut.opacity, whole.opacity, atol=1e-6)
     assert calls[-1] == (63, 63)

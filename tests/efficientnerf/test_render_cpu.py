@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 import torch
 
+from efficientnerf.asset.queries import density_block, normal_at
+from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, sigmoid, split16, trilinear4, unpack4
 from efficientnerf.backends.numba.tree import blocks as cpu_blocks
 from efficientnerf.backends.numba.tree import march
 from efficientnerf.backends.numba.tree.blocks import Pool, View, fill, grid_of, paint
+from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.geometry.cameras import Camera, rays, resized
 from efficientnerf.rendering.harmonics import basis_numpy
-from efficientnerf.rendering.render import render_tree_reference
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
@@ -120,8 +122,8 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
     side, owners = tree.brick + 2, np.random.default_rng(0).permutation(len(tree.voxel_index))
     values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
     toward, painted = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
-    paint(tree.packed, tree.brick, toward, np.float32(2), tree.degree, painted)
-    laid_out(tree.packed, painted, tree.brick, toward, nearest, tree.degree, owners, kind, values)
+    paint(packed_of(tree), tree.brick, toward, np.float32(2), tree.degree, painted)
+    laid_out(packed_of(tree), painted, tree.brick, toward, nearest, tree.degree, owners, kind, values)
     back = np.argsort(owners)
     return values[back].reshape(-1, side, side, side, 4), kind[back]
 
@@ -130,10 +132,10 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
 def test_blocks_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
     tree = random_tree(brick, brick=brick, degree=2)
     side = brick + 2
-    whole = 2 * tree.density_block((-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
+    whole = 2 * density_block(tree, (-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
     values, kind = blocks_of(tree, np.zeros(3), nearest=np.inf)
     assert (kind == cpu_blocks.EXACT).all()
-    for block, place, live in zip(values, tree.packed.place, tree.packed.live, strict=True):
+    for block, place, live in zip(values, packed_of(tree).place, packed_of(tree).live, strict=True):
         assert tree.brick_index[tuple(place)] >= 0
         expected = whole[tuple(slice(a, a + side) for a in place * brick)]
         density, stored = block[..., 0], block[..., 1].copy().view(np.int32)
@@ -159,7 +161,7 @@ def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_
     assert (kind == cpu_blocks.COLOURS).all()
     side = brick + 2
     cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
-    for block, place in zip(values, tree.packed.place, strict=True):
+    for block, place in zip(values, packed_of(tree).place, strict=True):
         at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
         local = (at - 1) % brick @ [brick**2, brick, 1]
         owner = cells[tuple(at.reshape(-1, 3).T)].reshape(local.shape)
@@ -175,7 +177,7 @@ def test_blocks_near_the_camera_keep_their_voxels() -> None:
     tree = random_tree(3, shape=(12, 12, 12), brick=4, degree=2, share=0.3)
     centre = np.array([-20.0, 24.0, 24.0])
     values, kind = blocks_of(tree, centre, nearest=40.0)
-    away = np.linalg.norm((tree.packed.place + 0.5) * 4 - centre, axis=1)
+    away = np.linalg.norm((packed_of(tree).place + 0.5) * 4 - centre, axis=1)
     assert np.array_equal(kind == cpu_blocks.COLOURS, away >= 52)
     assert 0.1 < (kind == cpu_blocks.COLOURS).mean() < 0.9
     voxels, _ = blocks_of(tree, centre, nearest=np.inf)
@@ -188,9 +190,9 @@ def test_bricks_near_which_nothing_absorbs_light_are_empty_to_the_kernel() -> No
     tree = replace(tree, density_values=dark.astype(np.float32))
     absorbs = np.zeros(tree.shape, bool)
     for cell in np.argwhere(tree.brick_index >= 0):
-        absorbs[tuple(cell)] = tree.density_block(tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
+        absorbs[tuple(cell)] = density_block(tree, tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
     assert 0 < absorbs.sum() < (tree.brick_index >= 0).sum()
-    leap = tree.packed.leap
+    leap = packed_of(tree).leap
     assert not leap[absorbs].any()
     for at in np.argwhere(~absorbs):
         assert leap[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()
@@ -211,9 +213,9 @@ def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTr
 def test_codes_into_palettes_are_drawn_as_what_they_decode_to(groups: tuple[int, ...], entries: int) -> None:
     tree = in_palettes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
     origins, directions = rays_at(tree, 300)
-    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    seen = tree.render_rays(origins, directions)
-    assert tree.packed.codes is tree.harmonics.codes  # type: ignore[union-attr]
+    colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    seen = render_rays(tree, origins, directions)
+    assert packed_of(tree).codes is tree.harmonics.codes  # type: ignore[union-attr]
     np.testing.assert_allclose(seen.opacity, opacity, atol=1.01e-3)
     np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
     assert seen.opacity.max() > 0.5
@@ -223,8 +225,8 @@ def test_codes_into_palettes_are_drawn_as_what_they_decode_to(groups: tuple[int,
 def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
     tree = in_palettes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
     origins, directions = rays_at(tree, 300)
-    colour, _ = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    np.testing.assert_allclose(tree.render_rays(origins, directions).colour, colour, atol=1e-3)
+    colour, _ = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    np.testing.assert_allclose(render_rays(tree, origins, directions).colour, colour, atol=1e-3)
 
 
 def far_camera(tree: NerfTree, voxels: float) -> Camera:
@@ -244,8 +246,8 @@ def test_pictures_are_the_torch_functions_from_near_and_far(degree: int, distanc
         tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 256)
     camera = far_camera(tree, distance) if distance else replace(camera_of(tree, distance=0.02), params=(8.0, 8.0, 13.0, 11.0))
     origins, directions = rays(camera)
-    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    seen = tree.render(camera)
+    colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    seen = render(tree, camera)
     np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour, atol=1e-3)
     np.testing.assert_allclose(seen.opacity.reshape(-1), opacity, atol=1.01e-3)
     assert (seen.opacity > 0.9).mean() > 0.1
@@ -255,14 +257,14 @@ def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytes
     from efficientnerf.backends.numba.tree import rendering
 
     tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=0.6, sigma=100.0)
-    tree.packed  # noqa: B018  # made once, for both
+    packed_of(tree)  # made once, for both
     for distance in (40.0, 2000.0):
         camera = far_camera(tree, distance)
-        usual = tree.render(camera, supersample=2)
+        usual = render(tree, camera, supersample=2)
         with monkeypatch.context() as patch:
             patch.setattr(rendering, "POOL_BYTES", 1)
             patch.setattr("numba.get_num_threads", lambda: 3)
-            other = tree.render(camera, supersample=2)
+            other = render(tree, camera, supersample=2)
         for name in FIELDS:
             assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
@@ -273,7 +275,7 @@ def test_the_work_of_a_picture_is_counted() -> None:
     tree = uniform_tree(sigma=0.5)
     camera = camera_of(tree)
     cells, tested, mixed, colours = np.moveaxis(image_work(tree, camera), -1, 0)
-    seen = tree.render(camera).opacity > 0
+    seen = render(tree, camera).opacity > 0
     assert ((mixed > 0) == seen).all()
     assert (tested >= mixed).all()
     assert (mixed >= colours).all()
@@ -287,8 +289,8 @@ def test_fog_and_solids_are_the_torch_functions(sigma: float, share: float, stop
     """The kernel may differ by what it leaves of the light, by 1e-4 for colours that are owed, and by rounding: 1e-3 together."""
     tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=share, sigma=sigma)
     origins, directions = rays_at(tree, 500)
-    colour, opacity = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    seen = tree.render_rays(origins, directions)
+    colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    seen = render_rays(tree, origins, directions)
     np.testing.assert_allclose(seen.opacity, opacity, atol=max(1e-4, 1.01 * stop))
     np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
     assert np.abs(seen.colour - colour.numpy()).mean() < 1e-4
@@ -302,8 +304,8 @@ def test_coefficients_as_large_as_a_file_can_hold_are_drawn_like_others() -> Non
     sh[1::7, 0] = -65000.0
     tree = replace(tree, harmonics=sh)
     origins, directions = rays_at(tree, 300)
-    colour, _ = render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    error = np.abs(tree.render_rays(origins, directions).colour - colour.numpy())
+    colour, _ = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
+    error = np.abs(render_rays(tree, origins, directions).colour - colour.numpy())
     # A coefficient beside one of 65000 is known to 1, but there the logistic is flat, except for the few rays on its slope.
     assert np.quantile(error, 0.98) < 1e-3
 
@@ -314,8 +316,8 @@ def test_pictures_of_every_camera_model_are_their_rays(model: str, supersample: 
     tree = random_tree(0, share=0.7, degree=2)
     camera = camera_of(tree, model)
     fine = resized(camera, camera.width * supersample, camera.height * supersample)
-    flat = tree.render_rays(*rays(fine))
-    picture = tree.render(camera, supersample=supersample)
+    flat = render_rays(tree, *rays(fine))
+    picture = render(tree, camera, supersample=supersample)
 
     def mean(values: np.ndarray) -> np.ndarray:
         return values.reshape(camera.height, supersample, camera.width, supersample, -1).mean((1, 3))
@@ -335,9 +337,9 @@ def test_pictures_of_every_camera_model_are_their_rays(model: str, supersample: 
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=share)
     timid = replace(tree)
-    timid.__dict__["packed"] = tree.packed._replace(leap=np.minimum(tree.packed.leap, 1))
+    timid.derived["packed"] = packed_of(tree)._replace(leap=np.minimum(packed_of(tree).leap, 1))
     camera = camera_of(tree, model, distance)
-    usual, other = tree.render(camera), timid.render(camera)
+    usual, other = render(tree, camera), render(timid, camera)
     for name in FIELDS:
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
@@ -346,7 +348,7 @@ def test_rays_that_belong_to_no_camera_may_come_in_any_order() -> None:
     tree = random_tree(3, shape=(9, 8, 7), brick=4, share=0.1)
     origins, directions = rays_at(tree, 700)
     order = np.random.default_rng(0).permutation(len(origins))
-    one, other = tree.render_rays(origins, directions), tree.render_rays(origins[order], directions[order])
+    one, other = render_rays(tree, origins, directions), render_rays(tree, origins[order], directions[order])
     for name in FIELDS:
         assert np.array_equal(getattr(one, name)[order], getattr(other, name)), name
 
@@ -354,12 +356,12 @@ def test_rays_that_belong_to_no_camera_may_come_in_any_order() -> None:
 def test_a_camera_inside_and_one_that_looks_away() -> None:
     tree = uniform_tree(sigma=40.0)
     inside = camera_of(tree, distance=0.05)
-    seen = tree.render(inside)
+    seen = render(tree, inside)
     assert (seen.opacity > 0.99).all()
     np.testing.assert_allclose(seen.depth[11, 13], np.log(2) / 40, rtol=0.05)
     away = inside.world_from_camera.copy()
     away[:3, 3] += 30 * away[:3, 2]
-    zeros16 = tree.render(replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
+    zeros16 = render(tree, replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
     assert not zeros16.opacity.any()
     assert np.isinf(zeros16.depth).all()
     assert not zeros16.normal.any()
@@ -369,12 +371,12 @@ def test_a_camera_inside_and_one_that_looks_away() -> None:
 def test_normals_are_those_of_the_tree_where_half_of_the_light_is_gone() -> None:
     tree = random_tree(6, shape=(5, 6, 4), brick=4, share=0.7, sigma=60.0)
     origins, directions = rays_at(tree, 400)
-    seen = tree.render_rays(origins, directions)
+    seen = render_rays(tree, origins, directions)
     hit = np.isfinite(seen.depth)
     assert hit.sum() > 50
     at = origins[hit] + seen.depth[hit, None] * directions[hit]
     # The gradient bends where a difference reaches from one voxel to the next; rounding may put it on either side.
-    assert np.quantile(np.abs(seen.normal[hit] - tree.normal(at)), 0.98) < 1e-3
+    assert np.quantile(np.abs(seen.normal[hit] - normal_at(tree, at)), 0.98) < 1e-3
 
 
 def test_harmonics_may_be_asked_for_other_directions_than_the_rays() -> None:
@@ -394,7 +396,7 @@ def test_harmonics_may_be_asked_for_other_directions_than_the_rays() -> None:
 
 def test_a_tree_without_voxels_has_pictures() -> None:
     tree = tree_from_voxels((2, 3, 1), 0.1, np.zeros(3), np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
-    seen = tree.render(camera_of(tree), supersample=2)
+    seen = render(tree, camera_of(tree), supersample=2)
     assert not seen.opacity.any()
     assert not seen.colour.any()
 
@@ -402,13 +404,13 @@ def test_a_tree_without_voxels_has_pictures() -> None:
 def test_a_background_has_three_numbers() -> None:
     tree = random_tree(0)
     with pytest.raises(ValueError, match="expected three numbers"):
-        tree.render(camera_of(tree), background=(1.0, 1.0))  # type: ignore[arg-type]
+        render(tree, camera_of(tree), background=(1.0, 1.0))  # type: ignore[arg-type]
 
 
 def test_directions_that_are_no_numbers_see_nothing() -> None:
     tree = random_tree(0)
     bad = np.array([[np.nan, 0, 1], [0, 0, 0], [np.inf, 0, 0]])
-    seen = tree.render_rays(np.zeros((3, 3)), bad)
+    seen = render_rays(tree, np.zeros((3, 3)), bad)
     assert np.isfinite(seen.opacity).all()
 
 
@@ -427,7 +429,7 @@ def test_trees_whose_voxels_are_numbered_otherwise_look_the_same(layout: str) ->
         harmonics=tree.harmonics.chosen(voxels) if layout == "codes" else tree.sh[voxels],  # type: ignore[union-attr]
     )
     for distance in (40.0, 2000.0):
-        one, two = tree.render(far_camera(tree, distance)), other.render(far_camera(tree, distance))
+        one, two = render(tree, far_camera(tree, distance)), render(other, far_camera(tree, distance))
         assert one.opacity.max() > 0.5
         for name in FIELDS:
             assert np.array_equal(getattr(one, name), getattr(two, name)), name

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from efficientnerf.asset.queries import colour_at, density_at, density_block, normal_at
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests import reference
 from tests.efficientnerf.trees import LOW, random_tree
@@ -27,7 +29,7 @@ def test_densities_are_those_of_the_loop(brick: int, degree: int) -> None:
     tree = random_tree(brick, brick=brick, degree=degree)
     points = queried(tree)
     expected = np.array([reference.tree_density(tree, p) for p in in_voxels(tree, points)])
-    np.testing.assert_allclose(tree.density(points), expected, atol=1e-3)
+    np.testing.assert_allclose(density_at(tree, points), expected, atol=1e-3)
     assert (expected > 0).any()
 
 
@@ -38,15 +40,15 @@ def test_colours_are_those_of_the_loop(brick: int, degree: int) -> None:
     directions = np.random.default_rng(2).normal(size=points.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     expected = [reference.tree_colour(tree, p, reference.harmonics(d, degree)) for p, d in zip(in_voxels(tree, points), directions, strict=True)]
-    np.testing.assert_allclose(tree.colour(points, directions), expected, atol=1e-4)
+    np.testing.assert_allclose(colour_at(tree, points, directions), expected, atol=1e-4)
     plain = [reference.tree_colour(tree, p, [0.28209479177387814]) for p in in_voxels(tree, points)]
-    np.testing.assert_allclose(tree.colour(points), plain, atol=1e-4)
+    np.testing.assert_allclose(colour_at(tree, points), plain, atol=1e-4)
 
 
 def test_normals_point_down_the_density() -> None:
     tree = random_tree(3)
     points = queried(tree)
-    for p, normal in zip(in_voxels(tree, points), tree.normal(points), strict=True):
+    for p, normal in zip(in_voxels(tree, points), normal_at(tree, points), strict=True):
         around = [(p + step, p - step) for step in np.eye(3)]
         gradient = np.array([reference.tree_density(tree, a) - reference.tree_density(tree, b) for a, b in around])
         length = np.linalg.norm(gradient)
@@ -57,22 +59,22 @@ def test_a_point_in_an_empty_cell_has_no_density_whatever_its_neighbours_hold() 
     indices = np.argwhere(np.ones((4, 4, 4), bool))
     tree = tree_from_voxels((2, 1, 1), 1.0, np.zeros(3), indices, np.full(64, 8.0, np.float32), np.zeros((64, 1, 3), np.float32))
     points = np.array([[3.99, 2.0, 2.0], [4.01, 2.0, 2.0], [3.5, 2.0, 2.0], [0.01, 2.0, 2.0], [-0.01, 2.0, 2.0]])
-    np.testing.assert_allclose(tree.density(points), [8 * 0.51, 0, 8, 8 * 0.51, 0], rtol=1e-4)
+    np.testing.assert_allclose(density_at(tree, points), [8 * 0.51, 0, 8, 8 * 0.51, 0], rtol=1e-4)
 
 
 def test_points_that_are_nowhere_have_no_density() -> None:
     tree = random_tree(0, shape=(9, 11, 13), brick=5)
     nowhere = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf, 0, 0], [1e30, 0, 0], [0, -1e30, 0], [0, 0, 1e18]])
-    assert (tree.density(nowhere) == 0).all()
-    assert (tree.normal(nowhere) == 0).all()
-    assert tree.colour(nowhere).shape == (6, 3)
+    assert (density_at(tree, nowhere) == 0).all()
+    assert (normal_at(tree, nowhere) == 0).all()
+    assert colour_at(tree, nowhere).shape == (6, 3)
 
 
 @pytest.mark.parametrize(("brick", "degree"), TREES)
 def test_blocks_hold_the_stored_values(brick: int, degree: int) -> None:
     tree = random_tree(brick, brick=brick, degree=degree)
     low, high = (-2, -1, 0), tuple(n + 2 for n in tree.resolution)
-    block = tree.density_block(low, high)  # type: ignore[arg-type]
+    block = density_block(tree, low, high)  # type: ignore[arg-type]
     expected = np.zeros(block.shape, np.float32)
     for i, j, k in np.ndindex(*tree.resolution):
         owner = tree.brick_index[i // brick, j // brick, k // brick]
@@ -81,15 +83,15 @@ def test_blocks_hold_the_stored_values(brick: int, degree: int) -> None:
             expected[i + 2, j + 1, k] = tree.density_values[stored]
     assert np.array_equal(block, expected)
     centres = tree.bounds_min + (np.argwhere(expected[2:-2, 1:-2, :-2] > 0) + 0.5) * tree.voxel
-    np.testing.assert_allclose(np.sort(tree.density(centres)), np.sort(expected[expected > 0]), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(np.sort(density_at(tree, centres)), np.sort(expected[expected > 0]), rtol=1e-3, atol=1e-3)
 
 
 def test_blocks_may_be_empty_or_far_outside_and_not_inside_out() -> None:
     tree = random_tree(0)
-    assert tree.density_block((2, 2, 2), (2, 5, 5)).shape == (0, 3, 3)
-    assert not tree.density_block((100, 0, 0), (103, 2, 2)).any()
+    assert density_block(tree, (2, 2, 2), (2, 5, 5)).shape == (0, 3, 3)
+    assert not density_block(tree, (100, 0, 0), (103, 2, 2)).any()
     with pytest.raises(ValueError, match="upper corner lies below"):
-        tree.density_block((2, 2, 2), (1, 5, 5))
+        density_block(tree, (2, 2, 2), (1, 5, 5))
 
 
 def test_the_order_of_the_list_does_not_matter() -> None:
@@ -127,7 +129,7 @@ def test_leaps_end_before_the_nearest_brick() -> None:
 def test_an_empty_tree_can_be_asked_anything() -> None:
     tree = tree_from_voxels((2, 3, 1), 0.1, LOW, np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
     points = queried(tree, 10)
-    assert not tree.density(points).any()
-    assert (tree.colour(points) == 0.5).all()
-    assert not tree.density_block((0, 0, 0), (8, 12, 4)).any()
-    assert not tree.render_rays(LOW[None] - 1, np.full((1, 3), 3**-0.5)).opacity.any()
+    assert not density_at(tree, points).any()
+    assert (colour_at(tree, points) == 0.5).all()
+    assert not density_block(tree, (0, 0, 0), (8, 12, 4)).any()
+    assert not render_rays(tree, LOW[None] - 1, np.full((1, 3), 3**-0.5)).opacity.any()

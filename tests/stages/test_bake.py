@@ -14,7 +14,7 @@ import torch
 
 from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format, serialisation
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.rendering import render
 from efficientnerf.rendering.compositing import activate
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
@@ -108,7 +108,7 @@ def test_damaged_scratch_is_made_anew(inputs: dict[str, Path], tmp_path: Path, u
 
 def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tuple[str, Job, int]) -> None:
     made = undisturbed[1]
-    tree = NerfTree.load(made.out / BakeOutputs.asset)
+    tree = format.load(made.out / BakeOutputs.asset)
     about = tree.metadata
     assert about["world_from_capture"] == {"scale": SIMILARITY.scale, "rotation": SIMILARITY.rotation.tolist(), "translation": SIMILARITY.translation.tolist()}
     assert about["orbit"] == {**dataclasses.asdict(ORBIT), "centre": list(ORBIT.centre)}
@@ -151,8 +151,8 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
     field = load_renderer(inputs["train"]).render(view.camera).colour
     made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=0), **inputs)
     run(made)
-    raw = NerfTree.load(made.out / BakeOutputs.asset).render(view.camera, background=white).colour
-    fitted = NerfTree.load(undisturbed[1].out / BakeOutputs.asset).render(view.camera, background=white).colour
+    raw = render(format.load(made.out / BakeOutputs.asset), view.camera, background=white).colour
+    fitted = render(format.load(undisturbed[1].out / BakeOutputs.asset), view.camera, background=white).colour
     truth = ground_truth(inputs["poses"], view, white).colour
     assert np.sqrt(((field - raw) ** 2).mean()) < 0.08
     assert ((fitted - truth) ** 2).mean() < 0.5 * ((raw - truth) ** 2).mean()
@@ -244,7 +244,7 @@ def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: 
     near = dataclasses.replace(QUICK, resolution=0, lookup="nearest", layout="sparse", refine_steps=0)
     made = job(tmp_path / "raw", near, **given)
     run(made)
-    tree = NerfTree.load(made.out / BakeOutputs.asset)
+    tree = format.load(made.out / BakeOutputs.asset)
     assert tree.lookup == "nearest"
     assert tree.resolution == (20, 20, 20)  # train.discretise
     m = load_renderer(given["train"]).model
@@ -257,7 +257,7 @@ def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: 
     np.testing.assert_allclose(tree.density_values[lit], np.minimum(said[lit], 65000), rtol=2e-3)
     fitted = job(tmp_path / "fitted", dataclasses.replace(near, refine_steps=12), **given)
     run(fitted)
-    assert NerfTree.load(fitted.out / BakeOutputs.asset).lookup == "nearest"
+    assert format.load(fitted.out / BakeOutputs.asset).lookup == "nearest"
     facts = json.loads((fitted.out / "report.json").read_text())["optimisation"]
     assert facts["psnr_after"] > facts["psnr_before"] > 10
 
@@ -274,4 +274,4 @@ def test_other_voxels_than_those_of_the_training_are_told_of(tmp_path: Path, inp
     told = [event["text"] for event in events if event["event"] == "warning"]
     assert len(told) == 1
     assert "train.discretise=16" in told[0]
-    assert NerfTree.load(made.out / BakeOutputs.asset).resolution == (20, 20, 20)
+    assert format.load(made.out / BakeOutputs.asset).resolution == (20, 20, 20)

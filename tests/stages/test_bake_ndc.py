@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from efficientnerf.asset import format
+from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import rays
 from efficientnerf.geometry.spaces import NdcSpace
@@ -51,7 +53,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def baked(folder: Path, inputs: dict[str, Path], told: list[dict[str, Any]] | None = None, **changes: Any) -> NerfTree:
     made = job(folder, BakeSettings(**{**QUICK, **changes}), events=told, **inputs)
     bake.run(made)
-    return NerfTree.load(made.out / BakeOutputs.asset)
+    return format.load(made.out / BakeOutputs.asset)
 
 
 def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path) -> None:
@@ -66,7 +68,7 @@ def test_deep_voxels_show_what_cubes_do(inputs: dict[str, Path], tmp_path: Path)
     assert deep.resolution[:2] == cubes.resolution[:2]
     assert deep.resolution[2] == pytest.approx(cubes.resolution[2] / NdcSpace.voxel_depth, abs=4)
     view = load(inputs["poses"]).views[0]
-    one, other = (tree.render(view.camera, background=(0.5, 0.5, 0.5)) for tree in (cubes, deep))
+    one, other = (render(tree, view.camera, background=(0.5, 0.5, 0.5)) for tree in (cubes, deep))
     assert one.colour.std() > 0.1
     assert np.abs(one.colour - other.colour).mean() < 0.01
     hit = np.isfinite(one.depth) & np.isfinite(other.depth)

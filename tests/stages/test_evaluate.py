@@ -68,7 +68,7 @@ def figures_of(job: Job) -> dict[str, Any]:
 def test_a_perfect_asset_is_as_good_as_eight_bits_allow(tmp_path: Path) -> None:
     job = job_in(tmp_path, make_scene(tmp_path / "poses", "rtrtrt"))
     field = BallField(TREE, background=WHITE, noise=0.02)
-    evaluate(TREE, lambda: field, job)
+    evaluate(TREE.render, lambda: field, job)
     metrics = figures_of(job)
     assert metrics["split"] == "test"
     assert [view["name"] for view in metrics["views"]] == ["v1.png", "v3.png", "v5.png"]
@@ -88,7 +88,7 @@ def test_figures_are_those_of_the_metrics(tmp_path: Path) -> None:
     poses = make_scene(tmp_path / "poses", "rt")
     worse = replace(TREE, radius=0.5)
     job = job_in(tmp_path, poses)
-    evaluate(worse, lambda: BallField(worse, background=WHITE), job)
+    evaluate(worse.render, lambda: BallField(worse, background=WHITE), job)
     with Image.open(poses / "images" / "v1.png") as image:
         pixels = np.asarray(image) / np.float32(255)
     truth = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
@@ -104,7 +104,7 @@ def test_figures_are_those_of_the_metrics(tmp_path: Path) -> None:
 def test_the_network_is_bounded_in_views_and_scale_and_the_asset_is_not(tmp_path: Path) -> None:
     job = job_in(tmp_path, make_scene(tmp_path / "poses", "t" * 6), EvaluateSettings(field_views=2, field_image_scale=0.5))
     field = BallField(TREE, background=WHITE)
-    evaluate(TREE, lambda: field, job)
+    evaluate(TREE.render, lambda: field, job)
     metrics = figures_of(job)
     assert [view["network"] is not None for view in metrics["views"]] == [False, True, False, False, True, False]
     assert (metrics["network"]["views"], metrics["network"]["scale"], metrics["asset"]["views"]) == (2, 0.5, 6)
@@ -117,7 +117,7 @@ def test_the_network_is_bounded_in_views_and_scale_and_the_asset_is_not(tmp_path
 def test_val_stands_in_for_test_and_train_for_both_with_a_warning(tmp_path: Path, splits: str, expected: str, warned: bool) -> None:
     events: list[dict[str, Any]] = []
     job = job_in(tmp_path, make_scene(tmp_path / "poses", splits), report=events.append)
-    evaluate(TREE, lambda: BallField(TREE, background=WHITE), job)
+    evaluate(TREE.render, lambda: BallField(TREE, background=WHITE), job)
     assert figures_of(job)["split"] == expected
     assert any("training saw" in event["text"] for event in events if event["event"] == "warning") == warned
 
@@ -125,7 +125,7 @@ def test_val_stands_in_for_test_and_train_for_both_with_a_warning(tmp_path: Path
 def test_on_photographs_the_asset_lies_over_the_networks_background(tmp_path: Path) -> None:
     job = job_in(tmp_path, make_scene(tmp_path / "poses", "tttt", background=None), EvaluateSettings(field_views=2, field_background_rays=WIDTH * HEIGHT // 2))
     field = BallField(TREE)
-    evaluate(TREE, lambda: field, job)
+    evaluate(TREE.render, lambda: field, job)
     metrics = figures_of(job)
     assert metrics["asset"]["psnr"] > 40, "surroundings are smooth: upsampling them loses little"
     assert metrics["asset"]["psnr_in_box"] > 45
@@ -137,7 +137,7 @@ def test_on_photographs_the_asset_lies_over_the_networks_background(tmp_path: Pa
 
 def test_an_asset_that_shows_nothing_is_bad_in_its_box_even_on_a_good_background(tmp_path: Path) -> None:
     job = job_in(tmp_path, make_scene(tmp_path / "poses", "t", background=None))
-    evaluate(replace(TREE, sigma=1e-6), lambda: BallField(TREE), job)
+    evaluate(replace(TREE, sigma=1e-6).render, lambda: BallField(TREE), job)
     metrics = figures_of(job)
     assert metrics["asset"]["psnr_in_box"] < 20
     assert metrics["asset"]["psnr"] < 25
@@ -155,7 +155,7 @@ def test_light_before_the_box_covers_the_asset(tmp_path: Path) -> None:
     camera = Camera("v0.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (70.0, WIDTH / 2, HEIGHT / 2), pose_on_sphere((0.0, 0.0, 0.0), 3.0, 0.0, 20.0))
     write_png(eight_bits(Fog(TREE).render(camera).colour), poses / "images" / "v0.png")
     job = job_in(tmp_path, poses)
-    evaluate(TREE, lambda: Fog(TREE), job)
+    evaluate(TREE.render, lambda: Fog(TREE), job)
     assert figures_of(job)["asset"]["psnr"] > 50
     assert figures_of(job)["network"]["psnr"] > 50
 
@@ -163,7 +163,7 @@ def test_light_before_the_box_covers_the_asset(tmp_path: Path) -> None:
 @pytest.mark.parametrize("background", [WHITE, None])
 def test_what_masks_hide_does_not_count(tmp_path: Path, background: tuple[float, float, float] | None) -> None:
     job = job_in(tmp_path, make_scene(tmp_path / "poses", "tt", background=background, masked=True), EvaluateSettings(field_views=1))
-    evaluate(TREE, lambda: BallField(TREE, background=background), job)
+    evaluate(TREE.render, lambda: BallField(TREE, background=background), job)
     metrics = figures_of(job)
     assert metrics["asset"]["psnr"] > 45
     assert metrics["asset"]["ssim"] > 0.99
@@ -175,7 +175,7 @@ def test_a_mask_that_hides_everything_leaves_the_view_out_of_the_means(tmp_path:
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(poses / "images" / "mask0.png")
     events: list[dict[str, Any]] = []
     job = job_in(tmp_path, poses, report=events.append)
-    evaluate(TREE, lambda: BallField(TREE, background=WHITE), job)
+    evaluate(TREE.render, lambda: BallField(TREE, background=WHITE), job)
     metrics = figures_of(job)
     assert metrics["views"][0]["asset"]["psnr"] is None
     assert metrics["asset"]["psnr"] == metrics["views"][1]["asset"]["psnr"]
@@ -189,7 +189,7 @@ def test_a_field_of_nans_counts_as_black_with_a_warning(tmp_path: Path) -> None:
 
     events: list[dict[str, Any]] = []
     job = job_in(tmp_path, make_scene(tmp_path / "poses", "t"), report=events.append)
-    evaluate(TREE, lambda: Broken(TREE, background=WHITE), job)
+    evaluate(TREE.render, lambda: Broken(TREE, background=WHITE), job)
     assert 0 < figures_of(job)["network"]["psnr"] < 10
     assert any("not finite" in event["text"] for event in events if event["event"] == "warning")
 
@@ -198,13 +198,13 @@ def test_a_field_of_nans_counts_as_black_with_a_warning(tmp_path: Path) -> None:
 def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp_path: Path, moment: int) -> None:
     poses = make_scene(tmp_path / "poses", "tttt", background=None)
     whole = job_in(tmp_path / "whole", poses, EvaluateSettings(field_views=2))
-    evaluate(TREE, lambda: BallField(TREE), whole)
+    evaluate(TREE.render, lambda: BallField(TREE), whole)
     asked, first, second = iter(range(100)), BallField(TREE), BallField(TREE)
     stopped = job_in(tmp_path, poses, EvaluateSettings(field_views=2), "first", stop=lambda: 2 if next(asked) >= moment else None)
     with pytest.raises(Interrupted):
-        evaluate(TREE, lambda: first, stopped)
+        evaluate(TREE.render, lambda: first, stopped)
     job = job_in(tmp_path, poses, EvaluateSettings(field_views=2), "second")
-    evaluate(TREE, lambda: second, job)
+    evaluate(TREE.render, lambda: second, job)
     for name in ("metrics.json", "contact_sheet.png"):
         assert hashlib.sha256((job.out / name).read_bytes()).digest() == hashlib.sha256((whole.out / name).read_bytes()).digest()
     finished = len(list((tmp_path / "work").glob("view_*.json"))) - len(second.calls)
@@ -213,12 +213,12 @@ def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp
 
 def test_the_field_is_not_loaded_where_nothing_needs_it(tmp_path: Path) -> None:
     poses = make_scene(tmp_path / "poses", "tt")
-    evaluate(TREE, lambda: BallField(TREE, background=WHITE), job_in(tmp_path, poses))
+    evaluate(TREE.render, lambda: BallField(TREE, background=WHITE), job_in(tmp_path, poses))
 
     def refuse() -> Any:
         raise AssertionError("loaded")
 
-    evaluate(TREE, refuse, job_in(tmp_path, poses, out="again"))
+    evaluate(TREE.render, refuse, job_in(tmp_path, poses, out="again"))
 
 
 def test_spread_is_even_and_complete() -> None:

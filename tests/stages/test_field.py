@@ -22,7 +22,7 @@ CAMERA = Camera("view", 8, 6, "SIMPLE_PINHOLE", (10.0, 4.0, 3.0), pose(0.4, 0.3)
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("field", ["hash", "mlp"])
 def test_a_saved_field_draws_the_same_picture(tmp_path: Path, field: str, contracted: bool) -> None:
-    from efficientnerf.rendering.render import FieldRenderer
+    from efficientnerf.rendering.field_renderer import FieldRenderer
 
     m = untrained(field=field, contracted=contracted)
     with torch.no_grad():

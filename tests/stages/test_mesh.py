@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Similarity
 from pipeline.errors import Interrupted, StageFailed
@@ -40,7 +41,7 @@ def bake_ball(folder: Path, density: float = 300.0) -> Path:
     }
     tree = tree_from_voxels((cells,) * 3, voxel, np.full(3, -1.0), index[kept], level, sh.astype(np.float32), metadata=metadata)
     folder.mkdir(parents=True)
-    tree.save(folder / "asset.nerftree")
+    format.save(tree, folder / "asset.nerftree")
     return folder
 
 

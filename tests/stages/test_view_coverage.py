@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from efficientnerf.asset import format
 from efficientnerf.asset.bake import voxel_coordinates
-from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import render_rays
@@ -137,7 +137,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, min
         train=trained.out,
     )
     bake.run(made)
-    tree = NerfTree.load(made.out / BakeOutputs.asset)
+    tree = format.load(made.out / BakeOutputs.asset)
     centre = tree.bounds_min + (voxel_coordinates(tree) + 0.5) * tree.voxel
     few = ~has_min_views(centre, [view.camera for view in views_of(s, "train")], 2)
     assert len(few) > 1000

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from efficientnerf.asset import format
 from pipeline.errors import BadInput
 from stages.io.scene import load, save
 from tests.efficientnerf.balls import cameras, picture
@@ -137,7 +138,7 @@ def test_a_tree_is_measured_on_as_many_views_as_the_network(tmp_path: Path, monk
     s = load(folder)
     save(dataclasses.replace(s, views=tuple(dataclasses.replace(view, split="test" if n < 3 else "train") for n, view in enumerate(s.views))), folder)
     (tmp_path / "bake").mkdir()
-    dataclasses.replace(random_tree(2, brick=4, degree=1, share=0.6), bounds_min=np.array([-0.6] * 3)).save(tmp_path / "bake" / "asset.nerftree")
+    format.save(dataclasses.replace(random_tree(2, brick=4, degree=1, share=0.6), bounds_min=np.array([-0.6] * 3)), tmp_path / "bake" / "asset.nerftree")
     run: Any = types.SimpleNamespace(path=tmp_path, folder=lambda name: tmp_path / name)
     sent: list[str] = []
     monkeypatch.setattr(NerfTree, "to", lambda self, device: sent.append(device) or self)

@@ -42,12 +42,13 @@ def _said(a: dict[str, Any] | None, b: dict[str, Any] | None) -> str:
 
 
 def _pictures(a: NerfTree, b: NerfTree, views: int, size: int) -> list[float]:
+    from efficientnerf.asset.rendering import render
     from efficientnerf.evaluation.metrics import psnr
     from stages.framing.camera_paths import turntable_cameras
 
     background = a.background or (1.0, 1.0, 1.0)
     cameras = turntable_cameras(a, frames=views, width=size, height=size)
-    return [min(PSNR_CAP, psnr(*(tree.render(camera, background=background).colour.clip(0, 1) for tree in (a, b)))) for camera in cameras]
+    return [min(PSNR_CAP, psnr(*(render(tree, camera, background=background).colour.clip(0, 1) for tree in (a, b)))) for camera in cameras]
 
 
 def in_words(found: dict[str, Any]) -> str:

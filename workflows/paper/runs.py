@@ -189,7 +189,7 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
     import numpy as np
 
     from efficientnerf.evaluation.metrics import psnr, ssim
-    from efficientnerf.rendering.render import SampleCounts
+    from efficientnerf.rendering.field_renderer import SampleCounts
     from stages.evaluate import evaluation_views, evenly_spaced, ground_truth
     from stages.io import scene
     from stages.io.field_file import load_renderer
@@ -236,16 +236,18 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
     from efficientnerf.backends import dispatch
 
     if tree.device == "cpu" or tree.ndc is not None or not dispatch.triton_usable():
+        from efficientnerf.asset.rendering import render
+
         begun = time.perf_counter()
-        tree.render(camera, background=background)
+        render(tree, camera, background=background)
         return time.perf_counter() - begun
     import torch
 
-    from efficientnerf.backends.triton.tree import render_image
+    from efficientnerf.backends.triton.tree import device_tree_of, render_image
 
     torch.cuda.synchronize()
     begun = time.perf_counter()
-    render_image(tree.on_device, camera, background=background)
+    render_image(device_tree_of(tree), camera, background=background)
     torch.cuda.synchronize()
     return time.perf_counter() - begun
 
@@ -255,19 +257,20 @@ def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
     their size."""
     import numpy as np
 
-    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.asset import format
+    from efficientnerf.asset.rendering import render
     from efficientnerf.evaluation.metrics import psnr, ssim
     from stages.evaluate import evaluation_views, evenly_spaced, ground_truth
     from stages.io import scene
 
-    tree = NerfTree.load(BakeOutputs.of_run(run.path).asset).to(device)
+    tree = format.load(BakeOutputs.of_run(run.path).asset).to(device)
     s = scene.load(run.folder("poses"))
     views, _ = evaluation_views(s)
     drawn = [views[k] for k in evenly_spaced(len(views), wanted)]
     _frame_seconds(tree, drawn[0].camera, s.background)  # compiled, and in memory
     decibels, similarities, seconds = [], [], []
     for view in drawn:
-        picture = tree.render(view.camera, background=s.background).colour
+        picture = render(tree, view.camera, background=s.background).colour
         seconds.append(_frame_seconds(tree, view.camera, s.background))
         truth = ground_truth(run.folder("poses"), view, s.background).colour
         decibels.append(psnr(np.clip(picture, 0, 1), truth))

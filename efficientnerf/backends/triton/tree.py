@@ -61,7 +61,7 @@ class DeviceTree:
 
 
 class DeviceRendering(NamedTuple):
-    """`efficientnerf.asset.tree.Rendering` on the device: colour (..., 3), opacity (...), depth (...), normal (..., 3), float32."""
+    """`efficientnerf.asset.rendering.Rendering` on the device: colour (..., 3), opacity (...), depth (...), normal (..., 3), float32."""
 
     colour: Tensor
     opacity: Tensor
@@ -91,6 +91,13 @@ def brick_arrays(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Te
         slot = (local[..., 0] * d + local[..., 1]) * d + local[..., 2]
         index[begin : begin + BRICKS_PER_BLOCK] = torch.where(there & (owner >= 0), voxel_index[owner.clamp(min=0), slot], -1)
     return torch.where(brick_index >= 0, brick_index, -leap).contiguous(), index
+
+
+def device_tree_of(tree: NerfTree) -> DeviceTree:
+    """The tree on the device that it is rendered on, sent once."""
+    if "device_tree" not in tree.derived:
+        tree.derived["device_tree"] = device_tree(tree, tree.device)
+    return tree.derived["device_tree"]
 
 
 def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTree:
@@ -154,7 +161,8 @@ def _camera_directions(width: int, height: int, model: str, params: tuple[float,
 def render_image(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> DeviceRendering:
     """The image of a camera in the tree's frame, (H, W, ...), on the device; nothing waits for it.
 
-    One launch where the camera is a pinhole and `supersample` is 1; else rays are made, or samples averaged, by some more. See `NerfTree.render`.
+    One launch where the camera is a pinhole and `supersample` is 1; else rays are made, or samples averaged, by some more. See
+    `efficientnerf.asset.rendering.render`.
     """
     if supersample < 1:
         raise ValueError(f"supersample {supersample}: expected at least 1")
@@ -180,7 +188,7 @@ def render_image(t: DeviceTree, camera: Camera, *, background: tuple[float, floa
 
 
 def _averaged(samples: DeviceRendering, background: tuple[float, float, float] | None) -> DeviceRendering:
-    """Pixels from samples (H, s, W, s, ...), as `efficientnerf.rendering.render.render_tree` makes them."""
+    """Pixels from samples (H, s, W, s, ...), as `efficientnerf.asset.rendering.render` makes them."""
     height, s, width, _ = samples.opacity.shape
     colour, opacity = samples.colour.mean(dim=(1, 3)), samples.opacity.mean(dim=(1, 3))
     along = samples.depth.permute(0, 2, 1, 3).reshape(height, width, s * s).sort(dim=-1).values

@@ -5,7 +5,7 @@ buffer is walked from its end to its beginning, and each sample leaves a record:
 loss by its density and by the arguments of the sigmoid. In a second pass the voxels are dealt to the threads in slabs, and each slab
 sums what concerns it in the order of the records. So there are no races, and the bytes depend neither on timing nor on the number of threads.
 
-The torch reference is `efficientnerf.rendering.render.render_tree_reference` and its autograd. All of it works in float32, and in float64 for tests.
+The torch reference is `efficientnerf.asset.rendering.render_reference` and its autograd. All of it works in float32, and in float64 for tests.
 R rays, N voxels, K harmonics, M records.
 """
 

@@ -1,5 +1,5 @@
 """Rays through trees whose voxels are not interpolated (`NerfTree.lookup` is "nearest"), on the CPU (numba, all cores): a plain march over the tree as it
-lies, sampled as FORMAT.md says, section 6. The torch reference is `efficientnerf.rendering.render.render_tree_reference`.
+lies, sampled as FORMAT.md says, section 6. The torch reference is `efficientnerf.asset.rendering.render_reference`.
 
 R rays, K harmonics.
 """

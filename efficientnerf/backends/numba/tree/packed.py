@@ -144,6 +144,13 @@ def _in_order(tree: NerfTree) -> NerfTree:
     return replace(tree, voxel_index=index, density_values=tree.density_values[order], harmonics=harmonics)
 
 
+def packed_of(tree: NerfTree) -> Packed:
+    """The packed form of a tree, made once."""
+    if "packed" not in tree.derived:
+        tree.derived["packed"] = pack(tree)
+    return tree.derived["packed"]
+
+
 def pack(tree: NerfTree) -> Packed:
     """The packed form of a tree; see the module. ValueError where the tree is not interpolated, as the kernel that reads it does."""
     from efficientnerf.asset.palettes import PaletteHarmonics

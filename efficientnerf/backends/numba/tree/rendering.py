@@ -2,7 +2,7 @@
 
 Pictures and rays go through `cpu_picture` and `cpu_march` over the tree's `packed` form; single points are looked up in the tree as it lies. Rays through
 trees that are not interpolated have a kernel of their own, `cpu_nearest`.
-The torch reference is `efficientnerf.rendering.render.render_tree_reference`.
+The torch reference is `efficientnerf.asset.rendering.render_reference`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.blocks import LEAST_BLOCKS, POOL_BYTES, paint
 from efficientnerf.backends.numba.tree.march import LOG2E, STEP
+from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.picture import TILE, Shot, merge, trace
 from efficientnerf.geometry.cameras import Camera, rays
 from efficientnerf.rendering.harmonics import basis_numpy
@@ -188,13 +189,13 @@ class Paint(NamedTuple):
 def _paint(tree: NerfTree, toward: np.ndarray) -> Paint:
     """Colours of all voxels, each as it is seen along the direction that `toward` gives it."""
     painted = np.empty((len(tree.density_values) + 1, 4), np.float32)
-    paint(tree.packed, tree.brick, toward, _scale(tree), tree.degree, painted)
+    paint(packed_of(tree), tree.brick, toward, _scale(tree), tree.degree, painted)
     return Paint(float(np.linalg.norm(toward[:, :3], 2)), _nearest_painted(tree), painted)
 
 
 def _nearest_painted(tree: NerfTree) -> float:
     """How far voxels are at least whose colours are summed once; see VOXELS_PER_SLOPE."""
-    return (VOXELS_PER_SLOPE if tree.ndc is None else VOXELS_PER_SLOPE_NDC) * tree.packed.slope
+    return (VOXELS_PER_SLOPE if tree.ndc is None else VOXELS_PER_SLOPE_NDC) * packed_of(tree).slope
 
 
 def _scale(tree: NerfTree) -> np.float32:
@@ -207,7 +208,7 @@ def _trace(
 ) -> None:
     work = np.zeros((0, 0, 4), np.int32) if work is None else work
     trace(
-        shot, behind, tree.packed, colours.painted, tree.brick, colours.nearest, colours.stretch, _scale(tree), tree.degree, float(tree.voxel), tile,
+        shot, behind, packed_of(tree), colours.painted, tree.brick, colours.nearest, colours.stretch, _scale(tree), tree.degree, float(tree.voxel), tile,
         numba.get_num_threads(), _capacity(tree), *out, work,
     )  # fmt: skip
 

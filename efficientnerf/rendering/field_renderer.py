@@ -1,0 +1,150 @@
+"""Images of trained fields: cameras to rays to pixels.
+
+R rays, H, W height and width of an image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.model import Model, RayOutputs, render_rays
+from efficientnerf.rendering.compositing import activate, ray_of_sample
+
+RAYS_PER_BLOCK = 8192
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """Samples of some rays; intervals: rays x N_c, between near and far (in contracted space, those that a ray passes); valid: see `valid_count`."""
+
+    rays: int = 0
+    intervals: float = 0.0
+    valid: int = 0
+    pivotal: int = 0
+    fine: int = 0
+
+    def __add__(self, other: SampleCounts) -> SampleCounts:
+        return SampleCounts(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
+
+    @property
+    def valid_share(self) -> float:
+        """V of equation 5: valid samples over rays x N_c."""
+        return self.valid / max(self.intervals, 1e-9)
+
+    @property
+    def pivotal_share(self) -> float:
+        """P of equation 12: pivotal samples over rays x N_c."""
+        return self.pivotal / max(self.intervals, 1e-9)
+
+
+@dataclass(frozen=True)
+class FieldRendering:
+    """The image that a camera takes of a field, split by where the density lies: before, in or behind the box.
+
+    colour          (H, W, 3) sRGB with all that lies behind
+    opacity         (H, W) of all samples
+    depth           (H, W) along the view axis, world units; infinity where the opacity stays below one half
+    before          (H, W, 4) premultiplied colour and opacity of what lies between the camera and the box
+    behind          (H, W, 3) colour of what lies beyond the box, as if the box were empty
+    inside_opacity  (H, W) of what lies in the box
+    counts          of the samples that it took
+    """
+
+    colour: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    before: np.ndarray
+    behind: np.ndarray
+    inside_opacity: np.ndarray
+    counts: SampleCounts = SampleCounts()
+
+
+def valid_count(m: Model, outputs: RayOutputs) -> int:
+    """How many coarse samples were valid: those that the density voxels left, or, where nothing is pruned, those whose density the voxels would call
+    valid. That is how section 3.3 of EfficientNeRF counts on a trained NeRF (equation 5)."""
+    if m.prunes:
+        return len(outputs.coarse.start)
+    density = outputs.coarse_raw[:, 0]
+    if m.voxels.rule == "maximum":
+        density = activate(density, m.proposal_field.activation)
+    return int((density > m.voxels.threshold).sum())
+
+
+@dataclass(frozen=True)
+class FieldRenderer:
+    """Renders a trained model; near and far along the view axis, world units."""
+
+    model: Model
+    near: float
+    far: float
+    rays_per_block: int = RAYS_PER_BLOCK
+
+    @torch.no_grad()
+    def render(self, camera: Camera, progress: Callable[..., Any] | None = None) -> FieldRendering:
+        """The image that a camera in the training frame takes of the field."""
+        m = self.model
+        count = camera.width * camera.height
+        parts, counts = [], SampleCounts()
+        # Where nothing is pruned a ray has as many samples as there are.
+        block = (
+            self.rays_per_block
+            if m.prunes
+            else min(self.rays_per_block, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
+        )
+        for begin in range(0, count, block):
+            index = np.arange(begin, min(count, begin + block))
+            pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)
+            origins, directions = (torch.as_tensor(a, dtype=torch.float32, device=m.device) for a in rays(camera, pixels))
+            slant = (directions @ torch.as_tensor(camera.forward, dtype=torch.float32, device=m.device)).clamp(min=1e-3)
+            beyond = m.behind(directions)
+            outputs = render_rays(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), beyond)
+            intervals = outputs.coarse.tried if m.space.contracted else len(index) * (self.far - self.near) / m.step
+            counts += SampleCounts(len(index), intervals, valid_count(m, outputs), int(outputs.pivotal.sum()), len(outputs.fine.start))
+            parts.append([part.cpu().numpy() for part in split_by_box(m, origins, directions, slant, outputs, beyond)])
+            if progress is not None:
+                progress(begin + len(index), count)
+        shape = (camera.height, camera.width)
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        colour, opacity, depth, before, behind, inside = (column.reshape(*shape, *column.shape[1:]) for column in columns)
+        return FieldRendering(colour, opacity, depth, before, behind, inside, counts)
+
+
+def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, outputs: RayOutputs, behind: Tensor) -> tuple[Tensor, ...]:
+    """The fields of a FieldRendering for rays (R, ...): each fine sample belongs in front of the box, in it or beyond it."""
+    count = len(origins)
+    ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
+    middle = outputs.fine.start + outputs.fine.extent / 2
+    origins, directions = outputs.rays.origins, outputs.rays.directions
+    enter, leave = m.space.intersect(origins, directions)
+    misses = leave <= torch.clamp(enter, min=0)  # such a ray sees nothing but what lies beyond
+    enter = torch.where(misses, -torch.inf, enter)
+    leave = torch.where(misses, -torch.inf, leave)
+
+    def gathered(chosen: Tensor) -> tuple[Tensor, Tensor]:
+        weight = outputs.fine_weight * chosen
+        colour = weight.new_zeros(count, 3).index_add(0, ray, weight[:, None] * outputs.fine_rgb)
+        return colour, weight.new_zeros(count).index_add(0, ray, weight)
+
+    in_front, beyond = middle < enter[ray], middle > leave[ray]
+    before, before_opacity = gathered(in_front)
+    _, inside_opacity = gathered(~in_front & ~beyond)
+    after, after_opacity = gathered(beyond)
+    reaching_box = (1 - before_opacity).clamp(min=0)
+    passing_box = (reaching_box - inside_opacity).clamp(min=0)
+    rest = (passing_box - after_opacity).clamp(min=0)
+    # Where next to no light passes the box nothing is known of what lies beyond it, and nothing depends on it.
+    beyond_colour = torch.where((passing_box > 1e-4)[:, None], (after + rest[:, None] * behind) / passing_box.clamp(min=1e-4)[:, None], behind)
+    inside = torch.where(reaching_box > 1e-4, inside_opacity / reaching_box.clamp(min=1e-4), torch.zeros_like(inside_opacity))
+    # Depth: the first sample at which half of the light is gone.
+    gone = torch.cumsum(outputs.fine_weight.double(), dim=0)
+    gone = gone - torch.cat([gone.new_zeros(1), gone])[outputs.fine.first[:-1]][ray]
+    distance = torch.where(gone >= 0.5, outputs.rays.world_distance(middle, ray), torch.inf)
+    depth = torch.full_like(slant, torch.inf).scatter_reduce(0, ray, distance, reduce="amin")
+    return outputs.fine_colour, outputs.fine_opacity, depth * slant, torch.cat([before, before_opacity[:, None]], dim=1), beyond_colour, inside.clamp(max=1)

@@ -1,0 +1,122 @@
+"""What a surface is extracted from: a grid of densities with colours, in a frame of its own.
+
+`WorldVolume` is a tree in the world. `NdcVolume` is a forward-facing tree: its surface is found in normalised device coordinates and handed out in the
+world. There a voxel is about a pixel wide at any depth, so that marching cubes, smoothing and decimation treat near and far as images do. What lies
+beyond the far limit is a backdrop and left out: it reaches to infinity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from efficientnerf.asset import queries
+from efficientnerf.backends.numba.tree import rendering
+from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+FARTHEST = 50.0  # times the near plane's depth: the far limit where the asset does not say
+
+
+class Volume(Protocol):
+    """Densities on a grid.
+
+    shape, brick, voxel, bounds_min  as in NerfTree
+    density_block(low, high)         density at the voxel centres low <= (i, j, k) < high, zero outside of the grid
+    density(points)                  at points (N, 3) of the frame
+    colour(points, directions)       sRGB (N, 3) at points of the frame, along unit directions of the world
+    """
+
+    @property
+    def shape(self) -> tuple[int, int, int]: ...
+    @property
+    def brick(self) -> int: ...
+    @property
+    def voxel(self) -> float: ...
+    @property
+    def bounds_min(self) -> np.ndarray: ...
+
+    def density_block(self, low: Any, high: Any) -> np.ndarray: ...
+    def density(self, points: np.ndarray) -> np.ndarray: ...
+    def colour(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class WorldVolume:
+    """A tree, its points in its own frame; see `Volume`."""
+
+    tree: NerfTree
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.tree.shape
+
+    @property
+    def brick(self) -> int:
+        return int(self.tree.brick)
+
+    @property
+    def voxel(self) -> float:
+        return float(self.tree.voxel)
+
+    @property
+    def bounds_min(self) -> np.ndarray:
+        return np.asarray(self.tree.bounds_min)
+
+    def density_block(self, low: Any, high: Any) -> np.ndarray:
+        return queries.density_block(self.tree, low, high)
+
+    def density(self, points: np.ndarray) -> np.ndarray:
+        return rendering.density_at(self.tree, points)
+
+    def colour(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        return rendering.colour_at(self.tree, points, directions)
+
+
+@dataclass(frozen=True, eq=False)
+class NdcVolume(WorldVolume):
+    """A tree in normalised device coordinates; see `Volume`."""
+
+    ndc: Ndc
+
+    @cached_property
+    def layers(self) -> int:
+        """How many layers of voxels along z' lie before the far limit."""
+        far = float((self.tree.metadata.get("spiral") or {}).get("far", FARTHEST * self.ndc.near))
+        return int(np.floor((1 - 2 * self.ndc.near / far - self.bounds_min[2]) / self.voxel))
+
+    def density_block(self, low: Any, high: Any) -> np.ndarray:
+        """Zero from the far limit on, too."""
+        block = super().density_block(low, high)
+        block[..., max(0, self.layers - int(low[2])) :] = 0
+        return block
+
+    def view_directions(self, points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
+        """Unit view directions (N, 3) of the world to points of the frame, from the reference camera and from about as far beside, above and below it as
+        the cameras were. From elsewhere nothing is known of the colours, whatever the normals are."""
+        x, y, _ = (self.tree.metadata.get("spiral") or {}).get("radii", (0.0, 0.0, 0.0))
+        places = np.array([[0, 0, 0], [x, 0, 0], [-x, 0, 0], [0, y, 0], [0, -y, 0]], np.float64)
+        centres = places @ self.ndc.world_from_camera[:3, :3].T + self.ndc.world_from_camera[:3, 3]
+        away = [self.ndc.world(np.asarray(points, np.float64)) - centre for centre in centres]
+        return [each / np.maximum(np.linalg.norm(each, axis=1, keepdims=True), 1e-12) for each in away]
+
+    def mesh(self, mesh: Mesh) -> Mesh:
+        """A mesh of the frame in the world. The map keeps the handedness, so that faces stay outside out."""
+        vertices = self.ndc.world(mesh.vertices)
+        return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
+
+    def points(self, cloud: PointCloud) -> PointCloud:
+        """A cloud of the frame in the world."""
+        return replace(cloud, positions=self.ndc.world(cloud.positions), normals=self.ndc.world_normals(cloud.positions, cloud.normals))
+
+
+def volume_of(tree: NerfTree) -> WorldVolume:
+    """The tree as a volume, interpolated: a surface lies between voxels, where those that hold its points may not be stored and have no colour."""
+    tree = replace(tree, lookup="trilinear") if tree.lookup != "trilinear" else tree
+    return WorldVolume(tree) if tree.ndc is None else NdcVolume(tree, tree.ndc)
