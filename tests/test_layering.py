@@ -23,11 +23,7 @@ ALLOWED = {
 KERNELS = ("efficientnerf/backends/numba", "efficientnerf/backends/triton", "efficientnerf/structures")  # compiled code, and what launches it
 MODULES_A_FOLDER, LINES, ARGUMENTS = 15, 60, 12
 # To be mended; nothing is to be added here.
-IN_RINGS = {
-    "efficientnerf.asset.format", "efficientnerf.asset.quantisation", "efficientnerf.asset.serialisation", "efficientnerf.asset.tree",
-    "efficientnerf.backends.numba.tree.packed", "efficientnerf.rendering.render", "efficientnerf.asset.refinement",
-    "efficientnerf.asset.refinement_device",
-}  # fmt: skip
+IN_RINGS = {"efficientnerf.asset.refinement", "efficientnerf.asset.refinement_device"}
 LONG = {"efficientnerf.training.loop:train", "stages.train:run"}
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
 
