@@ -372,9 +372,12 @@ def encode_frames(frames: Sequence[Path], path: Path, options: RenderOptions, ea
     write_mp4((over_background(read_png(frame), NAMED["white"]) for frame in frames), path, fps=options.fps, crf=options.crf, each=each)
 
 
-def render_path(tree: NerfTree, cameras: Sequence[Camera], out_dir: Path, options: RenderOptions, progress: Progress | None = None) -> list[Path]:
+def render_path(
+    tree: NerfTree, cameras: Sequence[Camera], out_dir: Path, options: RenderOptions, progress: Progress | None = None,
+    draw: Callable[..., Rendering] | None = None,
+) -> list[Path]:
     """Draw a path into a folder: PNG frames, EXR as asked, and the video; returns the files. Frames of the same names are overwritten."""
-    written = draw_frames(tree, cameras, out_dir, options, progress)
+    written = draw_frames(tree, cameras, out_dir, options, progress, draw=draw)
     if options.video is not None:
         video = out_dir / options.video
         encode_frames([path for path in written if path.suffix == ".png"], video, options)

@@ -206,7 +206,7 @@ def test_a_path_is_drawn(tmp_path: Path) -> None:
     cameras = read_camera_path(path_file(tmp_path), SIMILARITY, width=40).cameras
     steps: list[tuple[int, int]] = []
     options = RenderOptions(background="transparent", exr="all", video="path.mp4", fps=24)
-    written = render_path(tree, cameras, tmp_path / "out", options, lambda done, total: steps.append((done, total)))
+    written = render_path(tree, cameras, tmp_path / "out", options, lambda done, total: steps.append((done, total)), BallTree.render)
     names = ["frame_0000.png", "frame_0000.exr", "frame_0001.png", "frame_0001.exr", "path.mp4"]
     assert [path.name for path in written] == names
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(names)
