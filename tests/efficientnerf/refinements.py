@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from efficientnerf.rendering.render import render_tree_reference
 
 from efficientnerf.asset.refinement import grid_of, in_voxels
+from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
@@ -32,7 +32,7 @@ def loss_by_torch(colour: torch.Tensor, opacity: torch.Tensor, seen: RayTargets)
 def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets) -> tuple[np.ndarray, ...]:
     """What `gradients` gives, by torch's reference in float64."""
     density, sh = (torch.from_numpy(a).double().requires_grad_() for a in (tree.density_values, tree.sh))
-    loss = loss_by_torch(*render_tree_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
+    loss = loss_by_torch(*render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions), density, sh), seen)
     loss.sum().backward()
     assert density.grad is not None
     assert sh.grad is not None

@@ -14,6 +14,8 @@ import hashlib
 import numba
 import numpy as np
 
+from efficientnerf.asset.queries import colour_at, density_at, normal_at
+from efficientnerf.asset.rendering import render_rays
 from efficientnerf.training.loop import state_of, train, trainer
 from tests.efficientnerf.balls import pixels, untrained
 from tests.efficientnerf.networks import passes, weights_of
@@ -31,9 +33,9 @@ for bfloat16 in (False, True):
     for values in passes(features, weights, grad, bfloat16):
         print(hashlib.sha256(values.tobytes()).hexdigest())
 tree = random_tree()
-seen = tree.render_rays(*rays_at(tree, 3000))
+seen = render_rays(tree, *rays_at(tree, 3000))
 points = np.random.default_rng(0).uniform(tree.bounds_min, tree.bounds_max, (5000, 3))
-for values in (seen.colour, seen.opacity, seen.depth, seen.normal, tree.density(points), tree.normal(points), tree.colour(points, None)):
+for values in (seen.colour, seen.opacity, seen.depth, seen.normal, density_at(tree, points), normal_at(tree, points), colour_at(tree, points, None)):
     print(hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest())
 """
 
