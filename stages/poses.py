@@ -23,7 +23,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
 from stages.io import importers
 from stages.io.capture import Capture, Photo, SparsePoints
-from stages.io.importers.source import FEWEST, Source, listed
+from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.scene import SPLITS, Scene, View, save, save_points
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def run(job: Job) -> None:
 
     capture = read(job, settings, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
-    keep_alpha = working_images.composites(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].renders)
+    keep_alpha = working_images.alpha_is_coverage(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].renders)
     capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
     framed = training_frame.find_training_frame(capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space)
     splits = assign_splits(capture.photos, settings.test_every, warn)
@@ -144,7 +144,7 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     else:
         capture = _find_cameras(job, settings, warn)
     if settings.strict and capture.rejected:
-        which = listed([f"{image} ({why})" for image, why in capture.rejected])
+        which = abbreviated([f"{image} ({why})" for image, why in capture.rejected])
         raise BadInput(f"{job.source}: {len(capture.rejected)} images cannot be used: {which}. Refused by --strict.")
     return capture
 
@@ -180,7 +180,7 @@ def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tu
     from stages.io import working_images
     from stages.io.photo import UnreadableImage
 
-    relative = working_images.relative_paths([photo.camera for photo in capture.photos])
+    relative = working_images.image_paths([photo.camera for photo in capture.photos])
     kept: list[int] = []
     written = []
     failed: list[tuple[str, str]] = []
@@ -196,9 +196,9 @@ def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tu
             failed.append((photo.camera.name, str(error)))
     job.progress(len(capture.photos), len(capture.photos), "preparing images")
     if failed:
-        sentence = f"{len(failed)} of {len(capture.photos)} images cannot be used: {listed([f'{name} {reason}' for name, reason in failed])}."
-        if len(kept) < FEWEST or job.settings.strict:
-            why = "Refused by --strict." if len(kept) >= FEWEST else f"{len(kept)} remain; at least {FEWEST} are needed."
+        sentence = f"{len(failed)} of {len(capture.photos)} images cannot be used: {abbreviated([f'{name} {reason}' for name, reason in failed])}."
+        if len(kept) < MIN_IMAGES or job.settings.strict:
+            why = "Refused by --strict." if len(kept) >= MIN_IMAGES else f"{len(kept)} remain; at least {MIN_IMAGES} are needed."
             raise BadInput(f"{job.source}: {sentence} {why} Copy or convert them again, or take them out.")
         warn(f"{sentence} They are left out.")
     for sentence in [*odd[:3], *([f"... and {len(odd) - 3} more remarks like these."] if len(odd) > 3 else [])]:

@@ -195,10 +195,10 @@ def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: floa
 def silhouette(photo: Photo) -> np.ndarray | None:
     """(h, w) bool, upright, longest side at most SILHOUETTE: whether any pixel below is not wholly transparent; None without an alpha channel
     or where nothing is transparent."""
-    from stages.io.photo import UnreadableImage, alpha_channel
+    from stages.io.photo import UnreadableImage, read_alpha
 
     try:
-        alpha = alpha_channel(photo.image)
+        alpha = read_alpha(photo.image)
     except UnreadableImage:
         return None
     if alpha is None or not (alpha == 0).any():

@@ -1,4 +1,4 @@
-"""Reading a photograph the way it is meant to be seen: upright, eight bits sRGB, at a working size."""
+"""Reading photographs: after EXIF rotation, 8 bits sRGB, at a working size."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class UnreadableImage(Exception):
 
 
 @dataclass(frozen=True)
-class UprightPhoto:
-    """One photograph after EXIF rotation.
+class DecodedPhoto:
+    """A photograph after EXIF rotation.
 
     rgb            (h, w, 3) uint8 sRGB at working size
     opaque         (h, w) bool, False where the file's alpha is below one half; None without transparent pixels
-    width, height  of the source, upright, pixels
+    width, height  of the source after EXIF rotation, pixels
     orientation    EXIF's number, 1 where there is none
     focal          pixels of the source, from EXIF, or None
     maker          make and model
@@ -42,7 +42,7 @@ class UprightPhoto:
 
 
 def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
-    """The size at most `max_side` that keeps the aspect best, so that one scale serves both axes.
+    """The size with longest side at most `max_side` that keeps the aspect best, so that one scale serves both axes.
 
     Sizes down to 2 % below `max_side` are tried: rounding the shorter side alone changes the aspect by up to 0.1 %.
     """
@@ -55,7 +55,7 @@ def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
     return int(w[best]), int(h[best])
 
 
-def upright_photo(path: Path, max_side: int) -> UprightPhoto:
+def read_photo(path: Path, max_side: int) -> DecodedPhoto:
     """Decode a photograph; raises UnreadableImage."""
     from PIL import Image
 
@@ -69,33 +69,33 @@ def upright_photo(path: Path, max_side: int) -> UprightPhoto:
                 orientation = orientation if orientation in range(1, 9) else 1
                 full = image.size
                 _draft(image, max_side)
-                rgb, alpha = pixels_and_alpha(image)
+                rgb, alpha = rgb_and_alpha(image)
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise UnreadableImage(f"cannot be read ({reason.splitlines()[0] if reason else type(error).__name__})") from error
     width, height = full if orientation < 5 else full[::-1]
-    rgb = _resized(upright(rgb, orientation), working_size(width, height, max_side))
+    rgb = _resized(apply_exif_orientation(rgb, orientation), working_size(width, height, max_side))
     opaque = None
     if alpha is not None and (alpha < 128).any():
-        opaque = _resized(upright(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
+        opaque = _resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
     maker = " ".join(str(exif.get(tag, "")).strip(" \0") for tag in (_MAKE, _MODEL)).strip()
-    return UprightPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *full), maker)
+    return DecodedPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *full), maker)
 
 
-def alpha_channel(path: Path) -> np.ndarray | None:
-    """(H, W) uint8, upright, of an image file at full size; None if it has none. Raises UnreadableImage."""
+def read_alpha(path: Path) -> np.ndarray | None:
+    """(H, W) uint8 of an image file at full size, after EXIF rotation; None if it has no alpha channel. Raises UnreadableImage."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
             if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
                 return None
-            return upright(np.asarray(image.convert("RGBA"))[..., 3], image.getexif().get(_ORIENTATION, 1))
+            return apply_exif_orientation(np.asarray(image.convert("RGBA"))[..., 3], image.getexif().get(_ORIENTATION, 1))
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise UnreadableImage(f"{path.name} cannot be read") from error
 
 
-def mask_of(path: Path, photo: UprightPhoto) -> np.ndarray:
+def read_mask_file(path: Path, photo: DecodedPhoto) -> np.ndarray:
     """(h, w) bool at the photograph's working size, True where the mask is not black; raises UnreadableImage."""
     from PIL import Image
 
@@ -105,7 +105,7 @@ def mask_of(path: Path, photo: UprightPhoto) -> np.ndarray:
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise UnreadableImage(f"{path.name} cannot be read") from error
     if photo.orientation >= 5 and same_aspect(mask.shape[::-1], (photo.height, photo.width)):
-        mask = upright(mask, photo.orientation)  # drawn over the pixels as stored
+        mask = apply_exif_orientation(mask, photo.orientation)  # a mask of the pixels as stored
     if not same_aspect(mask.shape, (photo.height, photo.width)):
         raise UnreadableImage(f"{path.name} is {mask.shape[1]}x{mask.shape[0]}, the photograph {photo.width}x{photo.height}")
     height, width = photo.rgb.shape[:2]
@@ -149,7 +149,7 @@ def _number(value: Any) -> float | None:
 
 
 def _draft(image: Any, max_side: int) -> None:
-    """Let the JPEG decoder halve the image where that is exact: several times faster, and still above the working size."""
+    """Let the JPEG decoder downscale by a power of two where that is exact and still above the working size."""
     if image.format == "JPEG" and image.mode in ("RGB", "L"):
         scale = 1
         while scale < 8 and max(image.size) >= 2 * scale * max_side and all(side % (2 * scale) == 0 for side in image.size):
@@ -158,8 +158,8 @@ def _draft(image: Any, max_side: int) -> None:
             image.draft(image.mode, (image.size[0] // scale, image.size[1] // scale))
 
 
-def pixels_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """(rgb, alpha or None) as uint8; sixteen bits are cut to eight, which Pillow's own conversion would clip."""
+def rgb_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """(rgb, alpha or None) as uint8; 16 bits are scaled to 8, which Pillow would clip."""
     if image.mode.startswith("I") or image.mode == "F":
         values = np.asarray(image).astype(np.float64)
         values = values / 257.0 if values.max(initial=0) > 255 else values
@@ -170,8 +170,8 @@ def pixels_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
     return np.asarray(image.convert("RGB")), None
 
 
-def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Undo EXIF's orientation (tag 274): where row 0 and column 0 of the stored image belong."""
+def apply_exif_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """The pixels (H, W, ...) as they are meant to be seen, from those stored with an EXIF orientation 1-8 (tag 274)."""
     if orientation >= 5:
         pixels = pixels.swapaxes(0, 1)
     flip_rows, flip_columns = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)

@@ -1,4 +1,4 @@
-"""The images that later stages read: upright, 8 bits sRGB, at working size, with a mask where pixels are to be left out."""
+"""The images that later stages read: after EXIF rotation, 8 bits sRGB, at working size, with masks."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _LOSSY = (".jpg", ".jpeg", ".webp")
 class Decoded:
     """A source image after EXIF rotation.
 
-    pixels    (H, W, 3 or 4) uint8 sRGB, straight alpha
-    verbatim  whether the file itself holds exactly these pixels in a form that later stages read
-    turned    EXIF orientation, 1-8
+    pixels       (H, W, 3 or 4) uint8 sRGB, straight alpha
+    verbatim     whether the file itself holds exactly these pixels in a form that later stages read
+    orientation  EXIF's number, 1-8
     """
 
     pixels: np.ndarray
     verbatim: bool
-    turned: int
+    orientation: int
 
 
 @dataclass(frozen=True)
 class Written:
-    """What was written for one photo: paths relative to the folder of the scene, size in pixels, what is odd."""
+    """What was written for one photo: paths relative to the folder of the scene, size in pixels, warnings."""
 
     image: str
     mask: str | None
@@ -53,7 +53,7 @@ def decode(path: Path) -> Decoded:
 
     from PIL import Image
 
-    from stages.io.photo import pixels_and_alpha, upright
+    from stages.io.photo import apply_exif_orientation, rgb_and_alpha
 
     orientation = _orientation(path)
     try:
@@ -61,12 +61,12 @@ def decode(path: Path) -> Decoded:
             warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
             with Image.open(path) as image:
                 verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image, path)
-                rgb, alpha = pixels_and_alpha(image)
+                rgb, alpha = rgb_and_alpha(image)
     except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UnreadableImage(f"cannot be decoded ({reason[:100]})") from error
     pixels = rgb if alpha is None else np.dstack([rgb, alpha])
-    return Decoded(np.ascontiguousarray(upright(pixels, orientation)), verbatim, orientation)
+    return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation)
 
 
 def has_transparency(path: Path) -> bool:
@@ -75,7 +75,7 @@ def has_transparency(path: Path) -> bool:
     return pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any())
 
 
-def composites(photos: tuple[Photo, ...], choice: str, may_be_renders: bool) -> bool:
+def alpha_is_coverage(photos: tuple[Photo, ...], choice: str, may_be_renders: bool) -> bool:
     """Whether alpha is coverage (the images are composited on a constant background) instead of a mask.
 
     choice          the setting: "auto", "composite" or "mask"
@@ -116,7 +116,7 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alph
         before = f"{photo.camera.width}x{photo.camera.height}"
         raise BadInput(f"{photo.image}: {width}x{height} pixels, but {before} a moment ago. Leave the source alone while it is read.")
     size = working_size(width, height, max_side)
-    usable, warnings = (None, []) if photo.mask is None else _usable(photo, size, found.turned)
+    usable, warnings = (None, []) if photo.mask is None else _usable(photo, size, found.orientation)
     pixels = _resized(found.pixels, size)
     has_alpha = pixels.shape[2] == 4
     if has_alpha and not keep_alpha:
@@ -141,8 +141,8 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alph
     return Written(path.relative_to(folder).as_posix(), None if mask is None else mask.relative_to(folder).as_posix(), *size, tuple(warnings))
 
 
-def relative_paths(cameras: list[Camera]) -> list[str]:
-    """A path below images/ for each camera by its name; no two alike, even without their extensions."""
+def image_paths(cameras: list[Camera]) -> list[str]:
+    """A path below images/ for each camera by its name, unique even without the extension."""
     taken: set[str] = set()
     paths = []
     for camera in cameras:
@@ -176,7 +176,7 @@ def _is_plain(image: Any, path: Path) -> bool:
 
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """At another size by averaging areas in sRGB; colours weigh by their alpha, so that those of transparent pixels do not show."""
+    """Resized by area averaging in sRGB, colours weighted by alpha."""
     import cv2
 
     if pixels.shape[1::-1] == size:
@@ -190,9 +190,9 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.clip(np.rint(whole), 0, 255).astype(np.uint8)
 
 
-def _usable(photo: Photo, size: tuple[int, int], turned: int) -> tuple[np.ndarray, list[str]]:
+def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.ndarray, list[str]]:
     """(h, w) bool at working size from the photo's mask file, and warnings."""
-    from stages.io.photo import upright
+    from stages.io.photo import apply_exif_orientation
 
     assert photo.mask is not None
     try:
@@ -200,8 +200,8 @@ def _usable(photo: Photo, size: tuple[int, int], turned: int) -> tuple[np.ndarra
     except UnreadableImage as error:
         raise UnreadableImage(f"its mask {photo.mask.name} {error}") from error
     expected = photo.camera.width, photo.camera.height
-    if turned >= 5 and not same_aspect(mask.shape[::-1], expected):
-        mask = upright(mask, turned)  # drawn over the pixels as stored
+    if orientation >= 5 and not same_aspect(mask.shape[::-1], expected):
+        mask = apply_exif_orientation(mask, orientation)  # a mask of the pixels as stored
     found = mask.shape[1], mask.shape[0]
     sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
     if not same_aspect(found, expected):

@@ -1,8 +1,7 @@
-"""Photographs to features and verified matches: the part of structure from motion that takes long and is resumed.
+"""Photographs to features and verified matches, resumable.
 
-Everything lies in one work folder: upright copies of the photographs at working size (`images/`), their masks (`masks/`) and
-COLMAP's database. A feature depends on its image alone and a verified match on its two images alone, so that what a killed run
-left in the database is what an undisturbed run would have put there.
+The work folder holds copies of the photographs after EXIF rotation at working size (`images/`), their masks (`masks/`) and COLMAP's database. Features
+depend on their image alone and verified matches on their two images alone, so that a resumed run has the same database as an undisturbed one.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from typing import Any
 import numpy as np
 
 from pipeline.files import rename, write_atomically, write_json
-from stages.io.photo import UnreadableImage, UprightPhoto, mask_of, upright_photo
+from stages.io.photo import DecodedPhoto, UnreadableImage, read_mask_file, read_photo
 from stages.io.png import FAST, write_png
 
 LAYOUT = 1  # of the work folder; raise it when what is written there changes meaning
-BLOCK = 8  # images to a side of a block of pairs: a block takes a second or three, nothing answers inside one, and each builds its images' indices anew
-FINE_BELOW = 1000  # px, longest side: smaller images are searched at twice their size (four times slower, four times as exact)
-NEIGHBOURS = 10  # images matched after each one in a sequence
-KEYFRAMES = 40  # images of a sequence that are matched with each other, to close its loops
+BLOCK_SIZE = 8  # images along a side of a block of pairs: between two blocks lies a safe point, a second or three apart
+UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md
+OVERLAP = 10  # of sequential matching: images that follow each one
+KEYFRAMES = 40  # images of a sequence that are all matched with each other, for loop closure
 
 Progress = Callable[..., None]
 SafePoint = Callable[[], None]
@@ -39,14 +38,14 @@ SafePoint = Callable[[], None]
 
 @dataclass(frozen=True)
 class WorkImage:
-    """The upright copy of one photograph.
+    """The copy of one photograph after EXIF rotation.
 
     name            of the photograph
     file            of the copy: numbers in sorted order of name
-    width, height   of the photograph, upright, pixels
+    width, height   of the photograph after EXIF rotation, pixels
     work_width, work_height  of the copy
     focal           pixels of the photograph, from its EXIF data, or None
-    camera_key      photographs with equal keys were taken by one camera at one setting
+    camera_key      photographs with equal keys share a COLMAP camera: same size, maker and focal length
     """
 
     name: str
@@ -59,24 +58,21 @@ class WorkImage:
     camera_key: str
 
 
-# What glog catches. It does so from the moment pycolmap is imported, prints a stack trace and aborts: at SIGTERM too, instead of what the
-# process has arranged to do.
-_CAUGHT = (signal.SIGSEGV, signal.SIGILL, signal.SIGFPE, signal.SIGABRT, signal.SIGBUS, signal.SIGTERM)
-_ROOM = 1024  # bytes; a struct sigaction takes 152 on Linux
+# glog installs handlers of these when pycolmap is imported; they print a stack trace and abort, at SIGTERM too.
+_GLOG_SIGNALS = (signal.SIGSEGV, signal.SIGILL, signal.SIGFPE, signal.SIGABRT, signal.SIGBUS, signal.SIGTERM)
+_SIGACTION_BYTES = 1024  # bytes; a struct sigaction takes 152 on Linux
 
 
 def import_pycolmap() -> Any:
-    """pycolmap; the only place that imports it. Every signal is handled afterwards as it was before.
-
-    The handlers are kept as C has them: Python's own record knows nothing of those that faulthandler or another library has set, and
-    sets handlers in the main thread only.
+    """pycolmap, the only place that imports it. Signal handlers are restored afterwards, by sigaction(2): Python's signal module knows nothing of
+    handlers that faulthandler or another library has set, and works in the main thread only.
     """
     if "pycolmap" not in sys.modules:
         libc = ctypes.CDLL(None)
-        handlers = [(number, ctypes.create_string_buffer(_ROOM)) for number in _CAUGHT]
+        handlers = [(number, ctypes.create_string_buffer(_SIGACTION_BYTES)) for number in _GLOG_SIGNALS]
         for number, handler in handlers:
             libc.sigaction(int(number), None, handler)
-        # A SIGTERM that comes while glog holds its handler waits until ours is back.
+        # A SIGTERM that arrives meanwhile is delivered to the restored handler.
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         try:
             import pycolmap
@@ -101,7 +97,7 @@ def quiet_pycolmap() -> Iterator[Any]:
         pycolmap.logging.minloglevel = before
 
 
-def threads() -> int:
+def num_threads() -> int:
     """CPUs this process may use."""
     return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
@@ -111,7 +107,7 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def prepare(
+def prepare_images(
     folder: Path,
     names: Sequence[str],
     *,
@@ -124,7 +120,7 @@ def prepare(
     safe_point: SafePoint,
     warn: Callable[..., None],
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
-    """Upright copies of the photographs in `work/images`, longest side at most `max_side`; what cannot be read is left out.
+    """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 
@@ -173,7 +169,7 @@ def _digests(folder: Path, names: Sequence[str], masks: Mapping[str, Path], safe
 
 def _copy(folder: Path, name: str, index: int, max_side: int, mask_path: Path | None, work: Path) -> dict[str, Any]:
     try:
-        photo: UprightPhoto = upright_photo(folder / name, max_side)
+        photo: DecodedPhoto = read_photo(folder / name, max_side)
     except UnreadableImage as error:
         return {"reason": str(error)}
     file = f"{index:05d}.png"
@@ -181,7 +177,7 @@ def _copy(folder: Path, name: str, index: int, max_side: int, mask_path: Path | 
     mask, remark = photo.opaque, ""
     if mask_path is not None:
         try:
-            given = mask_of(mask_path, photo)
+            given = read_mask_file(mask_path, photo)
             mask = given if mask is None else mask & given
         except UnreadableImage as error:
             remark = f"its mask is not used: {error}"
@@ -203,12 +199,12 @@ def remove_database(work: Path) -> None:
 
 
 def open_database(work: Path, images: Sequence[WorkImage]) -> bool:
-    """A database that lists exactly `images`, each with its camera; made anew unless the one that is there is whole.
+    """Make a database of exactly `images`, each with its camera, unless there is an intact one.
 
     returns  whether features or matches of an earlier call are kept
     """
     if database_path(work).exists():
-        if _is_sound(database_path(work), images):
+        if _is_intact(database_path(work), images):
             return True
         remove_database(work)
     # The database appears by rename: a kill while the images are being listed leaves none.
@@ -231,10 +227,8 @@ def open_database(work: Path, images: Sequence[WorkImage]) -> bool:
 
 
 def _first_guess(image: WorkImage) -> Any:
-    """SIMPLE_RADIAL: one focal length and one distortion term, which every number of photographs can support.
-
-    Richer lenses are tried once the scene is known. Without EXIF data the focal length starts at 1.2 times the longest side, a
-    moderate wide angle as phones and small cameras have it.
+    """SIMPLE_RADIAL, which few photographs suffice for; `mapping.bundle_adjusted` tries OPENCV. Without EXIF data the initial focal length is 1.2
+    times the longest side, as COLMAP has it.
     """
     pycolmap = import_pycolmap()
     scale = np.sqrt(image.work_width * image.work_height / (image.width * image.height))
@@ -246,8 +240,8 @@ def _first_guess(image: WorkImage) -> Any:
     return camera
 
 
-def _is_sound(path: Path, images: Sequence[WorkImage]) -> bool:
-    """Whether SQLite finds no damage, the images are those expected, and no image or pair is half written."""
+def _is_intact(path: Path, images: Sequence[WorkImage]) -> bool:
+    """Whether SQLite finds no damage, the images are `images`, and no image or pair is written in part."""
     try:
         with contextlib.closing(sqlite3.connect(path)) as connection:
             ask = connection.execute
@@ -267,7 +261,7 @@ def _is_sound(path: Path, images: Sequence[WorkImage]) -> bool:
         return False
 
 
-def extract(work: Path, images: Sequence[WorkImage], *, features: int, progress: Progress, safe_point: SafePoint) -> None:
+def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, progress: Progress, safe_point: SafePoint) -> None:
     """SIFT features of the images that have none yet, a few images at a time."""
     with quiet_pycolmap() as pycolmap:
         with pycolmap.Database.open(database_path(work)) as database:
@@ -281,34 +275,34 @@ def extract(work: Path, images: Sequence[WorkImage], *, features: int, progress:
             reader.mask_path = work / "masks"
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
-        options.num_threads = threads()
+        options.num_threads = num_threads()
         options.sift.max_num_features = features
         done = len(known)
-        progress(done, len(images), "finding features")
+        progress(done, len(images), "detecting features")
         for octave in (-1, 0):
             options.sift.first_octave = octave
-            todo = [i for i in images if i.file not in known and (max(i.work_width, i.work_height) < FINE_BELOW) == (octave < 0)]
-            for start in range(0, len(todo), 2 * threads()):
+            todo = [i for i in images if i.file not in known and (max(i.work_width, i.work_height) < UPSAMPLE_BELOW) == (octave < 0)]
+            for start in range(0, len(todo), 2 * num_threads()):
                 safe_point()
-                some = [image.file for image in todo[start : start + 2 * threads()]]
+                some = [image.file for image in todo[start : start + 2 * num_threads()]]
                 pycolmap.extract_features(
                     database_path(work), work / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
                 )
                 done += len(some)
-                progress(done, len(images), "finding features")
+                progress(done, len(images), "detecting features")
 
 
 def pairs_to_match(count: int, how: str) -> list[list[tuple[int, int]]]:
     """Blocks of pairs (i < j) of positions in the sorted list of images.
 
     exhaustive  every pair
-    sequential  each image with the NEIGHBOURS after it and those 2, 4, 8 ... times as far; besides, up to KEYFRAMES images spread
-                evenly over the sequence with each other, so that a walk round an object is closed
+    sequential  each image with the OVERLAP that follow and those 2, 4, 8 times as far; and up to KEYFRAMES images, evenly spaced, with each other
+                for loop closure
     """
     if how == "exhaustive":
         wanted = {(i, j) for i in range(count) for j in range(i + 1, count)}
     elif how == "sequential":
-        offsets = [*range(1, NEIGHBOURS + 1), *(NEIGHBOURS * 2**k for k in range(1, 4))]
+        offsets = [*range(1, OVERLAP + 1), *(OVERLAP * 2**k for k in range(1, 4))]
         wanted = {(i, i + offset) for i in range(count) for offset in offsets if i + offset < count}
         key = range(0, count, max(1, -(-count // KEYFRAMES)))
         wanted |= {(i, j) for i in key for j in key if i < j}
@@ -316,16 +310,15 @@ def pairs_to_match(count: int, how: str) -> list[list[tuple[int, int]]]:
         raise ValueError(f"matching {how!r}: expected 'exhaustive' or 'sequential'")
     blocks: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j in sorted(wanted):
-        blocks.setdefault((i // BLOCK, j // BLOCK), []).append((i, j))
+        blocks.setdefault((i // BLOCK_SIZE, j // BLOCK_SIZE), []).append((i, j))
     return [blocks[place] for place in sorted(blocks)]
 
 
-def match(work: Path, images: Sequence[WorkImage], *, how: str, seed: int, progress: Progress, safe_point: SafePoint) -> None:
+def match_pairs(work: Path, images: Sequence[WorkImage], *, how: str, seed: int, progress: Progress, safe_point: SafePoint) -> None:
     """Matches and two-view geometries of the pairs that have none yet, a block at a time.
 
-    COLMAP compares descriptors by FAISS, which multiplies matrices with an OpenBLAS built for a single thread: two threads that ask for its
-    scratch memory at once may be given the same piece, and then some matches are wrong, about once in sixty runs on a busy machine. One
-    thread compares (COLMAP verifies in another one meanwhile, without BLAS).
+    On one thread: COLMAP's FAISS multiplies matrices by an OpenBLAS that is not thread-safe, which gave wrong matches in about one of sixty runs
+    (docs/experiments/sfm.md). COLMAP verifies in another thread meanwhile, without BLAS.
     """
     with quiet_pycolmap() as pycolmap:
         with pycolmap.Database.open(database_path(work)) as database:
@@ -353,9 +346,9 @@ def match(work: Path, images: Sequence[WorkImage], *, how: str, seed: int, progr
 def verified_pairs(path: Path) -> list[tuple[int, int]]:
     """Image ids of each pair in the table of two-view geometries, in order."""
     with contextlib.closing(sqlite3.connect(path)) as connection:
-        return [unpacked(row[0]) for row in connection.execute("SELECT pair_id FROM two_view_geometries ORDER BY pair_id")]
+        return [image_ids_of_pair(row[0]) for row in connection.execute("SELECT pair_id FROM two_view_geometries ORDER BY pair_id")]
 
 
-def unpacked(pair: int) -> tuple[int, int]:
-    """COLMAP packs the ids of two images into one number."""
+def image_ids_of_pair(pair: int) -> tuple[int, int]:
+    """The two image ids of a pair id in COLMAP's database."""
     return (pair - pair % 2147483647) // 2147483647, pair % 2147483647

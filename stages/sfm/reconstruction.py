@@ -1,6 +1,6 @@
-"""Cameras from photographs: structure from motion with COLMAP's incremental mapper, on the CPU, repeatable to the last bit.
+"""Structure from motion with COLMAP's incremental mapper, on the CPU, bit-exact from run to run.
 
-The frame is COLMAP's own: neither its scale nor its up axis means anything.
+The capture's frame is COLMAP's: its scale and axes are arbitrary.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import mapping, matches
 from stages.sfm.matches import WorkImage
 
-EXHAUSTIVE_UP_TO = 100  # photographs; beyond it, every pair would take longer than everything else together
-NAMED = 8  # photographs that an error lists by name
+MAX_EXHAUSTIVE = 100  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
+MAX_NAMES = 8  # photographs that an error lists by name
 
 
 def find_cameras(
@@ -40,39 +40,39 @@ def find_cameras(
     safe_point: Callable[[], None],
     warn: Callable[..., None],
 ) -> Capture:
-    """Find where each photograph was taken from, and what took it.
+    """Find the pose and the intrinsics of each photograph's camera.
 
     folder, names   the photographs, paths relative to the folder; any order
-    max_side        longest side at which features are searched, pixels
+    max_side        longest side of the photographs in which features are detected, pixels
     features        most features of a photograph
     matching        "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
     masks           of some or all names: no features where the mask is black
-    work            scratch folder; what a killed call left in it is used again, and the result is the same to the bit
-    returns         a Capture of kind "photographs"; photographs that failed are in `rejected`, with the reason
+    work            scratch folder; what a killed call left in it is used again, and the result has the same bits
+    returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
 
-    Raises BadInput where fewer than 3 or less than half of the photographs find their place.
+    Raises BadInput where fewer than 3 or less than half of the photographs are registered.
     """
     masks = masks or {}
     work.mkdir(parents=True, exist_ok=True)
-    images, unreadable = matches.prepare(
+    images, unreadable = matches.prepare_images(
         folder, names, max_side=max_side, features=features, seed=seed, masks=masks, work=work, progress=progress, safe_point=safe_point, warn=warn
     )
-    if len(images) < mapping.FEWEST:
+    if len(images) < mapping.MIN_MODEL_SIZE:
         raise BadInput(
-            f"{folder}: {len(images)} readable photographs; at least {mapping.FEWEST} are needed, and 20 or more all round a subject are better."
-            + (f" Unreadable: {_listed([name for name, _ in unreadable])}." if unreadable else "")
+            f"{folder}: {len(images)} readable photographs; at least {mapping.MIN_MODEL_SIZE} are needed, and 20 or more all round a subject are better."
+            + (f" Unreadable: {_abbreviated([name for name, _ in unreadable])}." if unreadable else "")
         )
     if matching == "auto":
-        matching = "exhaustive" if len(images) <= EXHAUSTIVE_UP_TO else "sequential"
+        matching = "exhaustive" if len(images) <= MAX_EXHAUSTIVE else "sequential"
     with _full_disk_named(work):
         matches.open_database(work, images)
-        matches.extract(work, images, features=features, progress=progress, safe_point=safe_point)
-        matches.match(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
-        models = mapping.models_of(work, images, seed, progress, safe_point)
-    rejected = [*unreadable, *_left_out(work, images, models)]
-    if mapping.registered(models) < max(mapping.FEWEST, len(images) / 2):
+        matches.extract_features(work, images, features=features, progress=progress, safe_point=safe_point)
+        matches.match_pairs(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
+        models = mapping.best_models(work, images, seed, progress, safe_point)
+    rejected = [*unreadable, *_unregistered(work, images, models)]
+    if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
         raise BadInput(_failure(folder, images, models, rejected, matching))
-    capture = _capture(folder, work, images, mapping.refined(work, images, models[0], safe_point), masks, rejected)
+    capture = _capture(folder, work, images, mapping.bundle_adjusted(work, images, models[0], safe_point), masks, rejected)
     for sentence in capture.warnings:
         warn(sentence)
     return capture
@@ -89,14 +89,14 @@ def _full_disk_named(work: Path) -> Iterator[None]:
         raise
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+def _abbreviated(names: Sequence[str]) -> str:
+    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
 
 
-def _left_out(work: Path, images: Sequence[WorkImage], models: Sequence[Any]) -> list[tuple[str, str]]:
-    """(name, reason) of each photograph that the best model does not hold."""
-    held = [{image.name for image in model.images.values() if image.has_pose} for model in models]
-    missing = [image for image in images if not held or image.file not in held[0]]
+def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]) -> list[tuple[str, str]]:
+    """(name, reason) of each photograph that is not registered in the best sub-model."""
+    of_model = [{image.name for image in model.images.values() if image.has_pose} for model in models]
+    missing = [image for image in images if not of_model or image.file not in of_model[0]]
     if not missing:
         return []
     with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
@@ -109,12 +109,12 @@ def _left_out(work: Path, images: Sequence[WorkImage], models: Sequence[Any]) ->
                 best[image_id] = max(best.get(image_id, 0), inliers)
     rejected = []
     for image in missing:
-        other = next((model for model in held[1:] if image.file in model), None)
+        other = next((model for model in of_model[1:] if image.file in model), None)
         inliers = best.get(ids[image.file], 0)
         if other is not None:
-            reason = f"belongs to a separate group of {len(other)} photographs that shares too little with the rest"
+            reason = f"belongs to another sub-model, of {len(other)} photographs, which shares too few points with the rest"
         elif features[image.file] < 50:
-            reason = f"only {features[image.file]} features found: blurred, dark or without texture"
+            reason = f"only {features[image.file]} features detected: blurred, dark or without texture"
         elif inliers < 15:
             reason = "overlaps no other photograph well enough"
         else:
@@ -129,10 +129,10 @@ def _failure(folder: Path, images: Sequence[WorkImage], models: Sequence[Any], r
         hints.append("--set poses.matching=exhaustive if the names do not follow the path of the camera")
     hints.append("--set poses.max_features=8192")
     worst = dict(rejected)
-    fewest = max(mapping.FEWEST, -(-len(images) // 2))
+    fewest = max(mapping.MIN_MODEL_SIZE, -(-len(images) // 2))
     return (
-        f"{folder}: cameras found for {mapping.registered(models)} of {len(images)} photographs; at least {fewest} are needed. "
-        f"Not placed: {_listed(list(worst))} ({next(iter(worst.values()), 'no model')}).\nTry {'; '.join(hints)}."
+        f"{folder}: cameras found for {mapping.num_registered(models)} of {len(images)} photographs; at least {fewest} are needed. "
+        f"Not registered: {_abbreviated(list(worst))} ({next(iter(worst.values()), 'no model')}).\nTry {'; '.join(hints)}."
     )
 
 
@@ -146,7 +146,7 @@ def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, 
     )
     index = {image.image_id: i for i, image in enumerate(registered)}
     points = _points(model, index)
-    agreement = mapping.agreement_of(work, images, model)
+    agreement = mapping.match_agreement(work, images, model)
     facts: dict[str, object] = {
         "photographs": len(images),
         "registered": len(photos),
@@ -154,9 +154,9 @@ def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, 
         "triangulation_angle": round(triangulation_angle(points, photos), 3),
         "pairs_agreeing": round(agreement, 4),
     }
-    warnings = _doubts(photos, points, agreement, [by_file[image.name].focal for image in registered])
+    warnings = _model_warnings(photos, points, agreement, [by_file[image.name].focal for image in registered])
     if rejected:
-        warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} found no place: {_listed([name for name, _ in rejected])}.")
+        warnings.append(f"{len(rejected)} photograph{'s' if len(rejected) > 1 else ''} not registered: {_abbreviated([name for name, _ in rejected])}.")
     return Capture(
         kind="photographs",
         photos=photos,
@@ -180,8 +180,7 @@ def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
 
 
 def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
-    """Median over the points of the largest angle between two of their rays, degrees; the depth of a scene seen under less than about
-    two is a guess."""
+    """Median over the points of the largest angle between two rays of a track, degrees; below about two, depth is unreliable."""
     if not len(points.xyz):
         return 0.0
     centres = np.array([photo.camera.centre for photo in photos])
@@ -194,22 +193,22 @@ def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
     return float(np.median(widest))
 
 
-def _doubts(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:
-    """What is odd about a model whose counts and reprojection error are fine."""
-    doubts = []
+def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:
+    """What is suspicious in a model whose counts and reprojection error are fine."""
+    warnings = []
     angle = triangulation_angle(points, photos)
     if angle < 2.0:
-        doubts.append(f"The photographs were taken almost from one place (points are seen under {angle:.1f} degrees): depth will be poor.")
+        warnings.append(f"The photographs were taken from almost one place (triangulation angle {angle:.1f} degrees): depth will be poor.")
     if agreement < 0.8:
-        doubts.append(
-            f"Only {agreement:.0%} of the matches between pairs of photographs agree with the cameras found: repeated structure may have folded the scene. "
+        warnings.append(
+            f"Only {agreement:.0%} of the verified matches agree with the cameras found: repeated structure may have folded the scene. "
             "Look at the cameras before training."
         )
     lenses = {photo.camera.params: (photo.camera, prior) for photo, prior in zip(photos, priors, strict=True)}
     for camera, prior in lenses.values():
         focal, longest = camera.intrinsics["fx"], max(camera.width, camera.height)
-        if prior and mapping.far_off(focal, prior):
-            doubts.append(f"{camera.name}: focal length {focal:.0f} px, but {prior:.0f} px by its EXIF data; cropped or edited photographs may explain it.")
+        if prior and mapping.contradicts_exif(focal, prior):
+            warnings.append(f"{camera.name}: focal length {focal:.0f} px, but {prior:.0f} px by its EXIF data; cropped or edited photographs may explain it.")
         elif not 0.35 < focal / longest < 6.0:
-            doubts.append(f"{camera.name}: an unlikely focal length, {focal:.0f} px at {longest} px wide.")
-    return doubts
+            warnings.append(f"{camera.name}: an unlikely focal length, {focal:.0f} px at {longest} px wide.")
+    return warnings

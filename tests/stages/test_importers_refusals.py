@@ -100,7 +100,7 @@ def test_json_that_is_no_data_set(tmp_path: Path, text: str | bytes, word: str) 
 def test_json_is_bounded(tmp_path: Path) -> None:
     path = captures.nerfstudio(tmp_path / "a") / "transforms.json"
     with pytest.raises(BadInput, match="6 frames; at most 5"):
-        transforms.read_document(path, most_frames=5)
+        transforms.read_document(path, max_frames=5)
     with pytest.raises(BadInput, match="larger than 100 bytes"):
         read_json(path, "Repair it.", limit=100)
 
@@ -295,7 +295,7 @@ def test_poses_bounds_truncated(tmp_path: Path, keep: int) -> None:
 def test_poses_bounds_is_bounded(tmp_path: Path) -> None:
     folder = captures.llff(tmp_path / "a")
     with pytest.raises(BadInput, match="more than -30 poses are not read"):  # its header alone has room for 30
-        llff.read_rows(folder / llff.POSES, most_frames=-30)
+        llff.read_rows(folder / llff.POSES, max_frames=-30)
 
 
 @pytest.mark.parametrize(("column", "value", "word"), [(4, 95.5, "whole pixels"), (14, 0.0, "focal length 0"), (15, -1.0, "near"), (16, 1.0, "near")])

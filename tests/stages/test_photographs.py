@@ -16,7 +16,7 @@ from PIL import Image
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.io import photo as upright
+from stages.io import photo as reading
 from stages.io.capture import Capture
 from stages.sfm import matches
 from stages.sfm.reconstruction import find_cameras
@@ -68,34 +68,34 @@ def test_exif_orientation_is_undone(tmp_path: Path, orientation: int) -> None:
     exif = Image.Exif()
     exif[274] = orientation
     stored.save(tmp_path / "a.png", exif=exif)
-    photo = upright.upright_photo(tmp_path / "a.png", 1600)
+    photo = reading.read_photo(tmp_path / "a.png", 1600)
     assert (photo.width, photo.height) == (30, 20)
     np.testing.assert_array_equal(photo.rgb, seen)
 
 
 def test_focal_length_from_exif() -> None:
-    assert upright.focal_from_exif({41989: 50}, 3600, 2400) == pytest.approx(5000)
+    assert reading.focal_from_exif({41989: 50}, 3600, 2400) == pytest.approx(5000)
     # 36 mm sensor, 3600 px across, 50 mm lens, the image scaled to a half since
-    assert upright.focal_from_exif({37386: 50.0, 41486: 100.0, 41488: 4, 40962: 3600}, 1800, 1200) == pytest.approx(2500)
-    assert upright.focal_from_exif({37386: 50.0, 41486: 1.0, 41488: 4}, 1800, 1200) is None  # a density that cannot be
-    assert upright.focal_from_exif({}, 1800, 1200) is None
+    assert reading.focal_from_exif({37386: 50.0, 41486: 100.0, 41488: 4, 40962: 3600}, 1800, 1200) == pytest.approx(2500)
+    assert reading.focal_from_exif({37386: 50.0, 41486: 1.0, 41488: 4}, 1800, 1200) is None  # a density that cannot be
+    assert reading.focal_from_exif({}, 1800, 1200) is None
 
 
 @pytest.mark.parametrize("size", [(4000, 3000), (4032, 3024), (3001, 1999), (1999, 3001), (5184, 3456), (1601, 37)])
 def test_working_size_keeps_the_aspect(size: tuple[int, int]) -> None:
-    w, h = upright.working_size(*size, 1600)
+    w, h = reading.working_size(*size, 1600)
     assert 1560 <= max(w, h) <= 1600
     assert abs(w / h * size[1] / size[0] - 1) < (0.02 if min(size) < 100 else 2e-4)
-    assert upright.working_size(*size, 5184) == size
+    assert reading.working_size(*size, 5184) == size
 
 
 def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
     Image.fromarray(np.full((8, 8), 65535 // 2, np.uint16)).save(tmp_path / "deep.png")
-    assert abs(int(upright.upright_photo(tmp_path / "deep.png", 100).rgb[0, 0, 0]) - 127) <= 1
+    assert abs(int(reading.read_photo(tmp_path / "deep.png", 100).rgb[0, 0, 0]) - 127) <= 1
     rgba = np.full((8, 8, 4), 255, np.uint8)
     rgba[:, :4, 3] = 0
     Image.fromarray(rgba).save(tmp_path / "alpha.png")
-    opaque = upright.upright_photo(tmp_path / "alpha.png", 100).opaque
+    opaque = reading.read_photo(tmp_path / "alpha.png", 100).opaque
     assert opaque is not None
     assert opaque[:, 4:].all()
     assert not opaque[:, :4].any()
@@ -103,14 +103,14 @@ def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
 
 def test_mask_must_fit(tmp_path: Path) -> None:
     Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
-    photo = upright.upright_photo(tmp_path / "a.png", 20)
+    photo = reading.read_photo(tmp_path / "a.png", 20)
     mask = np.zeros((60, 80), np.uint8)
     mask[:, 40:] = 255
     Image.fromarray(mask).save(tmp_path / "m.png")
-    np.testing.assert_array_equal(upright.mask_of(tmp_path / "m.png", photo), np.broadcast_to(np.arange(20) >= 10, (15, 20)))
+    np.testing.assert_array_equal(reading.read_mask_file(tmp_path / "m.png", photo), np.broadcast_to(np.arange(20) >= 10, (15, 20)))
     Image.fromarray(mask[:, :50]).save(tmp_path / "m.png")
-    with pytest.raises(upright.UnreadableImage, match="50x60, the photograph 40x30"):
-        upright.mask_of(tmp_path / "m.png", photo)
+    with pytest.raises(reading.UnreadableImage, match="50x60, the photograph 40x30"):
+        reading.read_mask_file(tmp_path / "m.png", photo)
 
 
 # ------------------------------------------------------------------------------------------------------------------- pairs
@@ -120,7 +120,7 @@ def test_exhaustive_pairs_are_all_pairs_once() -> None:
     blocks = matches.pairs_to_match(23, "exhaustive")
     pairs = [pair for block in blocks for pair in block]
     assert len(pairs) == len(set(pairs)) == 23 * 22 // 2
-    assert max(map(len, blocks)) <= matches.BLOCK**2
+    assert max(map(len, blocks)) <= matches.BLOCK_SIZE**2
 
 
 def test_sequential_pairs_reach_neighbours_and_close_loops() -> None:
@@ -196,7 +196,7 @@ find_cameras(folder, sys.argv[6:], work=work, progress=progress, safe_point=lamb
 """
 
 
-@pytest.mark.parametrize(("phase", "moment"), [("finding features", 6), ("matching pairs", 20)])
+@pytest.mark.parametrize(("phase", "moment"), [("detecting features", 6), ("matching pairs", 20)])
 def test_killed_and_resumed_gives_the_same_bits(ten: tuple[list[str], Path, Capture], tmp_path: Path, phase: str, moment: int) -> None:
     names, _, capture = ten
     command = [sys.executable, "-c", KILLED, str(STILL_LIFE), str(tmp_path), phase, str(moment), str(SIDE), *names]
@@ -207,7 +207,7 @@ def test_killed_and_resumed_gives_the_same_bits(ten: tuple[list[str], Path, Capt
         first_seen.setdefault(text, done)
 
     assert numbers(find(STILL_LIFE, names, tmp_path, progress=progress)) == numbers(capture)
-    assert first_seen["finding features"] >= 6  # what was found before the kill is used
+    assert first_seen["detecting features"] >= 6  # what was found before the kill is used
 
 
 def test_damaged_database_is_made_anew(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
@@ -223,7 +223,7 @@ def test_damaged_database_is_made_anew(ten: tuple[list[str], Path, Capture], tmp
 def test_half_written_database_is_not_trusted(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
     names, work, _ = ten
     shutil.copytree(work, tmp_path / "work")
-    images, _ = matches.prepare(
+    images, _ = matches.prepare_images(
         STILL_LIFE, names, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
         progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
     )  # fmt: skip
@@ -236,7 +236,7 @@ def test_half_written_database_is_not_trusted(ten: tuple[list[str], Path, Captur
     assert not matches.open_database(tmp_path / "work", images[:-1])  # and is not taken for another set
 
 
-def test_interrupted_while_placing_cameras(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+def test_interrupted_while_registering_images(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
     names, work, capture = ten
     shutil.copytree(work, tmp_path / "work")
 
@@ -250,7 +250,7 @@ def test_interrupted_while_placing_cameras(ten: tuple[list[str], Path, Capture],
         phase = text if done >= 3 else ""
 
     def safe_point() -> None:
-        if phase == "placing cameras":
+        if phase == "registering images":
             raise Stop
 
     with pytest.raises(Stop):
@@ -323,11 +323,11 @@ def test_masked_parts_give_no_features(tmp_path: Path) -> None:
     mask[:, 240:] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
     quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
-    images, _ = matches.prepare(
+    images, _ = matches.prepare_images(
         STILL_LIFE, names, max_side=240, features=500, seed=0, masks={names[1]: tmp_path / "mask.png"}, work=tmp_path / "w", warn=print, **quiet
     )
     matches.open_database(tmp_path / "w", images)
-    matches.extract(tmp_path / "w", images, features=500, **quiet)
+    matches.extract_features(tmp_path / "w", images, features=500, **quiet)
     with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(tmp_path / "w")) as database:
         columns = [database.read_keypoints(i)[:, 0] for i in (1, 2, 3)]
     assert columns[0].min() < 100
@@ -370,11 +370,11 @@ def test_one_thread_compares_descriptors(ten: tuple[list[str], Path, Capture], t
     connection.close()
     asked: list[int] = []
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda path, matching, *rest: asked.append(matching.num_threads))
-    images, _ = matches.prepare(
+    images, _ = matches.prepare_images(
         STILL_LIFE, names, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
         progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
     )  # fmt: skip
-    matches.match(tmp_path / "work", images, how="exhaustive", seed=0, progress=lambda *a, **k: None, safe_point=lambda: None)
+    matches.match_pairs(tmp_path / "work", images, how="exhaustive", seed=0, progress=lambda *a, **k: None, safe_point=lambda: None)
     assert set(asked) == {1}
 
 
@@ -439,4 +439,4 @@ def test_sigterm_while_colmap_is_imported_is_answered_by_us() -> None:
 
 
 def test_threads_are_those_allowed() -> None:
-    assert 1 <= matches.threads() <= (os.cpu_count() or 1)
+    assert 1 <= matches.num_threads() <= (os.cpu_count() or 1)

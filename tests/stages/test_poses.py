@@ -284,11 +284,11 @@ def test_it_stops_at_a_safe_point(tmp_path: Path) -> None:
 
 
 def test_names_that_differ_only_in_their_extension() -> None:
-    from stages.io.working_images import relative_paths
+    from stages.io.working_images import image_paths
 
     names = ["images/a.png", "images/a.jpg", "images_4/A.png", "b/../../a.png", "/c.png"]
     cameras = [replace(camera, name=name) for name, camera in zip(names, captures.cameras(5), strict=True)]
-    assert relative_paths(cameras) == ["a.png", "a_2.jpg", "A_3.png", "b/a.png", "c.png"]
+    assert image_paths(cameras) == ["a.png", "a_2.jpg", "A_3.png", "b/a.png", "c.png"]
 
 
 def test_real_photographs_with_colmap_cameras(tmp_path: Path) -> None:

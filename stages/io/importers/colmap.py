@@ -17,7 +17,7 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.colmap_model import Model, Points, count_images, model_files, read_model
 from stages.io.importers.photographs import masks_of
-from stages.io.importers.source import FEWEST, ImportSettings, Source, account_for_missing, account_for_places, listed
+from stages.io.importers.source import MIN_IMAGES, ImportSettings, Source, abbreviated, missing_images_warning, moved_images_warnings
 
 _MODEL_PLACES = (".", "sparse", "sparse/*", "colmap", "colmap/sparse", "colmap/sparse/*", "dense/sparse", "dense/*/sparse", "model", "models/*")
 _IMAGE_PLACES = ("images", "input", "rgb", "photos", ".", "../images", "../../images")
@@ -53,14 +53,14 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     images, places, extensions = _find_images(source, model)
     missing = sorted(model.images[number].name for number, path in images.items() if path is None)
     here = {number: path for number, path in images.items() if path is not None}
-    warnings = account_for_missing(where, len(images), len(here), missing, settings.strict, _REMEDY)
-    warnings += account_for_places(where, places, extensions)
+    warnings = missing_images_warning(where, len(images), len(here), missing, settings.strict, _REMEDY)
+    warnings += moved_images_warnings(where, places, extensions)
     others = [f"{source.name_of(other)} ({count_images(other)} images)" for other in model_folders(source.root) if other != place]
     if others:
-        warnings.append(f"{where} with {len(model.images)} images is used; there is also {listed(others)}.")
+        warnings.append(f"{where} with {len(model.images)} images is used; there is also {abbreviated(others)}.")
     photos, ids, rejected, remarks = _photos(source, model, here, where)
-    if len(photos) < FEWEST:
-        raise BadInput(f"{place}: {len(photos)} usable images; at least {FEWEST} are needed.")
+    if len(photos) < MIN_IMAGES:
+        raise BadInput(f"{place}: {len(photos)} usable images; at least {MIN_IMAGES} are needed.")
     points = _sparse(model.points, ids) if model.points is not None and len(model.points.xyz) else None
     if points is None:
         warnings.append(f"{where}: no points3D; the bounds are guessed from the cameras alone.")
@@ -122,8 +122,8 @@ def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> 
             warnings.append(f"{name}: {error}; left out.")
             continue
         pose = pose_from_colmap(np.array(posed.quaternion), np.array(posed.translation))
-        stated = lenses.checked(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {posed.camera}")
-        camera, remark = lenses.fitted(stated, header, f"{where}: {posed.name}")
+        stated = lenses.validated(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {posed.camera}")
+        camera, remark = lenses.fit_to_image(stated, header, f"{where}: {posed.name}")
         if remark is not None:
             odd.setdefault(remark, []).append(name)
         kept.append((number, Photo(camera, path, masks.get(path))))

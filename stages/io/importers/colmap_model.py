@@ -33,8 +33,8 @@ MODEL_NUMBERS = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
 }
-LARGEST_FILE = 8 << 30  # bytes
-MOST_IMAGES = 100_000
+MAX_FILE = 8 << 30  # bytes
+MAX_IMAGES = 100_000
 _AGAIN = "Copy the model again, or export it anew."
 
 
@@ -105,8 +105,8 @@ def read_model(folder: Path, *, points: bool = True) -> Model:
     if found is None:
         raise BadInput(f"{folder}: no COLMAP model: expected cameras and images as .bin or .txt.")
     for path in found:
-        if path.stat().st_size > LARGEST_FILE:
-            raise BadInput(f"{path}: {path.stat().st_size >> 30} GiB; at most {LARGEST_FILE >> 30} GiB are read.")
+        if path.stat().st_size > MAX_FILE:
+            raise BadInput(f"{path}: {path.stat().st_size >> 30} GiB; at most {MAX_FILE >> 30} GiB are read.")
     binary = found[0].suffix == ".bin"
     cameras = (_cameras_bin if binary else _cameras_txt)(found[0])
     images = (_images_bin if binary else _images_txt)(found[1])
@@ -179,7 +179,7 @@ def _posed(path: Path, name: str, camera: int, numbers: tuple[float, ...]) -> Po
 
 def _cameras_bin(path: Path) -> dict[int, Lens]:
     file, cameras = _Bytes(path), {}
-    for _ in range(file.count(24, "cameras", MOST_IMAGES)):
+    for _ in range(file.count(24, "cameras", MAX_IMAGES)):
         number, model_number, width, height = file.take("<IiQQ")
         if model_number not in MODEL_NUMBERS:
             raise BadInput(f"{path}: camera {number} has model number {model_number}, which is not known. Undistort with `colmap image_undistorter` first.")
@@ -191,7 +191,7 @@ def _cameras_bin(path: Path) -> dict[int, Lens]:
 
 def _images_bin(path: Path) -> dict[int, PosedImage]:
     file, images = _Bytes(path), {}
-    for _ in range(file.count(73, "images", MOST_IMAGES)):
+    for _ in range(file.count(73, "images", MAX_IMAGES)):
         number, *pose, camera = file.take("<I7dI")
         images[number] = _posed(path, file.text(), camera, tuple(pose))
         file.skip(24 * file.count(24, "points of an image"))  # x, y, id of the point: not needed
@@ -289,8 +289,8 @@ def _images_txt(path: Path) -> dict[int, PosedImage]:
             raise BadInput(f"{path}: line {line}: {len(words)} words, expected {expected}. {_AGAIN}")
         if points is not None and len(points.split()) % 3:
             raise BadInput(f"{path}: line {line + 1}: truncated: points come as X Y POINT3D_ID, found {len(points.split())} words. {_AGAIN}")
-        if len(images) >= MOST_IMAGES:
-            raise BadInput(f"{path}: more than {MOST_IMAGES} images; not read.")
+        if len(images) >= MAX_IMAGES:
+            raise BadInput(f"{path}: more than {MAX_IMAGES} images; not read.")
         numbers = tuple(_numbers(path, line, words[1:8]))
         images[_integer(path, line, words[0])] = _posed(path, words[9].strip(), _integer(path, line, words[8]), numbers)
     _check_count(path, "images", len(images))

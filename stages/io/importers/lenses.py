@@ -11,7 +11,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, quarter_turned, resized
 from pipeline.errors import BadInput
-from stages.io.importers.source import listed
+from stages.io.importers.source import abbreviated
 from stages.io.photo import same_aspect
 
 _EXIF_ORIENTATION = 0x0112
@@ -109,7 +109,7 @@ def rotation(columns: np.ndarray, where: str) -> np.ndarray:
     return np.asarray(left @ right)
 
 
-def checked(camera: Camera, where: str) -> Camera:
+def validated(camera: Camera, where: str) -> Camera:
     """The camera itself; BadInput for a lens that cannot be: a focal length that is not positive, numbers that are not finite."""
     named = camera.intrinsics
     if not all(math.isfinite(value) for value in camera.params):
@@ -121,7 +121,7 @@ def checked(camera: Camera, where: str) -> Camera:
     return camera
 
 
-def fitted(camera: Camera, header: Header, where: str) -> tuple[Camera, str | None]:
+def fit_to_image(camera: Camera, header: Header, where: str) -> tuple[Camera, str | None]:
     """The camera of a file's upright image, from a camera that may have been stated at another size or for the pixels as stored.
 
     returns  the camera and what was odd: "resized", "turned", "upright?" (turned by 180 degrees or mirrored, where the stated size
@@ -148,10 +148,10 @@ def fitted(camera: Camera, header: Header, where: str) -> tuple[Camera, str | No
 
 
 def fit_warnings(where: str, odd: dict[str, list[str]]) -> list[str]:
-    """Sentences about what `fitted` found odd: kind -> names of the images."""
+    """Sentences about what `fit_to_image` found odd: kind -> names of the images."""
     said = {
         "resized": "are not of the stated size; the intrinsics were scaled to them",
         "turned": "are turned by EXIF and their cameras stated for the pixels as stored; the cameras were turned too",
         "upright?": "are turned by EXIF; their cameras are taken to be those of the upright images",
     }
-    return [f"{where}: {len(names)} images ({listed(names)}) {said[kind]}." for kind, names in odd.items()]
+    return [f"{where}: {len(names)} images ({abbreviated(names)}) {said[kind]}." for kind, names in odd.items()]

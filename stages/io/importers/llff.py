@@ -16,7 +16,7 @@ from pipeline.errors import BadInput
 from stages.io.capture import Capture, Photo
 from stages.io.importers import lenses
 from stages.io.importers.photographs import masks_of
-from stages.io.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, images_in
+from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in
 
 POSES = "poses_bounds.npy"
 
@@ -59,15 +59,15 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
             rejected.append((name, str(error)))
             warnings.append(f"{name}: {error}; left out.")
             continue
-        camera, remark = lenses.fitted(_camera(row, name, where), header, where)
+        camera, remark = lenses.fit_to_image(_camera(row, name, where), header, where)
         if remark in ("turned", "upright?"):  # another size than stated is what the folders are for
             odd.setdefault(str(remark), []).append(name)
         near, far = float(row[15]), float(row[16])
         if not 0 < near < far:
             raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
         photos.append(Photo(camera, image, masks.get(image), near=near, far=far))
-    if len(photos) < FEWEST:
-        raise BadInput(f"{folder}: {len(photos)} usable images; at least {FEWEST} are needed.")
+    if len(photos) < MIN_IMAGES:
+        raise BadInput(f"{folder}: {len(photos)} usable images; at least {MIN_IMAGES} are needed.")
     return Capture(
         kind="llff",
         photos=tuple(photos),
@@ -86,15 +86,15 @@ def _camera(row: np.ndarray, name: str, where: str) -> Camera:
     if width != round(width) or height != round(height) or not (0 < width <= 65535 and 0 < height <= 65535):
         raise BadInput(f"{where}: h, w are {height:g}, {width:g}; expected the image size in whole pixels.")
     width, height = int(width), int(height)
-    return lenses.checked(Camera(name, width, height, "SIMPLE_PINHOLE", (float(focal), width / 2, height / 2), pose), where)
+    return lenses.validated(Camera(name, width, height, "SIMPLE_PINHOLE", (float(focal), width / 2, height / 2), pose), where)
 
 
-def read_rows(path: Path, most_frames: int = MOST_FRAMES) -> np.ndarray:
-    """(N, 17) float64, finite, N at most `most_frames`; nothing but plain numbers is read from the file. Raises BadInput."""
+def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
+    """(N, 17) float64, finite, N at most `max_frames`; nothing but plain numbers is read from the file. Raises BadInput."""
     try:
         size = path.stat().st_size
-        if size > 17 * 8 * most_frames + 4096:
-            raise BadInput(f"{path}: {size} bytes; more than {most_frames} poses are not read.")
+        if size > 17 * 8 * max_frames + 4096:
+            raise BadInput(f"{path}: {size} bytes; more than {max_frames} poses are not read.")
         array = np.load(path, allow_pickle=False, mmap_mode=None)
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error

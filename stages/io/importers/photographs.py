@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.errors import BadInput
-from stages.io.importers.source import FEWEST, IMAGE_SUFFIXES, MOST_FRAMES, ImportSettings, Source, images_in, walk
+from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, walk
 
 MASKS = "masks"
 # What conversions leave beside the photographs: reductions, depth maps, masks.
@@ -30,8 +30,8 @@ def photographs(folder: Path) -> list[Path]:
         found = sorted(path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not _NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1]))
         if not found:
             raise BadInput(_nothing(folder, everything))
-    if len(found) > MOST_FRAMES:
-        raise BadInput(f"{folder}: {len(found)} images; at most {MOST_FRAMES} are read.")
+    if len(found) > MAX_FRAMES:
+        raise BadInput(f"{folder}: {len(found)} images; at most {MAX_FRAMES} are read.")
     return found
 
 
@@ -70,7 +70,7 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
 def _nothing(folder: Path, everything: Sequence[Path]) -> str:
     known = "png, jpg, webp, tif or bmp"
     if not everything:
-        return f"{folder}: the folder is empty. Expected at least {FEWEST} photographs ({known}) or a posed data set."
+        return f"{folder}: the folder is empty. Expected at least {MIN_IMAGES} photographs ({known}) or a posed data set."
     common = Counter(path.suffix.lower() or "(no extension)" for path in everything).most_common(3)
     return (
         f"{folder}: no images of a known type ({known}); found {', '.join(f'{count} {suffix}' for suffix, count in common)}. "

@@ -17,10 +17,10 @@ from efficientnerf.settings import Auto
 from pipeline.errors import BadInput
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-MOST_FRAMES = 100_000
-MOST_FILES = 1_000_000  # entries of a source folder that are looked through
-FEWEST = 3  # images that make a data set
-NAMED = 5  # names that a message lists
+MAX_FRAMES = 100_000
+MAX_FILES = 1_000_000  # entries of a source folder that are looked through
+MIN_IMAGES = 3  # images that make a data set
+MAX_NAMES = 5  # names that a message lists
 
 
 class ImportSettings(Protocol):
@@ -34,9 +34,9 @@ class ImportSettings(Protocol):
     def llff_factor(self) -> int | Auto: ...
 
 
-def listed(names: Sequence[str]) -> str:
+def abbreviated(names: Sequence[str]) -> str:
     """The first few names, and how many more there are."""
-    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+    return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,8 @@ def walk(folder: Path) -> list[Path]:
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         found += [Path(parent) / name for name in sorted(files) if not name.startswith(".")]
-        if len(found) > MOST_FILES:
-            raise BadInput(f"{folder}: more than {MOST_FILES} files. Name the folder of the data set itself.")
+        if len(found) > MAX_FILES:
+            raise BadInput(f"{folder}: more than {MAX_FILES} files. Name the folder of the data set itself.")
     return found
 
 
@@ -164,19 +164,19 @@ def images_in(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file())
 
 
-def account_for_missing(where: str, total: int, kept: int, missing: Sequence[str], strict: bool, remedy: str) -> list[str]:
+def missing_images_warning(where: str, total: int, kept: int, missing: Sequence[str], strict: bool, remedy: str) -> list[str]:
     """The warning about images that are listed but absent, if any; BadInput where too few remain or `strict` forbids it."""
     if not missing:
         return []
-    sentence = f"{where}: {len(missing)} of {total} images that it lists are missing: {listed(missing)}."
-    if kept < FEWEST:
-        raise BadInput(f"{sentence} {kept} remain; at least {FEWEST} are needed. {remedy}")
+    sentence = f"{where}: {len(missing)} of {total} images that it lists are missing: {abbreviated(missing)}."
+    if kept < MIN_IMAGES:
+        raise BadInput(f"{sentence} {kept} remain; at least {MIN_IMAGES} are needed. {remedy}")
     if strict:
         raise BadInput(f"{sentence} Refused by --strict. {remedy}")
     return [sentence]
 
 
-def account_for_places(where: str, places: Sequence[tuple[str, str]], extensions: Sequence[tuple[str, str]]) -> list[str]:
+def moved_images_warnings(where: str, places: Sequence[tuple[str, str]], extensions: Sequence[tuple[str, str]]) -> list[str]:
     """Warnings about images found elsewhere than listed, as (listed, found)."""
     sentences = []
     if places:

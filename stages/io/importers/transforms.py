@@ -23,11 +23,11 @@ from efficientnerf.geometry.cameras import MODELS, Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
-from stages.io.importers.source import FEWEST, MOST_FRAMES, ImportSettings, Source, account_for_missing, account_for_places
+from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, missing_images_warning, moved_images_warnings
 from stages.io.json_file import read_json
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
-LARGEST_PLY = 1 << 30  # bytes
+MAX_PLY = 1 << 30  # bytes
 _REMEDY = "Copy them into the source folder, or take their frames out of the JSON."
 _NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path")
 _NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
@@ -114,10 +114,10 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     listing = _list_frames(source)
     photos, rejected, odd, lens_warnings = _photos(source, listing, kind)
     rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *rejected]
-    warnings = account_for_missing(where, listing.total, len(photos), listing.missing, settings.strict, _REMEDY)
-    if len(photos) < FEWEST:
-        raise BadInput(f"{folder / where}: {len(photos)} usable images of {listing.total} frames; at least {FEWEST} are needed.")
-    warnings += account_for_places(where, listing.places, listing.extensions) + lenses.fit_warnings(where, odd) + lens_warnings
+    warnings = missing_images_warning(where, listing.total, len(photos), listing.missing, settings.strict, _REMEDY)
+    if len(photos) < MIN_IMAGES:
+        raise BadInput(f"{folder / where}: {len(photos)} usable images of {listing.total} frames; at least {MIN_IMAGES} are needed.")
+    warnings += moved_images_warnings(where, listing.places, listing.extensions) + lenses.fit_warnings(where, odd) + lens_warnings
     if listing.repeated:
         warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
     document = read_document(json_files(folder)[0])
@@ -139,15 +139,15 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     )
 
 
-def read_document(file: Path, most_frames: int = MOST_FRAMES) -> dict[str, Any]:
-    """The document of a transforms.json that lists 1 to `most_frames` frames. Raises BadInput."""
+def read_document(file: Path, max_frames: int = MAX_FRAMES) -> dict[str, Any]:
+    """The document of a transforms.json that lists 1 to `max_frames` frames. Raises BadInput."""
     document = read_json(file, "Write the data set again, or repair that place.")
     if not isinstance(document, dict) or not isinstance(document.get("frames"), list):
         raise BadInput(f"{file}: no data set: expected an object with a list `frames`. Name the folder of a data set, or choose a format with --as.")
     if not document["frames"]:
-        raise BadInput(f"{file}: its list of frames is empty. At least {FEWEST} are needed.")
-    if len(document["frames"]) > most_frames:
-        raise BadInput(f"{file}: {len(document['frames'])} frames; at most {most_frames} are read.")
+        raise BadInput(f"{file}: its list of frames is empty. At least {MIN_IMAGES} are needed.")
+    if len(document["frames"]) > max_frames:
+        raise BadInput(f"{file}: {len(document['frames'])} frames; at most {max_frames} are read.")
     return document
 
 
@@ -192,7 +192,7 @@ def _plain(name: str) -> str:
 
 
 def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str]], dict[str, list[str]], list[str]]:
-    """Photos, the rejected as (name, reason), what `lenses.fitted` found odd, and warnings."""
+    """Photos, the rejected as (name, reason), what `lenses.fit_to_image` found odd, and warnings."""
     photos: list[Photo] = []
     rejected: list[tuple[str, str]] = []
     odd: dict[str, list[str]] = {}
@@ -208,7 +208,7 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
             continue
         pose = _pose(frame)
         rolling += "transform_matrix" not in frame.entry
-        camera, remark = lenses.fitted(_lens(frame, name, header.size, pose), header, frame.where)
+        camera, remark = lenses.fit_to_image(_lens(frame, name, header.size, pose), header, frame.where)
         if remark is not None:
             odd.setdefault(remark, []).append(name)
         mask, ignore = _mask(source, frame)
@@ -258,7 +258,7 @@ def _lens(frame: _Frame, name: str, actual: tuple[int, int], pose: np.ndarray) -
     named |= {key: number(key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
     model = _model(frame, given, named)
     camera = Camera(name, int(width), int(height), model, tuple(named[parameter] for parameter in MODELS[model]), pose)
-    return lenses.checked(camera, frame.where)
+    return lenses.validated(camera, frame.where)
 
 
 def _focal(frame: _Frame, given: dict[str, Any], number: Any, width: float, height: float) -> tuple[float, float]:
@@ -336,7 +336,7 @@ def _points(source: Source, document: dict[str, Any]) -> tuple[SparsePoints | No
     if "ply_file_path" not in document:
         return None, []
     path = _ply(source, document)
-    if path is None or path.stat().st_size > LARGEST_PLY:
+    if path is None or path.stat().st_size > MAX_PLY:
         return None, [f"ply_file_path {document['ply_file_path']}: {'missing' if path is None else 'larger than 1 GiB'}; the points are not used."]
     import trimesh
 
