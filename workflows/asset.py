@@ -2,7 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.stage import Stage
 from stages import bake, evaluate, mesh, points, poses, train, turntable
+
+
+@dataclass(frozen=True)
+class Workflow:
+    """What the command line runs.
+
+    stages   in order
+    presets  the folder of its presets, TOML files
+    """
+
+    stages: tuple[Stage, ...]
+    presets: Path
+
 
 STAGES = (
     poses.STAGE,  # the source -> cameras, images, sparse points
@@ -13,3 +30,4 @@ STAGES = (
     mesh.STAGE,  # bake -> PLY, GLB
     points.STAGE,  # bake -> PLY
 )
+WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets")

@@ -14,17 +14,18 @@ from efficientnerf.settings import PositiveInt, setting
 from pipeline.errors import BadInput
 from pipeline.stage import Job, Stage
 from tests.workflows.command import Result
-from workflows import asset
+from workflows.asset import Workflow
 from workflows.cli.main import main
 
 
 @pytest.fixture
-def enerf(capfd: pytest.CaptureFixture[str]) -> Callable[..., Result]:
-    """enerf("run", ...) in this process."""
+def enerf(capfd: pytest.CaptureFixture[str], request: pytest.FixtureRequest) -> Callable[..., Result]:
+    """enerf("run", ...) in this process, on the toy workflow where the test has `toys`."""
+    workflow = Workflow(TOYS, request.getfixturevalue("toys").parent / "presets") if "toys" in request.fixturenames else None
 
     def call(*arguments: object) -> Result:
         capfd.readouterr()
-        code = main([str(argument) for argument in arguments])
+        code = main([str(argument) for argument in arguments], workflow)
         out, err = capfd.readouterr()
         return Result(code, out, err)
 
@@ -91,14 +92,12 @@ TOYS = (
 
 @pytest.fixture
 def toys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """The toy workflow in place of the real one, with presets of its own; returns its source."""
+    """A source for the toy workflow, with presets beside it."""
     presets = tmp_path / "presets"
     presets.mkdir()
     (presets / "preview.toml").write_text('description = "Toy."\n[train]\niterations = 3\n', encoding="utf-8")
     (presets / "tiny.toml").write_text('description = "Smaller toy."\n[train]\niterations = 1\nrate = 2\n', encoding="utf-8")
-    monkeypatch.setattr("workflows.cli.resolve.PRESETS_FOLDER", presets)
     monkeypatch.setattr("workflows.cli.device.cuda_device_count", lambda: 0)
-    monkeypatch.setattr(asset, "STAGES", TOYS)
     source = tmp_path / "source"
     source.mkdir()
     (source / "a.txt").write_text("words", encoding="utf-8")

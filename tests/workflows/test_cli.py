@@ -279,10 +279,10 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path) -> None:
     for number, code in ((signal.SIGTERM, 143), (signal.SIGINT, 130)):
         run = tmp_path / f"run {code}"
         program = (
-            "import sys, time; from workflows import asset; from tests.workflows.conftest import TOYS; asset.STAGES = TOYS\n"
+            "import sys, time; from pathlib import Path; from workflows.asset import Workflow; from tests.workflows.conftest import TOYS\n"
             "import pipeline.stage; known = pipeline.stage.Job.safe_point\n"
             "pipeline.stage.Job.safe_point = lambda job: (time.sleep(0.05), known(job))\n"
-            "from workflows.cli.main import main; sys.exit(main(sys.argv[1:]))"
+            f"from workflows.cli.main import main; sys.exit(main(sys.argv[1:], Workflow(TOYS, Path({str(toys.parent / 'presets')!r}))))"
         )
         command = [sys.executable, "-c", program, "run", str(toys), "--out", str(run), "--preset", "preview", "--set", "train.iterations=2000", "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:

@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import click
 
 from workflows.cli import assets, files, paper, presets, run, state
 from workflows.cli.failures import report_failure
+
+if TYPE_CHECKING:
+    from workflows.asset import Workflow
 
 
 @click.group(
@@ -46,12 +50,15 @@ for command in (
     enerf.add_command(command)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code. Errors are one or two lines on standard error, and a JSON object with --json."""
+def main(arguments: Sequence[str] | None = None, workflow: Workflow | None = None) -> int:
+    """Run the command line on a workflow, that of `workflows.asset` by default; returns the exit code.
+
+    Errors are one or two lines on standard error, and a JSON object with --json.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     as_json, debug = "--json" in given, "--debug" in given
     try:
-        result = enerf.main(args=given, prog_name="enerf", standalone_mode=False)
+        result = enerf.main(args=given, prog_name="enerf", standalone_mode=False, obj=workflow)
     except BaseException as error:
         return report_failure(error, as_json=as_json, debug=debug)
     return result if isinstance(result, int) else 0

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from workflows.asset import Workflow
 
 C = TypeVar("C", bound=Callable[..., Any])
 
@@ -15,6 +18,14 @@ quiet_option = click.option("--quiet", "-q", is_flag=True, help="Nothing but war
 set_option = click.option("--set", "sets", multiple=True, metavar="STAGE.NAME=VALUE", help="A setting of a stage; may be repeated. 'enerf presets' lists them.")
 device_option = click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where to compute; auto takes CUDA where there is one.")
 folder_type = click.Path(path_type=Path)
+
+
+def workflow() -> Workflow:
+    """The workflow that `main` was given, or that of this package."""
+    from workflows.asset import WORKFLOW
+
+    given: Workflow | None = click.get_current_context().find_root().obj
+    return given or WORKFLOW
 
 
 def common_options(command: C) -> C:

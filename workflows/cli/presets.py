@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from workflows.cli.options import common_options, json_option
+from workflows.cli.options import common_options, json_option, workflow
 
 if TYPE_CHECKING:
     from stages.settings import SettingInfo
@@ -21,19 +21,19 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
     """List the presets, and the settings that most users want, with their defaults and meaning; of STAGE... all settings, the advanced ones apart."""
     from pipeline.errors import UsageError
     from stages.settings import describe_settings
-    from workflows import asset
     from workflows.cli.progress import write_json
     from workflows.cli.resolve import Settings, nearest, preset_names, read_preset, table_of
 
-    types = {stage.name: stage.settings for stage in asset.STAGES}
+    folder = workflow().presets
+    types = {stage.name: stage.settings for stage in workflow().stages}
     for name in stages:
         if name not in types:
             raise UsageError(f"{name}: no such stage.{nearest(name, types)} Stages: {', '.join(types)}.")
     settings = Settings(types)
     if preset is not None:
-        settings.put_table(read_preset(preset).table, f"preset {preset}")
+        settings.put_table(read_preset(preset, folder).table, f"preset {preset}")
     values = table_of(settings.resolved())
-    known = [read_preset(name) for name in preset_names()]
+    known = [read_preset(name, folder) for name in preset_names(folder)]
     described = {stage: describe_settings(types[stage]) for stage in stages or types}
     if as_json:
         listed = [{"name": each.name, "description": each.description, "inherits": each.inherits, "settings": each.table} for each in known]

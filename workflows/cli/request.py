@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.errors import BadInput, UsageError
 from pipeline.run import NAME, Run
-from pipeline.stage import Stage
+from workflows.asset import Workflow
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, read_config, read_preset, seconds_of, table_of
 from workflows.cli.target import check_names, open_run, resume_command
@@ -56,7 +55,7 @@ class Plan:
         return run
 
 
-def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
+def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     """What `enerf run` with these options means for the folder `path`. Writes nothing. Raises BadInput and UsageError."""
     config = read_config(options.config) if options.config is not None else Config({})
     seed = options.seed if options.seed is not None else config.options.get("seed")
@@ -73,9 +72,9 @@ def plan_run(path: Path, stages: Sequence[Stage], options: Options) -> Plan:
         if preset is None:
             preset = "standard" if device != "cpu" and has_cuda() else "preview"
     warnings: list[str] = []
-    settings = Settings({stage.name: stage.settings for stage in stages})
+    settings = Settings({stage.name: stage.settings for stage in workflow.stages})
     if preset is not None:
-        settings.put_table(read_preset(preset).table, f"preset {preset}")
+        settings.put_table(read_preset(preset, workflow.presets).table, f"preset {preset}")
     elif standing is not None:
         check_names(standing)
         dropped = settings.put_recorded(standing.settings)

@@ -18,9 +18,9 @@ from pipeline.errors import BadInput, UnknownSetting, UsageError
 from pipeline.stage import settings_dict, settings_from
 from stages.renamed_settings import moved, updated
 from stages.settings import SettingInfo, describe_settings
+from workflows.asset import WORKFLOW
 
 Table = Mapping[str, Mapping[str, Any]]
-PRESETS_FOLDER = Path(__file__).parents[1] / "presets"
 # Beside the tables of the stages, a configuration file may hold what the dedicated options say.
 CONFIG_OPTIONS = ("preset", "device", "seed")
 
@@ -55,14 +55,14 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" Nearest: {found[0]}." if found else ""
 
 
-def preset_names(folder: Path | None = None) -> list[str]:
-    """Names of the presets in a folder; None: those that are shipped."""
-    return sorted(path.stem for path in (folder or PRESETS_FOLDER).glob("*.toml"))
+def preset_names(folder: Path = WORKFLOW.presets) -> list[str]:
+    """Names of the presets in a folder, those that are shipped by default."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
 
 
-def read_preset(name: str, folder: Path | None = None) -> Preset:
+def read_preset(name: str, folder: Path = WORKFLOW.presets) -> Preset:
     """A preset with what it inherits. Raises UsageError for one that is not there and for one that inherits from itself."""
-    return _read_preset(name, folder or PRESETS_FOLDER, ())
+    return _read_preset(name, folder, ())
 
 
 def _read_preset(name: str, folder: Path, heirs: tuple[str, ...]) -> Preset:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from workflows.cli.failures import Reported
-from workflows.cli.options import common_options, device_option, folder_type, json_option, quiet_option, set_option
+from workflows.cli.options import common_options, device_option, folder_type, json_option, quiet_option, set_option, workflow
 
 if TYPE_CHECKING:
     from pipeline.run import Run
@@ -40,11 +40,10 @@ def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, a
     SOURCE is a folder of photographs, or of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Without it, RUN goes on with the
     settings that it recorded; options given change them. What is up to date is not done again.
     """
-    from workflows import asset
     from workflows.cli.request import Options, plan_run
 
     options["format"] = options.pop("format_name")
-    plan = plan_run(run_folder, asset.STAGES, Options(**options))
+    plan = plan_run(run_folder, workflow(), Options(**options))
     _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run)
 
 
@@ -61,19 +60,18 @@ def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, a
 def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Run the stage NAME of RUN with what the run already has; the stages before it are never run, and named if they are stale."""
     from pipeline.errors import UsageError
-    from workflows import asset
     from workflows.cli.request import Options, plan_run
     from workflows.cli.resolve import nearest
     from workflows.cli.target import open_run
 
-    names = [each.name for each in asset.STAGES]
+    names = [each.name for each in workflow().stages]
     if name not in names:
         raise UsageError(f"{name}: no such stage.{nearest(name, names)} Stages: {', '.join(names)}.")
     for text in options["sets"]:
         if text.partition(".")[0].strip() in {*names} - {name}:
             raise UsageError(f"--set {text}: not a setting of {name}, the only stage that runs here. Use: enerf run --out {run_folder} --set {text}")
     open_run(run_folder)  # says so where it is none
-    plan = plan_run(run_folder, asset.STAGES, Options(**options))
+    plan = plan_run(run_folder, workflow(), Options(**options))
     _work(plan, as_json=as_json, quiet=quiet, only=name, force=force, dry_run=dry_run)
 
 
@@ -82,7 +80,6 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
     import time
 
     from pipeline.runner import run_stages
-    from workflows import asset
     from workflows.cli.device import resolve_device
     from workflows.cli.progress import display, write_json
     from workflows.report.summary import in_words, summary
@@ -97,7 +94,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
                 show({"event": "warning", "stage": "", "text": text, "time": time.time()})
             if not dry_run:
                 run = plan.write()
-            outcomes = run_stages(run, asset.STAGES, device=device, report=show, dry_run=dry_run, **selection)
+            outcomes = run_stages(run, workflow().stages, device=device, report=show, dry_run=dry_run, **selection)
             if any(outcome.action == "ran" for outcome in outcomes):
                 _describe(run)
     except (Exception, KeyboardInterrupt) as error:
@@ -112,19 +109,17 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
 def _describe(run: Run) -> None:
     """The page about the run: made anew whenever a stage was."""
     from pipeline.decide import survey
-    from workflows import asset
     from workflows.report.page import write_report
 
-    write_report(run, survey(asset.STAGES, run))
+    write_report(run, survey(workflow().stages, run))
 
 
 def _check_stages(selection: dict[str, Any]) -> None:
     """Refuse a stage that does not exist before a run is made."""
     from pipeline.errors import UsageError
-    from workflows import asset
     from workflows.cli.resolve import nearest
 
-    names = [stage.name for stage in asset.STAGES]
+    names = [stage.name for stage in workflow().stages]
     for option in ("until", "start"):
         name = selection.get(option)
         if name is not None and name not in names:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from workflows.cli.options import common_options, folder_type, json_option, quiet_option
+from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
 
 
 @click.command(short_help="Say of each stage whether it is up to date, and why not.")
@@ -20,14 +20,13 @@ def status(run_folder: Path, as_json: bool) -> None:
     Files whose size and time of change are the same are taken to be the same; 'enerf verify' reads them.
     """
     from pipeline.decide import survey
-    from workflows import asset
     from workflows.cli.progress import duration, size, write_json
     from workflows.cli.target import check_names, open_run
 
     run = open_run(run_folder)
     check_names(run)
     stages: list[dict[str, Any]] = []
-    for decision in survey(asset.STAGES, run):
+    for decision in survey(workflow().stages, run):
         made = decision.manifest
         stages.append(
             {
@@ -95,7 +94,6 @@ def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
 def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
     from pipeline.errors import CorruptArtifact
     from pipeline.runner import verify as verify_run
-    from workflows import asset
     from workflows.cli.failures import Reported
     from workflows.cli.progress import display, size, write_json
     from workflows.cli.target import open_run
@@ -103,7 +101,7 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
     run = open_run(run_folder)
     try:
         with display(as_json=as_json, quiet=quiet) as show:
-            outcomes = verify_run(run, asset.STAGES, show)
+            outcomes = verify_run(run, workflow().stages, show)
     except CorruptArtifact as error:
         raise Reported(error, {"run": str(run.path), "damaged": list(error.files)}) from error
     if as_json:
@@ -120,14 +118,13 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
 def report(run_folder: Path, as_json: bool) -> None:
     """Write RUN/report.html: what was made, how it looks, how good it is, of what settings. 'enerf run' writes it, too, when it is done."""
     from pipeline.decide import survey
-    from workflows import asset
     from workflows.cli.progress import write_json
     from workflows.cli.target import check_names, open_run
     from workflows.report.page import write_report
 
     run = open_run(run_folder)
     check_names(run)
-    path = write_report(run, survey(asset.STAGES, run))
+    path = write_report(run, survey(workflow().stages, run))
     if as_json:
         write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), "exit_code": 0})
     else:

@@ -8,6 +8,7 @@ from typing import Any
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, PosesOutputs
 from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from workflows.asset import STAGES
 from workflows.cli.progress import plain, size
 from workflows.cli.target import ASSET, describe_asset, is_run, open_run
 
@@ -52,7 +53,6 @@ def _describe_file(path: Path) -> dict[str, Any]:
 
 def _describe_run(path: Path) -> dict[str, Any]:
     from pipeline.decide import survey
-    from workflows import asset
     from workflows.report.summary import artifacts, metrics
 
     run = open_run(path)
@@ -62,7 +62,7 @@ def _describe_run(path: Path) -> dict[str, Any]:
         "path": str(run.path),
         "source": None if run.source is None else str(run.source),
         "preset": run.preset,
-        "stages": {decision.stage: decision.state for decision in survey(asset.STAGES, run)},
+        "stages": {decision.stage: decision.state for decision in survey(STAGES, run)},
         "artifacts": artifacts(run.path),
         "quality": {name: quality[name] for name in ("network", "asset") if name in quality},
     }
