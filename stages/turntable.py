@@ -51,7 +51,7 @@ def run(job: Job) -> None:
     from efficientnerf.asset import format
 
     inputs = inputs_of(TurntableInputs, job.inputs)
-    draw_turntable(format.load(inputs.bake.asset).to(job.device), job)
+    render_turntable(format.load(inputs.bake.asset).to(job.device), job)
 
 
 def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
@@ -63,9 +63,9 @@ def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
     )
 
 
-def draw_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None) -> None:
+def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None) -> None:
     """Frames go to job.work one by one, so that a kill costs at most one of them; the video is made of the PNGs, so that it does not depend on where."""
-    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames
+    from stages.pictures.frames import RenderOptions, encode_frames, render_frames
 
     s: TurntableSettings = job.settings
     cameras = cameras_of(tree, s)
@@ -75,7 +75,7 @@ def draw_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None) 
         job.safe_point()
         job.progress(done, total, "frames")
 
-    written = draw_frames(tree, cameras, job.work / "frames", options, each, reuse=True, draw=draw)
+    written = render_frames(tree, cameras, job.work / "frames", options, each, reuse=True, draw=draw)
     job.say("encoding the video")
     encode_frames([path for path in written if path.suffix == ".png"], TurntableOutputs(job.out).video, options, job.safe_point)
     for path in written:

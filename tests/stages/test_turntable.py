@@ -17,7 +17,7 @@ from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages.framing.camera_paths import turntable_cameras
 from stages.io.png import read_png
-from stages.turntable import STAGE, TurntableSettings, draw_turntable
+from stages.turntable import STAGE, TurntableSettings, render_turntable
 from tests.fakes import BallTree
 
 SETTINGS = TurntableSettings(frames=5, width=64, height=48, fps=10)
@@ -41,7 +41,7 @@ def job_in(folder: Path, out: str = "out", settings: TurntableSettings = SETTING
 
 def test_it_writes_frames_a_video_of_them_and_one_exr(tmp_path: Path) -> None:
     job = job_in(tmp_path)
-    draw_turntable(BallTree(), job, BallTree.render)
+    render_turntable(BallTree(), job, BallTree.render)
     assert sorted(digests(job.out)) == ["frame_0000.exr", *(f"frame_000{k}.png" for k in range(5)), "turntable.mp4"]
     frames = [read_png(job.out / f"frame_000{k}.png") for k in range(5)]
     assert all(frame.shape == (48, 64, 3) for frame in frames)
@@ -62,32 +62,32 @@ def test_it_writes_frames_a_video_of_them_and_one_exr(tmp_path: Path) -> None:
 @pytest.mark.parametrize("moment", [1, 3, 6, 8])
 def test_a_stop_anywhere_and_going_on_gives_the_same_bytes(tmp_path: Path, moment: int) -> None:
     whole = job_in(tmp_path / "whole")
-    draw_turntable(BallTree(), whole, BallTree.render)
+    render_turntable(BallTree(), whole, BallTree.render)
     asked = iter(range(100))
     with pytest.raises(Interrupted):
-        draw_turntable(BallTree(), job_in(tmp_path, "first", stop=lambda: 2 if next(asked) >= moment else None), BallTree.render)
+        render_turntable(BallTree(), job_in(tmp_path, "first", stop=lambda: 2 if next(asked) >= moment else None), BallTree.render)
     CountingTree.calls = 0
     job = job_in(tmp_path, "second")
-    draw_turntable(CountingTree(), job, CountingTree.render)
+    render_turntable(CountingTree(), job, CountingTree.render)
     assert digests(job.out) == digests(whole.out)
     assert CountingTree.calls == max(0, 5 - moment), "finished frames are not drawn again"
 
 
 def test_half_written_frames_are_drawn_again(tmp_path: Path) -> None:
     whole = job_in(tmp_path / "whole")
-    draw_turntable(BallTree(), whole, BallTree.render)
+    render_turntable(BallTree(), whole, BallTree.render)
     frames = tmp_path / "work" / "frames"
     frames.mkdir(parents=True)
     (frames / ".frame_0000.png.123.part").write_bytes(b"half")
     (frames / "frame_0000.exr").write_bytes(b"half")
     job = job_in(tmp_path)
-    draw_turntable(BallTree(), job, BallTree.render)
+    render_turntable(BallTree(), job, BallTree.render)
     assert digests(job.out) == digests(whole.out)
 
 
 def test_progress_ends_at_the_last_frame(tmp_path: Path) -> None:
     events: list[dict[str, Any]] = []
-    draw_turntable(BallTree(), job_in(tmp_path, report=events.append), BallTree.render)
+    render_turntable(BallTree(), job_in(tmp_path, report=events.append), BallTree.render)
     progress = [event for event in events if event["event"] == "progress"]
     assert (progress[-1]["done"], progress[-1]["total"]) == (5, 5)
 

@@ -134,8 +134,10 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
     from dataclasses import replace
 
     from pipeline.errors import UsageError
-    from stages.framing.camera_paths import RenderOptions, draw_frames, encode_frames, read_camera_path, similarity_of
+    from stages.framing.camera_paths import similarity_of
+    from stages.io.camera_path import read_camera_path
     from stages.io.exporters.frames import background_from_text
+    from stages.pictures.frames import RenderOptions, encode_frames, render_frames
     from stages.turntable import TurntableSettings, cameras_of
     from workflows.cli.progress import write_json
     from workflows.cli.target import load_asset
@@ -159,7 +161,7 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
     options = RenderOptions(background=settings.background, supersample=settings.supersample, exr=settings.exr, video=None, fps=fps, crf=settings.crf)
     with _shown(as_json, quiet) as show:
         progress = _progress("render", show)
-        written = draw_frames(tree, cameras, out, options, lambda done, total: progress(done, total, "frames"))
+        written = render_frames(tree, cameras, out, options, lambda done, total: progress(done, total, "frames"))
         if video is not None:
             encode_frames([each for each in written if each.suffix == ".png"], video, options)
             written.append(video)

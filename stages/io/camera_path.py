@@ -1,0 +1,107 @@
+"""nerfstudio's camera_path.json: the cameras of a video, one for each frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, Similarity, pose_from_opengl
+from pipeline.errors import BadInput
+from stages.io.json_file import read_json
+
+MAX_FILE = 64 << 20
+MAX_SIZE = 16384
+MAX_CAMERAS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPath:
+    """Cameras in the training frame, one for each frame, and the frames per second that the file asks for (None: it does not say)."""
+
+    cameras: tuple[Camera, ...]
+    fps: int | None
+
+
+def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int | None = None, height: int | None = None) -> CameraPath:
+    """The cameras of nerfstudio's camera_path.json.
+
+    path                file whose camera_to_world are in the capture's frame: 16 numbers row by row, x right, y up, looking along -z
+    world_from_capture  takes them to the training frame
+    width, height       in place of the file's render_width and render_height; with one of them the other follows
+
+    BadInput says what is wrong with the file.
+    """
+    document = read_json(path, "Expected a camera path as nerfstudio's viewer exports it.", limit=MAX_FILE)
+    if not isinstance(document, dict) or not isinstance(document.get("camera_path"), list):
+        hint = " It looks like a data set: `enerf run` reads those." if isinstance(document, dict) and "frames" in document else ""
+        raise BadInput(f"{path}: no list `camera_path`; expected a camera path as nerfstudio's viewer exports it.{hint}")
+    kind = document.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise BadInput(f"{path}: camera_type {str(kind)[:40]!r}; only perspective paths can be drawn.")
+    entries = document["camera_path"]
+    if not 1 <= len(entries) <= MAX_CAMERAS:
+        raise BadInput(f"{path}: camera_path holds {len(entries)} cameras; expected 1 to {MAX_CAMERAS}.")
+    size = _size(document, path, width, height)
+    cameras = []
+    for k, entry in enumerate(entries):
+        where = f"{path}: camera_path[{k}]"
+        if not isinstance(entry, dict):
+            raise BadInput(f"{where}: expected an object, found {_shown(entry)}.")
+        pose = world_from_capture.pose(_pose(entry.get("camera_to_world"), where))
+        vertical = _number(entry.get("fov", document.get("default_fov")), f"{where}.fov", "degrees between 0 and 180", 0.0, 180.0)
+        focal = 0.5 * size[1] / math.tan(math.radians(vertical / 2))
+        cameras.append(Camera(f"frame_{k:04d}", size[0], size[1], "SIMPLE_PINHOLE", (focal, size[0] / 2, size[1] / 2), pose))
+    fps = document.get("fps")
+    return CameraPath(tuple(cameras), None if fps is None else max(1, round(_number(fps, f"{path}: fps", "frames per second", 0.0, 1000.0))))
+
+
+def _size(document: dict[str, Any], path: Path, width: int | None, height: int | None) -> tuple[int, int]:
+    if width is not None and height is not None:
+        return width, height
+    found = []
+    for name in ("render_width", "render_height"):
+        value = _number(document.get(name), f"{path}: {name}", f"a whole number from 1 to {MAX_SIZE}", 0.0, MAX_SIZE + 1.0)
+        if value != int(value):
+            raise BadInput(f"{path}: {name} is {value:g}; expected a whole number.")
+        found.append(int(value))
+    if width is not None:
+        return width, max(1, round(width * found[1] / found[0]))
+    if height is not None:
+        return max(1, round(height * found[0] / found[1])), height
+    return found[0], found[1]
+
+
+def _pose(value: Any, where: str) -> np.ndarray:
+    """camera_to_world with the project's axes, its rotation made exactly orthonormal."""
+    where = f"{where}.camera_to_world"
+    if not isinstance(value, list) or len(value) != 16 or any(isinstance(x, bool) or not isinstance(x, int | float) for x in value):
+        raise BadInput(f"{where}: expected 16 numbers, found {_shown(value)}.")
+    if any(abs(x) > 1e100 for x in value):  # also infinity, and integers that no float holds
+        raise BadInput(f"{where}: holds a number that is not finite.")
+    matrix = np.array(value, np.float64).reshape(4, 4)
+    if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
+        hint = " It looks transposed; write it row by row." if np.allclose(matrix[:, 3], (0, 0, 0, 1), atol=1e-6) else ""
+        raise BadInput(f"{where}: its last row is {matrix[3].tolist()}, expected 0 0 0 1.{hint}")
+    rotation = matrix[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise BadInput(f"{where}: its upper left 3x3 is no rotation (determinant {np.linalg.det(rotation):.4g}).")
+    u, _, vt = np.linalg.svd(rotation)
+    matrix[:3, :3] = u @ vt
+    return pose_from_opengl(matrix)
+
+
+def _number(value: Any, where: str, expected: str, low: float, high: float) -> float:
+    """A finite number strictly between low and high."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
+        raise BadInput(f"{where}: found {_shown(value)}, expected {expected}.")
+    return float(value)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    return "nothing" if value is None else repr(value)[:40]

@@ -1,0 +1,105 @@
+"""Rendering a camera path: PNG and EXR frames, and the video of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from efficientnerf.geometry.cameras import Camera
+from stages.framing.camera_paths import similarity_of
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.rendering import Rendering
+    from efficientnerf.asset.tree import NerfTree
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a camera path is rendered.
+
+    background   white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white
+    supersample  rays along each side of a pixel
+    exr          "off", "first" or "all": which frames are written as EXR too
+    video        name of the MP4 in the output folder, or None
+    fps, crf     of the video
+    """
+
+    background: str = "white"
+    supersample: int = 1
+    exr: str = "first"
+    video: str | None = "turntable.mp4"
+    fps: int = 30
+    crf: int = 18
+
+
+Progress = Callable[[int, int], None]
+
+
+def render_frames(
+    tree: NerfTree,
+    cameras: Sequence[Camera],
+    folder: Path,
+    options: RenderOptions,
+    progress: Progress | None = None,
+    *,
+    reuse: bool = False,
+    draw: Callable[..., Rendering] | None = None,
+) -> list[Path]:
+    """Write frame_0000.png and so on (and .exr) to a folder; returns the files in order.
+
+    progress  called with (frames done, frames) before each and at the end; may raise to stop
+    reuse     keep frames that exist: only for a folder that this very request alone has written
+    draw      `efficientnerf.asset.rendering.render`, unless another is given
+    """
+    from efficientnerf.asset.rendering import render
+    from stages.io.exporters.exr import write_exr
+    from stages.io.exporters.frames import background_from_text, frame_from_rendering
+    from stages.io.png import write_png
+
+    background, similarity = background_from_text(options.background), similarity_of(tree)
+    draw = draw or render
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for k, camera in enumerate(cameras):
+        if progress is not None:
+            progress(k, len(cameras))
+        png, exr = folder / f"frame_{k:04d}.png", folder / f"frame_{k:04d}.exr"
+        with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
+        # The PNG is written last, atomically: where it exists, the frame is finished.
+        if not (reuse and png.exists()):
+            seen = draw(tree, camera, supersample=options.supersample)
+            if with_exr:
+                write_exr(exr, colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal, world_from_capture=similarity)
+            write_png(frame_from_rendering(seen.colour, seen.opacity, background), png)
+        written += [png, exr] if with_exr else [png]
+    if progress is not None:
+        progress(len(cameras), len(cameras))
+    return written
+
+
+def encode_frames(frames: Sequence[Path], path: Path, options: RenderOptions, each: Callable[[], None] | None = None) -> None:
+    """Encode PNGs as an MP4."""
+    from stages.io.exporters.frames import NAMED, over_background
+    from stages.io.exporters.video import write_mp4
+    from stages.io.png import read_png
+
+    write_mp4((over_background(read_png(frame), NAMED["white"]) for frame in frames), path, fps=options.fps, crf=options.crf, each=each)
+
+
+def render_path(
+    tree: NerfTree,
+    cameras: Sequence[Camera],
+    out_dir: Path,
+    options: RenderOptions,
+    progress: Progress | None = None,
+    draw: Callable[..., Rendering] | None = None,
+) -> list[Path]:
+    """Render a path to a folder: PNG frames, EXR and video by the options; returns the files. Frames of the same names are overwritten."""
+    written = render_frames(tree, cameras, out_dir, options, progress, draw=draw)
+    if options.video is not None:
+        video = out_dir / options.video
+        encode_frames([path for path in written if path.suffix == ".png"], video, options)
+        written.append(video)
+    return written
