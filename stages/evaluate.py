@@ -219,7 +219,7 @@ def evaluate_view(
     stride      of the pixels that the field renders
     perceptual  LPIPS networks by the name of their metric
     """
-    from stages.pictures.plots import eight_bits, error_picture
+    from stages.pictures.plots import error_map, to_uint8
 
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     background = constant_background(scene)
@@ -234,7 +234,7 @@ def evaluate_view(
         render = _clipped(rendering.colour, job, f"{view.name}: the field")
         metrics["network"] = {**compare(render, small, inside), "width": render.shape[1], "height": render.shape[0], **sample_shares(rendering.counts)}
         metrics["network"] |= lpips_metrics(perceptual or {}, render, small)
-        images += [eight_bits(small.colour), eight_bits(render), error_picture(render, small.colour)]
+        images += [to_uint8(small.colour), to_uint8(render), error_map(render, small.colour)]
     asset, inside = render_asset(render_tree, scene, view, rendering, stride)
     asset = _clipped(asset, job, f"{view.name}: the asset")
     metrics["asset"] = {**compare(asset, truth, truth.inside if inside is None else inside), "width": view.camera.width, "height": view.camera.height}
@@ -243,7 +243,7 @@ def evaluate_view(
         metrics["asset"]["background_scale"] = 1.0 / stride
     if metrics["asset"]["psnr"] is None:
         job.warn(f"{view.name}: its mask leaves no pixel to compare; the view is left out of the means")
-    return metrics, [*images, eight_bits(asset), error_picture(asset, truth.colour)]
+    return metrics, [*images, to_uint8(asset), error_map(asset, truth.colour)]
 
 
 def lpips_metrics(perceptual: Mapping[str, Lpips], image: np.ndarray, truth: GroundTruth) -> dict[str, float | None]:

@@ -1,4 +1,4 @@
-"""The asset as a mesh: PLY in the capture's frame, GLB for viewers, a report, and a picture to look at."""
+"""The mesh stage: the asset's surface as PLY in the capture's frame and as GLB, a report, and a preview."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
             faces=settings.max_faces,
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
-            viewpoints=orbit_places(tree.metadata),
+            viewpoints=orbit_points(tree.metadata),
             progress=progress,
         )
     except NoSurface as error:
         raise StageFailed(f"mesh: {error}. {remedy('mesh', given(settings.density_threshold))}") from error
 
 
-def orbit_places(metadata: Mapping[str, Any]) -> np.ndarray:
-    """(N, 3) places on the orbit of the capture's cameras, training frame; none where the asset records no orbit."""
+def orbit_points(metadata: Mapping[str, Any]) -> np.ndarray:
+    """(N, 3) points on the orbit of the capture's cameras, training frame; none where the asset's metadata have no orbit."""
     orbit = metadata.get("orbit")
     if not orbit:
         return np.zeros((0, 3))
@@ -76,7 +76,7 @@ def in_capture(mesh: Mesh, frame: SourceFrame) -> Mesh:
 
 
 def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
-    """What the report says of a mesh in the capture's frame: counts, whether it is closed, bounds, area, volume, and how it was made."""
+    """The report of a mesh in the capture's frame: counts, topology, bounds, area, volume, settings."""
     from dataclasses import asdict
 
     from efficientnerf.surface.mesh import face_areas, face_volumes, topology
@@ -100,7 +100,7 @@ def run(job: Job) -> None:
     from stages.io.exporters import MESH_EXPORTERS
     from stages.io.exporters.writing import source_frame
     from stages.io.png import write_png
-    from stages.pictures.shading import IN_FRONT, draw_sides
+    from stages.pictures.shading import IN_FRONT, render_sides
 
     outputs = MeshOutputs(job.out)
     tree = load(inputs_of(MeshInputs, job.inputs).bake.asset)
@@ -111,7 +111,7 @@ def run(job: Job) -> None:
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
     forward = bool(orbit.get("forward_facing", False))
     sides: dict[str, Any] = {"turns": IN_FRONT, "shown": 0.8} if forward else {}
-    write_png(draw_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides), outputs.preview)
+    write_png(render_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides), outputs.preview)
     job.safe_point()
     mesh = in_capture(found, frame)
     for path in (outputs.ply, outputs.glb):

@@ -1,4 +1,4 @@
-"""The asset as a point cloud with normals and colours: points spread evenly over its surface, as PLY in the capture's frame."""
+"""The points stage: points spread evenly over the asset's surface, with normals and colours, as PLY in the capture's frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
-from stages.mesh import orbit_places, remedy
+from stages.mesh import orbit_points, remedy
 
 if TYPE_CHECKING:
     from efficientnerf.surface.mesh import PointCloud
@@ -47,7 +47,7 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             seed=settings.seed,
-            viewpoints=orbit_places(tree.metadata),
+            viewpoints=orbit_points(tree.metadata),
             progress=progress,
         )
     except NoSurface as error:

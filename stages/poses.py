@@ -1,8 +1,8 @@
 """The poses stage: a source in any format becomes a scene that needs the source no more.
 
-    detect the format -> read the cameras, or find them -> working images -> training frame -> split -> write
+    detect the format -> read the cameras, or find them -> working images -> training frame -> splits -> write
 
-Undistortion is not needed: every later stage traces the distorted rays of the working images.
+Images are not undistorted: later stages trace the distorted rays.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ STAGE = Stage(name="poses", version=2, settings=PosesSettings, needs=(), run=run
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
-    """The capture of the job's source, its cameras found first where the format states none."""
+    """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
     assert job.source is not None
     possible = importers.candidates(job.source) if settings.format == "auto" else [settings.format]
     name = possible[0]
@@ -176,7 +176,7 @@ def _format_of(capture: Capture) -> str:
 
 
 def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tuple[Capture, list[Any]]:
-    """Write every working image; the capture without the images that cannot be decoded, and what was written for the others."""
+    """Write the working images. Returns the capture without the images that cannot be decoded, and what was written for the others."""
     from stages.io import working_images
     from stages.io.photo import UnreadableImage
 
@@ -207,7 +207,7 @@ def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tu
 
 
 def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, str]]) -> Capture:
-    """The capture with only the photos `kept`; the others are rejected, and points forget them."""
+    """The capture with only the photos `kept`; the others are rejected and leave the tracks."""
     if not failed:
         return capture
     place = {index: new for new, index in enumerate(kept)}
@@ -219,9 +219,9 @@ def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, s
 
 
 def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: None) -> list[str]:
-    """The split of each photo: the source's where it states any images to hold back, else every n-th in sorted order is for testing.
+    """The split of each photo: the source's where it states validation or test images, else every n-th in sorted order is a test image.
 
-    At least 2 are left for training, whatever the source says.
+    At least 2 are left for training, whatever the source states.
     """
     given = [photo.split for photo in photos]
     if any(split in ("val", "test") for split in given):
@@ -238,7 +238,7 @@ def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: 
 
 
 def _write_report(path: Path, capture: Capture, scene: Scene, framing_facts: dict[str, object], notes: Sequence[str]) -> None:
-    """What was used, what was not and why, and what was odd."""
+    """Images used and rejected, splits, facts and warnings."""
     report = {
         "kind": capture.kind,
         "registered": [

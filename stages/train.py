@@ -345,13 +345,13 @@ def _preview(renderer: Any, view: View | None, folder: Path, job: Job, step: int
     from efficientnerf.evaluation.metrics import psnr
     from stages.evaluate import ground_truth, subsample, subsample_camera
     from stages.io.png import write_png
-    from stages.pictures.plots import eight_bits
+    from stages.pictures.plots import to_uint8
 
     target = job.work / f"preview_{step:06d}.png"
     stride = max(1, math.ceil(max(view.camera.width, view.camera.height) / PREVIEW_SIDE))
     truth = subsample(ground_truth(folder, view, renderer.model.background).colour, stride)
     picture = np.clip(renderer.render(subsample_camera(view.camera, stride)).colour, 0, 1)
-    write_png(eight_bits(np.concatenate([truth, picture], axis=1)), target)
+    write_png(to_uint8(np.concatenate([truth, picture], axis=1)), target)
     return round(float(psnr(picture, truth)), 2)
 
 

@@ -1,4 +1,4 @@
-"""The turntable stage: PNG frames, an MP4 and an EXR of the baked asset seen from all around."""
+"""The turntable stage: PNG frames, MP4 and EXR of the baked asset along an orbit."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
 
 
 def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None) -> None:
-    """Frames go to job.work one by one, so that a kill costs at most one of them; the video is made of the PNGs, so that it does not depend on where."""
+    """Write frames and video. Frames are kept in job.work, so that a kill costs at most one; the video is encoded from the PNGs."""
     from stages.pictures.frames import RenderOptions, encode_frames, render_frames
 
     s: TurntableSettings = job.settings

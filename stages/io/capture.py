@@ -1,4 +1,4 @@
-"""What an importer hands over: cameras, images and points in the frame of the source, before anything is framed or resized."""
+"""What an importer returns: cameras, images and points in the capture's frame, at the source's size."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Photo:
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points that structure from motion (or a depth sensor) left behind.
+    """Sparse points of structure from motion or a depth sensor.
 
     xyz        (N, 3) float64, the capture's frame
     rgb        (N, 3) uint8, sRGB
@@ -54,8 +54,7 @@ class Capture:
 
     kind        "photographs", "blender", "nerfstudio", "instant-ngp", "llff" or "colmap"
     photos      in sorted order of name within each split; all registered
-    background  the constant sRGB colour (three floats, 0-1) that transparent pixels are composited on, or None where photographs show
-                real surroundings
+    background  the constant sRGB colour (0-1) that transparent pixels are composited on, of bounded scenes; None: unbounded
     up          unit up vector in the capture's frame where the format defines one (Blender: +z), else None
     points      or None
     bounds      (2, 3) box in the capture's frame where the source states one (instant-ngp's aabb), else None

@@ -1,17 +1,16 @@
-"""The scene: what the poses stage leaves and every later stage reads.
+"""The scene: what the poses stage writes and every later stage reads.
 
     scene.json           cameras, splits, bounds, the similarity to the capture's frame, the orbit (this module)
     images/, masks/      at working size, 8 bits, sRGB; masks are 0 or 255, 255 = use
     points.safetensors   sparse points in the training frame, where there are any
 
-Format 2 says what space the field lives in, and holds the reference camera of a forward-facing capture; format 1, without, is read as well.
+Format 2 adds the space of the field and the forward-facing scene; format 1 is read, too.
 
 Training frame: right-handed, z up, origin at the centre of the box, the largest half extent of the box 1.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from pipeline.files import write_json
 from stages.artifacts import PosesOutputs
 from stages.framing.forward_facing import SPACES, ForwardFacing
 from stages.io.capture import SparsePoints
-from stages.io.json_file import read_json
+from stages.io.json_file import JsonReader, read_json
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
@@ -34,13 +33,13 @@ AGAIN = "Run the poses stage again."
 
 @dataclass(frozen=True)
 class Orbit:
-    """How the capture goes round its subject, for turntables; in the training frame.
+    """The orbit of the capture's cameras round the subject, for turntables; in the training frame.
 
-    centre          what the cameras look at
-    radius          their usual distance from it, world units
-    elevation       their usual angle above the horizon, degrees
-    forward_facing  whether they all look about the same way instead of standing around it
-    heading         azimuth of the middle of the cameras seen from the centre, degrees, anticlockwise from +x
+    centre          point that the cameras look at
+    radius          median distance of the cameras from it, world units
+    elevation       median angle above the horizon, degrees
+    forward_facing  whether the cameras are on one side of the subject
+    heading         azimuth of the mean camera seen from the centre, degrees, anticlockwise from +x
     """
 
     centre: tuple[float, float, float]
@@ -78,13 +77,12 @@ class Scene:
     """All views of a capture in the training frame.
 
     kind        the kind of the capture ("photographs", "blender", ...)
-    bounds      (2, 3) the box of interest
-    background  constant sRGB colour (0-1) that the RGBA images are composited on; None: photographs with real surroundings
+    bounds      (2, 3) scene bounds
+    background  constant sRGB colour (0-1) that the RGBA images are composited on, in bounded scenes; None: unbounded
     points      whether points.safetensors stands beside scene.json
     metric      whether a unit of the capture's frame is a metre
-    space       where the field lives: "box", "contracted" (the box and a shell for all beyond) or "ndc" (normalised device coordinates); "auto"
-                is contracted for photographs with surroundings, else the box
-    forward     the forward-facing capture; there for ndc, and only there
+    space       of the field: "box" (bounded), "contracted", "ndc", or "auto": contracted without a background, else box
+    forward     the forward-facing scene, for ndc alone
     """
 
     kind: str
@@ -104,12 +102,12 @@ class Scene:
 
     @property
     def contracted(self) -> bool:
-        """Whether space beyond the box belongs to the field."""
+        """Whether the field's space is contracted."""
         return self.space == "contracted" or (self.space == "auto" and self.background is None)
 
     @property
     def up(self) -> tuple[float, float, float]:
-        """Always +z: the poses stage turns the capture upright."""
+        """+z: the poses stage rotates the capture so."""
         return (0.0, 0.0, 1.0)
 
 
@@ -121,7 +119,7 @@ def views_of(scene: Scene, split: str) -> tuple[View, ...]:
 
 
 def save(scene: Scene, folder: Path) -> None:
-    """Write folder/scene.json; images, masks and points are the caller's."""
+    """Write scene.json."""
     views = [
         {
             "image": view.image,
@@ -162,15 +160,15 @@ def save(scene: Scene, folder: Path) -> None:
 
 
 def load(folder: Path) -> Scene:
-    """Read folder/scene.json, checked; BadInput names what is wrong with it."""
+    """Read and check scene.json. Raises BadInput."""
     path = PosesOutputs(folder).scene
-    document = _Reader(read_json(path, AGAIN, missing="Run the poses stage first."), str(path))
+    document = JsonReader(read_json(path, AGAIN, missing="Run the poses stage first."), str(path), AGAIN)
     version = document.integer("format")  # also refuses what is not an object
     if not 1 <= version <= FORMAT:
         raise BadInput(f"{path}: format version {version}; this build reads 1 to {FORMAT}. Upgrade efficientnerf, or run the poses stage again.")
     background = document.value.get("background")
     transform, orbit = document.reader("world_from_capture"), document.reader("orbit")
-    views = tuple(_view_from_json(_Reader(view, f"{path}: views[{i}]"), folder) for i, view in enumerate(document.items("views")))
+    views = tuple(_view_from_json(JsonReader(view, f"{path}: views[{i}]", AGAIN), folder) for i, view in enumerate(document.items("views")))
     scene = Scene(
         kind=document.text("kind"),
         views=views,
@@ -217,7 +215,7 @@ def has_alpha(folder: Path, view: View) -> bool:
         with Image.open(folder / view.image) as image:
             return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
     except OSError:
-        return False  # reading it will say what is wrong
+        return False  # read_image says what is wrong
 
 
 def read_mask(folder: Path, view: View) -> np.ndarray | None:
@@ -264,7 +262,7 @@ def read_points(folder: Path) -> SparsePoints:
 
 
 def describe(folder: Path) -> dict[str, Any]:
-    """What `enerf inspect RUN/poses` prints: the source's cameras in the capture's frame, and what the scene knows of itself."""
+    """What `enerf inspect RUN/poses` prints: the source's cameras in the capture's frame, and the facts of the scene."""
     scene = load(folder)
     cameras = [
         {
@@ -323,10 +321,10 @@ def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:
     }
 
 
-def _space_from_json(document: _Reader, path: Path) -> dict[str, Any]:
+def _space_from_json(document: JsonReader, path: Path) -> dict[str, Any]:
     space = document.text("space")
     if space not in SPACES or (space == "ndc") != (document.value.get("forward") is not None):
-        raise BadInput(f"{path}: space {space[:40]!r}; expected one of {', '.join(SPACES)}, and ndc with what is said of it. Run the poses stage again.")
+        raise BadInput(f"{path}: space {space[:40]!r}; expected one of {', '.join(SPACES)}, and ndc with a forward-facing scene. Run the poses stage again.")
     if space != "ndc":
         return {"space": space}
     reader = document.reader("forward")
@@ -353,7 +351,7 @@ def _camera_to_json(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _camera_from_json(data: _Reader) -> Camera:
+def _camera_from_json(data: JsonReader) -> Camera:
     pose = data.numbers("world_from_camera", (4, 4))
     if not _is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any():
         raise BadInput(f"{data.where}.world_from_camera is not a rigid motion. Run the poses stage again.")
@@ -366,7 +364,7 @@ def _camera_from_json(data: _Reader) -> Camera:
         raise BadInput(f"{data.where}: {error}. Run the poses stage again.") from error
 
 
-def _view_from_json(data: _Reader, folder: Path) -> View:
+def _view_from_json(data: JsonReader, folder: Path) -> View:
     split = data.text("split")
     near, far = data.number("near"), data.number("far")
     if split not in SPLITS or not 0 <= near < far:
@@ -385,46 +383,3 @@ def _is_rotation(matrix: np.ndarray) -> bool:
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
-
-
-@dataclass(frozen=True)
-class _Reader:
-    """A JSON object whose fields are taken out by type; errors say where."""
-
-    value: Any
-    where: str
-
-    def _take(self, name: str, kinds: type | tuple[type, ...], expected: str) -> Any:
-        found = self.value.get(name) if isinstance(self.value, dict) else None
-        if not isinstance(found, kinds) or (isinstance(found, bool) and kinds is not bool):
-            raise BadInput(f"{self.where}.{name}: expected {expected}, found {str(found)[:40]!r}. Run the poses stage again.")
-        return found
-
-    def text(self, name: str) -> str:
-        return str(self._take(name, str, "text"))
-
-    def flag(self, name: str) -> bool:
-        return bool(self._take(name, bool, "true or false"))
-
-    def integer(self, name: str) -> int:
-        return int(self._take(name, int, "a whole number"))
-
-    def number(self, name: str) -> float:
-        return float(self.numbers(name, ()))
-
-    def items(self, name: str) -> list[Any]:
-        return list(self._take(name, list, "a list"))
-
-    def reader(self, name: str) -> _Reader:
-        return _Reader(self._take(name, dict, "an object"), f"{self.where}.{name}")
-
-    def numbers(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Finite float64 of this shape; (-1,) any length."""
-        found = self._take(name, (list, int, float), "numbers")
-        try:
-            array = np.array(found)
-        except ValueError:
-            array = np.array(None)
-        if array.dtype.kind not in "if" or not (array.shape == shape or (shape == (-1,) and array.ndim == 1)) or not all(map(math.isfinite, array.ravel())):
-            raise BadInput(f"{self.where}.{name}: expected finite numbers of shape {shape}, found {str(found)[:40]}. Run the poses stage again.")
-        return array.astype(np.float64)

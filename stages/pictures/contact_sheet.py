@@ -1,4 +1,4 @@
-"""One picture of all images of a scene: what is used for what, and what could not be used."""
+"""Contact sheet of a scene: thumbnails of all images by split, and of the rejected ones."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from stages.io.scene import SPLITS, Scene
 THUMBNAIL = 144  # px, longest side
 FRAME = 3  # px
 COLUMNS = 8
-MOST = 240  # thumbnails; larger captures are thinned evenly
+MAX_THUMBNAILS = 240  # of larger captures every n-th image is shown
 COLOURS = {"train": (70, 130, 180), "val": (218, 165, 32), "test": (60, 160, 75), "rejected": (200, 40, 40)}
 
 
 def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str, str]], source: Path) -> None:
-    """Write the contact sheet of the folder of a scene: thumbnails framed in the colour of their split, names below, the rejected ones crossed out last."""
+    """Write the contact sheet of the folder of a scene: thumbnails framed in the colour of their split, names below; rejected ones crossed out, at the end."""
     from stages.pictures.plots import contact_sheet
 
     entries: list[tuple[Path | None, str, str]] = [(folder / view.image, view.name, view.split) for view in scene.views]
-    every = -(-len(entries) // MOST)
+    every = -(-len(entries) // MAX_THUMBNAILS)
     counts = {split: sum(entry[2] == split for entry in entries) for split in SPLITS} | {"rejected": len(rejected)}
     title = f"{len(entries)} images: " + ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-    shown = entries[::every] + [(_readable(source / name), name, "rejected") for name, _ in rejected[: MOST // 4]]
+    shown = entries[::every] + [(_readable(source / name), name, "rejected") for name, _ in rejected[: MAX_THUMBNAILS // 4]]
     rows = [shown[first : first + COLUMNS] for first in range(0, len(shown), COLUMNS)]
     contact_sheet(
         [[_framed(path, split) for path, _, split in row] for row in rows],
@@ -53,7 +53,7 @@ def _readable(path: Path) -> Path | None:
 
 
 def _thumbnail(path: Path | None) -> Any:
-    """At most THUMBNAIL to a side; grey where there is nothing to show."""
+    """Longest side at most THUMBNAIL; grey without an image."""
     from PIL import Image, ImageOps
 
     if path is not None:
@@ -64,5 +64,5 @@ def _thumbnail(path: Path | None) -> Any:
                 upright.thumbnail((THUMBNAIL, THUMBNAIL))
                 return upright.convert("RGBA" if upright.mode in ("RGBA", "LA", "P", "PA") else "RGB")
         except Exception:
-            pass  # rejected because it cannot be read, most likely
+            pass  # probably rejected for being unreadable
     return Image.new("RGB", (THUMBNAIL, THUMBNAIL * 3 // 4), (200, 200, 200))

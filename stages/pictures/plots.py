@@ -1,4 +1,4 @@
-"""Pictures for people: contact sheets and curves, the same bytes for the same input."""
+"""Contact sheets, error maps and curves; the same bytes for the same input."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 MARGIN = 8
 LABEL_HEIGHT = 18
-PAPER = (255, 255, 255)
-INK = (32, 32, 32)
+BACKGROUND = (255, 255, 255)
+TEXT = (32, 32, 32)
 
 
 def contact_sheet(
@@ -22,9 +22,9 @@ def contact_sheet(
 ) -> None:
     """Write a PNG with rows of thumbnails, a label under each.
 
-    rows       images of any size: (H, W), (H, W, 3) or (H, W, 4), uint8 or floating point 0 to 1, sRGB; None leaves a gap. Rows may differ in length.
-    labels     one text for each image, or None; too long ones lose their middle
-    thumbnail  longest side of a thumbnail in pixels; smaller images are not enlarged beyond it, but are to it
+    rows       images of any size: (H, W), (H, W, 3) or (H, W, 4), uint8 or floating point 0 to 1, sRGB; None: a gap. Rows may differ in length.
+    labels     one text for each image, or None; long ones are elided in the middle
+    thumbnail  longest side of the thumbnails, pixels; smaller images are enlarged to it
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -37,46 +37,46 @@ def contact_sheet(
     label_h = LABEL_HEIGHT if labels is not None else 0
     top = MARGIN + (LABEL_HEIGHT + MARGIN if title else 0)
     columns = max(len(row) for row in rows)
-    sheet = Image.new("RGB", (MARGIN + columns * (cell_w + MARGIN), top + sum(height + label_h + MARGIN for height in heights)), PAPER)
+    sheet = Image.new("RGB", (MARGIN + columns * (cell_w + MARGIN), top + sum(height + label_h + MARGIN for height in heights)), BACKGROUND)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
     if title:
-        draw.text((MARGIN, MARGIN), _fitted(title, sheet.width - 2 * MARGIN, draw, font), INK, font)
+        draw.text((MARGIN, MARGIN), _fitted(title, sheet.width - 2 * MARGIN, draw, font), TEXT, font)
     for i, row in enumerate(thumbnails):
         for j, image in enumerate(row):
             x = MARGIN + j * (cell_w + MARGIN)
             if image is not None:
                 sheet.paste(image, (x + (cell_w - image.width) // 2, top))
             if labels is not None and labels[i][j]:
-                draw.text((x, top + heights[i] + 2), _fitted(labels[i][j], cell_w, draw, font), INK, font)
+                draw.text((x, top + heights[i] + 2), _fitted(labels[i][j], cell_w, draw, font), TEXT, font)
         top += heights[i] + label_h + MARGIN
     sheet.save(path, "PNG", compress_level=6)
 
 
 def grid_sheet(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, thumbnail: int = 160, title: str = "") -> None:
-    """A contact sheet of one list of images, filled row by row in about the shape of a screen."""
+    """A contact sheet of one list of images, row by row, about 3:2."""
     columns = max(1, min(len(images), int(np.ceil(np.sqrt(len(images) * 1.5)))))
     starts = range(0, len(images), columns)
     contact_sheet([images[s : s + columns] for s in starts], [labels[s : s + columns] for s in starts], path, thumbnail=thumbnail, title=title)
 
 
 def thumbnail_of(image: np.ndarray, longest: int) -> Image.Image:
-    """An image as a PIL RGB image whose longest side is `longest`; transparency is shown over a light grey."""
+    """A PIL RGB image whose longest side is `longest`; transparency is composited on light grey."""
     from PIL import Image
 
-    pixels = eight_bits(image)
+    pixels = to_uint8(image)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[:, :, None], 3, axis=2)
-    picture = Image.fromarray(np.ascontiguousarray(pixels))
-    scale = longest / max(picture.size)
-    size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
-    picture = picture.resize(size, Image.Resampling.LANCZOS if scale < 1 else Image.Resampling.NEAREST)
-    if picture.mode == "RGBA":
-        paper = Image.new("RGBA", picture.size, (224, 224, 224, 255))
-        picture = Image.alpha_composite(paper, picture)
-    return picture.convert("RGB")
+    resized = Image.fromarray(np.ascontiguousarray(pixels))
+    scale = longest / max(resized.size)
+    size = (max(1, round(resized.width * scale)), max(1, round(resized.height * scale)))
+    resized = resized.resize(size, Image.Resampling.LANCZOS if scale < 1 else Image.Resampling.NEAREST)
+    if resized.mode == "RGBA":
+        paper = Image.new("RGBA", resized.size, (224, 224, 224, 255))
+        resized = Image.alpha_composite(paper, resized)
+    return resized.convert("RGB")
 
 
-def eight_bits(image: np.ndarray) -> np.ndarray:
+def to_uint8(image: np.ndarray) -> np.ndarray:
     """uint8 of an image whose floating-point values run from 0 to 1 (clipped, rounded to nearest, nan is 0); uint8 passes through."""
     image = np.asarray(image)
     if image.dtype == np.uint8:
@@ -86,7 +86,7 @@ def eight_bits(image: np.ndarray) -> np.ndarray:
     return (np.clip(np.nan_to_num(image.astype(np.float32)), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def error_picture(image: np.ndarray, truth: np.ndarray, *, full: float = 0.25) -> np.ndarray:
+def error_map(image: np.ndarray, truth: np.ndarray, *, full: float = 0.25) -> np.ndarray:
     """Mean absolute difference over the channels as colours: black for none, light yellow for `full` and more.
 
     image, truth  (H, W, 3) floating point 0 to 1
@@ -95,7 +95,7 @@ def error_picture(image: np.ndarray, truth: np.ndarray, *, full: float = 0.25) -
     from matplotlib import colormaps
 
     error = np.abs(image - truth).mean(axis=2)
-    return np.asarray(eight_bits(colormaps["inferno"](np.clip(error / full, 0.0, 1.0))[:, :, :3]))
+    return np.asarray(to_uint8(colormaps["inferno"](np.clip(error / full, 0.0, 1.0))[:, :, :3]))
 
 
 def curve(
@@ -121,7 +121,7 @@ def curve(
     axes.grid(alpha=0.3)
     if series:
         axes.legend(frameon=False)
-    # the program's name and version are left out: the same curve is the same file
+    # without the program's name and version, for the same bytes
     canvas.print_png(path, metadata={"Software": None})
 
 

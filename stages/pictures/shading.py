@@ -1,4 +1,4 @@
-"""A mesh as a picture, for people to look at: four sides, above in its colours, below as grey clay."""
+"""Preview of a mesh: orthographic views from four sides, coloured above, shaded grey below."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from efficientnerf.surface.mesh import Mesh, sample
 _PAPER = np.array([0.93, 0.93, 0.93])
 _SAMPLES = 600_000
 ROUND = (0.0, 90.0, 180.0, 270.0)
-IN_FRONT = (-36.0, -12.0, 12.0, 36.0)  # what was photographed from one side has no other
+IN_FRONT = (-36.0, -12.0, 12.0, 36.0)  # of forward-facing captures
 
 
-def draw_sides(mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, size: int = 420, turns: Sequence[float] = ROUND, shown: float = 1.0) -> np.ndarray:
+def render_sides(
+    mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, size: int = 420, turns: Sequence[float] = ROUND, shown: float = 1.0
+) -> np.ndarray:
     """Orthographic views of a mesh in a frame with z up, from several sides.
 
     heading    degrees around z that the turns are counted from, from +x
     elevation  degrees above the horizon
     turns      degrees around z of each view
-    shown      share of the surface that the pictures reach, from its middle outwards: surfaces far behind a subject would leave it a few pixels
+    shown      share of the vertices, nearest to the middle, that the views are fitted to
     returns    (2 size, size times the number of views, 3) uint8 sRGB
 
-    The surface is drawn as a dense cloud of samples with a depth buffer: no rasteriser is needed for a picture this small.
+    The surface is splatted as a dense point cloud with a depth buffer.
     """
     face, weight = sample(mesh.vertices, mesh.faces, _SAMPLES, seed=0)
     corners = mesh.faces[face]  # (N, 3)
@@ -31,7 +33,7 @@ def draw_sides(mesh: Mesh, *, heading: float = 0.0, elevation: float = 20.0, siz
     normals = np.einsum("nci,nc->ni", mesh.normals[corners], weight)
     colours = np.einsum("nci,nc->ni", mesh.colours[corners], weight)
     if shown < 1:
-        centre = np.median(mesh.vertices, axis=0)  # vertices are dense where photographs show much
+        centre = np.median(mesh.vertices, axis=0)
         reach = float(np.quantile(np.linalg.norm(mesh.vertices - centre, axis=1), shown))
     else:
         centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
@@ -61,12 +63,12 @@ def _axes(heading: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _front_samples(x: np.ndarray, y: np.ndarray, height: np.ndarray, size: int) -> np.ndarray:
-    """(size, size) which sample, of those with x and y in -1..1, is nearest to the viewer in each pixel; -1 where there is none."""
+    """(size, size) index of the sample nearest to the viewer in each pixel, of those with x and y in -1..1; -1: none."""
     order = np.argsort(height, kind="stable")
     column = ((x * 0.97 + 1) / 2 * (size - 1)).astype(np.int64)[order]
     row = ((1 - y * 0.97) / 2 * (size - 1)).astype(np.int64)[order]
     front = np.full((size, size), -1)
-    # Each sample covers two by two pixels: what lies behind must not shine through where samples happen to be sparse.
+    # A sample covers two by two pixels, against holes where samples are sparse.
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         np.maximum.at(front, (row + i, column + j), np.arange(len(order)))
     return np.where(front >= 0, order[front], -1) if len(order) else front

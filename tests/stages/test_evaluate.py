@@ -21,7 +21,7 @@ from stages.framing.camera_paths import pose_on_sphere
 from stages.io.exporters.frames import frame_from_rendering
 from stages.io.png import write_png
 from stages.io.scene import Orbit, Scene, View, save
-from stages.pictures.plots import eight_bits
+from stages.pictures.plots import to_uint8
 from tests.fakes import WHITE, BallField, BallTree
 
 TREE = BallTree()
@@ -36,7 +36,7 @@ def make_scene(folder: Path, splits: str, *, background: tuple[float, float, flo
         pose = pose_on_sphere((0.0, 0.0, 0.0), 3.0, 30.0 * k, 20.0)
         camera = Camera(f"v{k}.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (70.0, WIDTH / 2, HEIGHT / 2), pose)
         if background is None:
-            frame = eight_bits(BallField(TREE).render(camera).colour)
+            frame = to_uint8(BallField(TREE).render(camera).colour)
         else:
             seen = TREE.render(camera)
             frame = frame_from_rendering(seen.colour, seen.opacity, None)
@@ -153,7 +153,7 @@ def test_light_before_the_box_covers_the_asset(tmp_path: Path) -> None:
 
     poses = make_scene(tmp_path / "poses", "t", background=None)
     camera = Camera("v0.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (70.0, WIDTH / 2, HEIGHT / 2), pose_on_sphere((0.0, 0.0, 0.0), 3.0, 0.0, 20.0))
-    write_png(eight_bits(Fog(TREE).render(camera).colour), poses / "images" / "v0.png")
+    write_png(to_uint8(Fog(TREE).render(camera).colour), poses / "images" / "v0.png")
     job = job_in(tmp_path, poses)
     evaluate(TREE.render, lambda: Fog(TREE), job)
     assert figures_of(job)["asset"]["psnr"] > 50

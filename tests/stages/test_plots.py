@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.pictures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, eight_bits, error_picture, grid_sheet
+from stages.pictures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, error_map, grid_sheet, to_uint8
 
 
 def test_sheet_holds_each_image_at_its_place(tmp_path: Path) -> None:
@@ -43,15 +43,15 @@ def test_no_images_is_an_error(tmp_path: Path) -> None:
 
 
 def test_eight_bits_clips_and_rounds() -> None:
-    assert eight_bits(np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan])).tolist() == [0, 0, 128, 255, 255, 0]
+    assert to_uint8(np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan])).tolist() == [0, 0, 128, 255, 255, 0]
     with pytest.raises(ValueError, match="int64"):
-        eight_bits(np.array([1]))
+        to_uint8(np.array([1]))
 
 
 def test_error_picture_is_black_where_equal_and_bright_where_not() -> None:
     truth = np.zeros((2, 2, 3))
     image = truth.copy()
     image[0, 0] = 0.25
-    picture = error_picture(image, truth)
+    picture = error_map(image, truth)
     assert picture[1, 1].max() < 10
     assert picture[0, 0].min() > 150

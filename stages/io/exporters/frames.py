@@ -30,20 +30,20 @@ def frame_from_rendering(colour: np.ndarray, opacity: np.ndarray, background: tu
     returns     (H, W, 3) or, without a background, (H, W, 4) uint8
     """
     from efficientnerf.rendering.colour import straight_from_premultiplied
-    from stages.pictures.plots import eight_bits
+    from stages.pictures.plots import to_uint8
 
     if background is not None:
-        return eight_bits(colour + (1.0 - opacity[..., None]) * np.asarray(background, np.float32))
+        return to_uint8(colour + (1.0 - opacity[..., None]) * np.asarray(background, np.float32))
     straight = straight_from_premultiplied(colour, opacity)
-    return eight_bits(np.concatenate([straight, opacity[..., None]], axis=-1))
+    return to_uint8(np.concatenate([straight, opacity[..., None]], axis=-1))
 
 
 def over_background(frame: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
     """(H, W, 4) uint8 over a colour -> (H, W, 3) uint8; RGB passes through."""
     if frame.shape[2] == 3:
         return frame
-    from stages.pictures.plots import eight_bits
+    from stages.pictures.plots import to_uint8
 
     values = frame.astype(np.float32) / 255.0
     alpha = values[..., 3:]
-    return eight_bits(values[..., :3] * alpha + (1.0 - alpha) * np.asarray(background, np.float32))
+    return to_uint8(values[..., :3] * alpha + (1.0 - alpha) * np.asarray(background, np.float32))
