@@ -1,5 +1,6 @@
 # make demo      install, then turn examples/still_life into a baked asset, turntable, mesh and point cloud under runs/demo
-# make test      install, then run the tests
+# make test      install, then run the tests on all cores, but those marked slow
+# make test-slow install, then run the tests marked slow
 # make torture   kill -9 a run at 30 moments and compare its artifacts with those of an undisturbed run
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
 # make docs      rewrite the pages under docs/ that are made from the code
@@ -10,13 +11,16 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test torture gpu docs lint install clean
+.PHONY: demo test test-slow torture gpu docs lint install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -q -n auto -m "not slow"
+
+test-slow: $(INSTALLED)
+	$(BIN)/python -m pytest -q -n auto -m slow
 
 torture: $(INSTALLED)
 	$(BIN)/python benchmarks/torture.py

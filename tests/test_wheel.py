@@ -1,0 +1,62 @@
+"""The wheel holds all that the packages need, and makes an asset where it is installed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("pipeline", "efficientnerf", "stages", "workflows")
+
+
+def call(*command: object, **options: Any) -> str:
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy, which has none of what earlier builds left behind."""
+    copy, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copyfile(ROOT / name, copy / name)
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
+    call(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", out, copy)
+    (built,) = out.glob("*.whl")
+    return built
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_each_file_of_the_packages_and_no_other(wheel: Path) -> None:
+    kept = {path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file() and "__pycache__" not in path.parts}
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert held == {path.relative_to(ROOT).as_posix() for path in kept}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_the_wheel_makes_an_asset_where_it_is_installed(wheel: Path, tmp_path: Path) -> None:
+    """In an environment of its own that borrows the libraries of this one."""
+    place = tmp_path / "environment"
+    call(sys.executable, "-m", "venv", "--without-pip", place)
+    python = place / "bin" / "python"
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    call(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel, env=environment)
+    (packages,) = (place / "lib").glob("python*/site-packages")
+    (packages / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    where = call(python, "-c", "import workflows, efficientnerf; print(workflows.__file__, efficientnerf.__file__)", cwd=tmp_path, env=environment)
+    assert all(name.startswith(str(packages)) for name in where.split())
+    run = tmp_path / "run"
+    call(place / "bin" / "enerf", "run", ROOT / "examples" / "still_life", "--preset", "tiny", "--out", run, cwd=tmp_path, env=environment)
+    for name in ("bake/asset.nerftree", "mesh/mesh.glb", "points/points.ply", "turntable/turntable.mp4", "report.html"):
+        assert (run / name).stat().st_size > 0
