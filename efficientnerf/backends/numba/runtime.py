@@ -21,7 +21,7 @@ from numba.core import caching, event
 
 from efficientnerf.backends import LAYERS, kernel_cache
 
-if not os.environ.get("NUMBA_THREADING_LAYER") and os.environ.get("NUMBA_THREADING_LAYER_PRIORITY", LAYERS) == LAYERS:
+if os.environ.get("NUMBA_THREADING_LAYER_PRIORITY", LAYERS) == LAYERS:
     numba.config.THREADING_LAYER_PRIORITY = LAYERS.split()  # numba may have been imported before the environment said so
 
 
