@@ -8,13 +8,15 @@ from pathlib import Path
 import pytest
 
 from workflows.cli.main import main
+from workflows.paper.document import make
+from workflows.paper.result import Repetitions, Request
 from workflows.paper.structures import COLUMNS, NAMES, Case
 
+ONCE = Repetitions(cachings=1, queries=1)
 
-def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workflows.paper.structures.CACHINGS", 1)
-    monkeypatch.setattr("workflows.paper.structures.QUERIES", 1)
-    assert main(["paper", "7", "--out", str(tmp_path), "--scale", "0.12", "--device", "cpu", "--quiet"]) == 0
+
+def test_table_7_compares_all_structures(tmp_path: Path) -> None:
+    make("7", Request(None, tmp_path, 0.12, "cpu", lambda text: None, timings=ONCE))
     table = json.loads((tmp_path / "table_7.json").read_text())
     assert table["columns"] == list(COLUMNS)
     cases = {row["voxels"] for row in table["rows"]}
@@ -34,14 +36,12 @@ def test_table_7_compares_all_structures(tmp_path: Path, monkeypatch: pytest.Mon
     assert "threads" in text
 
 
-def test_the_torch_versions_fill_the_same_table(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_torch_versions_fill_the_same_table() -> None:
     from workflows.paper import structures
 
-    monkeypatch.setattr(structures, "CACHINGS", 1)
-    monkeypatch.setattr(structures, "QUERIES", 1)
-    rows, note = structures._measure(Case(32, 0.2), 1000, structures._in_torch("cpu"))
+    rows, note = structures._measure(Case(32, 0.2), 1000, structures._in_torch("cpu"), ONCE)
     assert [row["structure"] for row in rows] == list(NAMES.values())
-    kernels, _ = structures._measure(Case(32, 0.2), 1000, structures._in_numba())
+    kernels, _ = structures._measure(Case(32, 0.2), 1000, structures._in_numba(), ONCE)
     for row, kernel in zip(rows, kernels, strict=True):
         assert row["memory of dense"] == pytest.approx(kernel["memory of dense"], rel=0.05, abs=0.01), row["structure"]
     assert "6,554 voxels" in note

@@ -1,4 +1,4 @@
-"""What a table of the paper is asked with, what it gives, and what it is (`workflows.paper.document`)."""
+"""Request and result of a table of the paper (`workflows.paper.document`)."""
 
 from __future__ import annotations
 
@@ -11,15 +11,24 @@ PAPER = " (paper)"
 
 
 @dataclass(frozen=True)
+class Repetitions:
+    """Of the timings of table 7; their medians are reported."""
+
+    cachings: int = 5
+    queries: int = 9
+
+
+@dataclass(frozen=True)
 class Request:
-    """What was asked for.
+    """What a table is measured on.
 
     data    folder of a scene, or of scenes
     out     where tables and runs go
     scale   1: as in the paper; less: iterations, resolution, networks and grids shrunk together
     device  "cpu" or "cuda"
     say     tells the user what is going on
-    report  takes the events of the stages, which for hours are all that is to be seen; None: nobody listens
+    report  takes the events of the stages; None: they are dropped
+    timings repetitions of what is timed
     """
 
     data: Path | None
@@ -28,6 +37,7 @@ class Request:
     device: str = "cpu"
     say: Callable[[str], None] = print
     report: Callable[[dict[str, Any]], None] | None = None
+    timings: Repetitions = Repetitions()
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Table 7 of the paper: what dense voxels, a sparse tensor, an octree and NerfTree take to cache and to look up the same voxels.
 
 On the CPU the kernels of `efficientnerf.structures`, on CUDA their plain torch versions. The structures take turns within each repetition, so that
-what else the machine does meets all of them alike.
+other load on the machine affects all of them equally.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from workflows.paper.result import PAPER, Request, Result
+from workflows.paper.result import PAPER, Repetitions, Request, Result
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,7 +35,6 @@ COLUMNS = (
     "random of dense", "query along rays / ms", "rays of dense", "rays of dense" + PAPER,
 )  # fmt: skip
 SIDES, POINTS = (256, 512), 1 << 21
-CACHINGS, QUERIES = 5, 9  # repetitions; the medians are reported
 SEED = 7
 
 
@@ -61,8 +60,12 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Bench:
-    """How a device builds and asks: `build` of a name gives a structure, its bytes and a function that asks one of the sets of points."""
+class Backend:
+    """How structures are built and queried on a device.
+
+    prepare  (voxels, sets of points by name) -> build(name of a structure), query(structure, name of a set), wait for the device
+    size     bytes of a structure
+    """
 
     prepare: Callable[[Voxels, Mapping[str, np.ndarray]], tuple[Callable[[str], Any], Callable[[Any, str], None], Callable[[], None]]]
     size: Callable[[Any], int]
@@ -76,24 +79,24 @@ def structures(request: Request) -> Result:
     if not cuda:
         cases.append(Case(sides[0], 0.2, shuffled=True))
     points = max(round(POINTS * request.scale * (8 if cuda else 1)), 1000)
-    bench, busy = (_in_torch(request.device) if cuda else _in_numba()), _Others()
+    backend, load = (_in_torch(request.device) if cuda else _in_numba()), _OtherLoad()
     rows: list[dict[str, Any]] = []
     notes: list[str] = []
     for case in cases:
         request.say(f"table 7: {case.name}")
-        measured, note = _measure(case, points, bench)
+        measured, note = _measure(case, points, backend, request.timings)
         rows += measured
         notes.append(note)
-    return Result(COLUMNS, rows, [*_explained(points), *notes, *([] if cuda else [_machine(busy)])])
+    return Result(COLUMNS, rows, [*_explained(points, request.timings), *notes, *([] if cuda else [_machine(load)])])
 
 
-def _measure(case: Case, points: int, bench: Bench) -> tuple[list[dict[str, Any]], str]:
-    """All structures in turn, repetition by repetition: a row for each, and what is to be known of the voxels."""
+def _measure(case: Case, points: int, backend: Backend, timings: Repetitions) -> tuple[list[dict[str, Any]], str]:
+    """All structures in turn, repetition by repetition: a row for each, and a note on the voxels."""
     from efficientnerf.structures.occupancy import random_points, ray_points
 
     voxels = case.voxels()
     sets = {"random": random_points(case.side, points, SEED), "rays": ray_points(case.side, points, SEED)}
-    cache, ask, wait = bench.prepare(voxels, sets)
+    cache, query, wait = backend.prepare(voxels, sets)
     took: dict[tuple[str, str], list[float]] = {}
     built: dict[str, Any] = {}
 
@@ -105,16 +108,16 @@ def _measure(case: Case, points: int, bench: Bench) -> tuple[list[dict[str, Any]
         took.setdefault((name, what), []).append(1e3 * (time.perf_counter() - start))
         return result
 
-    for _ in range(CACHINGS):
+    for _ in range(timings.cachings):
         for name in NAMES:
             built.pop(name, None)  # one of each at a time: the largest grid takes gigabytes
             built[name] = timed(name, "caching", lambda name=name: cache(name))  # type: ignore[misc]
-    for _ in range(QUERIES):
+    for _ in range(timings.queries):
         for name in NAMES:
             for what in sets:
-                timed(name, what, lambda name=name, what=what: ask(built[name], what))  # type: ignore[misc]
+                timed(name, what, lambda name=name, what=what: query(built[name], what))  # type: ignore[misc]
     middle = {key: median(times) for key, times in took.items()}
-    size = {name: bench.size(built[name]) for name in NAMES}
+    size = {name: backend.size(built[name]) for name in NAMES}
     printed = case.share == 0.2 and not case.scattered and not case.shuffled
     rows = [_row(case, name, size, middle, PRINTED.get(name) if printed else None) for name in NAMES]
     bricks = _brick_share(voxels)
@@ -143,7 +146,7 @@ def _row(case: Case, name: str, size: Mapping[str, int], middle: Mapping[tuple[s
     }
 
 
-def _in_numba() -> Bench:
+def _in_numba() -> Backend:
     import numpy as np
 
     from efficientnerf.structures.bricks import BrickTree, FullBricks
@@ -160,15 +163,15 @@ def _in_numba() -> Bench:
         longest = max(len(points) for points in sets.values())
         words, found = np.zeros(longest, np.uint64), np.zeros(longest, bool)
 
-        def ask(structure: Any, what: str) -> None:
+        def query(structure: Any, what: str) -> None:
             structure.query(sets[what], words[: len(sets[what])], found[: len(sets[what])])
 
-        return lambda name: kinds[name].cache(voxels), ask, lambda: None
+        return lambda name: kinds[name].cache(voxels), query, lambda: None
 
-    return Bench(prepare, lambda structure: sum(array.nbytes for array in structure.arrays.values()))
+    return Backend(prepare, lambda structure: sum(array.nbytes for array in structure.arrays.values()))
 
 
-def _in_torch(device: str) -> Bench:
+def _in_torch(device: str) -> Backend:
     import numpy as np
     import torch
 
@@ -187,7 +190,7 @@ def _in_torch(device: str) -> Bench:
 
         return cache, lambda structure, what: structure.query(points[what]), torch.cuda.synchronize if device == "cuda" else lambda: None
 
-    return Bench(prepare, lambda structure: sum(tensor.nbytes for tensor in structure.tensors.values()))
+    return Backend(prepare, lambda structure: sum(tensor.nbytes for tensor in structure.tensors.values()))
 
 
 def _brick_share(voxels: Voxels) -> float:
@@ -199,18 +202,18 @@ def _brick_share(voxels: Voxels) -> float:
     return float(occupied.mean())
 
 
-def _explained(points: int) -> list[str]:
+def _explained(points: int, timings: Repetitions) -> list[str]:
     return [
         f"Each voxel has four half-precision values, copied as one 64-bit word by every structure. A query looks about {points:,} points up: at random, "
         "and along the rays of cameras around the grid, in the order in which a renderer marches them. Caching builds from a list of voxels in the order "
-        f"of the grid, memory taken and cleared included. Medians of {CACHINGS} cachings and {QUERIES} queries, the structures in turn.",
+        f"of the grid, memory taken and cleared included. Medians of {timings.cachings} cachings and {timings.queries} queries, the structures in turn.",
         "The paper: 1024³, 20 % valid, four values of probably four bytes, all points of the grid in one query, on one RTX 3090; it does not say how the "
         "voxels lie. Its sparse tensor and NerfTree take less than 20 % of dense voxels, not possible where each value is stored once in the same type.",
     ]
 
 
-class _Others:
-    """How busy the machine was with anything else since this was made."""
+class _OtherLoad:
+    """Share of the processor time that other programs took since this was made."""
 
     def __init__(self) -> None:
         self.start, self.own = self._read(), self._own()
@@ -234,7 +237,7 @@ class _Others:
         return max(now[0] - self.start[0] - (self._own() - self.own), 0) / (now[1] - self.start[1])
 
 
-def _machine(busy: _Others) -> str:
+def _machine(load: _OtherLoad) -> str:
     """Threads, caches, and what memory can do: reads at random and in a row."""
     import numpy as np
 
@@ -256,7 +259,7 @@ def _machine(busy: _Others) -> str:
         return min(times)
 
     reads, writes = len(where) / best(lambda: gather(table, where, out)), table.nbytes / best(lambda: fill(table, np.uint64(1)))
-    others = busy.share()
+    others = load.share()
     return (
         f"{numba.get_num_threads()} threads, {platform.system()}; memory: {reads / 1e6:.0f} million words a second at random places of 1 GiB, "
         f"{writes / 1e9:.1f} GB/s written in a row; caches: {_caches()}; other programs took "
