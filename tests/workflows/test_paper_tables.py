@@ -100,7 +100,7 @@ def test_every_table_can_be_made_of_figures(number: str, tmp_path: Path, monkeyp
         assert document["rows"][-1]["less time %" + PAPER] == pytest.approx(88.6, abs=0.1)
         assert "do not count: valid on chair" in notes
     else:
-        assert "All rows are pictures" in notes
+        assert "All rows have converged" in notes
     if number == "1":
         assert document["rows"][0]["valid %" + PAPER] == 9.58
 
@@ -126,7 +126,7 @@ def test_a_table_from_end_to_end_goes_on_with_its_runs(tmp_path: Path, capsys: p
 
 
 def test_a_tree_is_measured_on_as_many_views_as_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the device that was asked for, its pictures' way back to the host not counted."""
+    """On the requested device, without the copy back to the host."""
     import numpy as np
 
     from efficientnerf.asset.tree import NerfTree
@@ -164,7 +164,7 @@ def test_scenes_are_found_and_their_absence_is_told(tmp_path: Path) -> None:
         scenes(tmp_path / "none")
 
 
-def test_figures_say_whether_they_are_a_picture() -> None:
+def test_figures_say_whether_they_have_converged() -> None:
     some: Any = made_up(0.1, 21.9)
-    assert not some.counts
-    assert dataclasses.replace(some, psnr=22.0).counts
+    assert not some.converged
+    assert dataclasses.replace(some, psnr=22.0).converged

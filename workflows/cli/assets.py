@@ -1,4 +1,4 @@
-"""`enerf diff` and `enerf convert`: what can be done with asset files and nothing else."""
+"""`enerf diff` and `enerf convert`: commands on asset files."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ DIFFERENT = 6  # exit code of `enerf diff`; 1 would be that of a defect
 LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asset.serialisation.WRITERS, which a test compares; that import is heavy
 
 
-@click.command(short_help="Compare two assets: what they say, their tensors, their pictures.")
+@click.command(short_help="Compare two assets: metadata, tensors, renders.")
 @click.argument("first", metavar="A", type=folder_type)
 @click.argument("second", metavar="B", type=folder_type)
-@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Pictures to compare, from around A; 0: none.")
-@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels along a side of the pictures.")
+@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Renders to compare, from around A; 0: none.")
+@click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels along a side of the renders.")
 @json_option
 @quiet_option
 @common_options
 def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet: bool) -> int:
-    """Say which metadata and tensors of the assets (or the runs' assets) A and B differ, and by how many decibels their pictures do.
+    """Say which metadata and tensors of the assets (or the runs' assets) A and B differ, and the PSNR between their renders.
 
     Exit code 0 if they are equal, 6 if they differ, 4 if one is damaged.
     """

@@ -1,4 +1,4 @@
-"""Whether torch could use CUDA here, without importing torch: that takes seconds, and a run with nothing to do needs none."""
+"""Whether torch can use CUDA, found out without importing torch, which takes seconds."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cuda_device_count() -> int:
     if visible is not None and visible.strip() in ("", "-1"):
         return 0
     try:
-        # Unlike the driver itself, this library can be asked without making the process unfit for forking.
+        # Unlike the driver itself, this library leaves the process fit for forking.
         library = ctypes.CDLL("libnvidia-ml.so.1")
         if library.nvmlInit_v2() != 0:
             return 0
@@ -46,14 +46,14 @@ def has_cuda() -> bool:
 
 
 def _torch_sees_one() -> bool:
-    """The last word; takes the seconds that importing torch takes."""
+    """Whether torch itself finds a CUDA device; importing it takes seconds."""
     import torch
 
     return torch.cuda.is_available()
 
 
 def resolve_device(wanted: str) -> str:
-    """`auto`, `cpu` or `cuda` as `cpu` or `cuda`; UsageError where cuda is asked for and there is none."""
+    """`auto`, `cpu` or `cuda` as `cpu` or `cuda`; UsageError where cuda is requested and there is none."""
     if wanted == "cpu":
         return "cpu"
     if has_cuda():

@@ -1,4 +1,4 @@
-"""How an error reaches the user: one or two lines, an exit code, and with --json an object as the last line."""
+"""Errors for the user: one or two lines, an exit code, and with --json an object as the last line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`enerf export`, `enerf render` and `enerf inspect`: what can be done with a run, and mostly with an asset file alone."""
+"""`enerf export`, `enerf render` and `enerf inspect`: commands on a run or an asset file."""
 
 from __future__ import annotations
 
@@ -113,12 +113,12 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
     return settings
 
 
-@click.command(short_help="Draw a turntable, or the cameras of a JSON path.")
+@click.command(short_help="Render a turntable, or the cameras of a JSON path.")
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder for frame_0000.png and so on; made if need be.")
 @click.option("--path", "camera_path", type=folder_type, metavar="JSON", help="A camera path as nerfstudio exports it, in the frame of the capture.")
-@click.option("--frames", type=click.IntRange(1, 9999), help="Pictures of the turntable.")
-@click.option("--width", type=click.IntRange(16, 8192), help="Pixels; with --path in place of what the file says.")
+@click.option("--frames", type=click.IntRange(1, 9999), help="Frames of the turntable.")
+@click.option("--width", type=click.IntRange(16, 8192), help="Pixels; with --path in place of the file's.")
 @click.option("--height", type=click.IntRange(16, 8192), help="Pixels.")
 @click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb.")
 @click.option("--video", metavar="FILE", type=folder_type, help="Also write the frames as an MP4 (H.264).")
@@ -127,7 +127,7 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @quiet_option
 @common_options
 def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any) -> None:
-    """Draw RUN's asset or ASSET from all around, or along a camera path, into DIR.
+    """Render RUN's asset or ASSET from all around, or along a camera path, into DIR.
 
     The settings of the stage turntable hold here too: '--set turntable.elevation=30'. Frames that exist are replaced.
     """

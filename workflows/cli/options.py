@@ -29,5 +29,5 @@ def workflow() -> Workflow:
 
 
 def common_options(command: C) -> C:
-    """--debug, which main() looks for itself: it must work before a command line has been understood."""
+    """--debug, which main() finds by itself, so that it holds for errors of the command line too."""
     return click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")(command)

@@ -1,4 +1,4 @@
-"""How a run shows itself: bars on a terminal, lines in a log, one JSON object per event, or nothing but warnings.
+"""Displays of a run: bars on a terminal, lines in a log, one JSON object per event, or nothing but warnings.
 
 Each display is a callable that takes the engine's events. Everything for people goes to standard error; standard output is left to
 results.
@@ -40,14 +40,14 @@ def size(count: float) -> str:
 
 
 def facts(event: Event) -> str:
-    """What an event says beside its text, as `loss 0.0123, psnr 24.1`."""
+    """Facts of an event beside its text, as `loss 0.0123, psnr 24.1`."""
     known = {"event", "stage", "time", "done", "total", "text", "left"}
     shown = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in event.items() if name not in known]
     return ", ".join(shown)
 
 
 def sentence(event: Event) -> str:
-    """An event in words, without its stage; empty for those that say nothing to people."""
+    """An event in words, without its stage; empty for those that are not shown."""
     match event["event"]:
         case "stage_started":
             reason = event.get("reason")

@@ -16,7 +16,7 @@ from workflows.cli.target import check_names, open_run, resume_command
 
 @dataclass(frozen=True)
 class Options:
-    """What was asked for on the command line; None or empty where nothing was said."""
+    """The options of the command line; None or empty where not given."""
 
     source: Path | None = None
     format: str | None = None
@@ -32,7 +32,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """A run as it will be, nothing of it written yet.
+    """A run before it is written.
 
     run       a Run with the new settings
     new       whether its folder has yet to be made
@@ -65,7 +65,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     preset = options.preset or config.options.get("preset")
     standing = _standing(path)
     if standing is None:
-        # Before anything else: a wrong folder must not be answered with a remark about settings.
+        # Before anything else: a wrong folder is the first thing to report.
         Run(path, resume_text=resume_command).check_free()
         if options.source is None:
             raise UsageError(f"{path}: no run is there. To begin one: enerf run SOURCE --out {path}")

@@ -1,4 +1,4 @@
-"""From presets, files and options to the settings of every stage: names checked, values typed, the last word wins.
+"""Settings of all stages from presets, files and options: names and values are checked, later sources override earlier ones.
 
 The order is: the defaults of the dataclasses, the preset, the configuration file, `--set`, the dedicated options. A table here is
 what TOML gives: `{stage: {setting: value}}`.
@@ -187,7 +187,7 @@ class Settings:
         self.put(stage, name, parse_value(value.strip()), f"--set {text}")
 
     def put_seed(self, seed: int) -> None:
-        """Every stage that draws random numbers has a setting `seed`."""
+        """Set `seed` in every stage that has it."""
         for stage, entries in self.about.items():
             if "seed" in entries:
                 self.put(stage, "seed", [seed], f"--seed {seed}")

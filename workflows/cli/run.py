@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
 @click.option("--from", "start", metavar="STAGE", help="Do this stage and those after it again, even if they are up to date.")
 @device_option
-@click.option("--seed", type=int, help="The seed of every stage that draws random numbers.")
+@click.option("--seed", type=int, help="Seed of every stage with random choices.")
 @click.option("--budget", metavar="TIME", help="Train for so long, as 90s, 10m or 1h, in place of a number of steps: train.time_budget.")
 @click.option("--strict", is_flag=True, help="Refuse a source of which anything is missing or unreadable.")
 @click.option("--allow-outside", is_flag=True, help="Let a data set name files outside of its folder.")

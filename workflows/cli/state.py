@@ -10,12 +10,12 @@ import click
 from workflows.cli.options import common_options, folder_type, json_option, quiet_option, workflow
 
 
-@click.command(short_help="Say of each stage whether it is up to date, and why not.")
+@click.command(short_help="Show for each stage whether it is up to date, and why not.")
 @click.argument("run_folder", metavar="RUN", type=folder_type)
 @json_option
 @common_options
 def status(run_folder: Path, as_json: bool) -> None:
-    """Say of each stage of RUN whether it is fresh, stale, missing, partial or corrupt, with the reason, its seconds and its size.
+    """Show for each stage of RUN whether it is fresh, stale, missing, partial or corrupt, with the reason, its seconds and its size.
 
     Files whose size and time of change are the same are taken to be the same; 'enerf verify' reads them.
     """
@@ -111,12 +111,12 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
         click.echo(f"{run.path}: {len(outcomes)} stages, {size(total)}, all as written")
 
 
-@click.command(short_help="Write a page about a run: pictures, figures, settings.")
+@click.command(short_help="Write a page about a run: renders, figures, settings.")
 @click.argument("run_folder", metavar="RUN", type=folder_type)
 @json_option
 @common_options
 def report(run_folder: Path, as_json: bool) -> None:
-    """Write RUN/report.html: what was made, how it looks, how good it is, of what settings. 'enerf run' writes it, too, when it is done."""
+    """Write RUN/report.html: files, renders, metrics and settings of RUN. 'enerf run' writes it when it is done."""
     from pipeline.decide import survey
     from workflows.cli.progress import write_json
     from workflows.cli.target import check_names, open_run

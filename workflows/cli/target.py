@@ -1,4 +1,4 @@
-"""What a path on the command line is: a run, an asset, a stage's folder, a file of a known kind, or a data set."""
+"""Kinds of paths on the command line: a run, an asset, a stage's folder, a file of a known kind, or a data set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What two assets have in common, in the file and in pictures."""
+"""Comparison of two assets: metadata, tensors and renders."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
-PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal pictures get this
+PSNR_CAP = 100.0  # decibels: JSON has no infinity; equal renders get this
 
 
 def compare(first: Path, second: Path, views: int, size: int) -> dict[str, Any]:
-    """Metadata and tensors that differ, and the PSNR between pictures of `size` pixels a side from `views` places on the first one's orbit.
+    """Metadata and tensors that differ, and the PSNR between renders of `size` pixels a side from `views` cameras on the first one's orbit.
 
     `equal` says that all tensors and all metadata are the same, whatever the order and the padding of the header.
     """
     from efficientnerf.asset.format import contents
     from workflows.cli.target import asset_of, load_asset
 
-    a, b = load_asset(first), load_asset(second)  # refuses files that are damaged before anything is said about them
+    a, b = load_asset(first), load_asset(second)  # refuses damaged files first
     (meta_a, tensors_a), (meta_b, tensors_b) = (contents(asset_of(path)) for path in (first, second))
     metadata = {key: [meta_a.get(key), meta_b.get(key)] for key in sorted({*meta_a, *meta_b}) if meta_a.get(key) != meta_b.get(key)}
-    tensors = {name: _said(tensors_a.get(name), tensors_b.get(name)) for name in sorted({*tensors_a, *tensors_b})}
+    tensors = {name: _difference(tensors_a.get(name), tensors_b.get(name)) for name in sorted({*tensors_a, *tensors_b})}
     equal = not metadata and set(tensors.values()) <= {"same"}
     found: dict[str, Any] = {"equal": equal, "metadata": metadata, "tensors": tensors, "psnr": None, "views": []}
     if views:
-        found["views"] = [PSNR_CAP] * views if equal else _pictures(a, b, views, size)
+        found["views"] = [PSNR_CAP] * views if equal else _psnr_of_renders(a, b, views, size)
         found["psnr"] = sum(found["views"]) / views
     return found
 
 
-def _said(a: dict[str, Any] | None, b: dict[str, Any] | None) -> str:
+def _difference(a: dict[str, Any] | None, b: dict[str, Any] | None) -> str:
     if a is None or b is None:
         return "only in the second" if a is None else "only in the first"
     if a == b:
@@ -41,7 +41,7 @@ def _said(a: dict[str, Any] | None, b: dict[str, Any] | None) -> str:
     return f"{a['dtype']} {a['shape']} and {b['dtype']} {b['shape']}"
 
 
-def _pictures(a: NerfTree, b: NerfTree, views: int, size: int) -> list[float]:
+def _psnr_of_renders(a: NerfTree, b: NerfTree, views: int, size: int) -> list[float]:
     from efficientnerf.asset.rendering import render
     from efficientnerf.evaluation.metrics import psnr
     from stages.framing.camera_paths import turntable_cameras
@@ -57,7 +57,7 @@ def in_words(found: dict[str, Any]) -> str:
     lines = [f"{key:<24} {_short(a)} -> {_short(b)}" for key, (a, b) in found["metadata"].items()]
     lines += [f"{name:<24} {said}" for name, said in found["tensors"].items() if said != "same"]
     if found["views"]:
-        lines.append(f"{'pictures':<24} {found['psnr']:.2f} dB apart (PSNR), mean of {len(found['views'])} views; least {min(found['views']):.2f}")
+        lines.append(f"{'renders':<24} {found['psnr']:.2f} dB apart (PSNR), mean of {len(found['views'])} views; least {min(found['views']):.2f}")
     return "\n".join(lines)
 
 

@@ -93,7 +93,7 @@ def shown(value: Any) -> str:
 
 
 def hardware(device: str) -> dict[str, Any]:
-    """What the figures were measured on: they mean nothing without it."""
+    """What the figures were measured on."""
     name = platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

@@ -1,4 +1,4 @@
-"""The runs behind a table: settings from the preset `paper-n4`, shrunk where asked, trained through the engine, and measured.
+"""The runs behind a table: settings from the preset `paper-n4`, shrunk by a scale, trained through the engine, and measured.
 
 A row's run is an ordinary run folder, OUT/runs/<scene>/<row>: it resumes after an interruption, and `enerf status` and the rest work on it.
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pipeline.run import Run
 
 PRESET = "paper-n4"
-FEWEST_DECIBELS = 22.0  # less is not a picture: such a row says nothing about the method
+CONVERGED_PSNR = 22.0  # less is not converged: such a row says nothing about the method
 SCENES_OF = {"transforms_train.json", "transforms.json", "poses_bounds.npy"}
 
 
@@ -66,9 +66,9 @@ class Figures:
     tree: Mapping[str, Any] | None = None
 
     @property
-    def counts(self) -> bool:
-        """Whether it is a picture."""
-        return self.psnr >= FEWEST_DECIBELS
+    def converged(self) -> bool:
+        """Whether it has converged."""
+        return self.psnr >= CONVERGED_PSNR
 
 
 def scenes(data: Path) -> list[Path]:
@@ -84,13 +84,11 @@ def scenes(data: Path) -> list[Path]:
 
 
 def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[str, Any]]:
-    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, voxels 0.225, batches 0.2, widths 0.15, depths 0.05.
+    """Settings shrunk together: iterations by `scale`, and by powers of it: image sides 0.3, density voxels 0.225, batches 0.2, widths 0.15, depths 0.05.
 
-    Samples along a ray stay as they are, so that ratios between rows keep their meaning. The rate rises by the third root, for networks are small
-    and time is short, and falls less over the run; the warm-up becomes a larger share of it, since pruning must wait until the coarse network knows where
-    matter is, and more rays are looked at whole, to bring back what was pruned by mistake. As in the paper, voxels learn from rays alone: asking about
-    them densely besides pruned them sooner, and chair was no better for it. How often rays meet a voxel depends on the exponent of the voxels: at a
-    scale of 0.001 chair ended with 6.0 % of its samples valid with 0.25, 12.2 % with 0.2, at the same PSNR (the paper: 9.6 %).
+    Samples on a ray stay, so that ratios between rows keep their meaning. The learning rate rises by the third root and falls less over the run, for
+    small networks and few steps. The warm-up becomes a larger fraction of the steps, because pruning must wait until the coarse network has converged,
+    and pruned samples are evaluated on more rays, which recovers density that was pruned by mistake.
     """
     if scale == 1:
         return stages
@@ -106,7 +104,7 @@ def scaled(stages: dict[str, dict[str, Any]], scale: float) -> dict[str, dict[st
         train[name] = width(train[name])
     for name in ("num_layers", "coarse_num_layers"):
         train[name] = max(2, round(train[name] * scale**0.05))
-    train["occupancy_resolution"] = max(32, 8 * round(train["occupancy_resolution"] * scale**0.225 / 8))
+    train["occupancy_resolution"] = max(32, 8 * round(train["occupancy_resolution"] * scale**0.225 / 8))  # docs/experiments/occupancy.md
     train["learning_rate"] = train["learning_rate"] / scale ** (1 / 3)
     train["lr_decay_steps"] = max(1, round(train["lr_decay_steps"] * scale**0.9))
     train["occupancy_warmup_steps"] = round(train["iterations"] * min(0.35, train["occupancy_warmup_steps"] / 1e6 * scale**-0.6))
@@ -207,9 +205,9 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
     for view in [views[k] for k in evenly_spaced(len(views), _count(settings["evaluate"]["field_views"]))]:
         rendering = renderer.render(view.camera)
         truth = ground_truth(run.folder("poses"), view, s.background).colour
-        picture = np.clip(rendering.colour, 0, 1)
-        decibels.append(psnr(picture, truth))
-        similarities.append(ssim(picture, truth))
+        image = np.clip(rendering.colour, 0, 1)
+        decibels.append(psnr(image, truth))
+        similarities.append(ssim(image, truth))
         counts += rendering.counts
     quality = {
         "of": key,
@@ -230,7 +228,7 @@ def _count(field_views: int | str) -> int | None:
 
 
 def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None) -> float:
-    """Seconds of a picture; on a device it stays there."""
+    """Seconds of a render; on a device its framebuffer stays there."""
     import time
 
     from efficientnerf.backends import dispatch
@@ -253,7 +251,7 @@ def _frame_seconds(tree: NerfTree, camera: Camera, background: tuple[float, floa
 
 
 def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
-    """PSNR and SSIM of the baked tree on `wanted` of the test views (None: all), those of the network, and how many frames it draws in a second at
+    """PSNR and SSIM of the baked tree on the test views of the network (`wanted` of them, None: all), and frames a second at
     their size."""
     import numpy as np
 
@@ -270,11 +268,11 @@ def _tree_figures(run: Run, wanted: int | None, device: str) -> dict[str, Any]:
     _frame_seconds(tree, drawn[0].camera, s.background)  # compiled, and in memory
     decibels, similarities, seconds = [], [], []
     for view in drawn:
-        picture = render(tree, view.camera, background=s.background).colour
+        image = render(tree, view.camera, background=s.background).colour
         seconds.append(_frame_seconds(tree, view.camera, s.background))
         truth = ground_truth(run.folder("poses"), view, s.background).colour
-        decibels.append(psnr(np.clip(picture, 0, 1), truth))
-        similarities.append(ssim(np.clip(picture, 0, 1), truth))
+        decibels.append(psnr(np.clip(image, 0, 1), truth))
+        similarities.append(ssim(np.clip(image, 0, 1), truth))
     size = BakeOutputs.of_run(run.path).asset.stat().st_size
     camera = drawn[0].camera
     return {

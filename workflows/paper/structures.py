@@ -204,7 +204,7 @@ def _brick_share(voxels: Voxels) -> float:
 
 def _explained(points: int, timings: Repetitions) -> list[str]:
     return [
-        f"Each voxel has four half-precision values, copied as one 64-bit word by every structure. A query looks about {points:,} points up: at random, "
+        f"Each voxel has four half-precision values, copied as one 64-bit word by every structure. A query looks up about {points:,} points: at random, "
         "and along the rays of cameras around the grid, in the order in which a renderer marches them. Caching builds from a list of voxels in the order "
         f"of the grid, memory taken and cleared included. Medians of {timings.cachings} cachings and {timings.queries} queries, the structures in turn.",
         "The paper: 1024³, 20 % valid, four values of probably four bytes, all points of the grid in one query, on one RTX 3090; it does not say how the "

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from workflows.paper.result import PAPER, Request, Result
-from workflows.paper.runs import FEWEST_DECIBELS, Figures, Row, measured, scenes, settings_of
+from workflows.paper.runs import CONVERGED_PSNR, Figures, Row, measured, scenes, settings_of
 
 # Table 1, percent: valid, pivotal.
 SHARES = {
@@ -20,10 +20,10 @@ NERF: dict[str, Any] = {
 }  # fmt: skip
 LARGE = {"coarse_hidden_dim": 256, "coarse_num_layers": 8}
 SMALL = {"hidden_dim": 128, "num_layers": 4}
-# The fine stage by importance cannot tell 128 coarse samples from 64 in its own cost; NeRF's counts are kept until pivotal sampling comes.
+# NeRF's numbers of samples, for the rows before pivotal sampling.
 IMPORTANCE = {"num_coarse_samples": 64, "num_importance_samples": 128}
 
-TIMED = "Frames/s are of drawing alone: on a device pictures stay there."
+TIMED = "Frames/s are of rendering alone: on a device the framebuffer stays there."
 FIT = "The tree's values were fitted to the training images after they were baked, so that it may be ahead of its network; the paper caches the network's."
 
 
@@ -129,7 +129,7 @@ def modules(request: Request) -> Result:
     notes = [
         f"All modules: {faster:.1f} times as fast as NeRF per iteration in the steady state (median of the last fifth of the run), {overall:.1f} times over the"
         " whole run, warm-up included; the paper: 8.8.",
-        "The row of valid sampling draws its fine samples by importance among the valid ones, and none on rays without any.",
+        "The row of valid sampling takes its fine samples by importance among the valid ones, and none on rays without any.",
     ]
     return Result(columns, table, [*notes, *_notes(request, rows)], curves)
 
@@ -188,9 +188,9 @@ def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
         "All rows share kernels, number type, batch, learning rate and loss. Seconds are of training steps alone; PSNR is of the network on test views.",
     ]
     if request.scale != 1:
-        low = [f"{row.name} on {scene.name}" for row in rows for scene in found if not measured(_quiet(request), scene, row).counts]
-        verdict = f"Rows that are not yet a picture (less than {FEWEST_DECIBELS:g} dB) and do not count: {', '.join(low)}." if low else (
-            f"All rows are pictures (at least {FEWEST_DECIBELS:g} dB)."
+        low = [f"{row.name} on {scene.name}" for row in rows for scene in found if not measured(_quiet(request), scene, row).converged]
+        verdict = f"Rows that have not converged (less than {CONVERGED_PSNR:g} dB) and do not count: {', '.join(low)}." if low else (
+            f"All rows have converged (at least {CONVERGED_PSNR:g} dB)."
         )  # fmt: skip
         notes.append(verdict)
     return notes
@@ -204,7 +204,7 @@ def _quiet(request: Request) -> Request:
 
 def _data(request: Request) -> Any:
     if request.data is None:
-        raise ValueError("a table that trains was asked for without data")
+        raise ValueError("a table that trains needs data")
     return request.data
 
 

@@ -1,6 +1,6 @@
-"""A page about a run, for people who would rather look than read: RUN/report.html.
+"""A page about a run, RUN/report.html: renders, figures and settings.
 
-It is made from what the run holds and points to the pictures there by relative paths, so it may be opened from wherever the run is moved to. It
+It is made from what the run holds and points to the images there by relative paths, so it may be opened from wherever the run is moved to. It
 belongs to no stage's artifact: it can be thrown away and made again. No script, nothing from the network. The template is report.html.j2.
 """
 

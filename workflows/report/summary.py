@@ -13,7 +13,7 @@ from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOu
 from workflows.cli.progress import duration, size
 
 RUN = Path()
-# What people look for in a run, and where it lies.
+# The files of a run that a user wants.
 ARTIFACTS = {
     "scene": PosesOutputs.of_run(RUN).scene,
     "field": TrainOutputs.of_run(RUN).field,
