@@ -4,8 +4,8 @@
                              [--json FILE]
 
 Prints a line and ends where torch has no CUDA device. Each part runs in a process of its own, because an error on a device can break what follows it;
-a part that has not ended after its share of --seconds is stopped and recorded as such. All but the pipeline need torch, triton, numba, scipy and
-safetensors alone (the tests pytest too): neither pycolmap nor this project has to be installed.
+a part that has not ended after its share of --seconds is stopped and recorded as such. All but the pipeline need METHOD alone
+(the tests pytest too): neither pycolmap nor this project has to be installed.
 """
 
 from __future__ import annotations
@@ -29,8 +29,10 @@ ROOT = HERE.parent
 PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
 TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
 TESTS = ["tests/efficientnerf", "--ignore=tests/efficientnerf/test_cuda_builds.py", "-k", "cuda or late or device or gpu"]
+METHOD = ["torch", "triton", "numba", "scipy", "safetensors", "msgspec", "platformdirs"]
 PIPELINE = [
-    "msgspec", "click", "rich", "filelock", "safetensors", "PIL", "cv2", "scipy", "skimage", "matplotlib", "OpenEXR", "av", "trimesh", "fast_simplification",
+    "msgspec", "platformdirs", "jinja2",
+    "click", "rich", "filelock", "safetensors", "PIL", "cv2", "scipy", "skimage", "matplotlib", "OpenEXR", "av", "trimesh", "fast_simplification",
 ]  # fmt: skip
 
 
@@ -89,6 +91,9 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
         options = ["--preset", given.preset, *(word for text in given.sets for word in ("--set", text))]
         with tempfile.TemporaryDirectory(prefix="gpu-") as folder:
             return run(given.source, Path(folder) / "run", options, seconds)
+    missing = [name for name in METHOD if importlib.util.find_spec(name) is None]
+    if missing:
+        return {"left_out": f"not installed here: {', '.join(missing)}"}
     import gpu_asset
     import gpu_kernels
 

@@ -172,7 +172,7 @@ def march_kernel(seconds: float) -> dict[str, Any]:
     from efficientnerf.training.settings import TrainSettings
 
     s = TrainSettings()
-    side = s.occupancy_resolution or 128
+    side = BoundedSpace.occupancy_resolution if s.occupancy_resolution == "auto" else s.occupancy_resolution
     axis = (torch.arange(side) + 0.5) / side * 2 - 1
     distance = (axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2).sqrt()
     voxels = ((distance - 0.6).abs() < 0.04).float()
