@@ -50,7 +50,7 @@ class Contender:
             if next(self.steps, None) is None:
                 self.done = True
             elif self.budget is not None and (fixed := self.budget(self.trainer.step, self.wall + time.perf_counter() - began)) is not None:
-                self.trainer.model.settings = fixed
+                self.trainer.schedule = fixed
                 self.budget = None
         self.wall += time.perf_counter() - began
         self.processor += time.process_time() - used
@@ -69,25 +69,22 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
     from efficientnerf.model import model
     from efficientnerf.rendering.field_renderer import FieldRenderer
     from efficientnerf.training.loop import train, trainer
+    from efficientnerf.training.schedule import schedule_of
     from stages.io import scene
     from stages.io.field_file import space_of
-    from stages.train import anchors_of, pixels_of, stated_range
-    from stages.training.budget import MOST, TIMED
+    from stages.training.budget import TIMED, UNKNOWN
+    from stages.training.data import depth_range, pixels_of, sparse_depth_of
     from stages.training.hash_resolution import with_auto_sizes
 
     s, settings = scene.load(poses), settings_of(preset)
     views = scene.views_of(s, "train")
     pixels = pixels_of(poses, views)
     settings = with_auto_sizes(settings, s, len(pixels))
-    near, far = min(view.near for view in s.views), max(view.far for view in s.views)
-    if settings.far_plane > 0:
-        near, far = stated_range(s, settings)
-        pixels.near[:], pixels.far[:] = near, far
-    hold = settings.occupancy_warmup_steps + TIMED
-    if whole:
-        settings = dataclasses.replace(settings, iterations=MOST, rate_hold=hold)
+    near, far = depth_range(s, pixels, settings)
     m = model(space_of(s), settings, s.background, "cpu", (near, far))
-    t = trainer(m, len(views))
+    hold = settings.occupancy_warmup_steps + TIMED
+    schedule = dataclasses.replace(schedule_of(settings), iterations=UNKNOWN, hold=hold) if whole else schedule_of(settings)
+    t = trainer(m, len(views), schedule)
     warmed: list[tuple[int, float]] = []
 
     def plan(step: int, wall: float) -> Any:
@@ -97,9 +94,9 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
         if step < hold:
             return None
         each = (wall - warmed[0][1]) / (step - warmed[0][0])
-        return dataclasses.replace(settings, iterations=step + max(1, int((seconds - wall) / each)))
+        return dataclasses.replace(schedule, iterations=step + max(1, int((seconds - wall) / each)))
 
-    return Contender(preset, t, iter(train(t, pixels, anchors_of(poses, s))), FieldRenderer(m, near, far), plan if whole else None)
+    return Contender(preset, t, iter(train(t, pixels, sparse_depth_of(poses, s))), FieldRenderer(m, near, far), plan if whole else None)
 
 
 def test_views(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
@@ -158,7 +155,7 @@ def main() -> None:
     run = arguments.runs / arguments.source.name
     command = [sys.executable, "-m", "workflows.cli.main", "run", str(arguments.source), "--out", str(run), "--until", "poses", "--quiet"]
     subprocess.run(command, check=True)
-    from stages.train import use_all_cores
+    from stages.cores import use_all_cores
 
     use_all_cores()
     poses, seconds, load = run / "poses", 60 * arguments.minutes, os.getloadavg()

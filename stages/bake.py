@@ -21,6 +21,7 @@ from pipeline.files import atomic
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
+from stages.cores import use_all_cores
 
 if TYPE_CHECKING:
     from efficientnerf.asset.bake import Visible
@@ -98,7 +99,7 @@ def run(job: Job) -> None:
     from stages.evaluate import constant_background
     from stages.io import scene
     from stages.io.field_file import load_renderer
-    from stages.train import pixels_of, use_all_cores
+    from stages.training.data import pixels_of
 
     settings: BakeSettings = job.settings
     use_all_cores()

@@ -192,7 +192,7 @@ def _looked_into(m: Model, grid: torch.Tensor) -> torch.Tensor:
     Where it says less a pivot is among the lightest of its ray and dropped before the subject, but not before the sky: the network hides what
     the fine field has there just where it would be seen, and nothing in the asset could.
     """
-    if m.coarse is None or m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
+    if m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
         return torch.ones(len(grid), dtype=torch.bool, device=m.device)
     raw = m.coarse(m.snapped_points(grid.float().to(m.device)))[:, 0]
     return activate(raw, m.coarse.activation) > m.voxels.threshold

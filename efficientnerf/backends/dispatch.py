@@ -15,7 +15,8 @@ from torch import Tensor
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.rendering import compositing
 from efficientnerf.rendering.compositing import Composite
-from efficientnerf.sampling import samples
+from efficientnerf.sampling import pivotal as pivotal_sampling
+from efficientnerf.sampling import valid as valid_sampling
 from efficientnerf.sampling.samples import Samples
 
 if TYPE_CHECKING:
@@ -72,14 +73,14 @@ def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
     capacity: int | None = None, *, whole: int = 0,
 ) -> Samples:  # fmt: skip
-    """See `efficientnerf.sampling.samples.valid_samples`; `capacity` is for the Triton kernels alone, see `efficientnerf.backends.triton.sampling`."""
+    """See `efficientnerf.sampling.valid.valid_samples`; `capacity` is for the Triton kernels alone, see `efficientnerf.backends.triton.sampling`."""
     if on_device(origins, directions, near, far, offset, voxels):
         from efficientnerf.backends.triton import sampling as cuda_sampling
 
         return cuda_sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, capacity, whole=whole)
     _refuse(capacity)
     if not _fast(origins, directions, near, far, offset, voxels):
-        return samples.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, whole=whole)
+        return valid_sampling.valid_samples(space, origins, directions, near, far, offset, step, slots, voxels, threshold, whole=whole)
     from efficientnerf.backends.numba import sampling as cpu
 
     *packed, tried = cpu.valid_samples(
@@ -101,13 +102,13 @@ def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activat
 
 
 def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
-    """See `efficientnerf.sampling.samples.select_pivots`."""
+    """See `efficientnerf.sampling.pivotal.select_pivots`."""
     if on_device(weight):
         from efficientnerf.backends.triton import sampling as cuda_sampling
 
         return cuda_sampling.select_pivots(weight, first, threshold, most)
     if not _fast(weight):
-        return samples.select_pivots(weight, first, threshold, most)
+        return pivotal_sampling.select_pivots(weight, first, threshold, most)
     from efficientnerf.backends.numba import sampling as cpu
 
     out = torch.empty(len(weight), dtype=torch.bool)
@@ -118,14 +119,14 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) ->
 def pivotal_samples(
     space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int, capacity: int | None = None
 ) -> Samples:
-    """See `efficientnerf.sampling.samples.pivotal_samples`; `capacity` as for `valid_samples`."""
+    """See `efficientnerf.sampling.pivotal.pivotal_samples`; `capacity` as for `valid_samples`."""
     if on_device(origins, directions, offset, coarse.start):
         from efficientnerf.backends.triton import sampling as cuda_sampling
 
         return cuda_sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot, capacity)
     _refuse(capacity)
     if not _fast(origins, directions, offset, coarse.start):
-        return samples.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
+        return pivotal_sampling.pivotal_samples(space, origins, directions, offset, coarse, pivotal, per_pivot)
     from efficientnerf.backends.numba import sampling as cpu
 
     fine = cpu.pivotal_samples(

@@ -1,27 +1,47 @@
-"""Fields: position in; density (before its activation) and harmonics out. One contract, one file per field.
+"""Fields: from a point of space to density and colour. One contract, one module a field.
 
-    field(points)          (N, 3) grid coordinates -> (N, 1 + 3K)
-    field.density(points)  (N, 3) -> (N,) the density alone, before its activation
-    field.activation       "exp" or "softplus"
-    field.degree           of the harmonics
-
-The original NeRF's field alone is asked with directions beside the points, has K = 1 and cannot be baked.
+    hash  multiresolution hash grid        mlp  the paper's networks        nerf  the original NeRF's, for comparison
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    import torch
+    from torch import Tensor, nn
+
+    from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 
 class Field(Protocol):
+    """What a field offers. N points in grid coordinates, R rays, K spherical harmonics.
+
+    activation         "exp" or "softplus": from a raw density to a density >= 0 (`efficientnerf.rendering.compositing.activate`)
+    degree             of the spherical harmonics
+    gradient_buffers   of tables whose gradient is summed outside of autograd, by the parameter's name
+    field(points)      (N, 3) to (N, 1 + 3K): raw density and coefficients. Fields whose colour depends on the direction otherwise have none, and
+                       cannot be baked
+    """
+
     activation: str
     degree: int
 
-    def __call__(self, points: Tensor) -> Tensor: ...
+    @property
+    def gradient_buffers(self) -> dict[str, GradientBuffer]: ...
 
-    def density(self, points: Tensor) -> Tensor: ...
+    def __call__(self, *args: Any) -> Tensor: ...
 
-    def parameters(self) -> object: ...
+    def density(self, points: Tensor) -> Tensor:
+        """Raw density (N,) at points (N, 3)."""
+
+    def along_rays(self, points: Tensor, directions: Tensor, first: Tensor) -> Tensor:
+        """(N, 1 + 3K) at points (N, 3) of rays along unit directions (R, 3); ray r owns points first[r] to first[r + 1]."""
+
+    def harmonics(self, directions: Tensor) -> Tensor:
+        """(R, K) factors of the coefficients along unit directions (R, 3)."""
+
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]: ...
+
+    def to(self, device: str | torch.device) -> Any: ...

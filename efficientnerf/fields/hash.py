@@ -17,12 +17,14 @@ from torch import Tensor, nn
 from efficientnerf.backends.dispatch import on_device
 from efficientnerf.backends.numba.hash_grid import PRIME_Y, PRIME_Z
 from efficientnerf.backends.torch.linear_chain import precision_of
+from efficientnerf.fields.bakeable import BakeableField
+from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.rendering.harmonics import harmonics_count
 
 FEATURES = 2
 
 
-class HashField(nn.Module):
+class HashField(BakeableField):
     """hidden x layers ReLU network over 2L features; see `efficientnerf.fields`."""
 
     activation = "exp"
@@ -43,6 +45,7 @@ class HashField(nn.Module):
         self.starts = np.array([0, *np.cumsum(counts)[:-1]], np.int64)
         self.mask = np.uint32(size - 1)
         self.table = nn.Parameter((torch.rand(sum(counts), FEATURES, generator=generator) * 2 - 1) * 1e-4)
+        self.table_gradient = GradientBuffer()
         widths = [levels * FEATURES, *[hidden] * layers, 1 + 3 * harmonics_count(degree)]
         self.weights = nn.ParameterList()
         for inputs, outputs in itertools.pairwise(widths):
@@ -52,6 +55,10 @@ class HashField(nn.Module):
         self.weights[-1].data.mul_(0.1)
         self.log_initial_density = math.log(initial_density)
         self.precision = precision
+
+    @property
+    def gradient_buffers(self) -> dict[str, GradientBuffer]:
+        return {"table": self.table_gradient}
 
     def forward(self, points: Tensor) -> Tensor:
         return self._network(points, self.weights[-1])
@@ -99,18 +106,12 @@ def _encoded(points: Tensor, table: Tensor, field: HashField) -> tuple[Tensor, T
     return turned, out
 
 
-def _add_table_gradient(points: Tensor, grad: Tensor, table: Tensor, field: HashField) -> None:
-    """Add to the table's gradient what features (2L, N) pull at points (3, N).
-
-    It is added here, and not handed to autograd, because a step looks through a field more than once and each sum over the whole table costs as much
-    as the encoding. The buffer is the one that `Adam` left cleared, if there is one.
-    """
+def _encode_backward(points: Tensor, grad: Tensor, table: Tensor, field: HashField) -> None:
+    """Add the gradient of the table for features' gradients (2L, N) at points (3, N) to the field's buffer."""
     from efficientnerf.backends.numba import hash_grid
 
-    if table.grad is None:
-        cleared = table.__dict__.pop("cleared_grad", None)
-        table.grad = torch.zeros_like(table) if cleared is None else cleared
-    hash_grid.encode_backward(points.numpy(), grad.numpy(), field.sides, field.dense, field.starts, field.mask, table.grad.numpy())
+    accumulator = field.table_gradient.accumulator(table)
+    hash_grid.encode_backward(points.numpy(), grad.numpy(), field.sides, field.dense, field.starts, field.mask, accumulator.numpy())
 
 
 class _Encode(torch.autograd.Function):
@@ -123,7 +124,7 @@ class _Encode(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[None, ...]:
-        _add_table_gradient(ctx.saved_tensors[0], grad.t().contiguous(), ctx.table, ctx.field)
+        _encode_backward(ctx.saved_tensors[0], grad.t().contiguous(), ctx.table, ctx.field)
         return None, None, None
 
 
@@ -147,9 +148,9 @@ class _Network(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         from efficientnerf.backends.numba import mlp
 
-        pull, of_weights = mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
+        of_features, of_weights = mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
         ctx.kept = None
-        _add_table_gradient(ctx.at, torch.from_numpy(pull), ctx.table, ctx.field)
+        _encode_backward(ctx.at, torch.from_numpy(of_features), ctx.table, ctx.field)
         return None, None, None, None, *map(torch.from_numpy, of_weights)
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from efficientnerf.backends.torch.linear_chain import chain, precision_of
+from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.rendering.harmonics import harmonics_count
 
 FREQUENCIES = 10
@@ -45,7 +46,7 @@ def linear_layers(shapes: list[tuple[int, int]], generator: torch.Generator) -> 
     return weights, biases
 
 
-class MlpField(nn.Module):
+class MlpField(BakeableField):
     """`layers` of `hidden` units; the input enters again in the middle. See `efficientnerf.fields`.
 
     precision  "auto", "float32" or "bfloat16": what products are computed in (`efficientnerf.backends.torch.linear_chain`)
@@ -63,12 +64,12 @@ class MlpField(nn.Module):
         self.weights, self.biases = linear_layers(list(zip(widths, outputs, strict=True)), generator)
 
     def forward(self, points: Tensor) -> Tensor:
-        return self._ask(points, self.weights[-1], self.biases[-1])
+        return self._network(points, self.weights[-1], self.biases[-1])
 
     def density(self, points: Tensor) -> Tensor:
-        return self._ask(points, self.weights[-1][:1], self.biases[-1][:1])[:, 0]
+        return self._network(points, self.weights[-1][:1], self.biases[-1][:1])[:, 0]
 
-    def _ask(self, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    def _network(self, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         weights, biases = [*list(self.weights)[:-1], weight], [*list(self.biases)[:-1], bias]
         precision = precision_of(self.precision, points.device.type)
         return chain(positional_encoding(points * 2 - 1), weights, biases, skip=self.skip, precision=precision)

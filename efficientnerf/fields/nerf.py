@@ -6,20 +6,25 @@ frequencies, 27 numbers) goes through one layer of half the width to the colour.
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
 from efficientnerf.backends.torch.linear_chain import chain, precision_of
+from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.fields.mlp import FREQUENCIES, linear_layers, positional_encoding
+from efficientnerf.rendering.compositing import ray_of_sample
 
 DIRECTION_FREQUENCIES = 4
 
 
 class NerfField(nn.Module):
-    """See `efficientnerf.fields`; asked with the samples' directions beside their points, it says the density and the colour before its sigmoid."""
+    """See `efficientnerf.fields`; its values are the density and the colour before its sigmoid."""
 
     activation = "softplus"
     degree = 0  # one coefficient a colour, of a constant
+    gradient_buffers: ClassVar[dict[str, GradientBuffer]] = {}
 
     def __init__(self, *, hidden: int, layers: int, generator: torch.Generator, precision: str = "float32") -> None:
         super().__init__()
@@ -33,12 +38,18 @@ class NerfField(nn.Module):
         self.colour_weights, self.colour_biases = linear_layers([(hidden + directions, hidden // 2), (hidden // 2, 3)], generator)
 
     def forward(self, points: Tensor, directions: Tensor) -> Tensor:
-        """(N, 4) at points (N, 3) in grid coordinates, seen along unit directions (N, 3)."""
+        """(N, 4) at points (N, 3) in grid coordinates, along unit directions (N, 3)."""
         precision = precision_of(self.precision, points.device.type)
         both = chain(positional_encoding(points * 2 - 1), list(self.weights), list(self.biases), skip=self.skip, precision=precision)
-        seen = torch.cat([both[:, 1:], positional_encoding(directions, DIRECTION_FREQUENCIES)], dim=-1)
-        colour = chain(seen, list(self.colour_weights), list(self.colour_biases), precision=precision)
+        inputs = torch.cat([both[:, 1:], positional_encoding(directions, DIRECTION_FREQUENCIES)], dim=-1)
+        colour = chain(inputs, list(self.colour_weights), list(self.colour_biases), precision=precision)
         return torch.cat([both[:, :1], colour], dim=-1)
+
+    def along_rays(self, points: Tensor, directions: Tensor, first: Tensor) -> Tensor:
+        return self.forward(points, directions[ray_of_sample(first, len(points))])
+
+    def harmonics(self, directions: Tensor) -> Tensor:
+        return torch.ones_like(directions[:, :1])  # the colour is the network's
 
     def density(self, points: Tensor) -> Tensor:
         weights, biases = [*list(self.weights)[:-1], self.weights[-1][:1]], [*list(self.biases)[:-1], self.biases[-1][:1]]

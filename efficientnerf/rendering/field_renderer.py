@@ -73,7 +73,7 @@ def valid_count(m: Model, outputs: RayOutputs) -> int:
         return len(outputs.coarse.start)
     density = outputs.coarse_raw[:, 0]
     if m.voxels.rule == "maximum":
-        density = activate(density, m.proposal_field.activation)
+        density = activate(density, m.coarse.activation)
     return int((density > m.voxels.threshold).sum())
 
 

@@ -20,7 +20,6 @@ from torch import Tensor
 
 from efficientnerf.backends import transfer
 from efficientnerf.backends.transfer import to_device
-from efficientnerf.rendering.compositing import sample_weights
 
 
 @dataclass
@@ -117,21 +116,6 @@ def _blend(flat: Tensor, beta: float, cell: Tensor, density: Tensor, real: Tenso
     flat.index_put_((cell,), torch.where((counts > 0) & ~torch.isneginf(old), (1 - beta) * old + beta * mean, old))
 
 
-DEEPEST = 1.0  # optical depth of an interval at most, where voxels alone say what hides what
-
-
-def voxel_weights(voxels: DensityVoxels, point: Tensor, length: Tensor, first: Tensor) -> Tensor:
-    """(N,) weights of coarse samples by the density that the voxels remember, in place of a coarse field's.
-
-    A voxel remembers the largest density anywhere in it: one that a surface grazes would hide what is behind. So no interval's optical depth counts as
-    more than `DEEPEST`, and a surface is followed through a few intervals.
-
-    point (N, 3) grid coordinates, length (N,) of the intervals, first (R + 1,) offsets of the rays
-    """
-    density = voxels.values.view(-1)[cell_of(point, voxels.side)].clamp(min=0)
-    return sample_weights((density * length).clamp(max=DEEPEST), first)
-
-
 LEAST_DECAY = 1e-30  # nothing is kept either, but what is closed stays so
 
 
@@ -162,7 +146,7 @@ def _chosen_on_device(valid: Tensor, count: int, generator: torch.Generator) -> 
     return torch.where(turn | (before[-1] == 0), anywhere, among)
 
 
-def refresh_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def random_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Cells to ask about anew, half anywhere and half among the valid, and a random point in each: (count,), (count, 3) grid coordinates."""
     flat = voxels.values.view(-1)
     if transfer.remote(flat):

@@ -1,10 +1,9 @@
-"""Training without waiting for the device: what a step counted there is learned some steps later, and room for its samples is made by experience.
+"""Training without waiting for the device: the counts of a step are read back some steps later, and the capacity for its samples is estimated.
 
-A host that asks a device for a number waits until all that it has launched is done, and the device then idles until the host has launched more. How
-many samples a bundle has is such a number. So once the averages have settled a step makes room for MARGIN times as many samples as rays had of late
-(those that are looked at whole among them, `train.occupancy_update_ray_fraction`, which come first and so find room first); rays that find no room
-are left out of the
-loss and counted, which is rare, and the counts and losses of a step are read LAG steps after it.
+A host that asks a device for a number waits until all that it has launched is done, and the device then idles until the host has launched more. The
+number of samples of a bundle is such a number. So once the averages are known a step has a capacity of MARGIN times as many samples as rays had in the
+steps before (those of unpruned rays among them, `train.occupancy_update_ray_fraction`, which come first and so always fit). Rays whose samples do not fit
+are left out of the loss and counted, which is rare. The counts and losses of a step are read LAG steps after it.
 """
 
 from __future__ import annotations
@@ -17,23 +16,16 @@ from torch import Tensor
 
 from efficientnerf.backends.transfer import to_host_async
 from efficientnerf.sampling.occupancy import DensityVoxels
-from efficientnerf.sampling.samples import Samples
+from efficientnerf.sampling.samples import SampleCapacity, Samples, complete_rays
 
 LAG = 8  # steps; the device is hardly ever further behind
-SETTLED = 64  # steps at the beginning, and when pruning begins, that are counted exactly, at the price of waiting
+EXACT_STEPS = 64  # steps at the beginning, and when pruning begins, that are counted exactly, which the host waits for
 MARGIN = 1.3
-GRAIN = 4096  # samples: arrays of few different sizes are found again by the allocator
-
-
-class SampleCapacity(NamedTuple):
-    """For how many samples there is room in each stage."""
-
-    coarse: int
-    fine: int
+GRANULARITY = 4096  # samples: the allocator finds arrays of few different sizes again
 
 
 class StepCounts(NamedTuple):
-    """What a step said: mean squared error; coarse intervals tried, valid and pivotal samples, fine samples; rays left out of the loss."""
+    """Statistics of a step: mean squared error; coarse intervals tried, valid and pivotal samples, fine samples; rays left out of the loss."""
 
     loss: float
     tried: int
@@ -44,36 +36,38 @@ class StepCounts(NamedTuple):
 
 
 class AsyncReadback:
-    """The counts of the last steps, on their way to the host."""
+    """The counts of the last steps, on their way to the host; arguments: see the module."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, lag: int = LAG, exact_steps: int = EXACT_STEPS, granularity: int = GRANULARITY) -> None:
+        self.lag, self.exact_steps, self.granularity = lag, exact_steps, granularity
         self.steps = 0
         self.pending: deque[tuple[Tensor, Any]] = deque()
         self.known = StepCounts(0.0, 0, 0, 0, 0)
         self.valid_per_ray = self.fine_per_ray = 0.0
 
-    def room(self, rays: int) -> SampleCapacity | None:
-        """For the next step's samples; None while nothing is known: then they are counted, and waited for."""
-        if self.steps < SETTLED:
+    def capacity(self, rays: int) -> SampleCapacity | None:
+        """Of the next step; None while the averages are not known: then samples are counted, and waited for."""
+        if self.steps < self.exact_steps:
             return None
-        coarse, fine = (max(GRAIN, -(-int(MARGIN * mean * rays) // GRAIN) * GRAIN) for mean in (self.valid_per_ray, self.fine_per_ray))
+        size = self.granularity
+        coarse, fine = (max(size, -(-int(MARGIN * mean * rays) // size) * size) for mean in (self.valid_per_ray, self.fine_per_ray))
         return SampleCapacity(coarse, fine)
 
-    def forget(self) -> None:
-        """Count anew: rays will need other numbers of samples than so far."""
+    def restart(self) -> None:
+        """Count exactly again: rays will have other numbers of samples than so far."""
         self.steps, self.valid_per_ray, self.fine_per_ray = 0, 0.0, 0.0
 
-    def note(self, rays: int, loss: Tensor, coarse: Samples, pivotal: Tensor, fine: Samples) -> StepCounts:
-        """Send a step's counts on their way; returns the latest that have arrived: the step's own at first, later those of LAG steps ago."""
+    def record(self, rays: int, loss: Tensor, coarse: Samples, pivotal: Tensor, fine: Samples) -> StepCounts:
+        """Start the transfer of a step's counts; returns the latest that have arrived: the step's own at first, later those of `lag` steps ago."""
         # Numbers that the host has are filled in on the device: sending one makes it wait.
         tried, every = (x if isinstance(x, Tensor) else torch.full((), x, device=loss.device) for x in (coarse.tried, rays))
-        real = torch.arange(len(pivotal), device=loss.device) < coarse.first[-1]  # padding may have been chosen by chance
-        served, whole = coarse.complete, whole_rays(coarse, fine)
-        found_room = [every if some is None else some.sum() for some in (served, whole)]
-        numbers = torch.stack([x.detach().double() for x in (loss, tried, coarse.first[-1], (pivotal & real).sum(), fine.first[-1], every, *found_room)])
+        real = torch.arange(len(pivotal), device=loss.device) < coarse.first[-1]  # exploration may have chosen padding
+        masks = coarse.complete, complete_rays(coarse, fine)
+        complete = [every if mask is None else mask.sum() for mask in masks]
+        numbers = torch.stack([x.detach().double() for x in (loss, tried, coarse.first[-1], (pivotal & real).sum(), fine.first[-1], every, *complete)])
         self.pending.append(to_host_async(numbers))
         self.steps += 1
-        while len(self.pending) > (0 if self.steps < SETTLED else LAG):
+        while len(self.pending) > (0 if self.steps < self.exact_steps else self.lag):
             self._take(*self.pending.popleft())
         return self.known
 
@@ -81,41 +75,25 @@ class AsyncReadback:
         if arrived is not None:
             arrived.synchronize()
         loss, *counts = numbers.tolist()
-        *counts, rays, served, whole = (int(n) for n in counts)
-        self.known = StepCounts._make([loss, *counts, rays - whole])
+        *counts, rays, coarse_complete, complete = (int(n) for n in counts)
+        self.known = StepCounts._make([loss, *counts, rays - complete])
         share = 1.0 if self.valid_per_ray == self.fine_per_ray == 0 else 0.1
-        # Samples that found no room are not counted: what is known is how many each of those rays has that were served.
-        self.valid_per_ray += share * (self.known.valid / max(served, 1) - self.valid_per_ray)
-        self.fine_per_ray += share * (self.known.fine / max(whole, 1) - self.fine_per_ray)
+        # Samples that did not fit are not counted: known is how many each of those rays has whose samples did.
+        self.valid_per_ray += share * (self.known.valid / max(coarse_complete, 1) - self.valid_per_ray)
+        self.fine_per_ray += share * (self.known.fine / max(complete, 1) - self.fine_per_ray)
 
 
 class AsyncOccupancy:
-    """The share of valid voxels for those who show it now and then: on a device, as it was when it was last asked for (the first time, as it is)."""
+    """The fraction of valid voxels, for a log: on a device, as it was at the last call (at the first call, as it is)."""
 
     def __init__(self, voxels: DensityVoxels) -> None:
         self.voxels = voxels
         self.pending: tuple[Tensor, Any] | None = None
 
     def __call__(self) -> float:
-        asked = to_host_async(self.voxels.count_occupied())
-        number, arrived = asked if self.pending is None or asked[1] is None else self.pending
-        self.pending = asked
+        started = to_host_async(self.voxels.count_occupied())
+        number, arrived = started if self.pending is None or started[1] is None else self.pending
+        self.pending = started
         if arrived is not None:
             arrived.synchronize()
         return int(number) / self.voxels.values.numel()
-
-
-def whole_rays(coarse: Samples, fine: Samples) -> Tensor | None:
-    """(R,) bool: rays that found room for all of their samples; None: all did."""
-    if coarse.complete is None or fine.complete is None:
-        return fine.complete if coarse.complete is None else coarse.complete
-    return coarse.complete & fine.complete
-
-
-def mean_over(values: Tensor, rays: Tensor | None) -> Tensor:
-    """Mean of values (R, ...) over some rays (R,) bool, or over all."""
-    if rays is None:
-        return values.mean()
-    per_ray = values.reshape(len(values), -1).mean(dim=1)
-    # A product would let through what is no number.
-    return torch.where(rays, per_ray, 0).sum() / rays.sum().clamp(min=1)

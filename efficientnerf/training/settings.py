@@ -78,9 +78,6 @@ class TrainSettings:
     max_pivots: Annotated[int, Meta(ge=1, le=4096)] = setting(
         8, "Most pivotal samples on a ray; those of least weight are dropped (the paper drops none).", advanced=True
     )
-    coarse: Literal["field", "voxels"] = setting(
-        "field", "What pivots of the hash field are chosen by: a lighter field of densities, or the density voxels.", advanced=True
-    )
     exploration_fraction: Fraction = setting(
         0.1, "Fraction of the valid samples that are not pivotal on which the fine network is trained all the same.", advanced=True
     )
@@ -131,8 +128,6 @@ class TrainSettings:
     lr_decay_steps: PositiveInt | Auto = setting(
         "auto", "Steps in which the learning rate falls to lr_final_ratio of itself (the paper: 500,000); auto: all steps.", advanced=True
     )
-    rate_hold: Count = setting(0, "First steps in which the learning rate does not fall.", advanced=True)
-    rate_aims: tuple[PositiveInt, ...] = setting((), "Pairs n, s: up to step s the schedule was one of n steps.", advanced=True)
     adam_beta2: Annotated[float, Meta(ge=0.0, le=0.99999)] = setting(0.99, "Decay beta_2 of Adam's second moment (the paper: 0.999).", advanced=True)
     adam_epsilon: NonNegative = setting(1e-15, "Epsilon of Adam (the paper: 1e-8).", advanced=True)
     precrop_steps: Count = setting(0, "First steps, in which rays go through the middle half of each image's sides alone (NeRF: 500).", advanced=True)

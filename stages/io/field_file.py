@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.model import Model
     from efficientnerf.rendering.field_renderer import FieldRenderer
+    from efficientnerf.training.schedule import Schedule
     from stages.io.scene import Scene
 
 FORMAT = 1
@@ -74,18 +75,25 @@ def space_of(s: Scene) -> Space:
 GAINS = "exposure.gains"
 
 
-def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, np.ndarray] | None = None) -> None:
-    """gains: of each training view by the name of its image, (3,) the factors from the scene's colours to the photograph's, where they were learned."""
+def save_model(
+    m: Model, near: float, far: float, path: Path, gains: dict[str, np.ndarray] | None = None, schedule: Schedule | None = None
+) -> None:
+    """
+    gains     of each training view by the name of its image, (3,) the gains from the scene's colours to the photograph's, where they were learned
+    schedule  that the model was trained with, which gives it again to the byte
+    """
     import torch
 
     from efficientnerf.model import state_of
 
-    about = {
-        "settings": dataclasses.asdict(m.settings),
+    trained = {} if schedule is None else {"iterations": schedule.iterations}
+    about: dict[str, Any] = {
+        "settings": dataclasses.asdict(m.settings) | trained,
         "bounds": m.space.bounds.tolist(),
         "contracted": m.space.contracted,
         "ndc": None if m.space.ndc is None else m.space.ndc.to_json(),
         "background": m.background,
+        "schedule": None if schedule is None else schedule.state(),
         "near": near,
         "far": far,
     }

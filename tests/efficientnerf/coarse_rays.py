@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from efficientnerf.geometry.spaces import Space, space_from
-from efficientnerf.sampling import samples
+from efficientnerf.sampling import valid as valid_sampling
 from efficientnerf.sampling.samples import Samples
 
 BOUNDS = np.array([[-1.0, -0.5, -0.25], [1.0, 0.5, 0.75]])
@@ -46,5 +46,5 @@ def voxels_of(seed: int = 0) -> torch.Tensor:
 
 def coarse_samples_of(rays: Rays, contracted: bool) -> tuple[Space, Samples, torch.Tensor]:
     space = space_from(BOUNDS, contracted=contracted)
-    coarse = samples.valid_samples(space, *rays, STEP, 60, voxels_of().to(rays.origins.dtype), 0.4)
+    coarse = valid_sampling.valid_samples(space, *rays, STEP, 60, voxels_of().to(rays.origins.dtype), 0.4)
     return space, coarse, torch.rand(len(coarse.start), generator=torch.Generator().manual_seed(0)) < 0.5

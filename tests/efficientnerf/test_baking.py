@@ -7,22 +7,24 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.bake import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
 from efficientnerf.asset.queries import density_at, density_block
 from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
 
-class Ball(nn.Module):
+class Ball(BakeableField):
     """log density 5 in a ball of radius 0.5 round the world's origin, -12 outside; harmonics linear in the position. Grid coordinates of the box."""
 
-    activation, degree = "exp", 1
+    activation = "exp"
+    degree = 1
 
     def forward(self, points: Tensor) -> Tensor:
         world = points * 2 - 1
@@ -205,7 +207,7 @@ def test_nothing_is_baked_that_the_coarse_field_hides() -> None:
     ((before, _),) = voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 0)
     assert (before > 1).all()
     field = m.coarse
-    m.coarse = type("Half", (nn.Module,), {"activation": "exp", "forward": lambda self, p: field(p) - 20.0 * (p[:, :1] > 0.5)})()
+    m.coarse = type("Half", (BakeableField,), {"activation": "exp", "forward": lambda self, p: field(p) - 20.0 * (p[:, :1] > 0.5)})()
     ((after, _),) = voxel_values(m, indices, 1 / 8, BOUNDS[0], 4, 0)
     assert after.tolist() == [0, before[1]]
 

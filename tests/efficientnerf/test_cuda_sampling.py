@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from efficientnerf.geometry.spaces import BoundedSpace, space_from
-from efficientnerf.sampling import samples as sampling
+from efficientnerf.sampling import pivotal as pivotal_sampling
+from efficientnerf.sampling import valid as valid_sampling
 from efficientnerf.sampling.samples import Samples
 from tests.efficientnerf.coarse_rays import BOUNDS, STEP, Rays, coarse_samples_of, make_rays, voxels_of
 from tests.efficientnerf.device import DEVICE
@@ -36,7 +37,7 @@ def of_ray(samples: Samples, r: int) -> list[torch.Tensor]:
 def test_valid_samples_are_those_of_torch(kind: str, contracted: bool, threshold: float) -> None:
     rays, space = make_rays(kind), space_from(BOUNDS, contracted=contracted)
     ours = here(cuda.valid_samples(space, *there(rays), STEP, 60, voxels_of().to(DEVICE), threshold))
-    theirs = sampling.valid_samples(space, *(t.double() for t in rays), STEP, 60, voxels_of().double(), threshold)
+    theirs = valid_sampling.valid_samples(space, *(t.double() for t in rays), STEP, 60, voxels_of().double(), threshold)
     assert ours.first.dtype == torch.int64
     assert abs(ours.tried - theirs.tried) <= 2  # where a ray ends, rounding may turn a decision
     alike = [r for r in range(len(rays.origins)) if ours.first[r + 1] - ours.first[r] == theirs.first[r + 1] - theirs.first[r]]
@@ -93,7 +94,7 @@ def test_the_first_rays_can_be_looked_at_whole(contracted: bool, room: int | Non
 def test_pivotal_samples_are_those_of_torch(contracted: bool, per_pivot: int, room: int | None) -> None:
     rays = make_rays("inside")
     space, coarse, pivotal = coarse_samples_of(rays, contracted)
-    theirs = sampling.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, pivotal, per_pivot)
+    theirs = pivotal_sampling.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, pivotal, per_pivot)
     padded, marked = coarse, pivotal
     if room is not None:  # what comes of a coarse stage with a capacity: padding, and the choice of padding by chance
         more = [torch.cat([t, t.new_zeros(40, *t.shape[1:])]) for t in coarse[1:5]]
@@ -116,7 +117,7 @@ def test_pivots_are_those_of_torch(most: int) -> None:
     counts = [0, 4, 12, 1, 7, 0, 30, 0]
     weight = torch.from_numpy(np.round(rng.random(sum(counts)), 1).astype(np.float32))  # many equals
     first = torch.from_numpy(np.concatenate([[0], np.cumsum(counts)]))
-    expected = sampling.select_pivots(weight, first, float(np.float32(0.3)), most)
+    expected = pivotal_sampling.select_pivots(weight, first, float(np.float32(0.3)), most)
     assert torch.equal(cuda.select_pivots(weight.to(DEVICE), first.to(DEVICE), float(np.float32(0.3)), most).cpu(), expected)
     padded = torch.cat([weight, torch.ones(9)]).to(DEVICE)  # heavy, but of no ray
     ours = cuda.select_pivots(padded, first.to(DEVICE), float(np.float32(0.3)), most).cpu()

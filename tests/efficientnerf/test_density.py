@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -11,16 +9,14 @@ import torch
 from efficientnerf.backends import dispatch
 from efficientnerf.rendering.compositing import activate
 from efficientnerf.sampling.occupancy import (
-    DEEPEST,
     apply_decay,
     cell_of,
     density_voxels,
     mask_cells,
-    refresh_cells,
+    random_cells,
     reset_cells,
     sweep_cells,
     update,
-    voxel_weights,
 )
 from tests import reference
 
@@ -154,12 +150,12 @@ def test_refreshed_points_lie_in_their_cells_half_of_them_valid() -> None:
     voxels = density_voxels(8, "maximum", threshold=1.0)
     voxels.values.zero_()
     voxels.values[2, 3, 4] = 5.0
-    cell, point = refresh_cells(voxels, 101, torch.Generator().manual_seed(1))
+    cell, point = random_cells(voxels, 101, torch.Generator().manual_seed(1))
     assert torch.equal(cell_of(point, 8), cell)
     assert len(cell) == 101
     assert (cell[51:] == (2 * 8 + 3) * 8 + 4).all()
     voxels.values.zero_()
-    cell, point = refresh_cells(voxels, 100, torch.Generator().manual_seed(1))
+    cell, point = random_cells(voxels, 100, torch.Generator().manual_seed(1))
     assert torch.equal(cell_of(point, 8), cell)
 
 
@@ -179,24 +175,8 @@ def test_refreshing_lets_pruned_space_return(rule: str, empty: float, full: floa
     for density in (empty, full):
         for _ in range(300):
             apply_decay(voxels)
-            cell, _ = refresh_cells(voxels, 20, generator)
+            cell, _ = random_cells(voxels, 20, generator)
             update(voxels, cell, torch.full((len(cell),), density))
         shares.append(voxels.occupied)
     assert shares[0] == 0.0
     assert shares[1] > 0.9
-
-
-def test_weights_by_voxels_are_those_of_their_densities_up_to_a_depth() -> None:
-    voxels = density_voxels(4, "maximum", threshold=0.1)
-    voxels.values.copy_(torch.rand(4, 4, 4, generator=torch.Generator().manual_seed(0)))
-    voxels.values[0] = 1e6
-    point = torch.rand(30, 3, generator=torch.Generator().manual_seed(1))
-    length, first = torch.full((30,), 0.2), torch.tensor([0, 10, 10, 30])
-    depth = [min(float(voxels.values[tuple((p * 4).long())]) * 0.2, DEEPEST) for p in point]
-    expected = []
-    for begin, end in ((0, 10), (10, 30)):
-        light = 1.0
-        for d in depth[begin:end]:
-            expected.append(light * (1 - math.exp(-d)))
-            light *= math.exp(-d)
-    torch.testing.assert_close(voxel_weights(voxels, point, length, first), torch.tensor(expected), atol=1e-6, rtol=1e-5)

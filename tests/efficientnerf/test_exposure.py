@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-import pytest
 import torch
 
-from efficientnerf.training import loop
 from efficientnerf.training.exposure import SCALE, exposed, exposure_loss, log_gains
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.schedule import schedule_of
 from tests.efficientnerf.balls import cameras, photograph, untrained
 
 
@@ -38,12 +39,12 @@ def photographs(gains: np.ndarray) -> Pixels:
     return Pixels(made, images, [None] * len(made), np.full(len(made), 1.0), np.full(len(made), 50.0))
 
 
-def test_differences_between_photographs_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "RATE_WARM_UP", 10)
+def test_differences_between_photographs_are_found() -> None:
     gains = np.exp(0.1 * np.array([1.0, -1, 1, -1, 1, -1, 1, -1]))[:, None] * np.array([1.0, 1.0, 0.95])
     losses = {}
     for kind in ("gain", "off"):
-        t = trainer(untrained(contracted=True, iterations=150, exposure=kind), len(gains))
+        m = untrained(contracted=True, iterations=150, exposure=kind)
+        t = trainer(m, len(gains), replace(schedule_of(m.settings), ramp_steps=10))
         losses[kind] = np.mean([done.loss for done in train(t, photographs(gains))][-20:])
         if kind == "gain":
             assert t.exposure is not None

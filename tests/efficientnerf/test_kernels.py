@@ -12,8 +12,9 @@ import torch
 from torch import nn
 
 from efficientnerf.backends.numba import adam as cpu_adam
+from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.geometry.cameras import Camera, rays
-from efficientnerf.training.loop import BETA1, Adam
+from efficientnerf.training.optimiser import BETA1, Adam, ParameterGroup
 from efficientnerf.training.pixels import Pixels
 from tests import reference
 from tests.efficientnerf.steps import RATES, gradients
@@ -21,9 +22,9 @@ from tests.efficientnerf.steps import RATES, gradients
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def stepped(name: str, grads: list[torch.Tensor]) -> nn.Parameter:
+def stepped(grads: list[torch.Tensor], *, sparse: bool = False) -> nn.Parameter:
     p = nn.Parameter(torch.ones_like(grads[0]))
-    adam = Adam([(name, p)])
+    adam = Adam([ParameterGroup({"p": p}, sparse)])
     for number, (grad, rate) in enumerate(zip(grads, RATES, strict=True), 1):
         p.grad = grad.clone()
         adam.step(number, rate)
@@ -38,11 +39,11 @@ def test_adam_is_torchs() -> None:
         theirs.grad = grad.clone()
         optimiser.param_groups[0]["lr"] = rate
         optimiser.step()
-    torch.testing.assert_close(stepped("fine.weights.0", gradients()), theirs, rtol=2e-5, atol=1e-6)
+    torch.testing.assert_close(stepped(gradients()), theirs, rtol=2e-5, atol=1e-6)
 
 
 def test_adam_is_the_papers() -> None:
-    ours = stepped("fine.weights.0", gradients())
+    ours = stepped(gradients())
     for entry in (0, 7, 49):
         expected = reference.adam(1.0, [float(g[entry, 1]) for g in gradients()], RATES, BETA1, 0.99, 1e-15)
         assert float(ours[entry, 1].detach()) == pytest.approx(expected, rel=1e-5)
@@ -52,16 +53,35 @@ def test_table_entries_without_a_gradient_are_left_alone() -> None:
     grads = gradients()
     for grad in grads[1:]:
         grad[10:20] = 0
-    sparse, dense = stepped("fine.table", grads).detach(), stepped("fine.weights.0", grads).detach()
-    once = stepped("fine.table", [grads[0], *[torch.zeros(50, 2)] * 3]).detach()
+    sparse, dense = stepped(grads, sparse=True).detach(), stepped(grads).detach()
+    once = stepped([grads[0], *[torch.zeros(50, 2)] * 3], sparse=True).detach()
     assert torch.equal(sparse[10:20], once[10:20])
     assert (dense[10:20] != once[10:20]).all()
     assert torch.equal(sparse[20:], dense[20:])
 
 
+def test_a_gradient_buffer_is_read_cleared_and_used_again() -> None:
+    p, buffer = nn.Parameter(torch.ones(50, 2)), GradientBuffer()
+    adam, grads = Adam([ParameterGroup({"p": p}, sparse=True, buffers={"p": buffer})]), gradients()
+    accumulators = set()
+    for number, (grad, rate) in enumerate(zip(grads, RATES, strict=True), 1):
+        for _ in range(2):  # two backward passes
+            accumulators.add(id(buffer.accumulator(p)))
+            buffer.accumulator(p).add_(grad / 2)
+        adam.step(number, rate)
+        assert not buffer.filled
+        assert buffer.values is not None
+        assert not buffer.values.any()
+    assert len(accumulators) == 1
+    assert p.grad is None
+    assert torch.equal(p, stepped(grads, sparse=True))
+    adam.step(5, 0.1)  # nothing was added
+    assert torch.equal(p, stepped(grads, sparse=True))
+
+
 def test_a_parameter_that_was_not_used_is_left_alone() -> None:
     p = nn.Parameter(torch.ones(3))
-    Adam([("sky.sh", p)]).step(1, 0.1)
+    Adam([ParameterGroup({"p": p})]).step(1, 0.1)
     assert torch.equal(p.detach(), torch.ones(3))
 
 

@@ -17,11 +17,12 @@ from efficientnerf.geometry.spaces import BoundedSpace, space_from
 from efficientnerf.model import Model, model
 from efficientnerf.rendering import compositing
 from efficientnerf.sampling.occupancy import density_voxels
-from efficientnerf.sampling.samples import Samples
-from efficientnerf.training import loop
-from efficientnerf.training import readback as late
+from efficientnerf.sampling.samples import SampleCapacity, Samples, complete_rays
+from efficientnerf.training import loop, readback
 from efficientnerf.training.device_pixels import DevicePixels
-from efficientnerf.training.readback import AsyncOccupancy, AsyncReadback, SampleCapacity, mean_over, whole_rays
+from efficientnerf.training.losses import mean_over
+from efficientnerf.training.readback import AsyncOccupancy, AsyncReadback
+from efficientnerf.training.sparse_depth import SparseDepthRays
 from tests.efficientnerf.balls import BOUNDS, pixels, settings
 from tests.efficientnerf.device import DEVICE
 
@@ -34,31 +35,29 @@ def samples(counts: list[int], tried: int = 50, room: int | None = None) -> Samp
     return Samples(first.clamp(max=len(empty)), empty, empty, empty, torch.zeros(len(empty), 3), tried, complete)
 
 
-def test_counts_arrive_late_once_they_have_settled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(late, "SETTLED", 3)
-    monkeypatch.setattr(late, "LAG", 2)
-    kept = AsyncReadback()
+def test_counts_arrive_late_once_the_averages_are_known() -> None:
+    kept = AsyncReadback(lag=2, exact_steps=3)
     arrived, rooms = [], []
     for step in range(1, 9):
-        rooms.append(kept.room(4))
-        counted = kept.note(4, torch.tensor(float(step)), samples([step, 0, 0, 0]), torch.ones(step, dtype=torch.bool), samples([2 * step, 0, 0, 0]))
+        rooms.append(kept.capacity(4))
+        counted = kept.record(4, torch.tensor(float(step)), samples([step, 0, 0, 0]), torch.ones(step, dtype=torch.bool), samples([2 * step, 0, 0, 0]))
         arrived.append((counted.loss, counted.valid, counted.fine))
     assert [loss for loss, _, _ in arrived] == [1, 2, 2, 2, 3, 4, 5, 6]
     assert all(fine == 2 * valid for _, valid, fine in arrived)
     assert rooms[:3] == [None] * 3
-    assert rooms[3] == SampleCapacity(late.GRAIN, late.GRAIN)
+    assert rooms[3] == SampleCapacity(readback.GRANULARITY, readback.GRANULARITY)
     assert kept.fine_per_ray == pytest.approx(2 * kept.valid_per_ray)
-    big = kept.room(10**6)
+    big = kept.capacity(10**6)
     assert big is not None
-    assert big.fine >= late.MARGIN * kept.fine_per_ray * 10**6 > big.fine - late.GRAIN - 1
+    assert big.fine >= readback.MARGIN * kept.fine_per_ray * 10**6 > big.fine - readback.GRANULARITY - 1
 
 
 def test_rays_without_room_are_left_out() -> None:
-    whole = whole_rays(samples([2, 3, 4, 0], room=6), samples([1, 1, 1, 0], room=10))
+    whole = complete_rays(samples([2, 3, 4, 0], room=6), samples([1, 1, 1, 0], room=10))
     assert whole is not None
     assert whole.tolist() == [True, True, False, False]
-    assert whole_rays(samples([2, 4]), samples([2, 4])) is None  # counted, not padded
-    one = whole_rays(samples([2, 4]), samples([2, 4], room=6))
+    assert complete_rays(samples([2, 4]), samples([2, 4])) is None  # counted, not padded
+    one = complete_rays(samples([2, 4]), samples([2, 4], room=6))
     assert one is not None
     assert one.all()  # it is full, and nothing was lost
     values = torch.tensor([[1.0, 3.0], [5.0, 5.0], [float("nan"), 1.0], [1e9, 0.0]], requires_grad=True)
@@ -71,17 +70,14 @@ def test_rays_without_room_are_left_out() -> None:
     assert float(mean_over(values.detach(), torch.zeros(4, dtype=torch.bool))) == 0
 
 
-def test_rays_that_were_left_out_are_counted_and_room_is_made_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All of a sudden rays have ten times as many samples: what is lost is not known, but how many those have that found room is."""
-    monkeypatch.setattr(late, "SETTLED", 2)
-    monkeypatch.setattr(late, "LAG", 0)
-    monkeypatch.setattr(late, "GRAIN", 10)
-    kept, left_out = AsyncReadback(), []
+def test_rays_that_were_left_out_are_counted_and_room_is_made_for_them() -> None:
+    """All of a sudden rays have ten times as many samples: what is lost is not known, but how many those have whose samples fit is."""
+    kept, left_out = AsyncReadback(lag=0, exact_steps=2, granularity=10), []
     for step in range(40):
         each = 3 if step < 4 else 30
-        room = kept.room(100) or SampleCapacity(3000, 3000)
+        room = kept.capacity(100) or SampleCapacity(3000, 3000)
         found = samples([each] * 100, room=room.coarse), samples([each] * 100, room=room.fine)
-        left_out.append(kept.note(100, torch.tensor(0.0), found[0], torch.ones(len(found[0].start), dtype=torch.bool), found[1]).left_out)
+        left_out.append(kept.record(100, torch.tensor(0.0), found[0], torch.ones(len(found[0].start), dtype=torch.bool), found[1]).left_out)
     assert left_out[:4] == [0] * 4
     assert left_out[4] == 100 - int(1.3 * 300) // 30
     assert left_out[-1] == 0
@@ -99,7 +95,7 @@ def test_a_share_is_told_late_on_a_device_alone(monkeypatch: pytest.MonkeyPatch)
         def synchronize(self) -> None:
             arrived.append(self)
 
-    monkeypatch.setattr(late, "to_host_async", lambda values: (values, Event()))
+    monkeypatch.setattr(readback, "to_host_async", lambda values: (values, Event()))
     voxels.values.fill_(10)
     share = AsyncOccupancy(voxels)
     assert share() == 1
@@ -124,7 +120,6 @@ STRATEGIES: dict[str, dict[str, Any]] = {
     "uniform": {**PAPER, "sampling": "uniform", "field": "nerf", "near_plane": 1.0, "far_plane": 5.0},
     "hash": {},
     "contracted": {"occupancy_update_ray_fraction": 0.2},
-    "voxels": {"coarse": "voxels"},
 }
 
 
@@ -145,12 +140,14 @@ def model_of(strategy: str, **changes: Any) -> Model:
     return m
 
 
+def quick_readback(exact_steps: int = 2) -> AsyncReadback:
+    """Steps are padded from the fourth on, two after pruning began."""
+    return AsyncReadback(lag=1, exact_steps=exact_steps, granularity=64)
+
+
 @pytest.fixture
 def interpreted(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """The path of a device on the CPU: Triton's kernels interpreted, steps padded from the fourth on, two after pruning began."""
-    monkeypatch.setattr(late, "SETTLED", 2)
-    monkeypatch.setattr(late, "LAG", 1)
-    monkeypatch.setattr(late, "GRAIN", 64)
+    """The path of a device on the CPU: Triton's kernels interpreted."""
     monkeypatch.setattr(dispatch, "triton_usable", lambda: True)
     if DEVICE == "cpu":
         monkeypatch.setattr(dispatch, "on_device", lambda *tensors: all(t.dtype == torch.float32 for t in tensors))
@@ -160,14 +157,12 @@ def interpreted(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-def test_padded_steps_learn_what_counted_ones_do(strategy: str, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The whole step by the CUDA kernels, interpreted: with room from the fourth step on, and counted exactly. Losses, counts and voxels are the same."""
+def test_padded_steps_learn_what_counted_ones_do(strategy: str, interpreted: None) -> None:
+    """The whole step by the CUDA kernels, interpreted: padded from the fourth step on, and counted exactly. Losses, counts and voxels are the same."""
     steps, voxels = {}, {}
-    for settled in (2, 1000):
-        with monkeypatch.context() as patch:
-            patch.setattr(late, "SETTLED", settled)
-            m = model_of(strategy, iterations=6)
-            steps[settled], voxels[settled] = list(loop.train(loop.trainer(m), pixels(3, 8))), m.voxels.values
+    for exact in (2, 1000):
+        m = model_of(strategy, iterations=6)
+        steps[exact], voxels[exact] = list(loop.train(loop.trainer(m), pixels(3, 8), readback=quick_readback(exact))), m.voxels.values
     # From the third step on what arrives is the step before.
     for ours, theirs in zip(steps[2], [*steps[1000][:2], *steps[1000][1:-1]], strict=True):
         assert ours.loss == pytest.approx(theirs.loss, rel=1e-3)
@@ -213,19 +208,19 @@ def lines_that_wait(running: Iterator[loop.Progress]) -> list[str]:
 
 
 def test_lines_that_wait_are_found() -> None:
-    from efficientnerf.sampling.samples import pivotal_samples
+    from efficientnerf.sampling.pivotal import pivotal_samples
 
     space, found = BoundedSpace(BOUNDS), samples([2, 1])
     with Waits() as waits:
         pivotal_samples(space, torch.zeros(2, 3), torch.ones(2, 3), torch.zeros(2), found, torch.tensor([True, False, True]), 2)
         assert density_voxels(2, "momentum").occupied == 1
     assert {line.partition(":")[0] for line in waits.lines} == {"index", "_local_scalar_dense"}
-    assert any("samples.py" in line for line in waits.lines)
+    assert any("pivotal.py" in line for line in waits.lines)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_no_line_of_a_step_waits(strategy: str, interpreted: None) -> None:
-    running = loop.train(loop.trainer(model_of(strategy, iterations=9)), pixels(3, 8))
+    running = loop.train(loop.trainer(model_of(strategy, iterations=9)), pixels(3, 8), readback=quick_readback())
     assert lines_that_wait(running) == []
 
 
@@ -238,12 +233,12 @@ def test_no_line_that_makes_a_bundle_waits() -> None:
 
 @pytest.mark.parametrize("discretise", ["off", 12])
 def test_no_line_of_a_step_on_photographs_waits(discretise: int | str, interpreted: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With exposures, anchors, and explored intervals."""
+    """With exposures, sparse depth and exploration."""
     monkeypatch.setattr(dispatch, "composite", compositing.composite)
     m = model_of("contracted", iterations=9, exposure="gain", exploration_fraction=0.1, discretise=discretise)
     origins, directions = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (8, 1)), np.tile(np.float32([[1.0, 0, 0]]), (8, 1))
-    anchors = loop.SparseDepthRays(origins, directions, np.full(8, 3.0, np.float32))
-    running = loop.train(loop.trainer(m, 3), pixels(3, 8), anchors)
+    sparse_depth = SparseDepthRays(origins, directions, np.full(8, 3.0, np.float32))
+    running = loop.train(loop.trainer(m, 3), pixels(3, 8), sparse_depth, readback=quick_readback())
     assert lines_that_wait(running) == []
 
 
@@ -252,8 +247,8 @@ def test_no_line_of_a_step_on_photographs_waits(discretise: int | str, interpret
 def test_no_step_waits_for_the_device(strategy: str) -> None:
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device")
-    running = loop.train(loop.trainer(model_of(strategy, iterations=late.SETTLED + 20, max_rays_per_batch=64, exploration_fraction=0.1)), pixels(3, 8))
-    for _ in range(late.SETTLED + 4):
+    running = loop.train(loop.trainer(model_of(strategy, iterations=readback.EXACT_STEPS + 20, max_rays_per_batch=64, exploration_fraction=0.1)), pixels(3, 8))
+    for _ in range(readback.EXACT_STEPS + 4):
         next(running)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

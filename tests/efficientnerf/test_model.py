@@ -7,18 +7,20 @@ import math
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.geometry.spaces import BoundedSpace
 from efficientnerf.model import Model, model, render_rays, restore, state_of
 from efficientnerf.training.settings import TrainSettings
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
 
 
-class Counting(nn.Module):
-    """A field that remembers where it was asked: a ball of density e^6 round the grid's centre, e^-6 elsewhere."""
+class Counting(BakeableField):
+    """A field that remembers where it was queried: a ball of density e^6 round the grid's centre, e^-6 elsewhere."""
 
-    activation, degree = "exp", 0
+    activation = "exp"
+    degree = 0
 
     def __init__(self) -> None:
         super().__init__()

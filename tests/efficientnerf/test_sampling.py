@@ -13,13 +13,14 @@ import torch
 from efficientnerf.backends import dispatch
 from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace, space_from
 from efficientnerf.rendering.compositing import ray_of_sample
-from efficientnerf.sampling import samples
+from efficientnerf.sampling import pivotal as pivotal_sampling
+from efficientnerf.sampling import valid as valid_sampling
 from efficientnerf.sampling.samples import Samples
 from tests import reference
 from tests.efficientnerf.coarse_rays import BOUNDS, SIDE, STEP, Rays, coarse_samples_of, make_rays, voxels_of
 
-FINDERS = {"torch": samples.valid_samples, "kernel": dispatch.valid_samples}
-DIVIDERS = {"torch": samples.pivotal_samples, "kernel": dispatch.pivotal_samples}
+FINDERS = {"torch": valid_sampling.valid_samples, "kernel": dispatch.valid_samples}
+DIVIDERS = {"torch": pivotal_sampling.pivotal_samples, "kernel": dispatch.pivotal_samples}
 
 
 def double(rays: Rays) -> Rays:
@@ -56,7 +57,7 @@ def test_valid_samples_are_those_of_the_loop(kind: str, contracted: bool, thresh
 @pytest.mark.parametrize("contracted", [False, True])
 def test_both_try_the_same_number(contracted: bool) -> None:
     rays, space = make_rays("outside"), space_from(BOUNDS, contracted=contracted)
-    fast, slow = (find(space, *rays, STEP, 60, voxels_of(), 0.4) for find in (dispatch.valid_samples, samples.valid_samples))
+    fast, slow = (find(space, *rays, STEP, 60, voxels_of(), 0.4) for find in (dispatch.valid_samples, valid_sampling.valid_samples))
     assert fast.tried == pytest.approx(slow.tried, abs=2)
     assert len(fast.start) < fast.tried
 
@@ -141,7 +142,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     assert reach.min() > reference.FARTHEST
 
 
-@pytest.mark.parametrize("choose", [samples.select_pivots, dispatch.select_pivots], ids=["torch", "kernel"])
+@pytest.mark.parametrize("choose", [pivotal_sampling.select_pivots, dispatch.select_pivots], ids=["torch", "kernel"])
 @pytest.mark.parametrize("most", [1, 3, 5, 100])
 def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[..., torch.Tensor], most: int) -> None:
     rng = np.random.default_rng(3)
@@ -181,14 +182,14 @@ def test_the_pivotal_kernel_is_the_torch_function(contracted: bool) -> None:
     rays = make_rays("inside")
     space, coarse, pivotal = coarse_samples_of(rays, contracted)
     args = (space, rays.origins, rays.directions, rays.offset, coarse, pivotal, 4)
-    for fast, slow in zip(dispatch.pivotal_samples(*args)[:6], samples.pivotal_samples(*args)[:6], strict=True):
+    for fast, slow in zip(dispatch.pivotal_samples(*args)[:6], pivotal_sampling.pivotal_samples(*args)[:6], strict=True):
         torch.testing.assert_close(torch.as_tensor(fast), torch.as_tensor(slow), rtol=1e-4, atol=1e-5)
 
 
 def test_no_point_is_evaluated_twice() -> None:
     rays = double(make_rays("outside"))
     space, coarse, _ = coarse_samples_of(rays, False)
-    fine = samples.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, torch.ones(len(coarse.start), dtype=torch.bool), 4)
+    fine = pivotal_sampling.pivotal_samples(space, rays.origins, rays.directions, rays.offset, coarse, torch.ones(len(coarse.start), dtype=torch.bool), 4)
     assert len(torch.unique(coarse.point, dim=0)) == len(coarse.point)
     assert len(torch.unique(fine.point, dim=0)) == len(fine.point)
 

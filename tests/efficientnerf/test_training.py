@@ -4,42 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from efficientnerf.model import Model, render_rays
-from efficientnerf.training import loop
-from efficientnerf.training.loop import (
-    Adam,
-    Progress,
-    SparseDepthRays,
-    anchor_loss,
-    fine_samples_at,
-    learning_rate,
-    restore,
-    share_of_fall,
-    state_of,
-    train,
-    trainer,
-)
+from efficientnerf.training.loop import Progress, restore, state_of, train, trainer
+from efficientnerf.training.optimiser import Adam, parameter_groups
 from efficientnerf.training.pixels import Pixels
+from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.settings import TrainSettings
+from efficientnerf.training.sparse_depth import SparseDepthRays, sparse_depth_loss
 from tests.efficientnerf.balls import cameras, photograph, pixels, settings, untrained
 
 MLP = {"field": "mlp", "hidden_dim": 24, "num_layers": 2, "coarse_num_layers": 1, "learning_rate": 1e-2}
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The rate rises in a few steps."""
-    monkeypatch.setattr(loop, "RATE_WARM_UP", 10)
-
-
 def run(m: Model, which: Pixels | None = None) -> list[Progress]:
-    return list(train(trainer(m), which or pixels()))
+    """The learning rate rises in a few steps."""
+    return list(train(trainer(m, schedule=replace(schedule_of(m.settings), ramp_steps=10)), which or pixels()))
 
 
 def psnr_of(steps: list[Progress]) -> float:
@@ -63,13 +50,12 @@ def test_intervals_are_sampled_more_finely_in_the_second_half_of_the_schedule() 
     assert [step.fine for step in steps] == [(2 if step.step < 20 else 5) * step.pivotal for step in steps]
     constant = run(untrained(iterations=40, samples_per_pivot=5, early_samples_per_pivot="off"))
     assert all(step.fine == 5 * step.pivotal > 0 for step in constant)
-    # A schedule that was settled anew counts by its own share, not by steps over all steps: of 40 steps to step 10, then of 20.
-    settled = TrainSettings(samples_per_pivot=5, early_samples_per_pivot=2, iterations=20, rate_aims=(40, 10))
-    found = [fine_samples_at(settled, share_of_fall(n, settled.iterations, settled.rate_hold, settled.rate_aims)) for n in range(1, 21)]
-    assert found == [2] * 13 + [5] * 7  # a quarter by step 10, and the rest in ten steps
+    # A schedule with a revised number of iterations counts by its own fraction: of 40 steps to step 10, then of 20.
+    revised = schedule_of(TrainSettings(samples_per_pivot=5, early_samples_per_pivot=2, iterations=40)).with_iterations(20, 10)
+    assert [revised.samples_per_pivot_at(n) for n in range(1, 21)] == [2] * 13 + [5] * 7  # a quarter by step 10, and the rest in ten steps
 
 
-def test_surroundings_are_learned_too() -> None:
+def test_unbounded_scenes_are_learned_too() -> None:
     made = cameras()
     photographs = Pixels(made, [photograph(camera) for camera in made], [None] * len(made), np.full(len(made), 1.0), np.full(len(made), 50.0))
     steps = run(untrained(contracted=True), photographs)
@@ -137,14 +123,14 @@ def test_the_number_of_rays_follows_the_samples_they_need() -> None:
 
 
 def test_the_rate_rises_and_falls() -> None:
-    rates = [learning_rate(step, 1e-2, 0.05, 2000) for step in range(1, 2001)]
+    rates = [Schedule(2000, learning_rate=1e-2, ramp_steps=10).learning_rate_at(step) for step in range(1, 2001)]
     assert rates[0] < rates[4] < rates[9]
     assert all(a >= b for a, b in itertools.pairwise(rates[9:]))
     assert rates[-1] == pytest.approx(5e-4)
 
 
 def test_a_held_rate_does_not_depend_on_the_end() -> None:
-    short, long = ([learning_rate(step, 1e-2, 0.05, n, hold=300) for step in range(1, n + 1)] for n in (500, 5000))
+    short, long = ([Schedule(n, hold=300, learning_rate=1e-2).learning_rate_at(step) for step in range(1, n + 1)] for n in (500, 5000))
     assert short[:300] == long[:300]
     assert short[299] == 1e-2
     assert short[-1] == pytest.approx(5e-4)
@@ -162,16 +148,16 @@ def test_transparent_pixels_teach_no_colour() -> None:
     assert losses[0] == losses[1]
 
 
-def test_anchors_pull_the_light_to_their_points() -> None:
+def test_sparse_depth_gathers_the_weight_at_its_points() -> None:
     m = untrained(contracted=True)
     origins = np.tile(np.float32([[-3.0, 0.1, 0.05]]), (4, 1))
     directions = np.float32([[1, 0, 0], [0.995, 0.0998, 0], [0.995, 0, 0.0998], [0.995, -0.0998, 0]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    anchors = SparseDepthRays(origins, directions, np.full(4, 3.0, np.float32))
-    adam = Adam(m.parameters())
+    rays = SparseDepthRays(origins, directions, np.full(4, 3.0, np.float32))
+    adam = Adam(parameter_groups(m))
     losses = []
     for step in range(1, 41):
-        loss = anchor_loss(m, anchors, 16, np.random.default_rng(step), prune=False)
+        loss = sparse_depth_loss(m, rays, 16, np.random.default_rng(step), prune=False)
         loss.backward()
         adam.step(step, 3e-2)
         losses.append(float(loss.detach()))
@@ -230,31 +216,45 @@ def test_other_samplings_learn_too_and_only_those_that_prune_touch_the_voxels(fi
 
 
 def test_the_rate_can_fall_by_a_tenth_in_so_many_steps() -> None:
-    assert learning_rate(500_000, 5e-4, 0.1, 1_000_000, 500_000) == pytest.approx(5e-5)
-    assert learning_rate(1_000_000, 5e-4, 0.1, 1_000_000, 500_000) == pytest.approx(5e-6)
+    schedule = Schedule(1_000_000, learning_rate=5e-4, lr_final_ratio=0.1, lr_decay_steps=500_000)
+    assert schedule.learning_rate_at(500_000) == pytest.approx(5e-5)
+    assert schedule.learning_rate_at(1_000_000) == pytest.approx(5e-6)
 
 
-@pytest.mark.parametrize("contracted", [False, True])
-def test_voxels_alone_can_choose_the_pivots(contracted: bool) -> None:
-    m = untrained(contracted=contracted, coarse="voxels", iterations=120)
-    made = cameras()
-    photographs = Pixels(made, [photograph(camera) for camera in made], [None] * len(made), np.full(len(made), 1.0), np.full(len(made), 50.0))
-    steps = run(m, photographs if contracted else None)
-    assert not any(name.startswith("coarse") for name, _ in m.parameters())
-    assert psnr_of(steps[-10:]) > psnr_of(steps[:5]) + 2
-    for step in steps[: m.settings.occupancy_warmup_steps]:
-        assert step.tried == step.valid == step.pivotal == step.fine  # everything, once
-    for step in steps[m.settings.occupancy_warmup_steps :]:
-        assert step.fine == m.settings.samples_per_pivot * step.pivotal
-    assert all(step.valid < step.tried for step in steps[-10:])  # what is empty is found
+def test_a_schedule_whose_iterations_are_revised_goes_on_from_where_it_was() -> None:
+    first = Schedule(1000, hold=100, learning_rate=1e-2)
+    second = first.with_iterations(3000, 400)
+    last = second.with_iterations(2000, 700)
+    assert (last.aims, last.iterations, last.settled) == (((1000, 400), (3000, 700)), 2000, 700)
+    fractions = [last.fraction(step) for step in range(2001)]
+    assert all(a <= b for a, b in itertools.pairwise(fractions))
+    assert max(b - a for a, b in itertools.pairwise(fractions)) < 2 / 900  # no leap
+    assert fractions[:401] == [first.fraction(step) for step in range(401)]
+    assert fractions[:701] == [second.fraction(step) for step in range(701)]
+    assert fractions[2000] == pytest.approx(1)
+    assert last.learning_rate_at(2000) == pytest.approx(5e-4)
 
 
-def test_a_schedule_that_was_settled_anew_goes_on_from_where_it_stood() -> None:
-    aims = (1000, 400, 3000, 700)
-    shares = [loop.share_of_fall(step, 2000, 100, aims) for step in range(2001)]
-    assert all(a <= b for a, b in itertools.pairwise(shares))
-    assert max(b - a for a, b in itertools.pairwise(shares)) < 2 / 900  # no leap
-    assert shares[:401] == [loop.share_of_fall(step, 1000, 100) for step in range(401)]
-    assert shares[:701] == [loop.share_of_fall(step, 3000, 100, aims[:2]) for step in range(701)]
-    assert shares[2000] == pytest.approx(1)
-    assert learning_rate(2000, 1e-2, 0.05, 2000, 0, 100, aims) == pytest.approx(5e-4)
+def test_a_schedule_is_what_its_state_and_the_settings_say() -> None:
+    given = settings(iterations=20, learning_rate=3e-3, lr_final_ratio=0.2)
+    revised = replace(schedule_of(given), hold=4).with_iterations(12, 6)
+    state = json.loads(json.dumps(revised.state()))
+    assert schedule_of(given, state) == revised
+    for wrong in ({}, {"iterations": 3}, {"iterations": 3, "hold": 0, "aims": [3]}):
+        with pytest.raises((KeyError, TypeError, ValueError)):
+            schedule_of(given, wrong or {"hold": 1})
+
+
+def test_a_schedule_that_is_replaced_on_the_way_is_repeated_by_the_last_one() -> None:
+    """To the byte: what a schedule says of the steps before its revision is what was done in them."""
+    states = []
+    for revise in (True, False):
+        t = trainer(untrained(iterations=12, occupancy_warmup_steps=4))
+        early, late = replace(t.schedule, iterations=100, hold=3), replace(t.schedule, iterations=100, hold=3).with_iterations(9, 5)
+        t.schedule = early if revise else late
+        for done in train(t, pixels()):
+            if done.step == 5:
+                t.schedule = late
+        assert t.step == 9
+        states.append({name: tensor.numpy().tobytes() for name, tensor in state_of(t).items()})
+    assert states[0] == states[1]

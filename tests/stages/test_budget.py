@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from efficientnerf.model import model, state_of
 from efficientnerf.training import loop
 from efficientnerf.training.loop import Progress, Trainer
-from efficientnerf.training.settings import TrainSettings
+from efficientnerf.training.schedule import schedule_of
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages import train
 from stages.artifacts import TrainOutputs
-from stages.io.field_file import load_renderer
-from stages.training.budget import MOST, TIMED, Budget
+from stages.io.field_file import load_renderer, read_tensors, space_of
+from stages.io.scene import load, views_of
+from stages.training.budget import TIMED, UNKNOWN, Budget
+from stages.training.data import depth_range, pixels_of
+from stages.training.hash_resolution import with_auto_sizes
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -48,34 +50,38 @@ def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stages.pictures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
-def digest(made: Job) -> str:
-    train.run(made)
-    return hashlib.sha256((made.out / TrainOutputs.field).read_bytes()).hexdigest()
-
-
 def report(made: Job) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((made.out / "report.json").read_text())
     return found
 
 
-def repeated(said: dict[str, Any]) -> TrainSettings:
-    """The settings of a plain run, as the report names them."""
-    return replace(settings(**QUICK), time_budget="off", iterations=said["iterations"], rate_hold=said["rate_hold"], rate_aims=tuple(said["rate_aims"]))
+def tensors_of(made: Job) -> dict[str, bytes]:
+    """Those of the trained field."""
+    return {name: tensor.numpy().tobytes() for name, tensor in state_of(load_renderer(made.out).model).items()}
+
+
+def repeated(scene: Path, said: dict[str, Any]) -> dict[str, bytes]:
+    """The tensors of a field that is trained with the schedule of the report."""
+    s = load(scene)
+    views = views_of(s, "train")
+    pixels = pixels_of(scene, views)
+    given = with_auto_sizes(settings(**QUICK), s, len(pixels))
+    m = model(space_of(s), given, s.background, span=depth_range(s, pixels, given))
+    t = loop.trainer(m, len(views), schedule_of(given, said["schedule"]))
+    assert len(list(loop.train(t, pixels))) == said["iterations"]
+    return {name: tensor.numpy().tobytes() for name, tensor in state_of(m).items()}
 
 
 def test_the_budget_is_met_and_its_steps_give_the_same_bytes(scene: Path, tmp_path: Path) -> None:
     budgeted = job(tmp_path / "a", settings(**QUICK), poses=scene)
-    first = digest(budgeted)
+    train.run(budgeted)
     said = report(budgeted)
     assert said["iterations"] > QUICK["occupancy_warmup_steps"] + TIMED  # it was long enough to be planned
     assert 0.95 * QUICK["time_budget"] <= said["seconds"] <= QUICK["time_budget"]
-    assert len(said["rate_aims"]) >= 2  # settled anew on the way
-    aims = json.dumps(said["rate_aims"], separators=(",", ":"))
-    steps = f"--set train.iterations={said['iterations']} --set train.rate_hold={said['rate_hold']}"
-    assert said["again"] == f"--set train.time_budget=off {steps} --set train.rate_aims={aims}"
-    plain = repeated(said)
-    assert digest(job(tmp_path / "b", plain, poses=scene)) == first
-    assert load_renderer(budgeted.out).model.settings == plain
+    assert len(said["schedule"]["aims"]) >= 1  # set again on the way
+    assert read_tensors(budgeted.out / TrainOutputs.field)[1]["schedule"] == said["schedule"]
+    assert load_renderer(budgeted.out).model.settings.iterations == said["iterations"]
+    assert repeated(scene, said) == tensors_of(budgeted)
 
 
 @pytest.mark.parametrize("at", [6, 51, 60])
@@ -84,14 +90,13 @@ def test_an_interrupted_run_keeps_to_its_plan(scene: Path, tmp_path: Path, at: i
     stop = StopAt(at)
     with pytest.raises(Interrupted):
         train.run(job(tmp_path, settings(**QUICK), poses=scene, stop=stop))
-    plan = tmp_path / "work" / "plan.json"
+    plan = tmp_path / "work" / "schedule.json"
     assert plan.exists() == (at > QUICK["occupancy_warmup_steps"] + TIMED)
     again = job(tmp_path, settings(**QUICK), poses=scene, stop=stop)
-    first = digest(again)
+    train.run(again)
     said = report(again)
     assert 0.95 * QUICK["time_budget"] <= said["seconds"] <= QUICK["time_budget"]  # what was spent before counts
-    plain = repeated(said)
-    assert digest(job(tmp_path / "plain", plain, poses=scene)) == first
+    assert repeated(scene, said) == tensors_of(again)
 
 
 def test_a_budget_that_is_over_before_anything_is_timed_ends_the_training(scene: Path, tmp_path: Path) -> None:
@@ -105,18 +110,18 @@ def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
     """The warm-up's steps are slower than those that follow, and say nothing about them."""
     now = [0.0]
     budget = Budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 0.0, lambda: now[0])
-    assert budget.planned().iterations == MOST
-    fixed = None
+    assert budget.schedule.iterations == UNKNOWN
+    assert not budget.known
     for step in range(1, 100):
         now[0] += 3.0 if step <= 10 else 0.5
-        if (fixed := budget.after(step)) is not None:
+        if budget.after(step):
             break
     assert step == 10 + TIMED
-    assert fixed is not None
-    assert fixed.iterations == step + int((99 - 54) / 0.5)
-    assert Budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 54.0, lambda: 0.0).planned() == fixed
-    (tmp_path / "plan.json").write_text("{")
-    assert Budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 54.0, lambda: 0.0).planned().iterations == MOST
+    assert budget.schedule.iterations == step + int((99 - 54) / 0.5)
+    given = settings(occupancy_warmup_steps=10, time_budget=100.0)
+    assert Budget(given, tmp_path, 54.0, lambda: 0.0).schedule == budget.schedule
+    (tmp_path / "schedule.json").write_text("{")
+    assert not Budget(given, tmp_path, 54.0, lambda: 0.0).known
 
 
 PACES: dict[str, Callable[[int], float]] = {
@@ -133,23 +138,17 @@ def test_steps_that_change_their_pace_end_on_time(tmp_path: Path, pace: Callable
     times, step, spent, began = [0.0], 0, 0.0, 0.0
     given = settings(occupancy_warmup_steps=10, time_budget=120.0)
     budget = Budget(given, tmp_path, 0.0, lambda: times[-1])
-    planned = budget.planned()
-    lost: dict[int, TrainSettings] = {}  # what the steps after the checkpoint were taken with
-    while step < planned.iterations:
-        if step in stops and step not in lost:
-            lost[step] = planned
+    before_stop: set[int] = set()
+    while step < budget.schedule.iterations:
+        if step in stops and step not in before_stop:
+            before_stop.add(step)
             step -= 10
             spent, began = spent + times[-1] - began, times[-1]
             budget = Budget(given, tmp_path, spent, lambda: times[-1])
-            planned = budget.planned()
-        before = rate(step + 1, planned)
+        before = budget.schedule.fraction(step + 1)
         times.append(times[-1] + pace(step))
         step += 1
-        planned = budget.after(step) or planned
-        assert rate(step, planned) == pytest.approx(before, abs=1e-6)  # what is settled later changes nothing that has been done
+        budget.after(step)
+        assert budget.schedule.fraction(step) == pytest.approx(before, abs=1e-6)  # a revision changes nothing that has been done
     assert 0.97 * 120 < spent + times[-1] - began <= 120 * 1.005
-    assert rate(step, planned) == pytest.approx(1.0)
-
-
-def rate(step: int, s: TrainSettings) -> float:
-    return loop.share_of_fall(step, s.iterations, s.rate_hold, s.rate_aims)
+    assert budget.schedule.fraction(step) == pytest.approx(1.0)

@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import Interrupted, UsageError
+from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages import train
 from stages.artifacts import TrainOutputs
 from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
 from stages.io.field_file import load_gains, load_renderer
+from stages.training.data import sparse_depth_of
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
@@ -59,13 +60,13 @@ def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Pat
     ]  # fmt: skip
     lines = [json.loads(line) for line in (made.out / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [5, 10, 13]
-    assert [line["held_back_psnr"] is None for line in lines] == [False, False, True]
+    assert [line["preview_psnr"] is None for line in lines] == [False, False, True]
     assert all(line["step_seconds"] > 0 for line in lines)
     assert all(0 < line["valid"] <= line["tried"] and 0 < line["occupied"] <= 1 for line in lines)
     assert checkpoints(made) == ["checkpoint_00000008.safetensors", "checkpoint_00000012.safetensors"]
     assert events[-1]["event"] == "progress"
     assert events[-1]["done"] == events[-1]["total"] == 13
-    assert {"loss", "psnr", "held_back_psnr", "samples_per_s", "occupied", "left"} <= events[-1].keys()
+    assert {"loss", "psnr", "preview_psnr", "samples_per_s", "occupied", "left"} <= events[-1].keys()
     assert events[-1]["samples_per_s"] > 0
     assert events[-1]["left"] == 0
     assert (made.work / "curve.png").exists()  # drawn at each preview, for those who wait
@@ -152,7 +153,7 @@ def test_photographs_with_masks(tmp_path: Path) -> None:
         train.run(job(tmp_path / "b", few, poses=folder))
 
 
-def test_points_in_a_camera_or_behind_it_are_no_anchors(tmp_path: Path) -> None:
+def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) -> None:
     folder = poses(tmp_path / "poses", points=True)
     s = scenes.load(folder)
     cameras = [view.camera for view in s.views]
@@ -163,14 +164,14 @@ def test_points_in_a_camera_or_behind_it_are_no_anchors(tmp_path: Path) -> None:
     def rays(points: SparsePoints) -> tuple[list[tuple[int, int]], Any]:
         """(point, camera) of each anchor, found again from the ray."""
         scenes.save_points(points, folder)
-        anchors = train.anchors_of(folder, s)
-        if anchors is None:
+        found_rays = sparse_depth_of(folder, s)
+        if found_rays is None:
             return [], None
-        np.testing.assert_allclose(np.linalg.norm(anchors.directions, axis=1), 1, atol=1e-6)
-        ends = anchors.origins + anchors.distance[:, None] * anchors.directions
+        np.testing.assert_allclose(np.linalg.norm(found_rays.directions, axis=1), 1, atol=1e-6)
+        ends = found_rays.origins + found_rays.distance[:, None] * found_rays.directions
         found = [(int(np.nanargmin(np.linalg.norm(points.xyz - end, axis=1))), int(np.argmin(np.linalg.norm(centres - origin, axis=1))))
-                 for origin, end in zip(anchors.origins, ends, strict=True)]  # fmt: skip
-        return sorted(found), anchors
+                 for origin, end in zip(found_rays.origins, ends, strict=True)]  # fmt: skip
+        return sorted(found), found_rays
 
     centres = np.array([camera.centre for camera in cameras])
     before = {(n, view) for n, views in enumerate(seen) for view in views if len(views) > 2 and (xyz[n] - centres[view]) @ cameras[view].forward > 1e-9}
@@ -190,15 +191,3 @@ def test_exposures_are_saved(tmp_path: Path) -> None:
     assert all((scene / name).exists() for name in gains)
     assert np.log(np.stack(list(gains.values()))).mean(axis=0) == pytest.approx(0, abs=1e-6)
     assert any(np.abs(gain - 1).max() > 1e-6 for gain in gains.values())
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"rate_aims": (30,)}, r"train\.rate_aims=\[30\]: expected pairs"),
-        ({"coarse": "voxels", "field": "mlp"}, r"train\.coarse=voxels needs train\.field=hash"),
-    ],
-)
-def test_settings_that_contradict_each_other_are_told(scene: Path, tmp_path: Path, changes: dict[str, object], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        train.run(job(tmp_path, settings(**changes), poses=scene))

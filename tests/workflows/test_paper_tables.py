@@ -58,7 +58,7 @@ def test_scale_one_is_the_paper_and_less_shrinks_everything_together() -> None:
 
 def test_the_pace_is_that_of_the_log() -> None:
     lines = [
-        {"step": step, "step_seconds": 2.0 if step <= 50 else 1.0, "held_back_psnr": None if step % 50 else 20.0 + step, "rays": 10, "valid": 30, "fine": 50}
+        {"step": step, "step_seconds": 2.0 if step <= 50 else 1.0, "preview_psnr": None if step % 50 else 20.0 + step, "rays": 10, "valid": 30, "fine": 50}
         for step in range(10, 101, 10)
     ]
     pace = _pace(lines)

@@ -168,9 +168,9 @@ def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     late = [line for line in lines if line["step"] > 0.8 * lines[-1]["step"]] or list(lines[-1:])
     curve: tuple[list[float], list[float]] = ([], [])
     for n, line in enumerate(lines):
-        if line["held_back_psnr"] is not None:
+        if line["preview_psnr"] is not None:
             curve[0].append(math.fsum(spent[: n + 1]))
-            curve[1].append(line["held_back_psnr"])
+            curve[1].append(line["preview_psnr"])
     rays = sum(line["rays"] for line in late)
     return {
         "step": total / lines[-1]["step"],
@@ -188,10 +188,10 @@ def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], d
 
     from efficientnerf.evaluation.metrics import psnr, ssim
     from efficientnerf.rendering.field_renderer import SampleCounts
+    from stages.cores import use_all_cores
     from stages.evaluate import evaluation_views, evenly_spaced, ground_truth
     from stages.io import scene
     from stages.io.field_file import load_renderer
-    from stages.train import use_all_cores
 
     kept = run.path / "network.json"
     key = {"field": digest, "views": settings["evaluate"]["field_views"]}

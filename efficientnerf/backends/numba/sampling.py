@@ -112,7 +112,7 @@ def _write_valid(  # type: ignore[no-untyped-def]
 def valid_samples(  # type: ignore[no-untyped-def]
     origins, directions, near, far, offset, centre, half, contracted, step, max_intervals, voxels, threshold, unpruned=0
 ):
-    """`efficientnerf.sampling.samples.valid_samples` on float32 arrays: (first, start, extent, length, point, number of intervals visited)."""
+    """`efficientnerf.sampling.valid.valid_samples` on float32 arrays: (first, start, extent, length, point, number of intervals visited)."""
     rays = len(origins)
     counts, visited, t_exit = np.zeros(rays, np.int64), np.zeros(rays, np.int64), np.empty(rays, np.float32)
     starts = np.empty((rays, max_intervals), np.float32)  # pages of a row are touched only as far as the ray has valid samples
@@ -131,7 +131,7 @@ def valid_samples(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def select_pivots(weight, first, threshold, max_pivots, out):  # type: ignore[no-untyped-def]
-    """`efficientnerf.sampling.samples.select_pivots` into out (N,) bool."""
+    """`efficientnerf.sampling.pivotal.select_pivots` into out (N,) bool."""
     rays = len(first) - 1
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         for r in range(block * BLOCK, min(rays, (block + 1) * BLOCK)):
@@ -180,7 +180,7 @@ def _write_pivotal(  # type: ignore[no-untyped-def]
 def pivotal_samples(  # type: ignore[no-untyped-def]
     origins, directions, offset, centre, half, contracted, first, start, extent, length, pivotal, per_pivot
 ):
-    """`efficientnerf.sampling.samples.pivotal_samples` on arrays: (first, start, extent, length, point)."""
+    """`efficientnerf.sampling.pivotal.pivotal_samples` on arrays: (first, start, extent, length, point)."""
     total = np.concatenate([np.zeros(1, np.int64), np.cumsum(pivotal, dtype=np.int64)])
     fine_first = total[first] * per_pivot
     n = int(fine_first[-1])

@@ -163,7 +163,7 @@ def valid_samples(
     space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
     capacity: int | None = None, *, whole: int = 0,
 ) -> Samples:  # fmt: skip
-    """See `efficientnerf.sampling.samples.valid_samples`; with `capacity` see the module, and `tried` is then a tensor on the device."""
+    """See `efficientnerf.sampling.valid.valid_samples`; with `capacity` see the module, and `tried` is then a tensor on the device."""
     origins, directions, near, far, offset, voxels = (t.detach().contiguous() for t in (origins, directions, near, far, offset, voxels))
     rays, side = len(origins), voxels.shape[0]
     device = origins.device
@@ -221,7 +221,7 @@ def _pivots(weight, first, out, rays, samples, threshold, most, BITS: tl.constex
 
 
 def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
-    """See `efficientnerf.sampling.samples.select_pivots`; padding is never pivotal."""
+    """See `efficientnerf.sampling.pivotal.select_pivots`; padding is never pivotal."""
     weight, rays, samples = weight.detach().contiguous(), len(first) - 1, len(weight)
     out = torch.zeros(samples, dtype=torch.bool, device=weight.device)
     if rays and samples:
@@ -258,7 +258,7 @@ def _pivotal(  # type: ignore[no-untyped-def]
 def pivotal_samples(
     space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int, capacity: int | None = None
 ) -> Samples:
-    """See `efficientnerf.sampling.samples.pivotal_samples`; with `capacity` see the module."""
+    """See `efficientnerf.sampling.pivotal.pivotal_samples`; with `capacity` see the module."""
     origins, directions, offset = (t.detach().contiguous() for t in (origins, directions, offset))
     rays, samples = len(origins), len(pivotal)
     pivotal = pivotal & (torch.arange(samples, device=origins.device) < coarse.first[-1])  # padding may have been marked by chance

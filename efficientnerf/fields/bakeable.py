@@ -1,0 +1,25 @@
+"""What fields share whose values depend on the position alone, so that they can be baked."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from efficientnerf.fields.gradient_buffer import GradientBuffer
+from efficientnerf.rendering.harmonics import basis
+
+
+class BakeableField(nn.Module):
+    """A field of `efficientnerf.fields` whose `forward` takes points (N, 3) alone."""
+
+    degree: int
+
+    @property
+    def gradient_buffers(self) -> dict[str, GradientBuffer]:
+        return {}
+
+    def along_rays(self, points: Tensor, directions: Tensor, first: Tensor) -> Tensor:
+        out: Tensor = self(points)
+        return out
+
+    def harmonics(self, directions: Tensor) -> Tensor:
+        return basis(directions, self.degree)

@@ -1,0 +1,226 @@
+"""Which samples of a bundle the two fields are evaluated at: one class for each sampling strategy.
+
+    Efficient     valid samples through the coarse field, pivotal ones through the fine field (EfficientNeRF)
+    Valid         valid samples, then importance samples of the fine field
+    Hierarchical  stratified samples, then importance samples of the fine field (NeRF)
+    Uniform       stratified samples of the fine field alone
+
+R rays, N coarse samples.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from efficientnerf.backends import dispatch
+from efficientnerf.backends.transfer import to_device
+from efficientnerf.geometry.spaces import RayBundle, Space
+from efficientnerf.rendering.compositing import ray_of_sample
+from efficientnerf.sampling.importance import importance_samples
+from efficientnerf.sampling.occupancy import DensityVoxels
+from efficientnerf.sampling.samples import SampleCapacity, Samples
+from efficientnerf.sampling.stratified import stratified_samples
+
+
+class SamplingRequest(NamedTuple):
+    """A bundle of rays to be sampled.
+
+    rays               in the frame of the space
+    offset             (R,) in [0, 1): where in its interval a sample lies
+    samples_per_pivot  N_s
+    prune              whether the density voxels are used (not in the warm-up)
+    rng                in training: for jitter, exploration and rays that are not pruned; None: nothing is random
+    capacity           on CUDA: samples are padded to this many, and their number is not waited for; None: no padding
+    """
+
+    rays: RayBundle
+    offset: Tensor
+    samples_per_pivot: int
+    prune: bool = True
+    rng: np.random.Generator | None = None
+    capacity: SampleCapacity | None = None
+
+
+class CoarseStage(NamedTuple):
+    """Coarse samples, and their distances along the rays (N,) where these are not at the bundle's offsets."""
+
+    samples: Samples
+    distance: Tensor | None = None
+
+
+class Strategy(Protocol):
+    """A sampling strategy.
+
+    prunes                            whether it uses the density voxels
+    coarse(request)                   the coarse samples; None: the strategy has no coarse stage
+    fine(request, coarse, weight)     which coarse samples are pivotal (N,) bool, and the fine samples; weight (N,) without gradient
+    """
+
+    prunes: ClassVar[bool]
+
+    def coarse(self, request: SamplingRequest) -> CoarseStage | None: ...
+
+    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]: ...
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """How rays are cut into coarse intervals.
+
+    step           length of an interval in the box, units of the frame
+    most           intervals on a ray at most
+    count          N_c
+    within_planes  whether they run from near to far plane instead of through the box
+    keep_outside   whether samples outside of the space are kept: a network can be evaluated there, a hash grid cannot
+    """
+
+    space: Space
+    voxels: DensityVoxels
+    step: float
+    most: int
+    count: int
+    within_planes: bool
+    keep_outside: bool
+
+    def valid(self, request: SamplingRequest, unpruned_fraction: float) -> Samples:
+        """Coarse samples in valid voxels; in training, all samples of a fraction of the rays: the first ones, which are as random as any."""
+        threshold = self.voxels.threshold if request.prune else -math.inf
+        unpruned = math.ceil(unpruned_fraction * len(request.offset)) if request.rng is not None else 0
+        capacity = None if request.capacity is None else request.capacity.coarse
+        bundle = (*request.rays[:4], request.offset)
+        return dispatch.valid_samples(self.space, *bundle, self.step, self.most, self.voxels.values, threshold, capacity, whole=unpruned)
+
+    def stratified(self, request: SamplingRequest, count: int, capacity: int | None) -> CoarseStage:
+        """`count` samples between near and far, or between where the ray enters the box and leaves it, whatever the density voxels hold."""
+        origins, directions, near, far = request.rays[:4]
+        if self.space.contracted:  # intervals that grow with the distance, all of them
+            step, most = self.step * self.count / count, math.ceil(self.most * count / self.count)
+            bundle = (origins, directions, near, far, request.offset)
+            samples = dispatch.valid_samples(self.space, *bundle, step, most, self.voxels.values, -math.inf, capacity)
+            return CoarseStage(samples, distances_at(samples, request.offset))
+        if not self.within_planes:
+            near, far = self.space.clip(origins, directions, near, far)
+        jitter = request.offset[:, None].expand(-1, count)
+        if request.rng is not None:
+            jitter = to_device(torch.from_numpy(request.rng.random((len(origins), count), np.float32)), request.offset.device)
+        return CoarseStage(*stratified_samples(self.space, origins, directions, near, far, jitter, outside=self.keep_outside, capacity=capacity))
+
+
+@dataclass(frozen=True)
+class Efficient:
+    """Valid, then pivotal samples (EfficientNeRF, sections 3.3 and 3.4).
+
+    exploration_fraction  in training: of the valid intervals without a pivot, these get fine samples too. Otherwise the fine field would be free to place
+                          density where this ray has no pivot and another has one, and the baked asset, which has no coarse field, would show it.
+    unpruned_fraction     in training: of the rays, these are sampled in invalid voxels too
+    """
+
+    prunes: ClassVar[bool] = True
+    intervals: Intervals
+    pivotal_threshold: float
+    max_pivots: int
+    exploration_fraction: float
+    unpruned_fraction: float
+
+    def coarse(self, request: SamplingRequest) -> CoarseStage:
+        return CoarseStage(self.intervals.valid(request, self.unpruned_fraction))
+
+    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
+        assert coarse is not None
+        assert weight is not None
+        pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
+        if request.rng is not None and self.exploration_fraction > 0:
+            pivotal = pivotal | _random_mask(len(pivotal), self.exploration_fraction, request.rng, pivotal.device)
+        capacity = None if request.capacity is None else request.capacity.fine
+        bundle = (request.rays.origins, request.rays.directions, request.offset)
+        return pivotal, dispatch.pivotal_samples(self.intervals.space, *bundle, coarse.samples, pivotal, request.samples_per_pivot, capacity)
+
+
+@dataclass(frozen=True)
+class Valid:
+    """Valid samples, then importance samples; `unpruned_fraction` as for `Efficient`."""
+
+    prunes: ClassVar[bool] = True
+    intervals: Intervals
+    pivotal_threshold: float
+    max_pivots: int
+    num_importance_samples: int
+    unpruned_fraction: float
+
+    def coarse(self, request: SamplingRequest) -> CoarseStage:
+        return CoarseStage(self.intervals.valid(request, self.unpruned_fraction))
+
+    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
+        assert coarse is not None
+        assert weight is not None
+        pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
+        return pivotal, _importance(self.intervals.space, request, coarse, weight, self.num_importance_samples)
+
+
+@dataclass(frozen=True)
+class Hierarchical:
+    """Stratified samples, then importance samples (NeRF, section 5.2)."""
+
+    prunes: ClassVar[bool] = False
+    intervals: Intervals
+    pivotal_threshold: float
+    max_pivots: int
+    num_importance_samples: int
+
+    def coarse(self, request: SamplingRequest) -> CoarseStage:
+        return self.intervals.stratified(request, self.intervals.count, None if request.capacity is None else request.capacity.coarse)
+
+    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
+        assert coarse is not None
+        assert weight is not None
+        pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
+        return pivotal, _importance(self.intervals.space, request, coarse, weight, self.num_importance_samples)
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """N_c and num_importance_samples stratified samples of the fine field, and no coarse stage."""
+
+    prunes: ClassVar[bool] = False
+    intervals: Intervals
+    num_importance_samples: int
+
+    def coarse(self, request: SamplingRequest) -> None:
+        return None
+
+    def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
+        capacity = None if request.capacity is None else request.capacity.fine
+        samples = self.intervals.stratified(request, self.intervals.count + self.num_importance_samples, capacity).samples
+        return torch.zeros(0, dtype=torch.bool, device=samples.start.device), samples
+
+
+def distances_at(samples: Samples, offset: Tensor) -> Tensor:
+    """(N,) distances of samples that lie at `offset` (R,) in their intervals."""
+    return samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
+
+
+def _importance(space: Space, request: SamplingRequest, coarse: CoarseStage, weight: Tensor, count: int) -> Samples:
+    quantile = _quantiles(len(request.offset), count, request.rng, request.offset.device)
+    distance = distances_at(coarse.samples, request.offset) if coarse.distance is None else coarse.distance
+    capacity = None if request.capacity is None else request.capacity.fine
+    return importance_samples(space, request.rays.origins, request.rays.directions, coarse.samples, distance, weight, quantile, capacity)
+
+
+def _quantiles(rays: int, count: int, rng: np.random.Generator | None, device: torch.device) -> Tensor:
+    """(rays, count), one in each of `count` equal parts of [0, 1]: random in training, the middles in rendering."""
+    within = torch.full((rays, count), 0.5) if rng is None else torch.from_numpy(rng.random((rays, count), np.float32))
+    return to_device((torch.arange(count) + within) / count, device)
+
+
+def _random_mask(count: int, fraction: float, rng: np.random.Generator, device: torch.device) -> Tensor:
+    """(count,) bool, about `fraction` of them; drawn on the device where there is one, since sending them takes longer."""
+    if device.type == "cuda":
+        generator = torch.Generator(device).manual_seed(int(rng.integers(2**62)))
+        return torch.rand(count, generator=generator, device=device) < fraction
+    return torch.from_numpy(rng.random(count, np.float32) < fraction)

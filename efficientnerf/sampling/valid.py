@@ -1,0 +1,53 @@
+"""Valid samples: coarse samples where the density voxels are above their threshold (EfficientNeRF, section 3.3), in plain torch. R rays, N samples."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from efficientnerf.geometry.spaces import FARTHEST, Space
+from efficientnerf.sampling.samples import Samples
+
+
+def valid_samples(
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
+    *, whole: int = 0,
+) -> Samples:  # fmt: skip
+    """The coarse samples of rays that lie where the density voxels are above `threshold` (equation 9).
+
+    origins, directions  (R, 3) world frame, unit directions
+    near, far, offset    (R,) distances, and the offset in [0, 1)
+    step, slots          length of an interval in the box (the last of a ray is cut short); at most so many intervals on a ray
+    voxels               (D, D, D) density voxels over the grid coordinates
+    whole                so many rays at the beginning are sampled in every interval, whatever the voxels say
+    """
+    t, leave = space.clip(origins, directions, near, far)
+    side = voxels.shape[0]
+    columns = []
+    tried = 0
+    limit = torch.full_like(t, threshold)
+    limit[:whole] = -torch.inf
+    for _ in range(slots):
+        stretch = torch.ones_like(t)
+        if space.contracted:
+            reach = space.unit(origins + t[:, None] * directions).abs().amax(dim=-1).clamp(min=1)
+            stretch = reach * reach
+            leave = torch.where(reach * FARTHEST > 1, t, leave)
+        alive = t < leave
+        if not alive.any():
+            break
+        extent = torch.minimum(step * stretch, leave - t)  # the last interval ends where the ray leaves
+        point = space.grid(origins + (t + offset * extent)[:, None] * directions)
+        cell = (point * side).long().clamp(0, side - 1)
+        valid = alive & (voxels[cell[:, 0], cell[:, 1], cell[:, 2]] > limit)
+        tried += int(alive.sum())
+        columns.append((valid, t, extent, extent / stretch, point))
+        t = t + step * stretch
+    if not columns:
+        empty = origins.new_zeros(0)
+        return Samples(torch.zeros(len(origins) + 1, dtype=torch.int64, device=origins.device), empty, empty, empty, empty.reshape(0, 3), 0)
+    valid = torch.stack([c[0] for c in columns], dim=1)  # (R, slots)
+    start, extent, length = (torch.stack([c[n] for c in columns], dim=1)[valid] for n in (1, 2, 3))
+    point = torch.stack([c[4] for c in columns], dim=1)[valid]
+    first = torch.cat([valid.new_zeros(1, dtype=torch.int64), valid.sum(dim=1).cumsum(dim=0)])
+    return Samples(first, start, extent, length, point, tried)

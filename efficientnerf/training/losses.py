@@ -1,0 +1,54 @@
+"""The losses of a step. R rays, N samples."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from efficientnerf.backends.transfer import to_device
+from efficientnerf.model import Model, RayOutputs
+from efficientnerf.rendering.compositing import ray_of_sample
+from efficientnerf.training.exposure import exposed
+
+
+def mean_over(values: Tensor, rays: Tensor | None) -> Tensor:
+    """Mean of values (R, ...) over some rays (R,) bool, or over all."""
+    if rays is None:
+        return values.mean()
+    per_ray = values.reshape(len(values), -1).mean(dim=1)
+    # A product would let through what is no number.
+    return torch.where(rays, per_ray, 0).sum() / rays.sum().clamp(min=1)
+
+
+def colour_losses(outputs: RayOutputs, colour: Tensor, complete: Tensor | None, view: Tensor | None, exposure: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Mean squared error of the fine colours, and of the coarse ones (None where there is no coarse stage).
+
+    colour    (R, 3) of the photographs
+    complete  (R,) bool, rays that count; None: all
+    view      (R,) int64 photograph of each ray; exposure (C, 3), see `efficientnerf.training.exposure`; None: exposure is not learned
+    """
+    fine, coarse = outputs.fine_colour, outputs.coarse_colour
+    if exposure is not None and view is not None:
+        fine = exposed(fine, view, exposure)
+        coarse = None if coarse is None else exposed(coarse, view, exposure)
+    return mean_over((fine - colour) ** 2, complete), None if coarse is None else mean_over((coarse - colour) ** 2, complete)
+
+
+def distortion_loss(m: Model, outputs: RayOutputs, fraction: float, complete: Tensor | None) -> Tensor:
+    """The distortion loss (Barron et al. 2022, "Mip-NeRF 360", equation 15), weighted; fraction of the schedule, 0 to 1."""
+    return m.space.distortion_schedule(fraction) * m.distortion * mean_over(outputs.distortion, complete)
+
+
+def scale_gradients_by_distance(m: Model, origins: Tensor, outputs: RayOutputs) -> None:
+    """Scale gradients by the square of the distance to the camera, up to the distance of the box's centre.
+
+    Rays are dense close to a camera, so that samples there get gradients far more often than those on the subject, and floaters grow before the camera.
+    Philip and Deschaintre 2023, "Floaters no more: radiance field gradient scaling for improved near-camera training".
+    """
+    subject = (origins - to_device(torch.as_tensor(m.space.centre, dtype=origins.dtype), origins.device)).norm(dim=-1)
+    for samples, raw in ((outputs.coarse, outputs.coarse_raw), (outputs.fine, outputs.fine_raw)):
+        if not raw.requires_grad:  # uniform sampling has no coarse stage
+            continue
+        ray = ray_of_sample(samples.first, len(samples.start))
+        scale = (samples.start / subject[ray]).clamp(max=1) ** 2
+        raw.register_hook(lambda grad, scale=scale: grad * scale[:, None])

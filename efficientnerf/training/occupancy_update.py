@@ -1,0 +1,59 @@
+"""Updates of the density voxels in training: with the coarse field's densities on the rays of a step, and at random voxels now and then."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from efficientnerf.backends import dispatch
+from efficientnerf.model import Model, RayOutputs
+from efficientnerf.rendering.compositing import activate
+from efficientnerf.sampling.occupancy import apply_decay, cell_of, random_cells, reset_cells, sweep_cells, update
+
+SWEEP_PARTS = 8  # updates of the warm-up that together query every voxel
+BLOCK = 2**17  # voxels that are queried at a time
+
+
+@torch.no_grad()
+def update_occupancy(m: Model, outputs: RayOutputs, number: int, rng: np.random.Generator, *, padded: bool, may_wait: bool) -> None:
+    """After step `number`: the coarse densities on its rays and, every `train.occupancy_update_interval` steps, those of some voxels.
+
+    padded    whether the step's samples are padded to a capacity
+    may_wait  whether the device may be asked for numbers
+    """
+    if not m.prunes:
+        return
+    update_at_points(m, outputs.coarse.point, outputs.coarse_raw[:, 0].detach(), count=outputs.coarse.first[-1] if padded else None)
+    due = number % m.settings.occupancy_update_interval == 0
+    if due:
+        update_at_random_cells(m, number, rng)
+    # Where nothing is sampled nothing has a gradient: a scene whose voxels are all invalid would stay empty.
+    if not may_wait and due:
+        reset_cells(m.voxels, ~(m.voxels.values > m.voxels.threshold).any())
+    elif may_wait and len(outputs.coarse.start) == 0 and not bool((m.voxels.values > m.voxels.threshold).any()):
+        reset_cells(m.voxels)
+
+
+def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> None:
+    """Decay the voxels, and query the coarse field at some of them: all in turn in the warm-up, then random ones."""
+    generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    apply_decay(m.voxels)
+    if m.settings.occupancy_update_fraction == 0:
+        return
+    if number <= m.settings.occupancy_warmup_steps:
+        cell, point = sweep_cells(m.voxels, number // m.settings.occupancy_update_interval, SWEEP_PARTS, generator)
+    else:
+        cell, point = random_cells(m.voxels, int(m.settings.occupancy_update_fraction * m.voxels.side**3), generator)
+    for begin in range(0, len(cell), BLOCK):
+        part = point[begin : begin + BLOCK]
+        update_at_points(m, part, m.coarse.density(m.snapped_points(part)), cell[begin : begin + BLOCK])
+
+
+def update_at_points(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:
+    """Update the density voxels with raw densities (N,) at points (N, 3) in grid coordinates; `cell` (N,), where it is known, and `count` as for `update`."""
+    kernel = cell is None and count is None and m.voxels.rule == "maximum"
+    if kernel and dispatch.update_occupancy_maximum(m.voxels.values, point, raw, m.coarse.activation):
+        return
+    cell = cell_of(point, m.voxels.side) if cell is None else cell
+    update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.coarse.activation), count)

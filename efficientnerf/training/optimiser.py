@@ -1,0 +1,81 @@
+"""Adam over the parameters of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from efficientnerf.backends import dispatch
+from efficientnerf.fields.gradient_buffer import GradientBuffer
+from efficientnerf.model import Model
+
+BETA1 = 0.9
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Parameters, by name, that are treated alike.
+
+    sparse   entries whose gradient is zero are left alone, their moments too, as in hash tables (Mueller et al. 2022)
+    buffers  where the gradients of some of them are summed instead of in `grad`
+    """
+
+    parameters: Mapping[str, nn.Parameter]
+    sparse: bool = False
+    buffers: Mapping[str, GradientBuffer] = field(default_factory=dict)
+
+    def gradient(self, name: str) -> Tensor | None:
+        """The gradient of this step; None where no backward pass has reached the parameter."""
+        buffer = self.buffers.get(name)
+        return buffer.values if buffer is not None and buffer.filled else self.parameters[name].grad
+
+
+def parameter_groups(m: Model) -> list[ParameterGroup]:
+    """The model's networks, and its hash tables, whose updates are sparse."""
+    buffers = m.gradient_buffers()
+    dense = {name: p for name, p in m.parameters() if name not in buffers}
+    return [ParameterGroup(dense), ParameterGroup({name: p for name, p in m.parameters() if name in buffers}, sparse=True, buffers=buffers)]
+
+
+class Adam:
+    """Kingma and Ba's Adam."""
+
+    def __init__(self, groups: list[ParameterGroup], beta2: float = 0.99, epsilon: float = 1e-15) -> None:
+        self.groups, self.beta2, self.epsilon = groups, beta2, epsilon
+        self.moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for group in groups for name, p in group.parameters.items()}
+
+    def step(self, number: int, learning_rate: float) -> None:
+        """The `number`-th step, from 1; clears the gradients."""
+        for group in self.groups:
+            for name, p in group.parameters.items():
+                grad = group.gradient(name)
+                if grad is None:
+                    continue
+                self._update(p, grad, *self.moments[name], number, learning_rate, sparse=group.sparse)
+                if grad is p.grad:
+                    p.grad = None
+                else:
+                    group.buffers[name].mark_cleared()
+
+    def _update(self, p: nn.Parameter, grad: Tensor, first: Tensor, second: Tensor, number: int, learning_rate: float, *, sparse: bool) -> None:
+        """One parameter and its moments, in place. On the CPU the gradient is cleared, too."""
+        correction1, correction2 = 1 - BETA1**number, 1 - self.beta2**number
+        if p.device.type == "cpu":
+            from efficientnerf.backends.numba import adam as cpu_adam
+
+            flat = [t.detach().view(-1).numpy() for t in (p, grad.contiguous(), first, second)]
+            cpu_adam.adam(*flat, *(np.float32(x) for x in (learning_rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
+        elif dispatch.on_device(p, grad):
+            from efficientnerf.backends.triton.adam import adam
+
+            adam(p, grad, first, second, learning_rate, BETA1, self.beta2, correction1, correction2, self.epsilon, skip_zeros=sparse)
+        else:
+            with torch.no_grad():
+                touched = (grad != 0) if sparse else torch.ones_like(grad, dtype=torch.bool)
+                first.copy_(torch.where(touched, first.lerp(grad, 1 - BETA1), first))
+                second.copy_(torch.where(touched, second.lerp(grad**2, 1 - self.beta2), second))
+                p.sub_(touched * learning_rate * (first / correction1) / ((second / correction2).sqrt() + self.epsilon))

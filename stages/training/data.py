@@ -1,0 +1,95 @@
+"""What a scene gives training: pixels with their rays, near and far planes, sparse depth, and the voxels in which nothing is learned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.settings import given
+from efficientnerf.training.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from efficientnerf.model import Model
+    from efficientnerf.training.pixels import Pixels
+    from efficientnerf.training.sparse_depth import SparseDepthRays
+    from pipeline.stage import Job
+    from stages.io.scene import Scene, View
+
+MIN_TRACK = 3  # images that a sparse point must be observed in
+MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
+
+
+def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
+    """All pixels of some views of a scene, as bytes; one image at a time is held beside them."""
+    from efficientnerf.training.pixels import Pixels
+    from stages.io import scene
+
+    images = (scene.read_image(folder, view) for view in views)
+    masks = (scene.read_mask(folder, view) for view in views)
+    near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
+    channels = 4 if any(scene.has_alpha(folder, view) for view in views) else 3
+    return Pixels([view.camera for view in views], images, masks, near, far, channels)
+
+
+def depth_range(s: Scene, pixels: Pixels, settings: TrainSettings) -> tuple[float, float]:
+    """Nearest and farthest of all views along their axes; where the settings state planes these, which are set for the pixels too."""
+    if settings.far_plane != "auto":
+        near, far = stated_planes(s, settings)
+        pixels.near[:], pixels.far[:] = near, far
+        return near, far
+    return min(view.near for view in s.views), max(view.far for view in s.views)
+
+
+def stated_planes(s: Scene, settings: TrainSettings) -> tuple[float, float]:
+    """train.near_plane and train.far_plane in the training frame; UsageError where the scene has none, or they are not in order."""
+    from pipeline.errors import UsageError
+
+    if s.background is None:
+        raise UsageError("train.near_plane and train.far_plane are for scenes on a constant background; this one is unbounded. Leave them auto.")
+    near, far = given(settings.near_plane), given(settings.far_plane)
+    if near is None or far is None or near >= far:
+        raise UsageError(f"train.near_plane={settings.near_plane}, train.far_plane={settings.far_plane}: expected two numbers, the second one greater.")
+    return near * float(s.world_from_capture.scale), far * float(s.world_from_capture.scale)
+
+
+def sparse_depth_of(folder: Path, s: Scene) -> SparseDepthRays | None:
+    """Rays of training cameras to the sparse points that are registered in their images; None: there are none.
+
+    Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
+    or in it, too.
+    """
+    from efficientnerf.training.sparse_depth import SparseDepthRays
+    from stages.io import scene
+
+    if not s.points:
+        return None
+    points = scene.read_points(folder)
+    in_training = np.array([view.split == "train" for view in s.views])
+    centres = np.array([view.camera.centre for view in s.views])
+    pairs = [(n, view) for n, track in enumerate(points.tracks) if len(track) >= MIN_TRACK for view in track if in_training[view]]
+    if not pairs:
+        return None
+    point, view = np.array(pairs, np.int64).T
+    offset = points.xyz[point] - centres[view]
+    distance = np.linalg.norm(offset, axis=1)
+    forward = np.array([v.camera.forward for v in s.views])
+    before = (offset * forward[view]).sum(1) > MIN_DISTANCE  # so is the distance; what is not a number is not before anything
+    if not before.any():
+        return None
+    offset, distance, view = offset[before], distance[before], view[before]
+    return SparseDepthRays(centres[view].astype(np.float32), (offset / distance[:, None]).astype(np.float32), distance.astype(np.float32))
+
+
+def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> None:
+    """Mask the density voxels of an unbounded scene that fewer than `train.min_views` training views have in view: their density could be at any depth."""
+    import torch
+
+    from efficientnerf.sampling.occupancy import mask_cells
+    from stages.framing.view_coverage import cells_below_min_views
+
+    if not m.space.contracted or m.settings.min_views == "off":
+        return
+    job.progress(0, m.settings.iterations, "computing view coverage")
+    mask_cells(m.voxels, torch.from_numpy(cells_below_min_views(m.space, [view.camera for view in views], m.settings.min_views, m.voxels.side)))

@@ -1,0 +1,127 @@
+"""The log of a training run, and the curve that is drawn of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from efficientnerf.training.loop import Progress
+
+EVERY = 10  # steps
+SMOOTHING = 0.95  # of the running mean of the loss
+
+
+class TrainLog:
+    """log.jsonl: a line every few steps, and at each preview.
+
+        seconds       of the stage so far, previews and checkpoints included
+        step_seconds  of a step alone, the mean since the last line
+        loss, psnr    running means over the training rays
+        left_out      of the step's rays, those whose samples did not fit their capacity
+
+    On CUDA counts and the fraction of valid voxels are those of some steps before (`efficientnerf.training.readback`). Lines are written by `flush`.
+    """
+
+    def __init__(self, path: Path, step: int, spent: float, occupied: Callable[[], float], clock: Callable[[], float]) -> None:
+        """
+        step, spent  the step that training goes on from, and the seconds up to it; lines after it are dropped, for they will be logged again
+        occupied     the fraction of valid voxels
+        clock        seconds, monotonic
+        """
+        self.path, self.first, self.spent, self.occupied, self.clock = path, step, spent, occupied, clock
+        self.began = self.step_began = clock()
+        self.logged, self.working = step, 0.0
+        self.loss, self.fraction = 0.0, 0.0
+        self.rates: dict[str, Any] = {}
+        self.unwritten: list[str] = []
+        if path.exists():
+            kept = [line for line in read_lines(path) if line["step"] <= step]
+            path.write_text("".join(json.dumps(line, sort_keys=True) + "\n" for line in kept), encoding="utf-8")
+
+    @property
+    def seconds(self) -> float:
+        """Trained for, earlier attempts included."""
+        return self.spent + self.clock() - self.began
+
+    def begin_step(self) -> None:
+        self.step_began = self.clock()
+
+    def end_step(self, done: Progress) -> None:
+        self.working += self.clock() - self.step_began
+        self.loss = done.loss if done.step == self.first + 1 else SMOOTHING * self.loss + (1 - SMOOTHING) * done.loss
+
+    def record(self, done: Progress, goal: int, psnr: float | None, *, last: bool) -> dict[str, Any]:
+        """Log the step where it is time; returns what a display shows of it.
+
+        goal  steps that are planned
+        psnr  of the preview that was drawn after this step, if one was
+        """
+        seconds, due = self.seconds, done.step % EVERY == 0 or last
+        if due or psnr is not None or not self.rates:
+            self.fraction = self.occupied()
+        if due or psnr is not None:
+            self.unwritten.append(json.dumps(self._line(done, seconds, psnr), sort_keys=True))
+            self.working, self.logged = 0.0, done.step
+        if due or not self.rates:
+            each = max((seconds - self.spent) / max(done.step - self.first, 1), 1e-9)
+            self.rates = {
+                "samples_per_s": round((done.valid + done.fine) / each),
+                "occupied": round(self.fraction, 4),
+                "left": round(each * max(0, goal - done.step), 1),
+            }
+        return {"loss": self.loss, "psnr": round(psnr_of(self.loss), 2), **self.rates}
+
+    def _line(self, done: Progress, seconds: float, psnr: float | None) -> dict[str, Any]:
+        return {
+            "step": done.step,
+            "seconds": round(seconds, 3),
+            "step_seconds": round(self.working / (done.step - self.logged), 6),
+            "loss": self.loss,
+            "psnr": psnr_of(self.loss),
+            "preview_psnr": psnr,
+            "rays": done.rays,
+            "tried": done.tried,
+            "valid": done.valid,
+            "pivotal": done.pivotal,
+            "fine": done.fine,
+            "left_out": done.left_out,
+            "occupied": self.fraction,
+        }
+
+    def flush(self) -> None:
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.writelines(line + "\n" for line in self.unwritten)
+        self.unwritten.clear()
+
+    def draw_curve(self, path: Path) -> None:
+        """PSNR over steps, of the training rays and of the previews."""
+        from stages.pictures.plots import curve
+
+        lines = [*read_lines(self.path), *map(json.loads, self.unwritten)]
+        series = {"training rays, running mean": ([x["step"] for x in lines], [x["psnr"] for x in lines])}
+        previews = [(x["step"], x["preview_psnr"]) for x in lines if x.get("preview_psnr") is not None]
+        if previews:
+            series["preview view"] = ([step for step, _ in previews], [psnr for _, psnr in previews])
+        curve(path, series, x_label="step", y_label="PSNR / dB")
+
+
+def psnr_of(loss: float) -> float:
+    """dB, of a mean squared error."""
+    return -10 * math.log10(max(loss, 1e-10))
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of a log, up to one that was cut short by a kill; none where there is no file yet."""
+    out: list[dict[str, Any]] = []
+    if not path.exists():
+        return out
+    for text in path.read_text(encoding="utf-8").splitlines():
+        try:
+            out.append(json.loads(text))
+        except ValueError:
+            break
+    return out

@@ -1,0 +1,64 @@
+"""Renders of one view now and then, beside its photograph."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from efficientnerf.rendering.field_renderer import FieldRenderer
+    from stages.io.scene import Scene, View
+
+SIDE = 200  # longest side of a preview, pixels
+
+
+class Previews:
+    """Preview renders in the scratch folder.
+
+    psnr  of the last one; None before the first
+    """
+
+    def __init__(self, renderer: FieldRenderer, poses: Path, s: Scene, work: Path, every: int | None) -> None:
+        """
+        poses  the folder of the scene
+        every  steps between previews; None: there are none
+        """
+        self.renderer, self.poses, self.work, self.every = renderer, poses, work, every
+        self.view = preview_view(s)
+        self.psnr: float | None = None
+
+    def draw(self, step: int) -> float | None:
+        """Render where it is time after a step; the PSNR of the preview, None where none is drawn."""
+        if self.view is None or self.every is None or step == 0 or step % self.every:
+            return None
+        from efficientnerf.evaluation.metrics import psnr
+        from stages.evaluate import ground_truth, subsample, subsample_camera
+        from stages.io.png import write_png
+        from stages.pictures.plots import to_uint8
+
+        stride = max(1, math.ceil(max(self.view.camera.width, self.view.camera.height) / SIDE))
+        truth = subsample(ground_truth(self.poses, self.view, self.renderer.model.background).colour, stride)
+        render = np.clip(self.renderer.render(subsample_camera(self.view.camera, stride)).colour, 0, 1)
+        write_png(to_uint8(np.concatenate([truth, render], axis=1)), self.work / f"preview_{step:06d}.png")
+        self.psnr = round(float(psnr(render, truth)), 2)
+        return self.psnr
+
+    def publish(self, folder: Path) -> None:
+        """Copy all previews, those of earlier attempts too, into `folder`, which is made if there are any."""
+        drawn = sorted(self.work.glob("preview_*.png"))
+        if drawn:
+            folder.mkdir()
+            for path in drawn:
+                shutil.copyfile(path, folder / path.name)
+
+
+def preview_view(s: Scene) -> View | None:
+    """A validation view if there is one, so that the test views stay unread until the end; None: there are neither."""
+    from stages.io.scene import views_of
+
+    views = views_of(s, "val") or views_of(s, "test")
+    return views[len(views) // 2] if views else None
