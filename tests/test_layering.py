@@ -24,7 +24,7 @@ KERNELS = ("efficientnerf/backends/numba", "efficientnerf/backends/triton", "eff
 MODULES_A_FOLDER, LINES, ARGUMENTS = 15, 60, 12
 # To be mended; nothing is to be added here.
 IN_RINGS = {"efficientnerf.asset.refinement", "efficientnerf.asset.refinement_device"}
-LONG = {"efficientnerf.training.loop:train", "stages.train:run"}
+LONG: set[str] = set()
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
 
 
