@@ -149,7 +149,7 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
             values[name] = msgspec.convert(value, hints[name], strict=True)
         except msgspec.ValidationError:
             raise UsageError(f"{prefix}{name}: found {_shown(value)}, expected {type_in_words(hints[name])}.{_near(hints[name], value)}") from None
-        if not all(math.isfinite(number) for number in _numbers(values[name])):
+        if not all(math.isfinite(number) for number in _floats(values[name])):
             raise UsageError(f"{prefix}{name}: found {_shown(value)}, expected a finite number.")
     return cls(**values)
 
@@ -169,10 +169,10 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
-def _numbers(value: Any) -> list[float]:
+def _floats(value: Any) -> list[float]:
     if isinstance(value, tuple):
-        return [number for item in value for number in _numbers(item)]
-    return [value] if isinstance(value, int | float) else []
+        return [number for item in value for number in _floats(item)]
+    return [value] if isinstance(value, float) else []
 
 
 def type_in_words(hint: Any) -> str:

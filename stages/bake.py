@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Fraction, NonNegative, PositiveInt, given, setting
+from efficientnerf.settings import Auto, Count, Fraction, NonNegative, PositiveInt, Seed, given, setting
 from pipeline.files import atomic
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, inputs_of, needs_of
@@ -72,7 +72,7 @@ class BakeSettings:
     samples_per_voxel: Annotated[int, Meta(ge=1, le=256)] = setting(
         8, "Jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels.", advanced=True
     )
-    seed: Count = setting(0, "Seed of the jitter and of the rays of the refinement.", advanced=True)
+    seed: Seed = setting(0, "Seed of the jitter and of the rays of the refinement.", advanced=True)
     refine_steps: Count | Auto = setting(
         "auto",
         "Steps in which the baked values are refined on the training images; auto: five rays for each voxel, at least 320 steps, or 160 in unbounded scenes.",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Fraction, PositiveInt, given, setting
+from efficientnerf.settings import Auto, Fraction, PositiveInt, Seed, given, setting
 from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
@@ -30,7 +30,7 @@ class PointsSettings:
     )
     min_component: Fraction = setting(0.01, "Area below which connected components get no points, as a fraction of the largest one's.", advanced=True)
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(10, "Iterations of Taubin smoothing of the surface.", advanced=True)
-    seed: Count = setting(0, "Seed of the places of the points on the surface.", advanced=True)
+    seed: Seed = setting(0, "Seed of the places of the points on the surface.", advanced=True)
 
 
 def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None]) -> PointCloud:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, PositiveInt, setting
+from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, PositiveInt, Seed, setting
 
 # What `auto` means for train.log2_hashmap_size and train.finest_resolution in bounded scenes.
 LOG2_TABLE = 17
@@ -26,7 +26,7 @@ class TrainSettings:
         65536, "Target number of samples in a step, from which the number of rays follows; off: always max_rays_per_batch rays.", advanced=True
     )
     max_rays_per_batch: PositiveInt = setting(8192, "Most rays in a step.", advanced=True)
-    seed: Count = setting(0, "Seed of every random choice in training.")
+    seed: Seed = setting(0, "Seed of every random choice in training.")
     field: Literal["hash", "mlp", "nerf"] = setting(
         "hash", "Kind of field: a multiresolution hash grid (hash), the paper's networks (mlp), or those of the original NeRF, which cannot be baked (nerf)."
     )

@@ -51,6 +51,7 @@ def test_plain_values_and_back() -> None:
         ({"iterations": True}, "train.iterations: found True (bool), expected a whole number"),
         ({"iterations": "5"}, "found '5' (str)"),
         ({"iterations": 0}, "at least 1"),
+        ({"iterations": 10**400}, "at most 1000"),
         ({"iterations": 1001}, "at most 1000"),
         ({"rate": float("nan")}, "expected a finite number"),
         ({"rate": float("inf")}, "expected a finite number"),

@@ -15,7 +15,7 @@ LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asse
 @click.command(short_help="Compare two assets: metadata, tensors, renders.")
 @click.argument("first", metavar="A", type=folder_type)
 @click.argument("second", metavar="B", type=folder_type)
-@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Renders to compare, from around A; 0: none.")
+@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, from around A.")
 @click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels along a side of the renders.")
 @json_option
 @quiet_option

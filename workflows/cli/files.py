@@ -28,7 +28,7 @@ CAMERAS = ".json"
 def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, sets: tuple[str, ...], as_json: bool, quiet: bool) -> None:
     """Write the surface of RUN or ASSET as .ply, .glb or .obj, with --points as .ply or .xyz; or the cameras of RUN as .json (nerfstudio).
 
-    Files that exist are replaced, and only once the new ones are whole. '--set mesh.faces=...' and the other settings of mesh and points hold here too.
+    Files that exist are replaced, and only once the new ones are whole. '--set mesh.max_faces=...' and the other settings of mesh and points hold here too.
     """
     from pipeline.errors import UsageError
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
