@@ -61,7 +61,7 @@ def workplace(run: Path, stage: str, request: Request) -> Workplace:
 
 @dataclass(frozen=True)
 class Differences:
-    """Between what a manifest lists and what lies in the folder; names, sorted."""
+    """Between the outputs of a manifest and the files in the folder; names, sorted."""
 
     altered: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
@@ -69,7 +69,7 @@ class Differences:
 
     @property
     def damaged(self) -> tuple[str, ...]:
-        """Altered or missing. A file too many damages nothing."""
+        """Altered or missing; extra files do no harm."""
         return tuple(sorted(self.altered + self.missing))
 
     def text(self) -> str:
@@ -121,7 +121,7 @@ def differences(folder: Path, outputs: dict[str, Output], hashes: Hashes | None 
 
 
 def prepare(place: Workplace, trash: Path) -> bool:
-    """Make room for a request: other requests' work goes, out/ is empty, scratch/ is as it was left. Returns whether scratch held anything."""
+    """Make the folders of a request: an empty out/, scratch/ as it was; other requests' work is removed. Returns whether scratch/ held anything."""
     place.root.mkdir(parents=True, exist_ok=True)
     for other in list(place.root.iterdir()):
         if other.name != place.request:
@@ -133,7 +133,7 @@ def prepare(place: Workplace, trash: Path) -> bool:
 
 
 def abandon(place: Workplace, trash: Path) -> None:
-    """After a failure: what was being written goes, checkpoints stay."""
+    """After a failure: out/ is removed, checkpoints stay."""
     files.discard(place.out, trash)
     if place.scratch.is_dir() and not files.is_empty(place.scratch):
         place.out.mkdir()
@@ -144,7 +144,7 @@ def abandon(place: Workplace, trash: Path) -> None:
 
 
 def seal(out: Path, made: Manifest) -> None:
-    """Step 1: everything in the folder reaches the disk, then the manifest does."""
+    """Step 1: sync everything in the folder, then write the manifest."""
     files.sync_tree(out)
     files.write_atomically(out / manifest.NAME, made.to_bytes())
 
@@ -182,7 +182,7 @@ def recover(run: Path) -> list[str]:
     done = []
     for old in sorted(work.glob("old-*")):
         stage = old.name.removeprefix("old-")
-        done.append(f"{stage}: {_settled(run, stage, old)}")
+        done.append(f"{stage}: {_recovered(run, stage, old)}")
     for root in sorted(path for path in work.iterdir() if path.is_dir() and "-" not in path.name):
         _clear_published(run / root.name, root, work)
     for trash in work.glob("trash-*"):
@@ -190,7 +190,7 @@ def recover(run: Path) -> list[str]:
     return done
 
 
-def _settled(run: Path, stage: str, old: Path) -> str:
+def _recovered(run: Path, stage: str, old: Path) -> str:
     work, target = run / WORK, run / stage
     if files.exists(target) and _is_sealed(target):
         files.discard(old, work)

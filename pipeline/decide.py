@@ -1,10 +1,10 @@
-"""Whether a stage has to run, and why. Looks, and changes nothing: neither the run nor the source.
+"""Whether a stage has to run, and why. No side effects on the run or the source.
 
 missing  never run
 fresh    nothing to do
 stale    made by another request: other settings, other inputs, another version
-partial  work on the present request was cut short; what stands, if anything does, is of another request
-corrupt  what lies on disk is not what was written
+partial  work on the present request was cut short; the published artifact, if any, is of another request
+corrupt  the files are not those that were written
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _CHANGES_SHOWN = 4
 
 @dataclass(frozen=True)
 class Decision:
-    """What was found about one stage.
+    """The state of one stage.
 
     state     fresh, stale, missing, partial or corrupt
     reason    why it has to run; None if and only if fresh
-    note      what else is worth saying
-    request   what it would be run with now; None where that cannot be known, and then
-    obstacle  the error that says what stands in the way
-    manifest  of the artifact that stands, if it can be read
+    note      a remark for the user
+    request   of a run of the stage now; None where it cannot be determined, and then
+    obstacle  the error that prevents it
+    manifest  of the published artifact, if it can be read
     extra     files in its folder that it did not write
     """
 
@@ -55,15 +55,15 @@ class Decision:
 def why_run(stage: Stage, run: Run) -> str | None:
     """The reason why the stage has to run on what the run has now, or None. No side effects.
 
-    Stages before it are taken as they lie on disk; survey() also sees that they are about to change.
+    Stages before it are taken as they are on disk; survey() also considers whether they have to run.
     """
     return decide(stage, run).reason
 
 
 def survey(stages: Sequence[Stage], run: Run, *, forced: Collection[str] = (), hashes: Hashes | None = None) -> list[Decision]:
-    """A decision for each stage, in order. One that needs a stage which has to run is stale, too: it may turn out to stay as it is.
+    """A decision for each stage, in order. One that needs a stage which has to run is stale, too; it may yet turn out fresh.
 
-    forced  names of stages that count as stale whatever is found
+    forced  names of stages that are stale in any case
     """
     hashes = hashes or Hashes(run.cache)
     found: dict[str, Decision] = {}
@@ -80,7 +80,7 @@ def survey(stages: Sequence[Stage], run: Run, *, forced: Collection[str] = (), h
 
 
 def decide(stage: Stage, run: Run, hashes: Hashes | None = None) -> Decision:
-    """What why_run says, with all that was found on the way. Raises UsageError if the run's settings of the stage make no sense."""
+    """The decision about one stage. Raises UsageError if the run's settings of the stage are invalid."""
     hashes = hashes or Hashes(run.cache)
     folder = run.folder(stage.name)
     recorded, damage = _recorded(folder, stage)
@@ -104,7 +104,7 @@ def decide(stage: Stage, run: Run, hashes: Hashes | None = None) -> Decision:
 
 
 def _recorded(folder: Path, stage: Stage) -> tuple[Manifest | None, str | None]:
-    """The manifest of the artifact that stands, or what is wrong with it."""
+    """The manifest of the published artifact, or what is wrong with it."""
     if not files.exists(folder):
         return None, None
     try:
@@ -117,7 +117,7 @@ def _recorded(folder: Path, stage: Stage) -> tuple[Manifest | None, str | None]:
 
 
 def _cut_short(stage: Stage, run: Run, request: Request | None) -> tuple[str, str] | None:
-    """State and reason if work on this request lies about."""
+    """State and reason if there is unfinished work on this request."""
     if files.exists(run.path / artifact.WORK / f"old-{stage.name}") and not files.exists(run.folder(stage.name)):
         return "partial", "incomplete: its replacement was cut short; the next run completes it"
     if request is None:
@@ -132,7 +132,7 @@ def _cut_short(stage: Stage, run: Run, request: Request | None) -> tuple[str, st
 
 
 def _request(stage: Stage, run: Run, recorded: Manifest | None, hashes: Hashes) -> tuple[Request | None, PipelineError | None, str | None]:
-    """(what the stage would be run with, or None; then what stands in the way; a note)."""
+    """(the request of a run now, or None; then the error that prevents it; a note)."""
     settings: Any = settings_from(stage.settings, run.settings.get(stage.name, {}), where=stage.name)
     inputs = {}
     for need in stage.needs:
@@ -160,7 +160,7 @@ def _source(stage: Stage, run: Run, settings: Any, former: dict[str, str] | None
     if source is None or _is_gone(source):
         what = "the run names no source" if source is None else f"{source} is not there, or empty"
         if former is not None:
-            return former, f"{what}; {stage.name} stands as it was made"
+            return former, f"{what}; {stage.name} stays as it was made"
         raise BadInput(f"{stage.name} needs the source: {what}. Name it: {run.how_to_resume(with_source=True)}")
     base = source if source.is_dir() else source.parent
     prefix, digests = f"source of {stage.name}:", {}
@@ -175,7 +175,7 @@ def _source(stage: Stage, run: Run, settings: Any, former: dict[str, str] | None
 
 
 def _is_gone(source: Path) -> bool:
-    """An empty folder counts as gone: that is what is left of a disk that is not mounted."""
+    """An empty folder counts as gone: it may be the mount point of a disk that is not mounted."""
     try:
         return not source.exists() or (source.is_dir() and files.is_empty(source))
     except OSError:

@@ -45,7 +45,7 @@ class StageFailed(PipelineError):
 
 
 class DiskFull(StageFailed):
-    """No space (or quota) left while a stage wrote. What the run held before still stands."""
+    """No space (or quota) left while a stage wrote. What was published before stays."""
 
 
 class CorruptArtifact(PipelineError):
@@ -62,7 +62,7 @@ class CorruptArtifact(PipelineError):
 
 
 class RunLocked(PipelineError):
-    """Another process holds the run's lock; the text says who."""
+    """Another process holds the run's lock; the text names it."""
 
     exit_code = 5
 

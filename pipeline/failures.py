@@ -1,4 +1,4 @@
-"""From whatever a stage raised to the one error that the user is to see."""
+"""From an exception of a stage to the error that is shown to the user."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _NOTHING_FREE = 2**16  # bytes
 
 def history(error: BaseException) -> Iterator[BaseException]:
     """The error, what it was raised from, what was being handled then, and so on."""
-    seen: set[int] = set()
+    visited: set[int] = set()
     pending: list[BaseException | None] = [error]
     while pending:
         current = pending.pop()
-        if current is None or id(current) in seen:
+        if current is None or id(current) in visited:
             continue
-        seen.add(id(current))
+        visited.add(id(current))
         yield current
         pending += [current.__context__, current.__cause__]
 
@@ -44,7 +44,7 @@ def translated(error: BaseException, stage: str, run: Path) -> PipelineError:
     if isinstance(error, PipelineError):
         return error
     if any(isinstance(cause, MemoryError) for cause in history(error)):
-        return StageFailed(f"{stage}: out of memory. Close other programs, or ask for less (a smaller preset, smaller images).")
+        return StageFailed(f"{stage}: out of memory. Close other programs, or use a smaller preset or smaller images.")
     first = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
     text = f"{type(error).__name__}: {first}" if first else type(error).__name__
     return StageFailed(f"{stage}: {text[:500]}")
@@ -59,5 +59,5 @@ def _full_folder(error: BaseException, run: Path) -> Path | None:
         if any(text in str(cause).lower() for text in _FULL_TEXTS):
             return run
     if not isinstance(error, PipelineError) and shutil.disk_usage(run).free < _NOTHING_FREE:
-        return run  # a library that did not say why it failed
+        return run  # a library that gave no reason
     return None

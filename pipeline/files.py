@@ -22,7 +22,7 @@ MAX_JSON = 64 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
 
 
 class Unreadable(ValueError):
-    """A JSON file that is too large, cut off or not valid; the text says which."""
+    """A JSON file that is too large, cut off or not valid; the text says why."""
 
 
 def canonical_json(value: Any) -> bytes:
@@ -31,7 +31,7 @@ def canonical_json(value: Any) -> bytes:
 
 
 def pretty_json(value: Any, *, sort_keys: bool = True, default: Callable[[Any], Any] | None = None) -> bytes:
-    """For files that people look into."""
+    """Indented JSON, for files that people read."""
     return json.dumps(value, indent=1, sort_keys=sort_keys, ensure_ascii=True, allow_nan=False, default=default).encode("ascii") + b"\n"
 
 
@@ -106,7 +106,7 @@ def remove_temporaries(path: Path) -> None:
 
 
 def write_json(path: Path, value: Any, *, sort_keys: bool = False, default: Callable[[Any], Any] | None = None, durable: bool = True) -> None:
-    """A JSON file that people look into, atomically; see `json.dumps`. Raises ValueError for NaN and infinity."""
+    """An indented JSON file, written atomically; see `json.dumps`. Raises ValueError for NaN and infinity."""
     write_atomically(path, pretty_json(value, sort_keys=sort_keys, default=default), durable=durable)
 
 

@@ -16,7 +16,7 @@ _GRACE = 0.3  # seconds for Python's own handler to end the process before the w
 
 
 class Stop:
-    """Whether a signal has asked to stop. Calling it gives the number of the first, or None."""
+    """Whether a signal has arrived. Calling it returns the number of the first, or None."""
 
     def __init__(self) -> None:
         self.number: int | None = None

@@ -1,6 +1,6 @@
 """One writer at a time: an operating system's lock on RUN/.lock, and beside it who holds it.
 
-The lock vanishes with its process, so what a dead process left behind never stands in the way.
+The lock ends with its process: a killed process never blocks a run.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Holder:
 
 
 def holder_of(run: Path) -> Holder | None:
-    """Who wrote down that it holds the lock, if it may still be alive. Takes no lock, writes nothing."""
+    """The process that holds the lock by HOLDER, if it may still be alive. Takes no lock, writes nothing."""
     try:
         value = files.read_json(run / HOLDER, limit=2**16)
         holder = Holder(int(value["pid"]), str(value["host"]), float(value["since"]), str(value["command"]))

@@ -26,7 +26,7 @@ from pipeline.errors import CorruptArtifact
 NAME = "manifest.json"
 FORMAT = "enerf-manifest"
 VERSION = 1
-ABSENT = "absent"  # stands for the digest of a source file that is listed but not there
+ABSENT = "absent"  # in place of the digest of a source file that is listed but missing
 DISTRIBUTION = "efficientnerf"  # its requirements are the packages whose versions are written down
 
 
@@ -144,7 +144,7 @@ def artifact_digest(outputs: dict[str, Output]) -> str:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest in an artifact's folder. What it says is checked, not trusted. Raises CorruptArtifact."""
+    """The manifest in an artifact's folder. Every value is checked. Raises CorruptArtifact."""
     path = folder / NAME
     where = f"{folder.name}/{NAME}"
     try:
@@ -156,7 +156,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 class _Bad(ValueError):
-    """A manifest that says something it must not."""
+    """A manifest with an invalid value."""
 
 
 def _plain_output(output: Output) -> dict[str, Any]:

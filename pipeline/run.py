@@ -1,4 +1,4 @@
-"""The run folder: what it was made from and with, and where everything lies in it.
+"""The run folder: its source and settings, and its layout.
 
     RUN/run.json     {"format": "enerf-run", "version": 1, "source", "settings", "preset", "seed", "device", "created"}
     RUN/<stage>/     an artifact (artifact.py)
@@ -50,7 +50,7 @@ def resume_in_words(run: Path, *, until: str | None = None, only: str | None = N
 
 @dataclass
 class Run:
-    """A run folder and what its run.json says. `Run(path, ...)` alone writes nothing: a plan of a run, for a dry run.
+    """A run folder and its run.json. `Run(path, ...)` alone writes nothing: a planned run, for a dry run.
 
     path         absolute
     source       absolute, or None
@@ -190,10 +190,10 @@ class Run:
 
 
 def disk_full(folder: Path, what: str) -> DiskFull:
-    """The error that says which disk is full and how much is left on it."""
+    """The error that names the disk that is full and the space left on it."""
     there = next((path for path in (folder, *folder.parents) if path.is_dir()), Path("/"))
     free = shutil.disk_usage(there).free / 2**20
-    return DiskFull(f"{what}: no space (or quota) left in {there} ({free:.1f} MiB free). Make room and go on; nothing that stood before was lost.")
+    return DiskFull(f"{what}: no space (or quota) left in {there} ({free:.1f} MiB free). Make room and go on; what was published before is not lost.")
 
 
 def is_disk_full(error: BaseException) -> bool:

@@ -1,4 +1,4 @@
-"""Executes what decide says, and checks what a run holds."""
+"""Runs the stages that `decide` finds not fresh, and verifies a run."""
 
 from __future__ import annotations
 
@@ -58,18 +58,18 @@ def run_stages(
     dry_run: bool = False,
     execute: Executor = local.execute,
 ) -> list[Outcome]:
-    """Bring a run up to date; returns an outcome for each stage looked at, in order.
+    """Bring a run up to date; returns an outcome for each stage considered, in order.
 
     stages   the workflow: each after those that it needs
-    until    the last stage to look at, in the order of the list
+    until    the last stage to consider, in the order of the list
     start    run this stage and those after it even if they are fresh; those before it if they are not
-    only     look at this stage alone, with what the run has of those before it; says so if they are not fresh
-    force    run whatever is looked at, even if it is fresh
+    only     consider this stage alone, with the artifacts of those before it; warns if they are not fresh
+    force    run the stages considered even if they are fresh
     device   handed to the stages
     report   takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
-    dry_run  say what would be done, and do nothing
+    dry_run  report what would be done, and do nothing
 
-    Raises what errors.py draws. What was published before stays; what was cut short goes on with the next call.
+    Raises PipelineError. What was published before stays; the next call resumes what was interrupted.
     """
     chosen, forced = _selection(stages, until=until, start=start, only=only, force=force)
     if dry_run:
@@ -115,7 +115,7 @@ class _Runner:
         return outcomes
 
     def one(self, stage: Stage, *, forced: bool) -> Outcome:
-        """Look at one stage, and run it if it has to."""
+        """Decide about one stage, and run it if needed."""
         decision = decide(stage, self.run, self.hashes)
         if decision.note:
             self.emit("warning" if not decision.fresh else "message", stage.name, text=decision.note)
@@ -142,7 +142,7 @@ class _Runner:
         return _outcome(stage, "ran", reason, made)
 
     def _make(self, stage: Stage, request: Request, place: Workplace, reason: str) -> Manifest:
-        """Run the stage and seal what it left."""
+        """Run the stage and seal its outputs."""
         resumed = artifact.prepare(place, self.work)
         self.emit("stage_started", stage.name, reason=reason, resumed=resumed)
         job = Job(
@@ -163,7 +163,7 @@ class _Runner:
         return made
 
     def _runnable(self, stage: Stage, decision: Decision, reason: str) -> Request:
-        """The request to run; raises what stands in the way."""
+        """The request to run; raises the error that prevents it."""
         until = self.run.how_to_resume(until=stage.name)
         if decision.request is None:
             obstacle = decision.obstacle
@@ -183,9 +183,9 @@ class _Runner:
         return decision.request
 
     def _failed(self, stage: Stage, place: Workplace, error: BaseException) -> NoReturn:
-        """Clear up after a stage that raised, and raise what the user is to see."""
+        """Clean up after a stage that raised, and raise the error for the user."""
         failure = interruption_in(error, self.stop()) or translated(error, stage.name, self.run.path)
-        with contextlib.suppress(OSError):  # else the next start clears up; the error that brought us here is the one to tell
+        with contextlib.suppress(OSError):  # else the next start cleans up; the first error is the one to report
             if files.exists(place.out / manifest.NAME):
                 artifact.recover(self.run.path)  # it was being published
             else:
@@ -201,9 +201,9 @@ class _Runner:
         number = error.number if isinstance(error, Interrupted) else signal.SIGINT
         go_on = self.run.how_to_resume(only=only)
         during = f" in {stage}" if stage else ""
-        told = Interrupted(number, f"interrupted by {signal.Signals(number).name}{during}; what is done is kept. Go on with: {go_on}")
-        self.emit("interrupted", stage, text=str(told), resume=go_on, exit_code=told.exit_code)
-        return told
+        interrupted = Interrupted(number, f"interrupted by {signal.Signals(number).name}{during}; what is done is kept. Go on with: {go_on}")
+        self.emit("interrupted", stage, text=str(interrupted), resume=go_on, exit_code=interrupted.exit_code)
+        return interrupted
 
     def safe_point(self) -> None:
         number = self.stop()
@@ -257,7 +257,7 @@ def _emit(report: Report | None, event: str, stage: str, **facts: Any) -> None:
 
 
 def _selection(stages: Sequence[Stage], *, until: str | None, start: str | None, only: str | None, force: bool) -> tuple[list[Stage], frozenset[str]]:
-    """(the stages to look at, the names of those to run even if fresh)."""
+    """(the stages to consider, the names of those to run even if fresh)."""
     names = _checked_names(stages)
     for name in (until, start, only):
         if name is not None and name not in names:
@@ -281,7 +281,7 @@ def _checked_names(stages: Sequence[Stage]) -> list[str]:
     for stage in stages:
         missing = [need for need in stage.needs if need not in names]
         if missing:
-            raise ValueError(f"stage {stage.name} stands before {missing[0]}, which it needs")
+            raise ValueError(f"stage {stage.name} comes before {missing[0]}, which it needs")
         if stage.name in names:
             raise ValueError(f"two stages are named {stage.name}")
         names.append(stage.name)

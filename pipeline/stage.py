@@ -62,7 +62,7 @@ class Job:
     inputs    need -> the folder of its artifact, to be read only
     source    the user's source for a stage with reads_source, else None
     out       an empty folder; what is in it when the stage returns is the artifact
-    work      scratch of this very request that survives a kill: checkpoints. Removed once the artifact stands
+    work      scratch of this very request that survives a kill: checkpoints. Removed once the artifact is published
     device    "cpu" or "cuda"; not part of the request
     report    takes each event, a dict; None: nobody listens
     stop      returns the number of the signal that arrived, or None
@@ -96,7 +96,7 @@ class Job:
         self.work.mkdir(parents=True, exist_ok=True)
 
     def progress(self, done: float, total: float, text: str = "", **facts: Any) -> None:
-        """Say how far it is. May be called as often as is convenient: all but the first, the last and one in 0.1 s are dropped."""
+        """Report progress. May be called often: at most one report in 0.1 s is passed on, and the first and the last."""
         now = time.monotonic()
         if done < total and text == self._last_text and now - self._last_progress < PROGRESS_SECONDS:
             return
@@ -113,11 +113,11 @@ class Job:
         self._emit("message", text=text, **facts)
 
     def warn(self, text: str, **facts: Any) -> None:
-        """A sentence about something that went wrong and was got round."""
+        """A sentence about a problem that was worked around."""
         self._emit("warning", text=text, **facts)
 
     def safe_point(self) -> None:
-        """Raise Interrupted if a signal has asked to stop. Call it where `work` holds all that is needed to go on."""
+        """Raise Interrupted if a signal has arrived. Call it where `work` holds all that is needed to resume."""
         number = self._stop() if self._stop is not None else None
         if number is not None:
             raise Interrupted(number)

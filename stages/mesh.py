@@ -121,7 +121,7 @@ def run(job: Job) -> None:
     if not report["watertight"]:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['crowded_edges']} crowded edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}
-    job.say(f"{report['faces']} faces in {report['components']} pieces", **facts)
+    job.say(f"{report['faces']} faces in {report['components']} components", **facts)
 
 
 STAGE = Stage(name="mesh", version=1, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

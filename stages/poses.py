@@ -29,7 +29,7 @@ from stages.io.scene import SPLITS, Scene, View, save, save_points
 if TYPE_CHECKING:
     Format = str
 else:
-    Format = Literal[importers.FORMATS]  # the table of importers says which
+    Format = Literal[importers.FORMATS]  # the names of the table of importers
 
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
 
@@ -184,13 +184,13 @@ def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tu
     kept: list[int] = []
     written = []
     failed: list[tuple[str, str]] = []
-    odd: list[str] = []
+    remarks: list[str] = []
     for index, photo in enumerate(capture.photos):
         job.safe_point()
         job.progress(index, len(capture.photos), "preparing images")
         try:
             written.append(working_images.write(photo, job.out, relative[index], max_side=job.settings.max_image_size, keep_alpha=keep_alpha))
-            odd += written[-1].warnings
+            remarks += written[-1].warnings
             kept.append(index)
         except UnreadableImage as error:
             failed.append((photo.camera.name, str(error)))
@@ -201,7 +201,7 @@ def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tu
             why = "Refused by --strict." if len(kept) >= MIN_IMAGES else f"{len(kept)} remain; at least {MIN_IMAGES} are needed."
             raise BadInput(f"{job.source}: {sentence} {why} Copy or convert them again, or take them out.")
         warn(f"{sentence} They are left out.")
-    for sentence in [*odd[:3], *([f"... and {len(odd) - 3} more remarks like these."] if len(odd) > 3 else [])]:
+    for sentence in [*remarks[:3], *([f"... and {len(remarks) - 3} more remarks like these."] if len(remarks) > 3 else [])]:
         warn(sentence)
     return without(capture, kept, failed), written
 

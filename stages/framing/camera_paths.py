@@ -155,8 +155,8 @@ def turntable_cameras(
 ) -> list[Camera]:
     """The cameras of a turntable, pinholes in the training frame.
 
-    elevation  degrees; None: as the capture's cameras stood
-    radius     distance from the centre in the capture's units; None: as the capture's cameras stood, or further where the asset would not fit
+    elevation  degrees; None: that of the capture's cameras
+    radius     distance from the centre in the capture's units; None: that of the capture's cameras, or more where the asset would not fit
     fov        vertical, degrees; None: so that the asset fits from everywhere, vertically centred
     sway       degrees; see turntable_poses
 

@@ -154,12 +154,12 @@ def content_depths(photos: Sequence[Photo], placed: Sequence[Camera], scale: flo
     points     (N, 3) in the training frame, or None
     tracks     for each point, the photos that observe it
     """
-    seen: list[list[int]] = [[] for _ in placed]
+    observed: list[list[int]] = [[] for _ in placed]
     for point, views in enumerate(tracks):
         for view in views:
-            seen[view].append(point)
+            observed[view].append(point)
     rows = np.full((len(placed), 2), np.nan)
-    for row, photo, camera, mine in zip(rows, photos, placed, seen, strict=True):
+    for row, photo, camera, mine in zip(rows, photos, placed, observed, strict=True):
         if photo.near and photo.far:
             row[:] = photo.near * scale, photo.far * scale
         elif points is not None and len(mine) >= 10:

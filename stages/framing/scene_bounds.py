@@ -11,7 +11,7 @@ from efficientnerf.geometry.cameras import Camera, Similarity, project, resized
 from stages.io.capture import Capture, Photo, SparsePoints
 
 MIN_POINTS = 50  # sparse points
-MIN_VIEW_RATIO = 0.65  # views of a point over those of the points with most: below, it belongs to the surroundings
+MIN_VIEW_RATIO = 0.65  # views of a point over those of the points with most: below, it is background
 MAX_CAMERAS = 48  # evenly spaced over the capture
 SILHOUETTE_SIZE = 160  # px, longest side at which alpha is read
 GRID_SIZE = 32  # voxels along a side of the region searched
@@ -28,7 +28,7 @@ def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, c
     photos = photos[:: -(-len(photos) // MAX_CAMERAS)]
     cameras = [turned.camera(photo.camera) for photo in photos]
     ranges = [(photo.near, photo.far) for photo in photos]
-    bounded = capture.background is not None  # silhouettes are more exact than points, where there are no surroundings
+    bounded = capture.background is not None  # silhouettes are more exact than points, in bounded scenes
     for way in ("silhouettes", "sparse points") if bounded else ("sparse points", "silhouettes"):
         if way == "silhouettes":
             # A wide region to start from: parts of the subject outside of close views are cut by the others.
@@ -133,11 +133,11 @@ def bounds_of_frusta(
     low, high = focus - reach, focus + reach
     for _ in range(2):  # the second pass refines the first
         xyz, step = voxel_centres(low, high)
-        seen = in_view(xyz, cameras)
-        for row, camera, (near, far) in zip(seen, cameras, limits, strict=True):
+        visible = in_view(xyz, cameras)
+        for row, camera, (near, far) in zip(visible, cameras, limits, strict=True):
             depth = (xyz - camera.centre) @ camera.forward
             row &= (depth >= near) & (depth <= far)
-        share = seen.mean(0)
+        share = visible.mean(0)
         kept = xyz[share >= least * min(1.0, float(share.max()))]
         if not len(kept) or share.max() == 0:
             break
@@ -163,13 +163,13 @@ def bounds_of_visual_hull(photos: Sequence[Photo], cameras: Sequence[Camera], lo
         return None
     for _ in range(3):  # each pass refines the one before
         kept, step = voxel_centres(low, high)
-        against, seen = np.zeros(len(kept), int), np.zeros(len(kept), int)
+        against, views_of = np.zeros(len(kept), int), np.zeros(len(kept), int)
         for camera, mask in views:
             inside, transparent = _transparent(camera, mask, kept, float(np.linalg.norm(step)) / 2)
-            against, seen = against + transparent, seen + inside
+            against, views_of = against + transparent, views_of + inside
             left = against <= len(views) // 50
-            kept, against, seen = kept[left], against[left], seen[left]
-        kept = kept[seen >= len(views) / 2]
+            kept, against, views_of = kept[left], against[left], views_of[left]
+        kept = kept[views_of >= len(views) / 2]
         if not len(kept):
             return None
         low, high = kept.min(0) - step / 2, kept.max(0) + step / 2

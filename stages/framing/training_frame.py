@@ -149,9 +149,9 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
 def focus_point(capture: Capture) -> tuple[np.ndarray, bool]:
     """The point that the cameras look at, in the capture's frame, and whether their axes meet there.
 
-    Least squares over the view axes, reweighted so that cameras that look elsewhere do not count. Where the axes are parallel, or meet
+    Robust least squares over the view axes. Where the axes are parallel, or meet
     behind the cameras, it is the point in front of the middle camera at the middle depth of the sparse points (else of near and far,
-    else at the cameras' own spread).
+    else at four times the cameras' mean distance from their centre).
     """
     cameras = [photo.camera for photo in capture.photos]
     centres = np.array([camera.centre for camera in cameras])
@@ -185,7 +185,7 @@ def _typical_depth(capture: Capture, centres: np.ndarray) -> float:
     stated = [(photo.near, photo.far) for photo in capture.photos if photo.near and photo.far]
     if stated:
         near, far = np.median(np.array(stated, np.float64), axis=0)
-        return float(2 / (1 / near + 1 / far))  # the middle of what the pictures show is the middle in 1 / depth
+        return float(2 / (1 / near + 1 / far))  # the middle in inverse depth
     return float(4 * np.linalg.norm(centres - centres.mean(0), axis=1).mean()) or 1.0
 
 
@@ -236,14 +236,14 @@ def near_far_planes(capture: Capture, placed: Sequence[Camera], world: Similarit
     beyond everything; without either, from a twentieth of the way to the box.
     """
     corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-    seen: list[list[int]] = [[] for _ in placed]
+    observed: list[list[int]] = [[] for _ in placed]
     if capture.points is not None:
         for point, track in enumerate(capture.points.tracks):
             for index in track:
-                seen[index].append(point)
+                observed[index].append(point)
     points = None if capture.points is None else world.points(capture.points.xyz)
     rows = []
-    for photo, camera, mine in zip(capture.photos, placed, seen, strict=True):
+    for photo, camera, mine in zip(capture.photos, placed, observed, strict=True):
         depths = (corners - camera.centre) @ camera.forward
         box_far = max(float(depths.max()), 0.1)
         inside = bool((np.abs(camera.centre) <= bounds[1]).all())

@@ -19,8 +19,8 @@ class Photo:
     image       the file itself
     mask        the file of its mask, or None
     mask_ignore "black" if zero pixels of the mask are left out, "white" if the non-zero ones are
-    split       "train", "val" or "test" where the source says so, else None
-    near, far   along the view axis in the capture's units where the source says so, else None
+    split       "train", "val" or "test" where the source states it, else None
+    near, far   along the view axis in the capture's units where the source states it, else None
     """
 
     camera: Camera

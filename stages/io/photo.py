@@ -17,7 +17,7 @@ _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
 class UnreadableImage(Exception):
-    """An image file that cannot be decoded, or a mask that does not fit; the text says why."""
+    """An image file that cannot be decoded, or a mask that does not fit; the text gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def read_mask_file(path: Path, photo: DecodedPhoto) -> np.ndarray:
 
 
 def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:
-    """Whether two sizes (both (width, height), or both (height, width)) show the same picture: equal aspect within 1 %, or within the rounding of a
+    """Whether two sizes (both (width, height), or both (height, width)) have the same aspect: within 1 %, or within the rounding of a
     side by one pixel."""
     (w, h), (width, height) = size, other
     if min(w, h, width, height) <= 0:

@@ -298,7 +298,7 @@ def describe(folder: Path) -> dict[str, Any]:
             "rotation": scene.world_from_capture.rotation.tolist(),
             "translation": scene.world_from_capture.translation.tolist(),
         },
-        "odd": _report_warnings(folder),
+        "warnings": _report_warnings(folder),
         "cameras": cameras,
     }
 

@@ -69,10 +69,10 @@ def render_frames(
         with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
         # The PNG is written last, atomically: where it exists, the frame is finished.
         if not (reuse and png.exists()):
-            seen = draw(tree, camera, supersample=options.supersample)
+            output = draw(tree, camera, supersample=options.supersample)
             if with_exr:
-                write_exr(exr, colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal, world_from_capture=similarity)
-            write_png(frame_from_rendering(seen.colour, seen.opacity, background), png)
+                write_exr(exr, colour=output.colour, opacity=output.opacity, depth=output.depth, normal=output.normal, world_from_capture=similarity)
+            write_png(frame_from_rendering(output.colour, output.opacity, background), png)
         written += [png, exr] if with_exr else [png]
     if progress is not None:
         progress(len(cameras), len(cameras))

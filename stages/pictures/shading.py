@@ -44,8 +44,8 @@ def render_sides(
     for turn in turns:
         right, up, back = _axes(heading + turn, elevation)
         facing = np.flatnonzero((normals @ back > -0.2) & near)
-        seen = local[facing]
-        picked = _front_samples(seen @ right, seen @ up, seen @ back, size)  # (size, size), -1 where nothing is
+        visible = local[facing]
+        picked = _front_samples(visible @ right, visible @ up, visible @ back, size)  # (size, size), -1 where nothing is
         picked = np.where(picked >= 0, facing[picked], -1) if len(facing) else picked
         light = back + 0.5 * up - 0.4 * right
         shade = np.clip(normals @ (light / np.linalg.norm(light)), 0, 1) * 0.7 + 0.2

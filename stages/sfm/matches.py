@@ -244,19 +244,19 @@ def _is_intact(path: Path, images: Sequence[WorkImage]) -> bool:
     """Whether SQLite finds no damage, the images are `images`, and no image or pair is written in part."""
     try:
         with contextlib.closing(sqlite3.connect(path)) as connection:
-            ask = connection.execute
-            if ask("PRAGMA integrity_check").fetchall() != [("ok",)]:
+            execute = connection.execute
+            if execute("PRAGMA integrity_check").fetchall() != [("ok",)]:
                 return False
-            if [row[0] for row in ask("SELECT name FROM images ORDER BY image_id")] != [image.file for image in images]:
+            if [row[0] for row in execute("SELECT name FROM images ORDER BY image_id")] != [image.file for image in images]:
                 return False
-            if ask("SELECT COUNT(DISTINCT camera_id) FROM images").fetchone()[0] != len({image.camera_key for image in images}):
+            if execute("SELECT COUNT(DISTINCT camera_id) FROM images").fetchone()[0] != len({image.camera_key for image in images}):
                 return False
-            keypoints = dict(ask("SELECT image_id, rows FROM keypoints").fetchall())
-            descriptors = dict(ask("SELECT image_id, rows FROM descriptors").fetchall())
+            keypoints = dict(execute("SELECT image_id, rows FROM keypoints").fetchall())
+            descriptors = dict(execute("SELECT image_id, rows FROM descriptors").fetchall())
             if keypoints != descriptors:
                 return False
-            matched = {row[0] for row in ask("SELECT pair_id FROM matches")}
-            return {row[0] for row in ask("SELECT pair_id FROM two_view_geometries")} <= matched
+            matched = {row[0] for row in execute("SELECT pair_id FROM matches")}
+            return {row[0] for row in execute("SELECT pair_id FROM two_view_geometries")} <= matched
     except sqlite3.Error:
         return False
 

@@ -93,7 +93,7 @@ def test_until_from_and_force(run: Run) -> None:
 
 
 def test_a_workflow_in_the_wrong_order_is_a_mistake_of_ours(run: Run) -> None:
-    with pytest.raises(ValueError, match="count stands before list"):
+    with pytest.raises(ValueError, match="count comes before list"):
         run_stages(run, [COUNT, LIST])
     with pytest.raises(ValueError, match="two stages are named list"):
         run_stages(run, [LIST, LIST])

@@ -184,7 +184,7 @@ def test_lists_that_have_travelled(tmp_path: Path) -> None:
         frame["file_path"] = name
     capture = read(captures.nerfstudio(tmp_path / "a", frames=frames))
     assert_same_rays(capture, made)
-    assert any("3 images are not where it says" in warning and "img_0.png" in warning for warning in capture.warnings)
+    assert any("3 images are not where they are listed" in warning and "img_0.png" in warning for warning in capture.warnings)
     assert any("another extension" in warning for warning in capture.warnings)
 
 
@@ -205,7 +205,7 @@ def test_cameras_stated_for_the_pixels_as_stored_turn_with_them(tmp_path: Path, 
     for index in range(6):
         captures.write_picture(folder / f"images/img_{index}.png", captures.picture(index), exif=exif)
     capture = read(folder)
-    assert any("the cameras were turned too" in warning for warning in capture.warnings)
+    assert any("the cameras were rotated too" in warning for warning in capture.warnings)
     turns = {6: 1, 8: 3}[orientation]
     truth = captures.cameras()
     for _ in range(turns):
@@ -223,7 +223,7 @@ def test_an_image_listed_twice_counts_once(tmp_path: Path) -> None:
 def test_several_formats_in_one_folder_are_named(tmp_path: Path) -> None:
     folder = captures.nerfstudio(captures.colmap_bin(tmp_path / "a"))
     assert importers.candidates(folder) == ["nerfstudio", "colmap", "photographs"]
-    assert any("--as colmap" in odd for odd in describe_source(folder)["odd"])
+    assert any("--as colmap" in odd for odd in describe_source(folder)["warnings"])
 
 
 def shared(name: str) -> Path:

@@ -190,7 +190,7 @@ def test_frames_missing_on_disk(tmp_path: Path) -> None:
         (folder / f"images/img_{index}.png").unlink()
     capture = read(folder)
     assert [photo.camera.name for photo in capture.photos] == [f"images/img_{i}.png" for i in (0, 2, 3, 5)]
-    assert any("2 of 6 images that it lists are missing: images/img_1.png, images/img_4.png" in warning for warning in capture.warnings)
+    assert any("2 of 6 listed images are missing: images/img_1.png, images/img_4.png" in warning for warning in capture.warnings)
     assert ("images/img_1.png", "listed but missing on disk") in capture.rejected
     refusal(folder, "2 of 6", "--strict", strict=True)
     for index in (0, 2):
@@ -322,7 +322,7 @@ def test_colmap_names_absent_images(tmp_path: Path) -> None:
     (folder / "images/img_0.png").unlink()
     capture = read(folder)
     assert len(capture.photos) == 5
-    assert any("1 of 6 images that it lists are missing: img_0.png" in warning for warning in capture.warnings)
+    assert any("1 of 6 listed images are missing: img_0.png" in warning for warning in capture.warnings)
     assert capture.points is not None
     assert capture.points.tracks[0] == (0, 1, 2, 3, 4)
     refusal(folder, "--strict", strict=True)

@@ -165,7 +165,7 @@ def test_description(tmp_path: Path) -> None:
     assert (camera["width"], camera["height"], camera["params"], camera["split"]) == (32, 24, [40.0, 16.0, 12.0], "test")
     np.testing.assert_array_equal(camera["capture_from_camera"], captures.cameras()[0].world_from_camera)
     assert described["count"] == 6
-    assert described["odd"] == ["odd"]
+    assert described["warnings"] == ["odd"]
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", *LENSES])

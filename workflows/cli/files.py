@@ -176,7 +176,7 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
 @json_option
 @common_options
 def inspect(what: Path, as_json: bool) -> None:
-    """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, what is odd."""
+    """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, warnings."""
     from workflows.cli.progress import write_json
     from workflows.inspection.describe import describe, in_words
 

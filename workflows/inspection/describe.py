@@ -108,7 +108,7 @@ def _lines(found: dict[str, Any], indent: str) -> list[str]:
             if value:
                 first = value[0]
                 lines.append(f"{label:<24} {len(value)}, listed with --json; the first: {first['name']}, {first['model']} {_shown(first['params'])}")
-        elif name == "odd" and isinstance(value, list):
+        elif name == "warnings" and isinstance(value, list):
             lines += [f"{label:<24} {sentence}" for sentence in value] or [f"{label:<24} nothing"]
         elif isinstance(value, dict):
             lines += [label, *_lines(value, indent + "  ")]

@@ -36,7 +36,7 @@ def write_exr(
     scale, rotation = (1.0, np.eye(3)) if world_from_capture is None else (world_from_capture.scale, world_from_capture.rotation)
     rgba = np.concatenate([linear_premultiplied(colour, opacity), opacity[..., None]], axis=-1)
     in_capture = normal @ rotation  # rows times R: the transpose of R applied to each
-    # OpenEXR writes arrays that are not contiguous wrongly and says nothing; float64 it refuses.
+    # OpenEXR silently writes wrong data for arrays that are not contiguous, and refuses float64.
     channels = {"RGBA": _plane(rgba), "depth.Z": _plane(depth / scale)}
     channels |= {f"normal.{axis}": _plane(in_capture[..., k]) for k, axis in enumerate("XYZ")}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -44,7 +44,7 @@ def write_exr(
         try:
             OpenEXR.File(header, channels).write(str(temporary))
         except RuntimeError as error:
-            # The library has one exception for everything; a full disk has to be told from the rest.
+            # The library has one exception for everything; a full disk is a case of its own.
             for number in (errno.ENOSPC, errno.EDQUOT):
                 if os.strerror(number) in str(error):
                     raise OSError(number, os.strerror(number), str(path)) from error

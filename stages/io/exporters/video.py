@@ -25,7 +25,7 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
 
     count, size = 0, None
     # bitexact: no names or versions of libraries, no dates. One thread: x264's decisions depend on their number. cpu-independent: x264's kernels for
-    # AVX-512 that look ahead do not even repeat themselves; without them every processor writes the same bytes.
+    # AVX-512 lookahead kernels vary from run to run; without them every processor writes the same bytes.
     encoding = {"crf": str(crf), "preset": "medium", "flags": "+bitexact", "x264-params": "cpu-independent=1"}
     options = {"movflags": "+faststart", "fflags": "+bitexact"}
     with atomic(path) as temporary, av.open(str(temporary), "w", format="mp4", container_options=options) as container:
@@ -43,10 +43,10 @@ def write_mp4(frames: Iterable[np.ndarray], path: Path, *, fps: int, crf: int = 
                 stream.width, stream.height = size[1] + size[1] % 2, size[0] + size[0] % 2
             if frame.shape != size:
                 raise ValueError(f"{path}: frame {count} has shape {frame.shape}, the first has {size}")
-            picture = _yuv(frame)
+            video_frame = _yuv(frame)
             # Not the stream's time base: the container changes that when it writes its header.
-            picture.pts, picture.time_base = count, Fraction(1, fps)
-            container.mux(stream.encode(picture))
+            video_frame.pts, video_frame.time_base = count, Fraction(1, fps)
+            container.mux(stream.encode(video_frame))
             count += 1
         if not count:
             raise ValueError(f"{path}: a video of no frames")

@@ -45,7 +45,7 @@ class Importer:
         return getattr(import_module(f"{__name__}.{self.module}"), function)(*arguments, *(() if self.dialect is None else (self.dialect,)))
 
 
-# In the order in which they are looked for: a folder may hold several, and the most explicit one counts.
+# In order of preference: a folder may hold several formats.
 IMPORTERS: dict[str, Importer] = {
     "blender": Importer("transforms", renders=True, dialect="blender"),
     "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),

@@ -111,7 +111,7 @@ def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> 
     kept: list[tuple[int, Photo]] = []
     rejected: list[tuple[str, str]] = []
     warnings: list[str] = []
-    odd: dict[str, list[str]] = {}
+    remarks_by_kind: dict[str, list[str]] = {}
     for number, path in here.items():
         posed, name = model.images[number], source.name_of(path)
         lens = model.cameras[posed.camera]
@@ -125,11 +125,11 @@ def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> 
         stated = lenses.validated(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {posed.camera}")
         camera, remark = lenses.fit_to_image(stated, header, f"{where}: {posed.name}")
         if remark is not None:
-            odd.setdefault(remark, []).append(name)
+            remarks_by_kind.setdefault(remark, []).append(name)
         kept.append((number, Photo(camera, path, masks.get(path))))
     kept.sort(key=lambda item: item[1].camera.name)
     ids = {number: index for index, (number, _) in enumerate(kept)}
-    return tuple(photo for _, photo in kept), ids, rejected, warnings + lenses.fit_warnings(where, odd)
+    return tuple(photo for _, photo in kept), ids, rejected, warnings + lenses.fit_warnings(where, remarks_by_kind)
 
 
 def _sparse(points: Points, ids: dict[int, int]) -> SparsePoints:

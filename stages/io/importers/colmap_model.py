@@ -1,7 +1,7 @@
 """COLMAP's files cameras, images and points3D, binary and text, read strictly.
 
 Every count is checked against the size of the file before anything is allocated; a file that ends early, or goes on after its end, is
-refused. Newer models also hold `rigs` and `frames`; the pose of every image still stands in `images`, so they are not needed.
+refused. Newer models also hold `rigs` and `frames`; `images` has every pose, so they are not needed.
 Formats: the COLMAP documentation, "Output format".
 """
 
@@ -87,7 +87,7 @@ def model_files(folder: Path) -> list[Path] | None:
 
 
 def count_images(folder: Path) -> int:
-    """How many images a model says to hold, at the price of a look; 0 where that cannot be told."""
+    """The number of images that a model states, from its header; 0 where it cannot be read."""
     found = model_files(folder)
     if not found:
         return 0
@@ -141,7 +141,7 @@ class _Bytes:
     def count(self, least_each: int, what: str, most: int | None = None) -> int:
         (count,) = self.take("<Q")
         if most is not None and count > most:
-            raise BadInput(f"{self.path}: says to hold {count} {what}; at most {most} are read. Is it a COLMAP model?")
+            raise BadInput(f"{self.path}: states {count} {what}; at most {most} are read. Is it a COLMAP model?")
         self.need(count * least_each)
         return int(count)
 

@@ -26,13 +26,13 @@ class Defaults:
 
 
 def describe_source(folder: Path, format: str = "auto") -> dict[str, Any]:
-    """What `enerf inspect SOURCE` prints of a data set as it stands: count, resolutions, camera models, bounds, oddities. Raises BadInput."""
+    """What `enerf inspect SOURCE` prints of a data set: count, resolutions, camera models, bounds, warnings. Raises BadInput."""
     possible = candidates(folder)
     name = possible[0] if format == "auto" else format
     described = _posed(IMPORTERS[name].read(folder, Defaults())) if IMPORTERS[name].posed else _photographs(folder)
     others = [other for other in possible if other not in (name, "photographs")]
     if others:
-        described["odd"].append(f"can also be read --as {' or '.join(others)}.")
+        described["warnings"].append(f"can also be read --as {' or '.join(others)}.")
     return {"what": "source", "format": name} | described
 
 
@@ -71,7 +71,7 @@ def _posed(capture: Capture) -> dict[str, Any]:
         "metric": capture.metric,
         "facts": capture.facts,
         "rejected": [{"name": name, "reason": reason} for name, reason in capture.rejected],
-        "odd": list(capture.warnings),
+        "warnings": list(capture.warnings),
         "cameras": cameras,
     }
 
@@ -88,11 +88,11 @@ def _photographs(folder: Path) -> dict[str, Any]:
             continue
         sizes.append(header.size)
         turned += header.orientation != 1
-    odd = [f"{entry['name']}: {entry['reason']}" for entry in rejected]
+    warnings = [f"{entry['name']}: {entry['reason']}" for entry in rejected]
     if turned:
-        odd.append(f"{turned} images are turned by their EXIF orientation.")
+        warnings.append(f"{turned} images are rotated by their EXIF orientation.")
     if len(set(sizes)) > 1:
-        odd.append("images are of mixed sizes.")
+        warnings.append("images are of mixed sizes.")
     return {
         "count": len(sizes),
         "resolution": _sizes(sizes),
@@ -100,6 +100,6 @@ def _photographs(folder: Path) -> dict[str, Any]:
         "bounds": None,
         "masks": len(masks_of(source, images)),
         "rejected": rejected,
-        "odd": odd,
+        "warnings": warnings,
         "cameras": [],
     }

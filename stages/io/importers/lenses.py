@@ -24,7 +24,7 @@ class UnreadableHeader(Exception):
 
 @dataclass(frozen=True)
 class Header:
-    """What an image file says before its pixels are decoded.
+    """The header of an image file.
 
     stored_width, stored_height  of the pixels as stored
     orientation                  EXIF's number, 1-8
@@ -70,7 +70,7 @@ def read_header(path: Path) -> Header:
 
 
 def rigid(matrix: Any, where: str) -> np.ndarray:
-    """A camera-to-world matrix from a file as (4, 4) float64 with an orthonormal rotation; BadInput says what is wrong with it.
+    """A camera-to-world matrix from a file as (4, 4) float64 with an orthonormal rotation; BadInput names what is wrong.
 
     Columns may deviate from a rotation by 1e-3, as rounded numbers do.
     """
@@ -124,7 +124,7 @@ def validated(camera: Camera, where: str) -> Camera:
 def fit_to_image(camera: Camera, header: Header, where: str) -> tuple[Camera, str | None]:
     """The camera of a file's upright image, from a camera that may have been stated at another size or for the pixels as stored.
 
-    returns  the camera and what was odd: "resized", "turned", "upright?" (turned by 180 degrees or mirrored, where the stated size
+    returns  the camera and a remark: "resized", "turned", "upright?" (turned by 180 degrees or mirrored, where the stated size
              does not say for which the camera was stated: taken to be the upright image) or None
     Raises BadInput where the aspect does not agree (1 %, or a pixel of rounding).
     """
@@ -147,11 +147,11 @@ def fit_to_image(camera: Camera, header: Header, where: str) -> tuple[Camera, st
     return resized(camera, width, height), "resized"
 
 
-def fit_warnings(where: str, odd: dict[str, list[str]]) -> list[str]:
-    """Sentences about what `fit_to_image` found odd: kind -> names of the images."""
-    said = {
+def fit_warnings(where: str, remarks: dict[str, list[str]]) -> list[str]:
+    """Sentences about the remarks of `fit_to_image`: remark -> names of the images."""
+    sentences = {
         "resized": "are not of the stated size; the intrinsics were scaled to them",
-        "turned": "are turned by EXIF and their cameras stated for the pixels as stored; the cameras were turned too",
-        "upright?": "are turned by EXIF; their cameras are taken to be those of the upright images",
+        "turned": "are rotated by EXIF and their cameras stated for the pixels as stored; the cameras were rotated too",
+        "upright?": "are rotated by EXIF; their cameras are taken to be those of the rotated images",
     }
-    return [f"{where}: {len(names)} images ({abbreviated(names)}) {said[kind]}." for kind, names in odd.items()]
+    return [f"{where}: {len(names)} images ({abbreviated(names)}) {sentences[kind]}." for kind, names in remarks.items()]

@@ -50,7 +50,7 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     masks = masks_of(source, images)
     photos: list[Photo] = []
     rejected: list[tuple[str, str]] = []
-    odd: dict[str, list[str]] = {}
+    remarks: dict[str, list[str]] = {}
     for index, (row, image) in enumerate(zip(rows, images, strict=True)):
         name, where = source.name_of(image), f"{POSES}: row {index} ({source.name_of(image)})"
         try:
@@ -61,7 +61,7 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
             continue
         camera, remark = lenses.fit_to_image(_camera(row, name, where), header, where)
         if remark in ("turned", "upright?"):  # another size than stated is what the folders are for
-            odd.setdefault(str(remark), []).append(name)
+            remarks.setdefault(str(remark), []).append(name)
         near, far = float(row[15]), float(row[16])
         if not 0 < near < far:
             raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
@@ -73,7 +73,7 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
         photos=tuple(photos),
         background=None,
         rejected=tuple(rejected),
-        warnings=tuple(warnings + lenses.fit_warnings(POSES, odd)),
+        warnings=tuple(warnings + lenses.fit_warnings(POSES, remarks)),
         facts={"image_folder": images[0].parent.name, "factor": factor},
     )
 

@@ -1,7 +1,7 @@
 """The folder of a source: finding the files that its lists name, and reading them within bounds.
 
 Data sets travel: lists hold absolute paths of another computer, extensions that have changed, files that were never copied. A listed
-name is therefore looked for, in this order: as it stands; with another extension; by its last parts, from the longest, inside the
+name is therefore searched for, in this order: as listed; with another extension; by its last parts, from the longest, inside the
 source; absolute paths also by their file name alone. What lies outside the source folder is not read unless the user allows it.
 """
 
@@ -18,7 +18,7 @@ from pipeline.errors import BadInput
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MAX_FRAMES = 100_000
-MAX_FILES = 1_000_000  # entries of a source folder that are looked through
+MAX_FILES = 1_000_000  # entries of a source folder
 MIN_IMAGES = 3  # images that make a data set
 MAX_NAMES = 5  # names that a message lists
 
@@ -168,7 +168,7 @@ def missing_images_warning(where: str, total: int, kept: int, missing: Sequence[
     """The warning about images that are listed but absent, if any; BadInput where too few remain or `strict` forbids it."""
     if not missing:
         return []
-    sentence = f"{where}: {len(missing)} of {total} images that it lists are missing: {abbreviated(missing)}."
+    sentence = f"{where}: {len(missing)} of {total} listed images are missing: {abbreviated(missing)}."
     if kept < MIN_IMAGES:
         raise BadInput(f"{sentence} {kept} remain; at least {MIN_IMAGES} are needed. {remedy}")
     if strict:
@@ -180,7 +180,7 @@ def moved_images_warnings(where: str, places: Sequence[tuple[str, str]], extensi
     """Warnings about images found elsewhere than listed, as (listed, found)."""
     sentences = []
     if places:
-        sentences.append(f"{where}: {len(places)} images are not where it says and were found by name, e.g. {places[0][0]} as {places[0][1]}.")
+        sentences.append(f"{where}: {len(places)} images are not where they are listed and were found by name, e.g. {places[0][0]} as {places[0][1]}.")
     if extensions:
-        sentences.append(f"{where}: {len(extensions)} images have another extension than it says, e.g. {extensions[0][0]} is {extensions[0][1]}.")
+        sentences.append(f"{where}: {len(extensions)} images have another extension than listed, e.g. {extensions[0][0]} is {extensions[0][1]}.")
     return sentences

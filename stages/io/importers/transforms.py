@@ -6,7 +6,7 @@ All state camera-to-world matrices with x right, y up, looking along -z, and are
     nerfstudio   intrinsics at the top or per frame, `mask_path` (black is left out), `train_filenames` etc., points in a PLY file
     instant-ngp  `aabb_scale`, `scale`, `offset`; masks `dynamic_mask_<image>.png` (white is left out); rolling-shutter pairs of matrices
 
-The capture's frame is that of the matrices as they stand: `applied_transform` says how nerfstudio got there, and is only recorded.
+The capture's frame is that of the matrices; `applied_transform` is recorded only.
 """
 
 from __future__ import annotations
@@ -112,12 +112,12 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     source = Source(folder, settings.allow_outside)
     where = ", ".join(file.name for file in json_files(folder))
     listing = _list_frames(source)
-    photos, rejected, odd, lens_warnings = _photos(source, listing, kind)
+    photos, rejected, remarks, lens_warnings = _photos(source, listing, kind)
     rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *rejected]
     warnings = missing_images_warning(where, listing.total, len(photos), listing.missing, settings.strict, _REMEDY)
     if len(photos) < MIN_IMAGES:
         raise BadInput(f"{folder / where}: {len(photos)} usable images of {listing.total} frames; at least {MIN_IMAGES} are needed.")
-    warnings += moved_images_warnings(where, listing.places, listing.extensions) + lenses.fit_warnings(where, odd) + lens_warnings
+    warnings += moved_images_warnings(where, listing.places, listing.extensions) + lenses.fit_warnings(where, remarks) + lens_warnings
     if listing.repeated:
         warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
     document = read_document(json_files(folder)[0])
@@ -192,10 +192,10 @@ def _plain(name: str) -> str:
 
 
 def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str]], dict[str, list[str]], list[str]]:
-    """Photos, the rejected as (name, reason), what `lenses.fit_to_image` found odd, and warnings."""
+    """Photos, the rejected as (name, reason), what `lenses.fit_to_image` found remarks, and warnings."""
     photos: list[Photo] = []
     rejected: list[tuple[str, str]] = []
-    odd: dict[str, list[str]] = {}
+    remarks: dict[str, list[str]] = {}
     warnings: list[str] = []
     rolling = lost_masks = 0
     for frame in listing.frames:
@@ -210,7 +210,7 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
         rolling += "transform_matrix" not in frame.entry
         camera, remark = lenses.fit_to_image(_lens(frame, name, header.size, pose), header, frame.where)
         if remark is not None:
-            odd.setdefault(remark, []).append(name)
+            remarks.setdefault(remark, []).append(name)
         mask, ignore = _mask(source, frame)
         lost_masks += mask is None and "mask_path" in frame.entry
         photos.append(Photo(camera, frame.image, mask, ignore, frame.split))
@@ -221,7 +221,7 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
     centred = [photo for photo in photos if 0 < photo.camera.intrinsics["cx"] < photo.camera.width and 0 < photo.camera.intrinsics["cy"] < photo.camera.height]
     if len(centred) < len(photos):
         warnings.append(f"{len(photos) - len(centred)} cameras have their principal point outside the image: cx, cy may belong to another size.")
-    return photos, rejected, odd, warnings
+    return photos, rejected, remarks, warnings
 
 
 def _pose(frame: _Frame) -> np.ndarray:
@@ -315,7 +315,7 @@ def _mask(source: Source, frame: _Frame) -> tuple[Path | None, str]:
 def _bounds(document: dict[str, Any], file: Path) -> np.ndarray | None:
     """instant-ngp's unit cube in the frame of the matrices: it maps x to scale * x + offset, and expects the subject within [0, 1].
 
-    `aabb_scale` widens that cube for the surroundings; what is wanted is the subject.
+    `aabb_scale` widens that cube for the background and is ignored.
     """
     if "aabb_scale" not in document and "scale" not in document:
         return None
