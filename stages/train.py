@@ -1,10 +1,10 @@
 """The train stage: a scene in, a trained field out.
 
-    field.safetensors  both fields, the density voxels, what they mean; the schedule; each photograph's gains where exposure was learned
-    report.json        steps and seconds
-    log.jsonl          a line every few steps
-    curve.png          PSNR over steps
-    previews/          renders of a validation view
+field.safetensors  both fields, the density voxels, what they mean; the schedule; each photograph's gains where exposure was learned
+report.json        steps and seconds
+log.jsonl          a line every few steps
+curve.png          PSNR over steps
+previews/          renders of a validation view
 """
 
 from __future__ import annotations

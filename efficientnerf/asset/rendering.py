@@ -163,9 +163,7 @@ def tree_density(tree: NerfTree, points: Tensor, values: Tensor) -> tuple[Tensor
     return sigma, index, weight
 
 
-def render_reference(
-    tree: NerfTree, origins: Tensor, directions: Tensor, density: Tensor | None = None, sh: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def render_reference(tree: NerfTree, origins: Tensor, directions: Tensor, density: Tensor | None = None, sh: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Colour (R, 3), premultiplied, and opacity (R,) of rays by plain sums over every step; differentiable in `density` and `sh`.
 
     origins, directions  (R, 3) world frame, unit directions

@@ -1,6 +1,6 @@
 """Fields: from a point of space to density and colour. One contract, one module a field.
 
-    hash  multiresolution hash grid        mlp  the paper's networks        nerf  the original NeRF's, for comparison
+hash  multiresolution hash grid        mlp  the paper's networks        nerf  the original NeRF's, for comparison
 """
 
 from __future__ import annotations

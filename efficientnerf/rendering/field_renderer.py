@@ -93,11 +93,7 @@ class FieldRenderer:
         count = camera.width * camera.height
         parts, counts = [], SampleCounts()
         # Where nothing is pruned a ray has as many samples as there are.
-        block = (
-            self.rays_per_block
-            if m.prunes
-            else min(self.rays_per_block, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
-        )
+        block = self.rays_per_block if m.prunes else min(self.rays_per_block, max(64, 2**19 // (m.num_coarse_samples + m.settings.num_importance_samples)))
         for begin in range(0, count, block):
             index = np.arange(begin, min(count, begin + block))
             pixels = np.stack([index % camera.width + 0.5, index // camera.width + 0.5], axis=-1)

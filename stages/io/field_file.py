@@ -75,9 +75,7 @@ def space_of(s: Scene) -> Space:
 GAINS = "exposure.gains"
 
 
-def save_model(
-    m: Model, near: float, far: float, path: Path, gains: dict[str, np.ndarray] | None = None, schedule: Schedule | None = None
-) -> None:
+def save_model(m: Model, near: float, far: float, path: Path, gains: dict[str, np.ndarray] | None = None, schedule: Schedule | None = None) -> None:
     """
     gains     of each training view by the name of its image, (3,) the gains from the scene's colours to the photograph's, where they were learned
     schedule  that the model was trained with, which gives it again to the byte
