@@ -16,8 +16,10 @@ import numpy as np
 import torch
 from gpu_kernels import BOUNDS, ball, orbit
 
-from efficientnerf.asset import bake, refinement
-from efficientnerf.asset.refinement import Targets
+from efficientnerf.asset import bake
+from efficientnerf.asset.refinement import fit
+from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, RefinementState, initial_state
+from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
@@ -60,26 +62,26 @@ def asset_rates(
     tree = baked(m, scene, resolution, pixels)
     clock.lap("bake")
     targets = Targets(scene, WHITE).to(device)
-    o = refinement.optimiser(tree, refinement.OPAQUE)
-    options: dict[str, Any] = {"steps": refine_steps, "rays": rays, "density_rate": 0.3, "colour_rate": 0.03, "final": 0.3, "seed": 0}
-    for _ in refinement.optimise(o, targets, until=refine_steps // 4, **options):
+    state = initial_state(tree, MAX_INITIAL_THICKNESS)
+    options: dict[str, Any] = {"steps": refine_steps, "rays": rays, "density_lr": 0.3, "sh_lr": 0.03, "lr_final_ratio": 0.3, "seed": 0}
+    for _ in fit.optimise(state, targets, until=refine_steps // 4, **options):
         pass
     clock.lap("refine_first_quarter")
-    for _ in refinement.optimise(o, targets, until=refine_steps, **options):
+    for _ in fit.optimise(state, targets, until=refine_steps, **options):
         pass
     clock.lap("refine")
     steps_per_second = (refine_steps - refine_steps // 4) / clock.seconds["refine"]
-    waits = waits_of(o, targets, device, {**options, "steps": refine_steps + 32, "until": refine_steps + 32})
+    waits = waits_of(state, targets, device, {**options, "steps": refine_steps + 32, "until": refine_steps + 32})
     clock.lap("waits")
-    weights = refinement.greatest_weights(o.result(), targets, pixels, 0)
+    weights = fit.max_weights(state.result(), targets, pixels, 0)
     clock.lap("weights")
-    errors = [refinement.error(each, targets, 2**16, 0) for each in (tree, o.result())]
+    errors = [fit.error(each, targets, 2**16, 0) for each in (tree, state.result())]
     clock.lap("errors")
     return {
         "seconds": clock.seconds, "voxels": len(tree.density_values), "voxels_that_show": int((weights > 1e-3).sum()),
         "refine_steps_per_second": round(steps_per_second, 1), "refine_waits_in_32_steps": waits, "refine_on": "device" if targets.on_device else "host",
         "training_psnr": {"baked": decibels(errors[0]), "refined": decibels(errors[1])},
-        "test_psnr": test_view_psnr(m, [tree, o.result()], test_camera, device),
+        "test_psnr": test_view_psnr(m, [tree, state.result()], test_camera, device),
     }  # fmt: skip
 
 
@@ -93,9 +95,9 @@ def baked(m: Model, scene: Pixels, resolution: int, pixels: int) -> NerfTree:
     return tree_from_voxels(shape, voxel, BOUNDS[0], indices, density, sh, background=WHITE)
 
 
-def waits_of(o: refinement.Optimiser, targets: Targets, device: str, options: dict[str, Any]) -> dict[str, int]:
+def waits_of(state: RefinementState, targets: Targets, device: str, options: dict[str, Any]) -> dict[str, int]:
     """Lines that waited for the device in further steps; the first is left out, which waits by design."""
-    running = refinement.optimise(o, targets, **options)
+    running = fit.optimise(state, targets, **options)
     next(running)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

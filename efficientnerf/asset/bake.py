@@ -4,7 +4,7 @@
    pixels show before and behind the box.
 2. `chosen_voxels`: those above a threshold, dilated by one voxel so that linear interpolation has all its corners.
 3. `voxel_values`: density and harmonics averaged over several jittered points of each voxel, in blocks.
-4. `efficientnerf.asset.refinement` makes the tree of these look like the photographs, and drops what does not show.
+4. `efficientnerf.asset.refinement` fits the tree of these to the training images; voxels that do not show are dropped.
 
 B coarse cells, P pixels, N voxels.
 """
@@ -39,7 +39,7 @@ def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int,
 
 
 @dataclass(frozen=True, eq=False)
-class Visible:
+class Visibility:
     """What the network showed of the voxels, and of what lies outside of the box.
 
     cells     (B,) int64 flat coarse cells (x slowest) in which any sample fell, ascending
@@ -60,7 +60,7 @@ class Visible:
 def visible_voxels(
     m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, bounds_min: np.ndarray, brick: int, count: int, done: Callable[[int, int], None],
     space: Space | None = None,
-) -> Visible:  # fmt: skip
+) -> Visibility:  # fmt: skip
     """Greatest weight of each voxel over about `count` training pixels, evenly spread. Memory grows with the cells that are met, not with the grid.
 
     done   called with pixels looked at and their number
@@ -97,7 +97,7 @@ def visible_voxels(
         done(min(len(chosen), begin + RAYS_PER_BLOCK), len(chosen))
     cells = torch.nonzero(row_of >= 0).squeeze(1)
     before, beyond = (np.concatenate(part) for part in zip(*surroundings, strict=True)) if surroundings else (None, None)
-    return Visible(cells.numpy(), greatest[row_of[cells].long()].numpy(), chosen, before, beyond)
+    return Visibility(cells.numpy(), greatest[row_of[cells].long()].numpy(), chosen, before, beyond)
 
 
 def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
@@ -111,8 +111,8 @@ def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
 
 
 def coarsened(
-    seen: Visible, shape: tuple[int, int, int], voxel: float, to_shape: tuple[int, int, int], to_voxel: float, brick: int, threshold: float
-) -> Visible:
+    seen: Visibility, shape: tuple[int, int, int], voxel: float, to_shape: tuple[int, int, int], to_voxel: float, brick: int, threshold: float
+) -> Visibility:
     """What was seen of a grid, for one of larger voxels of the same corner: each of these has the greatest weight of the voxels whose centres lie in it.
     Weights that don't exceed `threshold` are left out."""
     from efficientnerf.backends.numba.bricks import resample_weights
@@ -126,7 +126,7 @@ def coarsened(
     return replace(seen, cells=cells, greatest=greatest[row_of[cells]])
 
 
-def chosen_voxels(seen: Visible, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
+def chosen_voxels(seen: Visibility, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
     """Coordinates (N, 3) int32 of the voxels whose greatest weight exceeds `threshold`, and of those around them, in the order of the grid.
 
     They are marked in the cells that they reach, so that memory grows with what is found, and neither with the grid nor with the neighbours looked at.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from efficientnerf.asset.refinement import grid_of, in_voxels
+from efficientnerf.asset.refinement.host import grid_of, in_voxels
 from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset import bake
-from efficientnerf.asset.bake import Visible, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
+from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
 from efficientnerf.asset.queries import density_at, density_block
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.fields.bakeable import BakeableField
@@ -43,19 +43,19 @@ def greatest(count: int = 10**6, resolution: int = 16, **changes: Any) -> np.nda
     return dense(visible_voxels(model_of_a_ball(**changes), pixels(8, 24), shape, voxel, BOUNDS[0], 4, count, lambda done, total: None), shape, 4)
 
 
-def dense(seen: Visible, shape: tuple[int, int, int], brick: int) -> np.ndarray:
+def dense(seen: Visibility, shape: tuple[int, int, int], brick: int) -> np.ndarray:
     """The greatest weights as a plain grid."""
     out = np.zeros((*shape, brick, brick, brick), np.float32)
     out.reshape(-1, brick**3)[seen.cells] = seen.greatest
     return out.transpose(0, 3, 1, 4, 2, 5).reshape([n * brick for n in shape])
 
 
-def sparse(weight: np.ndarray, brick: int) -> Visible:
+def sparse(weight: np.ndarray, brick: int) -> Visibility:
     """The inverse of `dense`, cells without any weight left out."""
     x, y, z = (n // brick for n in weight.shape)
     rows = weight.reshape(x, brick, y, brick, z, brick).transpose(0, 2, 4, 1, 3, 5).reshape(-1, brick**3)
     cells = np.flatnonzero(rows.any(axis=1))
-    return Visible(cells, rows[cells], np.zeros(0, np.int64), None, None)
+    return Visibility(cells, rows[cells], np.zeros(0, np.int64), None, None)
 
 
 @pytest.mark.parametrize(("extent", "resolution", "brick"), [((2, 2, 2), 64, 4), ((2, 1, 0.3), 100, 4), ((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])

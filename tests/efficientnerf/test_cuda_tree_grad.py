@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset import refinement
-from efficientnerf.asset.refinement import Targets, error, greatest_weights, optimise, optimiser
+from efficientnerf.asset.refinement.fit import error, max_weights, optimise
+from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
+from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.gradients import RayTargets
 from efficientnerf.geometry.cameras import Camera
@@ -23,7 +24,7 @@ from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 from tests.efficientnerf.walls import camera_at, wall
 
 kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
-device = pytest.importorskip("efficientnerf.asset.refinement_device")
+device = pytest.importorskip("efficientnerf.asset.refinement.device")
 
 
 def there(seen: RayTargets) -> RayTargets:
@@ -105,12 +106,12 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
     assert (gradients(bare, origins, directions, seen_at_random(40, 0.0))[0] > 0).any()
 
 
-def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 6) -> tuple[refinement.Optimiser, list[float]]:
+def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 6) -> tuple[RefinementState, list[float]]:
     """Steps in one go, or in several with the state fetched in between, as a checkpoint does."""
-    o = optimiser(tree)
+    o = initial_state(tree)
     errors: list[float] = []
     for end in until:
-        errors += optimise(o, targets, until=end, steps=steps, rays=rays, density_rate=0.3, colour_rate=0.05, final=0.1, seed=1, view_share=0.5)
+        errors += optimise(o, targets, until=end, steps=steps, rays=rays, density_lr=0.3, sh_lr=0.05, lr_final_ratio=0.1, seed=1, view_dependent_lr_ratio=0.5)
         o.fetch()
     return o, errors
 
@@ -120,7 +121,7 @@ def test_steps_are_those_of_the_cpu() -> None:
     tree = ball_tree(8)
     tree = replace(tree, harmonics=np.random.default_rng(0).normal(size=tree.sh.shape).astype(np.float32))
     on_host = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
-    on_device = device.sent_targets(on_host, DEVICE)
+    on_device = on_host.sent(DEVICE)
     assert on_device.on_device
     ours, errors = fitted(on_device, tree, [4], steps=4)
     theirs, wanted = fitted(on_host, tree, [4], steps=4)
@@ -137,7 +138,7 @@ def test_steps_are_those_of_the_cpu() -> None:
 def test_interrupted_or_not_the_bytes_are_the_same() -> None:
     targets = device.sent_targets(Targets(pixels(6, 16), (1.0, 1.0, 1.0)), DEVICE)
     whole, apart = (fitted(targets, ball_tree(8), until)[0] for until in ([6], [2, 5, 6]))
-    for name in refinement.STATE:
+    for name in STATE:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 
 
@@ -145,8 +146,8 @@ def test_the_room_that_a_fit_takes_is_known_before() -> None:
     from stages.baking.memory import needed_on_device
 
     tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
-    fit = device.DeviceFit(optimiser(tree), torch.device(DEVICE))
-    tensors = [*fit.values.values(), fit.by_thickness, fit.by_sh, fit.stamp, fit.grid.index, fit.grid.grid]
+    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE))
+    tensors = [*arrays.values.values(), arrays.by_thickness, arrays.by_sh, arrays.stamp, arrays.grid.index, arrays.grid.grid]
     taken = sum(t.numel() * t.element_size() for t in tensors)
     # The grid is there once then; three times while it is sent.
     assert needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4) == taken + 8 * tree.brick_index.size
@@ -155,9 +156,9 @@ def test_the_room_that_a_fit_takes_is_known_before() -> None:
 def test_weights_are_those_of_the_cpu() -> None:
     tree = replace(random_tree(4, shape=(5, 5, 5), brick=4, degree=1, share=0.5, sigma=20.0), voxel=2 / 20, bounds_min=BOUNDS[0])
     targets = Targets(pixels(4, 12), (1.0, 1.0, 1.0))
-    wanted = greatest_weights(tree, targets, 700, 0)
+    wanted = max_weights(tree, targets, 700, 0)
     told: list[int] = []
-    found = greatest_weights(tree, device.sent_targets(targets, DEVICE), 700, 0, lambda done, _: told.append(done))
+    found = max_weights(tree, targets.sent(DEVICE), 700, 0, lambda done, _: told.append(done))
     assert told == [700]
     assert (wanted > 0.01).mean() > 0.2
     assert (np.abs(found - wanted) > 2e-3).mean() < 0.01
@@ -175,8 +176,8 @@ def test_targets_on_the_device_say_the_same(kind: str) -> None:
     else:
         if kind == "infinite":
             some.images = np.ascontiguousarray(some.images[:, :3])
-        targets = Targets(some, (0.2, 0.5, 0.7), infinite=kind == "infinite")
-    same = [each.draw(100, np.random.default_rng(1), declared=kind == "declared") for each in (targets, device.sent_targets(targets, DEVICE))]
+        targets = Targets(some, (0.2, 0.5, 0.7), reaches_infinity=kind == "infinite")
+    same = [each.draw(100, np.random.default_rng(1), constant_background=kind == "declared") for each in (targets, targets.sent(DEVICE))]
     for ours, theirs in zip((*same[1][:2], *same[1][2][:4]), (*same[0][:2], *same[0][2][:4]), strict=True):
         np.testing.assert_allclose(ours.cpu().numpy(), theirs, atol=2e-6)
         assert theirs.dtype == np.float32
@@ -208,9 +209,9 @@ def test_in_normalised_device_coordinates_too() -> None:
     tree: Any = wall()
     camera = camera_at(0, 0, 0)
     image = np.full((camera.height, camera.width, 3), 128, np.uint8)
-    targets = Targets(Pixels([camera], [image], [None], np.ones(1), np.full(1, 5.0)), (0.5, 0.5, 0.5), infinite=True)
+    targets = Targets(Pixels([camera], [image], [None], np.ones(1), np.full(1, 5.0)), (0.5, 0.5, 0.5), reaches_infinity=True)
     count = min(300, len(targets.pixels))
-    wanted, found = error(tree, targets, count, 0), error(tree, device.sent_targets(targets, DEVICE), count, 0)
+    wanted, found = error(tree, targets, count, 0), error(tree, targets.sent(DEVICE), count, 0)
     assert wanted > 1e-3
     assert found == pytest.approx(wanted, rel=1e-3)
 

@@ -12,7 +12,7 @@ import pytest
 from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
 from efficientnerf.asset.format import describe, load, save
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
-from efficientnerf.asset.refinement import optimiser
+from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.packed import packed_of
@@ -150,7 +150,7 @@ def test_trilinear_files_are_as_they_were(tmp_path: Path) -> None:
 
 def test_trees_made_of_it_keep_the_lookup() -> None:
     tree = nearest(4, 2)
-    made = [with_degree(tree, 1), with_resolution(tree, 10), pruned(tree), tree.with_values(tree.density_values, tree.sh), optimiser(tree).result()]
+    made = [with_degree(tree, 1), with_resolution(tree, 10), pruned(tree), tree.with_values(tree.density_values, tree.sh), initial_state(tree).result()]
     assert [each.lookup for each in made] == ["nearest"] * 5
 
 

@@ -9,10 +9,13 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset import refinement
 from efficientnerf.asset.bake import voxel_coordinates, with_voxels
 from efficientnerf.asset.queries import density_at
-from efficientnerf.asset.refinement import Targets, error, greatest_weights, grid_of, in_voxels, optimise, optimiser
+from efficientnerf.asset.refinement import state
+from efficientnerf.asset.refinement.fit import error, max_weights, optimise
+from efficientnerf.asset.refinement.host import grid_of, in_voxels
+from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
+from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
@@ -85,7 +88,7 @@ def test_records_grow_until_all_samples_fit() -> None:
     records = SampleRecords()
     records.room = 7
     start, along, bases = in_voxels(tree, origins, directions)
-    o = optimiser(tree)
+    o = initial_state(tree)
     seen = seen_at_random(300, 0.0, np.float32)
     _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
     assert 7 < counts.max() <= records.room
@@ -96,8 +99,8 @@ def test_records_grow_until_all_samples_fit() -> None:
 
 
 def fitted(tree: NerfTree, targets: Targets, steps: int, **more: Any) -> tuple[NerfTree, list[float]]:
-    o = optimiser(tree)
-    told = {"until": steps, "steps": steps, "rays": 512, "density_rate": 0.3, "colour_rate": 0.05, "final": 0.1, "seed": 1, **more}
+    o = initial_state(tree)
+    told = {"until": steps, "steps": steps, "rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "lr_final_ratio": 0.1, "seed": 1, **more}
     errors = list(optimise(o, targets, **told))
     return o.result(), errors
 
@@ -115,7 +118,7 @@ def test_fog_becomes_the_ball_of_the_pictures() -> None:
 def test_no_share_for_what_depends_on_the_direction_leaves_it_alone() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     tree = ball_tree(12)
-    fixed, _ = fitted(tree, targets, 10, view_share=0.0)
+    fixed, _ = fitted(tree, targets, 10, view_dependent_lr_ratio=0.0)
     free, _ = fitted(tree, targets, 10)
     np.testing.assert_array_equal(fixed.sh[:, 1:], tree.sh[:, 1:])
     assert (fixed.sh[:, 0] != tree.sh[:, 0]).any()
@@ -154,7 +157,7 @@ def test_any_background_is_the_mean_over_random_ones() -> None:
     truth = rgba[:, :3] * rgba[:, 3:] + behind * (1 - rgba[:, 3:])
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - truth) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
-    white = targets.of(index, None, declared=True)[2]
+    white = targets.of(index, None, constant_background=True)[2]
     assert white.opacity_weight == 0
     np.testing.assert_array_equal(white.background, 1)
 
@@ -163,7 +166,7 @@ def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> No
     some = pixels(6, 16)
     some.images = np.ascontiguousarray(some.images[:, :3])
     tree = ball_tree()
-    targets = Targets(some, (0.5, 0.5, 0.5), infinite=True)
+    targets = Targets(some, (0.5, 0.5, 0.5), reaches_infinity=True)
     index = np.arange(600, 700)
     origins, directions, seen = targets.of(index, None)
     loss = gradients(tree, origins, directions, seen, np.float32)[0]
@@ -171,7 +174,7 @@ def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> No
     behind = np.random.default_rng(0).random((20000, 1, 3))
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - some.images[index] / 255) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
-    declared = targets.of(index, None, declared=True)[2]
+    declared = targets.of(index, None, constant_background=True)[2]
     assert declared.opacity_weight == 0
     np.testing.assert_array_equal(declared.background, 0.5)
 
@@ -179,8 +182,8 @@ def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> No
 def test_the_same_bytes_interrupted_or_not_on_one_thread_or_two() -> None:
     targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     whole, _ = fitted(ball_tree(), targets, 12)
-    again = optimiser(ball_tree())
-    told: dict[str, Any] = {"steps": 12, "rays": 512, "density_rate": 0.3, "colour_rate": 0.05, "final": 0.1, "seed": 1}
+    again = initial_state(ball_tree())
+    told: dict[str, Any] = {"steps": 12, "rays": 512, "density_lr": 0.3, "sh_lr": 0.05, "lr_final_ratio": 0.1, "seed": 1}
     list(optimise(again, targets, until=5, **told))
     threads = numba.get_num_threads()
     try:
@@ -199,7 +202,7 @@ def test_weights_are_what_voxels_contribute() -> None:
     tree = uniform_tree((2, 2, 2), brick=4, voxel=0.25, sigma=4.0)
     tree = replace(tree, bounds_min=BOUNDS[0], background=(1.0, 1.0, 1.0))
     looked: list[tuple[int, int]] = []
-    weights = greatest_weights(tree, Targets(pixels(8, 24), (1.0, 1.0, 1.0)), 4000, 0, lambda *done: looked.append(done))
+    weights = max_weights(tree, Targets(pixels(8, 24), (1.0, 1.0, 1.0)), 4000, 0, lambda *done: looked.append(done))
     assert looked == [(4000, 4000)]
     at = voxel_coordinates(tree)
     skin = ((at == 0) | (at == 7)).any(axis=1)
@@ -251,7 +254,7 @@ def test_greatest_weights_are_those_of_a_march_by_hand_in_any_number_of_parts() 
 
 def test_steps_are_those_of_the_formula() -> None:
     tree = random_tree(4, brick=2, degree=1)
-    o, records = optimiser(tree), SampleRecords()
+    o, records = initial_state(tree), SampleRecords()
     sums, stamp = (np.zeros_like(o.density), np.zeros_like(o.sh)), np.zeros(len(o.density), np.int32)
     rates = np.linspace(0.01, 0.02, o.sh.shape[1]).astype(np.float32)
     density, sh = o.density.astype(np.float64), o.sh.astype(np.float64)
@@ -287,15 +290,15 @@ def test_what_hides_behind_an_opaque_wall_is_reached() -> None:
     """A wall of the wrong colour before a ball: from a capped start it gives way in steps in which it otherwise stays."""
     targets = Targets(pixels(10, 24), (1.0, 1.0, 1.0))
     wall = replace(ball_tree(), density_values=np.full(8000, 3000.0, np.float32))
-    assert optimiser(wall, refinement.OPAQUE).density.max() == pytest.approx(refinement.OPAQUE / wall.voxel)
+    assert initial_state(wall, MAX_INITIAL_THICKNESS).density.max() == pytest.approx(MAX_INITIAL_THICKNESS / wall.voxel)
     errors = {}
-    for thickest in (refinement.OPAQUE, np.inf):
-        o = optimiser(wall, thickest)
-        *_, errors[thickest] = optimise(o, targets, until=30, steps=30, rays=512, density_rate=0.3, colour_rate=0.05, final=0.1, seed=1)
-    assert errors[refinement.OPAQUE] < 0.75 * errors[np.inf]
+    for thickest in (MAX_INITIAL_THICKNESS, np.inf):
+        o = initial_state(wall, thickest)
+        *_, errors[thickest] = optimise(o, targets, until=30, steps=30, rays=512, density_lr=0.3, sh_lr=0.05, lr_final_ratio=0.1, seed=1)
+    assert errors[MAX_INITIAL_THICKNESS] < 0.75 * errors[np.inf]
 
 
 def test_state_names_every_array_of_an_optimiser() -> None:
-    o = optimiser(random_tree(2))
-    assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(refinement.SQUARES)
-    assert all(isinstance(getattr(o, name), np.ndarray) for name in refinement.STATE)
+    o = initial_state(random_tree(2))
+    assert {name for name, value in vars(o).items() if isinstance(value, np.ndarray)} == set(state.MOMENTS)
+    assert all(isinstance(getattr(o, name), np.ndarray) for name in state.STATE)

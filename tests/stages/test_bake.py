@@ -159,7 +159,7 @@ def test_the_raw_asset_looks_like_the_field_and_the_fitted_one_more_like_the_pho
 
 
 def test_a_device_without_room_leaves_the_fit_to_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.asset.refinement import Targets
+    from efficientnerf.asset.refinement.targets import Targets
     from tests.efficientnerf.balls import pixels
     from tests.efficientnerf.trees import random_tree
 
@@ -171,10 +171,10 @@ def test_a_device_without_room_leaves_the_fit_to_the_host(tmp_path: Path, monkey
     needed = 604 * len(tree.density_values) + 4 * 5**3 * len(tree.voxel_index) + 12 * 60 + 2 * 64 * 4
     for free, where in ((needed, there), (needed - 1, targets)):
         monkeypatch.setattr(memory, "free_on_device", lambda device, free=free: free)
-        assert refinement._where_there_is_room(made, tree, targets) is where
+        assert refinement.targets_on_device(made, tree, targets) is where
     assert ["fitted on the CPU" in event["text"] for event in events if event["event"] == "warning"] == [True]
     made.device = "cpu"
-    assert refinement._where_there_is_room(made, tree, targets) is targets
+    assert refinement.targets_on_device(made, tree, targets) is targets
 
 
 def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None:
@@ -209,10 +209,10 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
 
 def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
     chosen = BakeSettings(refine_rays_per_batch=1000)
-    assert [refinement.steps_of(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
-    assert {refinement.steps_of(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
+    assert [refinement.refinement_steps(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
+    assert {refinement.refinement_steps(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
     asked = dataclasses.replace(chosen, refine_steps=7)
-    assert {refinement.steps_of(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
+    assert {refinement.refinement_steps(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
     made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=None, refine_rays_per_batch=64), **inputs)
     run(made)
     report = json.loads((made.out / "report.json").read_text())["optimisation"]

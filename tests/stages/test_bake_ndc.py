@@ -18,7 +18,7 @@ from efficientnerf.geometry.spaces import NdcSpace
 from stages import bake, train
 from stages.artifacts import BakeOutputs
 from stages.bake import BakeSettings
-from stages.baking.refinement import WEIGHED_NDC
+from stages.baking.refinement import NDC_RAYS_PER_VOXEL
 from stages.baking.resolution import MIB, NDC_BYTES, NDC_MIB, budget_of, finest_resolution, ndc_pixel
 from stages.framing.forward_facing import detect_forward_facing
 from stages.io.field_file import load_renderer
@@ -84,7 +84,7 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     fitted = json.loads((tmp_path / "out" / "report.json").read_text())["optimisation"]
     assert fitted["psnr_after"] > fitted["psnr_before"] + 0.5
     looked = {event["total"] for event in told if event.get("text") == "dropping what does not show"}
-    assert looked == {min(int(WEIGHED_NDC * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
+    assert looked == {min(int(NDC_RAYS_PER_VOXEL * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
     assert max(looked) > 1000
     assert not [event for event in told if event["event"] == "warning"]
 

@@ -1,4 +1,4 @@
-"""`efficientnerf.asset.refinement` on a CUDA device: pixels, rays, values and steps stay there, and nothing waits for it but who asks for the state.
+"""Steps of refinement on CUDA: pixels, rays, values and steps stay on the device, and the host waits only when the state is fetched.
 
 Kernels: `efficientnerf.backends.triton.tree_gradients`. N voxels, K harmonics, R rays.
 """
@@ -7,46 +7,39 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.asset.refinement import DECAY, EPSILON, STATE, Bundle, Optimiser, Targets, randomness
+from efficientnerf.asset.refinement.host import DECAY, EPSILON
+from efficientnerf.asset.refinement.state import STATE, RefinementState
+from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
 from efficientnerf.training.device_pixels import DevicePixels
-from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.readback import LAG
 
 
-def sent_targets(targets: Targets, device: str | torch.device) -> Targets:
-    """The targets on a device."""
-    assert isinstance(targets.pixels, Pixels)
-    before, behind = (None if part is None else torch.from_numpy(np.ascontiguousarray(part)).to(device) for part in (targets.before, targets.behind))
-    return replace(targets, pixels=DevicePixels(targets.pixels, device), before=before, behind=behind)
+class DeviceArrays:
+    """A state's arrays on a device, by name (`efficientnerf.asset.refinement.state.STATE`), and the sums of the gradients."""
 
-
-class DeviceFit:
-    """An optimiser's arrays on a device, by the names they have there (`efficientnerf.asset.refinement.STATE`), and the gradients' sums."""
-
-    def __init__(self, o: Optimiser, device: torch.device) -> None:
-        self.values: dict[str, Tensor] = {name: torch.from_numpy(np.ascontiguousarray(getattr(o, name))).to(device) for name in STATE}
-        self.grid = device_grid(o.tree, device)
-        count, width = o.sh.shape
+    def __init__(self, state: RefinementState, device: torch.device) -> None:
+        self.values: dict[str, Tensor] = {name: torch.from_numpy(np.ascontiguousarray(getattr(state, name))).to(device) for name in STATE}
+        self.grid = device_grid(state.tree, device)
+        count, width = state.sh.shape
         self.by_thickness = torch.zeros(count, dtype=torch.int64, device=device)
         self.by_sh = torch.zeros(count, width, dtype=torch.int64, device=device)
         self.stamp = torch.zeros(count, dtype=torch.int32, device=device)
 
-    def to_host_async(self) -> dict[str, np.ndarray]:
+    def to_host(self) -> dict[str, np.ndarray]:
         """The arrays on the host."""
         return {name: values.cpu().numpy() for name, values in self.values.items()}
 
-    def step(self, number: int, rays: Rays, seen: Any, density_rate: float, colour_rate: float, view_share: float = 1.0) -> Tensor:
+    def step(self, number: int, rays: Rays, seen: Any, density_lr: float, sh_lr: float, view_dependent_lr_ratio: float = 1.0) -> Tensor:
         """Losses (R,) of the rays before the step."""
         v, sums = self.values, (self.by_thickness, self.by_sh)
         outputs = tree_gradients.forward(self.grid, rays, v["density"], v["sh"])
@@ -54,7 +47,7 @@ class DeviceFit:
         tree_gradients.backward(self.grid, rays, v["density"], v["sh"], outputs, (by[0], by[1]), sums, self.stamp, number)
         tree_gradients.rmsprop_step(
             self.grid, (v["density"], v["sh"]), sums, (v["square_density"], v["square_sh"]), v["visits"], self.stamp,
-            number=number, rays=len(loss), density_rate=density_rate, sh_rate=colour_rate, view_share=view_share, decay=DECAY, epsilon=EPSILON,
+            number=number, rays=len(loss), density_rate=density_lr, sh_rate=sh_lr, view_share=view_dependent_lr_ratio, decay=DECAY, epsilon=EPSILON,
         )  # fmt: skip
         return loss
 
@@ -67,31 +60,22 @@ def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
 
 
 def optimise(
-    o: Optimiser,
-    targets: Targets,
-    *,
-    until: int,
-    steps: int,
-    rays: int,
-    density_rate: float,
-    colour_rate: float,
-    final: float,
-    seed: int,
-    view_share: float = 1.0,
-) -> Iterator[float]:
-    """See `efficientnerf.asset.refinement.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
+    state: RefinementState, targets: Targets, *, until: int, steps: int, rays: int, density_lr: float, sh_lr: float, lr_final_ratio: float, seed: int,
+    view_dependent_lr_ratio: float,
+) -> Iterator[float]:  # fmt: skip
+    """See `efficientnerf.asset.refinement.fit.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
     assert isinstance(targets.pixels, DevicePixels)
-    o.fetch()
-    o.away = fit = DeviceFit(o, targets.pixels.device)
+    state.fetch()
+    state.device_state = arrays = DeviceArrays(state, targets.pixels.device)
     pending: deque[tuple[Tensor, Any]] = deque()
     error = None
-    while o.step < until:
-        number = o.step + 1
-        origins, directions, seen = targets.draw(rays, randomness(seed, number))
-        fall = final ** (number / steps)
-        loss = fit.step(number, rays_in_voxels(o.tree, origins, directions), seen, density_rate * fall, colour_rate * fall, view_share)
+    while state.step < until:
+        number = state.step + 1
+        origins, directions, seen = targets.draw(rays, step_rng(seed, number))
+        fall = lr_final_ratio ** (number / steps)
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), seen, density_lr * fall, sh_lr * fall, view_dependent_lr_ratio)
         pending.append(to_host_async(loss.mean() / 3))
-        o.step = number
+        state.step = number
         if error is None or len(pending) > LAG:
             value, arrived = pending.popleft()
             if arrived is not None:
@@ -117,7 +101,7 @@ def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> f
     return float(total)
 
 
-def greatest_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> np.ndarray:
+def max_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> np.ndarray:
     """(N,) over the rays of the bundles."""
     assert isinstance(targets.pixels, DevicePixels)
     grid, density, _ = values_of(tree, targets.pixels.device)

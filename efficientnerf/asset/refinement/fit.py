@@ -1,0 +1,83 @@
+"""From a baked tree to one that looks like the training images: gradient descent on its values.
+
+The structure of the tree stays. Fitted are the optical thickness of each voxel (its logarithm, so that it stays positive) and its harmonics. The loss
+of a ray is that of `RayTargets`: in unbounded scenes the training images are compared through what the field shows before and behind the box; objects
+with alpha over all backgrounds at once.
+
+Every random choice of step n is drawn from a generator seeded by (seed, n), as in training. On the CPU the same steps give the same bytes, on any
+number of threads and whether or not they were interrupted. On CUDA sums do not depend on their order, and values differ by rounding.
+
+PlenOctrees (Yu et al. 2021, section 4.3) and Plenoxels (Fridovich-Keil et al. 2022) optimise trees and grids this way. N voxels, R rays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from efficientnerf.asset.refinement import host
+from efficientnerf.asset.refinement.state import RefinementState
+from efficientnerf.asset.refinement.targets import Bundle, Targets
+from efficientnerf.asset.tree import NerfTree
+
+WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measured the rays leave records
+
+
+def optimise(
+    state: RefinementState, targets: Targets, *, until: int, steps: int, rays: int, density_lr: float, sh_lr: float, lr_final_ratio: float, seed: int,
+    view_dependent_lr_ratio: float = 1.0,
+) -> Iterator[float]:  # fmt: skip
+    """Take steps up to `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.
+
+    steps                    in all; learning rates fall exponentially, to `lr_final_ratio` of themselves at the last of them
+    rays                     of a step
+    density_lr               of the logarithm of the optical thickness
+    sh_lr                    of the harmonics
+    view_dependent_lr_ratio  factor of that for harmonics of degree 1 and above
+    """
+    if targets.on_device:
+        from efficientnerf.asset.refinement import device
+
+        steps_on = device.optimise
+    else:
+        steps_on = host.optimise
+    yield from steps_on(
+        state, targets, until=until, steps=steps, rays=rays, density_lr=density_lr, sh_lr=sh_lr, lr_final_ratio=lr_final_ratio, seed=seed,
+        view_dependent_lr_ratio=view_dependent_lr_ratio,
+    )  # fmt: skip
+
+
+def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
+    """Mean squared error of a channel over `count` training pixels drawn by `seed`; objects over the background of the scene."""
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 3, 0]))
+    bundles = (targets.draw(min(ERROR_RAYS, count - begin), rng, constant_background=True) for begin in range(0, count, ERROR_RAYS))
+    if targets.on_device:
+        from efficientnerf.asset.refinement import device
+
+        return device.total_loss(tree, targets, bundles) / (3 * count)
+    return host.total_loss(tree, bundles) / (3 * count)
+
+
+def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """(N,) the greatest contribution of each voxel to one of `count` random training pixels.
+
+    progress  called with the number of pixels done and `count`
+    """
+    rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 4, 0]))
+    bundles = _reported((targets.draw(min(WEIGHT_RAYS, count - begin), rng) for begin in range(0, count, WEIGHT_RAYS)), count, progress)
+    if targets.on_device:
+        from efficientnerf.asset.refinement import device
+
+        return device.max_weights(tree, targets, bundles)
+    return host.max_weights(tree, bundles)
+
+
+def _reported(bundles: Iterator[Bundle], count: int, progress: Callable[[int, int], None] | None) -> Iterator[Bundle]:
+    """The bundles, reporting the rays done after each."""
+    done = 0
+    for bundle in bundles:
+        yield bundle
+        done += len(bundle[0])
+        if progress is not None:
+            progress(done, count)

@@ -1,0 +1,143 @@
+"""Which voxels of which grid are baked: the resolution, and the voxels that training images show.
+
+N voxels.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from efficientnerf.settings import given
+from pipeline.stage import Job
+from stages.baking.scratch import read_npy, write_npy
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.bake import Visibility
+    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.training.pixels import Pixels
+    from stages.bake import BakeSettings
+    from stages.baking.resolution import Choice
+    from stages.io.scene import Scene
+
+MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: the refined tree shows which of them matter
+OVERSHOOT = 1.7  # the same where the resolution is chosen: few of the dilated voxels show. docs/experiments/bake-resolution.md
+
+
+def voxel_space(job: Job, m: Any) -> Space:
+    """The field's space, in a frame where voxels are cubes."""
+    from efficientnerf.geometry.spaces import NdcSpace
+
+    depth, discretise, space = given(job.settings.ndc_voxel_depth), given(m.settings.discretise), m.space
+    if not isinstance(space, NdcSpace):
+        if depth is not None:
+            job.warn("bake.ndc_voxel_depth is for scenes in normalised device coordinates, which this is none of: voxels are cubes")
+        return m.space
+    if depth is None:
+        depth = 1.0 if discretise else space.voxel_depth
+    elif discretise and depth != 1:
+        job.warn(f"bake.ndc_voxel_depth={depth:g}, but the field was trained on train.discretise={discretise}: on other voxels than are baked")
+    return space if depth == 1 else space.with_voxel_depth(depth)
+
+
+def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) -> tuple[Choice, Visibility, np.ndarray]:
+    """The resolution, the visibility of voxels at it, and the coordinates (N, 3) of the voxels to bake."""
+    from efficientnerf.asset import bake, serialisation
+    from stages.baking.resolution import Choice, affordable_resolution, finest_resolution
+
+    settings: BakeSettings = job.settings
+    bounds, brick = space.bounds, settings.brick_size
+
+    def room(resolution: int) -> int:
+        shape, _ = bake.grid_of(bounds, resolution, brick)
+        return serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, brick)
+
+    stated: int | None = given(settings.resolution)
+    discretise: int | None = given(m.settings.discretise)
+    if (fixed := stated or discretise) is not None:
+        choice = Choice(fixed, "bake.resolution" if stated else "train.discretise")
+        shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
+        visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
+        return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
+
+    finest = finest_resolution(s, given(settings.max_resolution))
+    top_shape, top_voxel = bake.grid_of(bounds, finest.resolution, brick)
+    visibility = _visibility(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64), space)
+    last: tuple[int, Visibility, np.ndarray] | None = None
+
+    def at_resolution(resolution: int) -> tuple[int, Visibility, np.ndarray]:
+        nonlocal last
+        if last is None or last[0] != resolution:
+            last = None
+            job.safe_point()
+            shape, voxel = bake.grid_of(bounds, resolution, brick)
+            coarse = visibility
+            if resolution != finest.resolution:
+                coarse = bake.coarsened(visibility, top_shape, top_voxel, shape, voxel, brick, settings.weight_threshold)
+            last = resolution, coarse, bake.chosen_voxels(coarse, shape, brick, settings.weight_threshold, settings.dilate)
+        return last
+
+    choice = affordable_resolution(finest, lambda at: len(at_resolution(at)[2]), lambda at: int(OVERSHOOT * room(at)))
+    _, coarse, indices = at_resolution(choice.resolution)
+    most = MAX_OVERSHOOT * room(choice.resolution)
+    if len(indices) > most:
+        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, choice.resolution, brick)[0], most)
+    return choice, coarse, indices
+
+
+def _visibility(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visibility:
+    """The visibility of voxels, computed or from an earlier attempt."""
+    from efficientnerf.asset import bake
+
+    settings: BakeSettings = job.settings
+    names = ("cells", "greatest", "chosen", "before", "behind")
+    stored = {name: part for name in names if (part := read_npy(job.work / f"visibility_{name}.npy")) is not None}
+    if len(stored) == len(names):
+        # before and behind are None with a constant background, and empty arrays in the files.
+        return bake.Visibility(**{name: None if name in ("before", "behind") and not len(part) else part for name, part in stored.items()})  # type: ignore[arg-type]
+
+    def progress(done: int, total: int) -> None:
+        job.progress(done, total, "finding the voxels that matter")
+        job.safe_point()
+
+    visibility = bake.visible_voxels(m, pixels, shape, voxel, low, settings.brick_size, settings.visibility_rays, progress, space)
+    for name in names:
+        part = getattr(visibility, name)
+        write_npy(np.empty(0, np.float16) if part is None else part, job.work / f"visibility_{name}.npy")
+    return visibility
+
+
+def _heaviest_voxels(job: Job, visibility: Visibility, shape: tuple[int, int, int], most: int) -> np.ndarray:
+    """Coordinates (N, 3) of the visible voxels: about `most` at most, and then those of greatest weight."""
+    from efficientnerf.asset import bake
+
+    settings: BakeSettings = job.settings
+    threshold = settings.weight_threshold
+    indices = bake.chosen_voxels(visibility, shape, settings.brick_size, threshold, settings.dilate)
+    weights = np.sort(visibility.greatest[visibility.greatest > threshold])
+    while len(indices) > most and len(weights) > 1:
+        job.safe_point()
+        # Dilated voxels are about in proportion to the visible ones; a little less, so that this ends soon.
+        weights = weights[-max(1, int(0.95 * len(weights) * most / len(indices))) :]
+        indices = bake.chosen_voxels(visibility, shape, settings.brick_size, float(weights[0]), settings.dilate)
+    return indices
+
+
+CENTRES_PER_BLOCK = 2**20
+
+
+def with_min_views(m: Any, s: Scene, indices: np.ndarray, resolution: int) -> np.ndarray:
+    """The voxels that at least train.min_views training images have in view, in contracted scenes. The density voxels, which training masked
+    elsewhere (`stages.framing.view_coverage`), are larger, and what they hold would stick out as a rim."""
+    from stages.framing.view_coverage import has_min_views
+    from stages.io import scene
+
+    if not m.space.contracted or m.settings.min_views == "off":
+        return indices
+    cameras = [view.camera for view in scene.views_of(s, "train")]
+    low, high = np.asarray(m.space.bounds, np.float64)
+    voxel = float((high - low).max()) / resolution
+    parts = (indices[at : at + CENTRES_PER_BLOCK] for at in range(0, len(indices), CENTRES_PER_BLOCK))
+    keep = [has_min_views((part + 0.5) * voxel + low, cameras, m.settings.min_views) for part in parts]
+    return indices[np.concatenate(keep)] if keep else indices
