@@ -235,3 +235,19 @@ def tree_ray(tree: Any, origin: np.ndarray, direction: np.ndarray) -> tuple[list
             light *= 1 - alpha
         k += 1
     return colour, 1 - light, depth
+
+
+def ssim(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Wang et al. 2004, equation 13, of each whole window of 11 x 11: (H - 10, W - 10, 3)."""
+    offsets = np.arange(-5, 6)
+    weight = np.exp(-0.5 * (offsets[:, None] ** 2 + offsets**2) / 1.5**2)
+    weight /= weight.sum()
+    out = np.empty((image.shape[0] - 10, image.shape[1] - 10, image.shape[2]))
+    for row, column, channel in np.ndindex(out.shape):
+        x, y = (a[row : row + 11, column : column + 11, channel] for a in (image, truth))
+        mean_x, mean_y = (weight * x).sum(), (weight * y).sum()
+        variance_x, variance_y = (weight * (x - mean_x) ** 2).sum(), (weight * (y - mean_y) ** 2).sum()
+        covariance = (weight * (x - mean_x) * (y - mean_y)).sum()
+        luminance = (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
+        out[row, column, channel] = luminance * (2 * covariance + 0.03**2) / (variance_x + variance_y + 0.03**2)
+    return out

@@ -1,6 +1,6 @@
-"""How close an image is to the photograph: PSNR and SSIM as published in the NeRF literature.
+"""PSNR and SSIM of an image against the ground truth, as published in the NeRF literature.
 
-Images are floating point, sRGB, 0 to 1, and are compared as they are (not rounded to 8 bits); whoever holds values outside 0 to 1 clips them first.
+Images are floating point, sRGB, 0 to 1, not rounded to 8 bits; callers clip values outside 0 to 1.
 """
 
 from __future__ import annotations
@@ -9,10 +9,7 @@ import math
 
 import numpy as np
 
-SSIM_RADIUS = 5  # an 11 x 11 window
-SSIM_SIGMA = 1.5
-SSIM_K1 = 0.01
-SSIM_K2 = 0.03
+WINDOW = 11  # pixels a side of SSIM's Gaussian window
 
 
 def mean_squared_error(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -47,7 +44,8 @@ def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
     outside = ~mask
     image = image.copy()
     image[outside] = truth[outside]
-    middle = mask[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
+    border = WINDOW // 2
+    middle = mask[border:-border, border:-border]
     similarity = ssim_map(image, truth)
     if not middle.any():
         raise ValueError("ssim: the mask leaves no pixel that is the middle of a whole window")
@@ -61,30 +59,18 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     returns       (H - 10, W - 10, 3) or (H - 10, W - 10)
 
     Wang, Bovik, Sheikh and Simoncelli 2004, equation 13, with an 11 x 11 Gaussian of sigma 1.5, K1 = 0.01, K2 = 0.03 and population (not sample)
-    covariances; scikit-image calls the same `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`.
+    covariances, as in the NeRF literature.
     """
+    from skimage.metrics import structural_similarity
+
     image, truth, _ = _checked(image, truth, None)
-    if min(image.shape[:2]) < 2 * SSIM_RADIUS + 1:
-        raise ValueError(f"ssim: an image of {image.shape[1]} x {image.shape[0]} pixels is smaller than the window of 11 x 11")
-    mean_i, mean_t = _windowed(image), _windowed(truth)
-    variance_i = _windowed(image * image) - mean_i * mean_i
-    variance_t = _windowed(truth * truth) - mean_t * mean_t
-    covariance = _windowed(image * truth) - mean_i * mean_t
-    c1, c2 = SSIM_K1**2, SSIM_K2**2
-    numerator = (2.0 * mean_i * mean_t + c1) * (2.0 * covariance + c2)
-    return numerator / ((mean_i**2 + mean_t**2 + c1) * (variance_i + variance_t + c2))
-
-
-def _windowed(values: np.ndarray) -> np.ndarray:
-    """Gaussian-weighted mean over each whole window: rows, then columns."""
-    from scipy.ndimage import correlate1d
-
-    offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
-    weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
-    weights /= weights.sum()
-    inner = slice(SSIM_RADIUS, -SSIM_RADIUS)
-    rows = correlate1d(values, weights, axis=0)[inner]  # (H - 10, W, ...): the border mode touches only what is cut off
-    return np.asarray(correlate1d(rows, weights, axis=1)[:, inner])
+    if min(image.shape[:2]) < WINDOW:
+        raise ValueError(f"ssim: an image of {image.shape[1]} x {image.shape[0]} pixels is smaller than the window of {WINDOW} x {WINDOW}")
+    _, similarity = structural_similarity(
+        truth, image, data_range=1.0, channel_axis=2 if image.ndim == 3 else None, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
+    )
+    border = WINDOW // 2  # where scikit-image mirrors the image
+    return np.asarray(similarity[border:-border, border:-border])
 
 
 def _checked(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
