@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from efficientnerf.settings import Auto, NonNegative, setting
 from pipeline.errors import PipelineError, UnknownSetting, UsageError
-from stages.renamed_settings import RENAMED
+from stages.renamed_settings import REMOVED, RENAMED
 from stages.settings import describe_settings
 from workflows.asset import STAGES
 from workflows.cli.resolve import Settings, parse_value, read_config, read_preset, seconds_of, shown, table_of
@@ -185,21 +185,23 @@ def test_what_is_no_time_is_refused(text: str) -> None:
         seconds_of(text)
 
 
-def test_old_names_are_answered_with_the_new_ones() -> None:
-    for option, words in (
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
         ("train.hidden=64", "train.hidden is now train.hidden_dim."),
         ("bake.final_rate=1", "bake.final_rate is now bake.lr_final_ratio."),
-        ("train.coarse=voxels", None),
-    ):
-        settings = Settings({stage.name: stage.settings for stage in STAGES})
-        if words is None and "coarse" in settings.about["train"]:
-            continue
-        with pytest.raises(UnknownSetting, match=re.escape(words or "train.coarse was removed")) as caught:
-            settings.put_option(option)
-        assert caught.value.exit_code == 2
-        stage, _, name = option.partition("=")[0].partition(".")
-        with pytest.raises(UnknownSetting, match=re.escape(words or "train.coarse was removed")):
-            settings.put_table({stage: {name: 1}}, "--config mine.toml")
+        ("train.coarse=voxels", "train.coarse was removed: pivots are always chosen by the coarse field."),
+        ("train.rate_hold=5", "train.rate_hold was removed"),
+    ],
+)
+def test_old_names_are_answered_with_the_new_ones(option: str, words: str) -> None:
+    settings = Settings({stage.name: stage.settings for stage in STAGES})
+    with pytest.raises(UnknownSetting, match=re.escape(words)) as caught:
+        settings.put_option(option)
+    assert caught.value.exit_code == 2
+    stage, _, name = option.partition("=")[0].partition(".")
+    with pytest.raises(UnknownSetting, match=re.escape(words)):
+        settings.put_table({stage: {name: 1}}, "--config mine.toml")
 
 
 def test_the_table_of_old_names_leads_to_settings_of_today() -> None:
@@ -208,6 +210,7 @@ def test_the_table_of_old_names_leads_to_settings_of_today() -> None:
         for old, new in RENAMED.get(stage.name, {}).items():
             assert new in known
             assert old not in known, "an old name cannot be used again: recorded settings could not be told apart"
+        assert not known & REMOVED.get(stage.name, {}).keys()
 
 
 def test_recorded_settings_of_before_are_read_under_their_new_names() -> None:
