@@ -10,7 +10,6 @@ import torch
 
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
-from stages import lpips_weights
 from stages.evaluate import GroundTruth, lpips_metrics, summary
 from stages.lpips_weights import BACKBONES, load_lpips
 
@@ -18,7 +17,6 @@ from stages.lpips_weights import BACKBONES, load_lpips
 @pytest.fixture(autouse=True)
 def nowhere_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(lpips_weights, "_shipped", list)
 
 
 def made_up(network: str) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
@@ -45,7 +43,7 @@ def images(side: int = 70) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("network", ["alex", "vgg"])
 def test_it_is_the_formula(network: str, tmp_path: Path) -> None:
-    metric = load_lpips(network, written(tmp_path / "weights", network))
+    metric = load_lpips(network, written(tmp_path / "weights", network), bundled=[])
     image, truth = images()
     features, heads = made_up(network)
     inputs = [((2 * a - 1 - np.array(SHIFT)) / np.array([0.458, 0.448, 0.450])).transpose(2, 0, 1)[None] for a in (image, truth)]
@@ -71,7 +69,7 @@ def test_it_is_the_formula(network: str, tmp_path: Path) -> None:
 
 
 def test_what_a_mask_leaves_out_does_not_count(tmp_path: Path) -> None:
-    metric = load_lpips("alex", written(tmp_path / "weights", "alex"))
+    metric = load_lpips("alex", written(tmp_path / "weights", "alex"), bundled=[])
     image, truth = images()
     mask = np.zeros(image.shape[:2], bool)
     assert metric(image, truth, mask) == 0
@@ -81,33 +79,32 @@ def test_what_a_mask_leaves_out_does_not_count(tmp_path: Path) -> None:
 
 def test_missing_weights_are_named_with_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"alexnet-owt-7be5be79\.pth.*download\.pytorch\.org.*lpips_weights.*lpips=off"):
-        load_lpips("alex", str(tmp_path))
+        load_lpips("alex", str(tmp_path), bundled=[])
     folder = Path(written(tmp_path / "weights", "vgg"))
     (folder / "vgg.pth").unlink()
     with pytest.raises(UsageError, match=r"vgg\.pth.*efficientnerf\[lpips\]"):
-        load_lpips("vgg", str(folder))
+        load_lpips("vgg", str(folder), bundled=[])
 
 
-def test_weights_in_torchs_cache_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_in_torchs_cache_are_found(tmp_path: Path) -> None:
     folder = Path(written(tmp_path / "weights", "alex"))
     (tmp_path / "home/hub/checkpoints").mkdir(parents=True)
     (folder / BACKBONES["alex"]).rename(tmp_path / "home/hub/checkpoints" / BACKBONES["alex"])
-    monkeypatch.setattr(lpips_weights, "_shipped", lambda: [folder])
-    load_lpips("alex", None)
+    load_lpips("alex", None, bundled=[folder])
 
 
 def test_damaged_and_wrong_weights_are_refused(tmp_path: Path) -> None:
     folder = Path(written(tmp_path / "weights", "alex"))
     torch.save({"lin0.model.1.weight": torch.zeros(1, 3, 1, 1)}, folder / "alex.pth")
     with pytest.raises(BadInput, match=r"lin0.*expected \(1, 64, 1, 1\)"):
-        load_lpips("alex", str(folder))
+        load_lpips("alex", str(folder), bundled=[])
     (folder / "alex.pth").write_bytes(b"not weights")
     with pytest.raises(BadInput, match="not a readable file of weights"):
-        load_lpips("alex", str(folder))
+        load_lpips("alex", str(folder), bundled=[])
 
 
 def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
-    metrics = {"lpips_alex": load_lpips("alex", written(tmp_path / "weights", "alex"))}
+    metrics = {"lpips_alex": load_lpips("alex", written(tmp_path / "weights", "alex"), bundled=[])}
     image, truth = (a.astype(np.float32) for a in images())
     figures = lpips_metrics(metrics, image, GroundTruth(truth, None, None))
     assert figures["lpips_alex"] is not None
