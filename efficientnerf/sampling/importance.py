@@ -9,7 +9,7 @@ from efficientnerf.geometry.spaces import Space
 from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.sampling.samples import Samples
 
-IMPORTANCE_FLOOR = 1e-5  # added to every weight, as in NeRF's code, so that a ray that meets nothing is searched evenly
+IMPORTANCE_FLOOR = 1e-5  # added to every weight, as in NeRF's code, so that a ray that meets nothing is sampled evenly
 
 
 def importance_samples(
@@ -19,13 +19,13 @@ def importance_samples(
 
         p_i = (w_i + 1e-5) / sum_j (w_j + 1e-5),  t = CDF^-1(quantile), p constant over each coarse interval
 
-    Every interval is then divided among the samples in it, halfway between neighbours, so that their lengths sum to its own: a sample that pruning
-    has left alone does not reach across the gap. (NeRF gives each sample the distance to the next and the last one 1e10; notes 4.)
+    Every interval is then divided among the samples in it, halfway between neighbours, so that their lengths sum to its own: a sample next to
+    pruned ones does not reach across the gap. (NeRF gives each sample the distance to the next and the last one 1e10.)
 
     at        (N,) distance of each coarse sample
     weight    (N,) of each coarse sample, without gradient
     quantile  (R, F) in [0, 1]; rays without coarse samples get none
-    capacity  see the module; there is no padding where there is room, none in `coarse`, and all rays have coarse samples
+    capacity  see `efficientnerf.sampling.samples`; no padding where all samples fit, none is in `coarse`, and all rays have coarse samples
     """
     drawn = quantile.shape[1]
     counts = coarse.first[1:] - coarse.first[:-1]

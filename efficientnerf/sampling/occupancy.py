@@ -1,14 +1,16 @@
-"""Momentum density voxels: the memory of the density over the scene (EfficientNeRF, section 3.3).
+"""Density voxels: a dense grid of the scene's density (EfficientNeRF, section 3.3), an occupancy grid in the words of instant-ngp.
 
-Two readings of the paper, and two rules of update, are named settings, because the paper's own can't be taken literally:
+Two rules of update, for the paper's equation 7 cannot be taken literally:
 
 - "momentum" is equation 7 on the raw density, before its activation, with threshold 0. (A momentum average of densities >= 0 that starts at
   10 never reaches 0, so nothing would ever be pruned.)
-- "maximum" keeps a decayed maximum of the activated density, v <- max(decay v, new), and calls a voxel valid whose density would absorb more
-  than about one percent of the light over an interval. It needs far fewer visits and heals itself.
+- "maximum" keeps a decayed maximum of the density, v <- max(decay v, new), as instant-ngp does; a voxel is valid if its density has an alpha above a
+  threshold over an interval. It needs far fewer updates.
 
-With both, pruned space can come back: `refresh` asks the field about random cells. Voxels that are closed hold minus infinity, which no rule
-changes: they are never valid, not even while nothing is pruned.
+Updates at random cells let pruned cells become valid again. Masked cells hold minus infinity, which no rule changes: they are never valid, not even
+while nothing is pruned. docs/experiments/occupancy.md
+
+D voxels a side, N samples.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from efficientnerf.backends.transfer import to_device
 
 @dataclass
 class DensityVoxels:
-    """values (D, D, D) float32 over grid coordinates, x slowest; `start` is what they began with."""
+    """values (D, D, D) float32 over grid coordinates, x slowest; a voxel is valid above `threshold`; `start` is the initial value."""
 
     values: Tensor
     rule: str
@@ -39,11 +41,11 @@ class DensityVoxels:
 
     @property
     def occupied(self) -> float:
-        """Share of valid voxels."""
+        """Fraction of valid voxels."""
         return int(self.count_occupied()) / self.values.numel()
 
     def count_occupied(self) -> Tensor:
-        """Number of valid voxels, where they lie."""
+        """Number of valid voxels, on their device."""
         return torch.count_nonzero(self.values > self.threshold)
 
 
@@ -53,7 +55,7 @@ def density_voxels(
     """Fresh voxels; all are valid."""
     if rule not in ("momentum", "maximum"):
         raise ValueError(f"density voxels updated by {rule!r}: expected 'momentum' or 'maximum'")
-    # A maximum that starts at twice the threshold is forgotten after some fourteen refreshes at the usual decay, and each cell has been asked by then.
+    # A maximum that starts at twice the threshold decays below it after some fourteen updates, by when every cell has been queried.
     start = initial if rule == "momentum" else 2 * threshold
     return DensityVoxels(torch.full((side, side, side), start, device=device), rule, beta, decay, threshold, start)
 
@@ -65,13 +67,14 @@ def cell_of(points: Tensor, side: int) -> Tensor:
 
 
 def update(voxels: DensityVoxels, cell: Tensor, density: Tensor, count: Tensor | None = None) -> None:
-    """Tell the voxels the density at some cells, in place.
+    """Update the voxels with the density at some cells, in place.
 
         momentum   V[i] <- (1 - beta) V[i] + beta mean(density in i)     equation 7; several samples in one voxel make one update
         maximum    V[i] <- max(V[i], max(density in i))
 
-    cell (N,) flat indices, density (N,): raw for "momentum", activated for "maximum"; count, a number of the device: only so many are meant, and what
-    follows is padding.
+    cell     (N,) flat indices
+    density  (N,) raw for "momentum", activated for "maximum"
+    count    number on the device of the samples that are no padding; None: all
     """
     flat = voxels.values.view(-1)
     density = torch.where(torch.isneginf(flat[cell]), -torch.inf, density.to(flat.dtype))
@@ -90,43 +93,43 @@ def update(voxels: DensityVoxels, cell: Tensor, density: Tensor, count: Tensor |
 
 
 def mask_cells(voxels: DensityVoxels, chosen: Tensor) -> None:
-    """No matter may be in these voxels, (D, D, D) bool, from now on."""
+    """Make these voxels, (D, D, D) bool, invalid for good."""
     voxels.values.masked_fill_(chosen.to(voxels.values.device), -torch.inf)
 
 
 def reset_cells(voxels: DensityVoxels, wanted: Tensor | None = None) -> None:
-    """Have all voxels but the closed ones as they were at first; only if `wanted`, a bool that may lie on a device, says so."""
-    as_they_are = torch.isneginf(voxels.values)
+    """Set all voxels that are not masked to their initial value; only if `wanted`, a bool that may be on a device, is true."""
+    kept = torch.isneginf(voxels.values)
     if wanted is not None:
-        as_they_are |= ~wanted
-    voxels.values.copy_(torch.where(as_they_are, voxels.values, voxels.start))
+        kept |= ~wanted
+    voxels.values.copy_(torch.where(kept, voxels.values, voxels.start))
 
 
 def _blend(flat: Tensor, beta: float, cell: Tensor, density: Tensor, real: Tensor) -> None:
-    """Equation 7 without finding out how many voxels were seen, for which the host would wait, and without touching others: samples of one voxel are
-    brought together by sorting, and all of them write the same value. Padding (N,) ~real counts for nothing, and leaves values as they are."""
+    """Equation 7 without the number of different voxels, for which the host would wait: samples are sorted by voxel, and all of one voxel write the same
+    value. Padding, (N,) ~real, is ignored."""
     if not len(cell):
         return
     cell, order = torch.sort(cell)
     group = torch.cumsum(torch.cat([cell.new_zeros(1), (cell[1:] != cell[:-1]).long()]), dim=0)
-    counted, told = real[order], torch.where(real[order], density[order], 0)
+    counted, values = real[order], torch.where(real[order], density[order], 0)
     counts = flat.new_zeros(len(cell)).index_add(0, group, counted.to(flat.dtype))[group]
-    mean = flat.new_zeros(len(cell)).index_add(0, group, told)[group] / counts.clamp(min=1)
+    mean = flat.new_zeros(len(cell)).index_add(0, group, values)[group] / counts.clamp(min=1)
     old = flat[cell]
     flat.index_put_((cell,), torch.where((counts > 0) & ~torch.isneginf(old), (1 - beta) * old + beta * mean, old))
 
 
-LEAST_DECAY = 1e-30  # nothing is kept either, but what is closed stays so
+MIN_DECAY = 1e-30  # in place of 0, which would make masked cells NaN
 
 
 def apply_decay(voxels: DensityVoxels) -> None:
-    """Forget a little, where the rule is "maximum": v <- decay v."""
+    """Under the rule "maximum": v <- decay v."""
     if voxels.rule == "maximum":
-        voxels.values.mul_(max(voxels.decay, LEAST_DECAY))
+        voxels.values.mul_(max(voxels.decay, MIN_DECAY))
 
 
 def sweep_cells(voxels: DensityVoxels, part: int, parts: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Every `parts`-th cell from the `part`-th on, and a random point in each: the warm-up asks about every cell this way."""
+    """Every `parts`-th cell from the `part`-th on, and a random point in each."""
     cell = torch.arange(part % parts, voxels.side**3, parts, device=voxels.values.device)
     return cell, _point_in(cell, voxels.side, generator)
 
@@ -137,17 +140,17 @@ def _point_in(cell: Tensor, side: int, generator: torch.Generator) -> Tensor:
 
 
 def _chosen_on_device(valid: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count,) cells, half anywhere and half among the valid (D^3,), wherever there are any; how many there are stays on the device."""
+    """(count,) cells, half anywhere and half among the valid (D^3,) if there are any; their number stays on the device."""
     chance = to_device(torch.rand(count, generator=generator, dtype=torch.float64), valid.device)
     anywhere = (chance * len(valid)).long()
     before = torch.cumsum(valid, dim=0)
     among = torch.searchsorted(before, (chance * before[-1]).long(), right=True).clamp(max=len(valid) - 1)
-    turn = torch.arange(count, device=valid.device) % 2 == 0
-    return torch.where(turn | (before[-1] == 0), anywhere, among)
+    first_half = torch.arange(count, device=valid.device) % 2 == 0
+    return torch.where(first_half | (before[-1] == 0), anywhere, among)
 
 
 def random_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Cells to ask about anew, half anywhere and half among the valid, and a random point in each: (count,), (count, 3) grid coordinates."""
+    """Random cells (count,), half anywhere and half among the valid, and a random point in each (count, 3), grid coordinates."""
     flat = voxels.values.view(-1)
     if transfer.remote(flat):
         cell = _chosen_on_device(flat > voxels.threshold, count, generator)

@@ -12,7 +12,7 @@ from efficientnerf.sampling.samples import Samples
 def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
     """Which coarse samples are pivotal: (N,) bool, those with a weight above `threshold`, the `most` heaviest of a ray.
 
-    The cap bounds the work where a field is still fog. The lowest weights are dropped, in training and in rendering alike; among equals the
+    The cap bounds the work while densities are still spread out. The lowest weights are dropped, in training and in rendering alike; among equals the
     nearer is kept. (The authors' release drops a random subset.)
     """
     pivotal = weight > threshold
@@ -33,9 +33,9 @@ def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: T
     rays = len(origins)
     counts = coarse.first[1:] - coarse.first[:-1]
     ray = torch.repeat_interleave(torch.arange(rays, device=origins.device), counts, output_size=len(pivotal))[pivotal]
-    slot = torch.arange(per_pivot, device=origins.device)
+    part = torch.arange(per_pivot, device=origins.device)
     extent = (coarse.extent[pivotal] / per_pivot)[:, None].expand(-1, per_pivot)
-    start = coarse.start[pivotal][:, None] + slot * extent
+    start = coarse.start[pivotal][:, None] + part * extent
     length = (coarse.length[pivotal] / per_pivot)[:, None].expand(-1, per_pivot)
     at = start + offset[ray][:, None] * extent
     point = space.grid(origins[ray][:, None] + at[..., None] * directions[ray][:, None])

@@ -16,8 +16,8 @@ def stratified_samples(
 
     near, far  (R,) distances; a ray whose far is not beyond its near gets none
     jitter     (R, S) in [0, 1), where in its interval each sample lies
-    outside    whether samples outside of the space are kept (a network can be asked there, a grid can't)
-    capacity   see the module; where all samples are kept, and there is room, there is no padding
+    outside    whether samples outside of the space are kept (a network can be evaluated there, a hash grid cannot)
+    capacity   see `efficientnerf.sampling.samples`; where all samples are kept and fit, there is no padding
     """
     count = jitter.shape[1]
     extent = ((far - near) / count)[:, None].expand(-1, count)  # (R, S)
@@ -30,13 +30,13 @@ def stratified_samples(
     first = torch.cat([kept.new_zeros(1, dtype=torch.int64), kept.sum(dim=1).cumsum(dim=0)])
     if capacity is None:
         return Samples(first, start[kept], extent[kept], extent[kept], point[kept], kept.numel()), at[kept]
-    room = min(capacity, kept.numel())
+    size = min(capacity, kept.numel())
     place = torch.cumsum(kept.reshape(-1), dim=0) - 1
-    place = torch.where(kept.reshape(-1), place, room).clamp(max=room)  # what is left out, or finds no room, goes to one place behind the others
+    place = torch.where(kept.reshape(-1), place, size).clamp(max=size)  # samples that are left out or do not fit go to one place behind the others
 
     def placed(column: Tensor) -> Tensor:
         flat = column.reshape(kept.numel(), *column.shape[2:])
-        return flat.new_zeros(room + 1, *flat.shape[1:]).index_put((place,), flat)[:room]
+        return flat.new_zeros(size + 1, *flat.shape[1:]).index_put((place,), flat)[:size]
 
     start, extent, point, at = (placed(column) for column in (start, extent, point, at))
-    return Samples(first.clamp(max=room), start, extent, extent, point, kept.numel(), first[1:] <= room), at
+    return Samples(first.clamp(max=size), start, extent, extent, point, kept.numel(), first[1:] <= size), at

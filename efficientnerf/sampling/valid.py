@@ -17,32 +17,32 @@ def valid_samples(
 
     origins, directions  (R, 3) world frame, unit directions
     near, far, offset    (R,) distances, and the offset in [0, 1)
-    step, slots          length of an interval in the box (the last of a ray is cut short); at most so many intervals on a ray
+    step, slots          length of an interval in the box (the last of a ray is cut short); intervals on a ray at most
     voxels               (D, D, D) density voxels over the grid coordinates
-    whole                so many rays at the beginning are sampled in every interval, whatever the voxels say
+    whole                the first so many rays are not pruned
     """
-    t, leave = space.clip(origins, directions, near, far)
+    t, t_exit = space.clip(origins, directions, near, far)
     side = voxels.shape[0]
     columns = []
     tried = 0
     limit = torch.full_like(t, threshold)
     limit[:whole] = -torch.inf
     for _ in range(slots):
-        stretch = torch.ones_like(t)
+        growth = torch.ones_like(t)  # of the interval, with the distance
         if space.contracted:
-            reach = space.unit(origins + t[:, None] * directions).abs().amax(dim=-1).clamp(min=1)
-            stretch = reach * reach
-            leave = torch.where(reach * FARTHEST > 1, t, leave)
-        alive = t < leave
+            norm = space.unit(origins + t[:, None] * directions).abs().amax(dim=-1).clamp(min=1)
+            growth = norm * norm
+            t_exit = torch.where(norm * FARTHEST > 1, t, t_exit)
+        alive = t < t_exit
         if not alive.any():
             break
-        extent = torch.minimum(step * stretch, leave - t)  # the last interval ends where the ray leaves
+        extent = torch.minimum(step * growth, t_exit - t)  # the last interval ends where the ray leaves the space
         point = space.grid(origins + (t + offset * extent)[:, None] * directions)
         cell = (point * side).long().clamp(0, side - 1)
         valid = alive & (voxels[cell[:, 0], cell[:, 1], cell[:, 2]] > limit)
         tried += int(alive.sum())
-        columns.append((valid, t, extent, extent / stretch, point))
-        t = t + step * stretch
+        columns.append((valid, t, extent, extent / growth, point))
+        t = t + step * growth
     if not columns:
         empty = origins.new_zeros(0)
         return Samples(torch.zeros(len(origins) + 1, dtype=torch.int64, device=origins.device), empty, empty, empty, empty.reshape(0, 3), 0)

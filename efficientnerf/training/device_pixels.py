@@ -1,4 +1,4 @@
-"""Training pixels on a device: `efficientnerf.training.pixels` without the host's part in looking them up. R rays, C views, P pixels."""
+"""Training pixels on a device: `efficientnerf.training.pixels` without looking them up on the host. R rays, C views, P pixels."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from torch import Tensor
 from efficientnerf.backends.transfer import to_device
 from efficientnerf.training.pixels import Pixels
 
-MOST_OF_MEMORY = 0.5  # of the device's free memory: photographs that would take more stay on the host
+MEMORY_FRACTION = 0.5  # of the device's free memory: photographs that would take more stay on the host
 
 
 class DevicePixels:
-    """The pixels, and all that their rays are made of, on a device. Which ones are looked at is chosen on the host, as ever, by the same random numbers."""
+    """The pixels, and all that their rays are made of, on a device. They are chosen on the host, by the same random numbers as there."""
 
     def __init__(self, pixels: Pixels, device: str | torch.device) -> None:
         self.pixels, self.device = pixels, torch.device(device)
-        self.offsets, self.width, self.lens, self.knots = (self._there(a) for a in (pixels.offsets, pixels.width, pixels.lens, pixels.knots))
+        self.offsets, self.width, self.lens, self.knots = (self._to_device(a) for a in (pixels.offsets, pixels.width, pixels.lens, pixels.knots))
         self.rotation, self.centre, self.near, self.far, self.lookup = (
-            self._there(a) for a in (pixels.rotation, pixels.centre, pixels.near, pixels.far, pixels.lookup)
+            self._to_device(a) for a in (pixels.rotation, pixels.centre, pixels.near, pixels.far, pixels.lookup)
         )
         room = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else np.inf
-        self.images = self._there(pixels.images) if pixels.images.nbytes <= MOST_OF_MEMORY * room else None
+        self.images = self._to_device(pixels.images) if pixels.images.nbytes <= MEMORY_FRACTION * room else None
 
-    def _there(self, values: np.ndarray) -> Tensor:
+    def _to_device(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
     def __len__(self) -> int:

@@ -13,14 +13,14 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, rays
 
 EXACT = 2**23  # pixels of all lenses together up to which each has a direction of its own (12 bytes each)
-STRIDE = 8  # beyond it: every so many pixels there is a knot
+STRIDE = 8  # beyond it: pixels between knots
 
 
 class Pixels:
     """All training pixels, and the rays that they see.
 
     images    (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha
-    usable    (P / 8,) uint8 or None: a bit for each pixel that masks leave in
+    usable    (P / 8,) uint8 or None: a bit for each pixel, set where masks allow it
     lookup    (K, 3) float32: unit directions in the camera at knots, `stride` pixels apart; one table for all views that share a lens
 
     Between knots 8 apart directions are interpolated: with a focal length of f pixels that is off by less than about 8 / f pixels.
@@ -32,7 +32,7 @@ class Pixels:
         """
         images, masks  of each view, (H, W, 3 or 4) uint8, and (H, W) bool or None; taken one after the other, so that they may come from disk
         near, far      (C,) along the view axis
-        channels       3, or 4 if any image has alpha; 0 looks for itself, and keeps all images at once
+        channels       3, or 4 if any image has alpha; 0: found from the images, all of which are then held at once
         """
         self.near, self.far = near.astype(np.float32), far.astype(np.float32)
         if not channels:
@@ -49,7 +49,7 @@ class Pixels:
         self.usable = self._usable(masks)
         self.rotation = np.stack([camera.world_from_camera[:3, :3] for camera in cameras]).astype(np.float32)
         self.centre = np.stack([camera.centre for camera in cameras]).astype(np.float32)
-        self._look_up(cameras)
+        self._build_lookup(cameras)
 
     def _usable(self, masks: Iterable[np.ndarray | None]) -> np.ndarray | None:
         bits = None
@@ -67,7 +67,7 @@ class Pixels:
             raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
         return bits
 
-    def _look_up(self, cameras: list[Camera]) -> None:
+    def _build_lookup(self, cameras: list[Camera]) -> None:
         """The tables of directions, and for each view where its own begins and how many knots a row has."""
         lenses: dict[tuple, list[int]] = {}
         for n, camera in enumerate(cameras):
@@ -88,7 +88,7 @@ class Pixels:
         return len(self.images)
 
     def choose(self, count: int, rng: np.random.Generator, *, middle: bool = False) -> np.ndarray:
-        """Indices of `count` usable pixels, with replacement; with `middle`, of the middle half of the pictures' sides where any is usable there."""
+        """Indices of `count` usable pixels, with replacement; with `middle`, of the middle half of the images' sides where any is usable there."""
         if self.usable is None and not middle:
             return rng.integers(len(self), size=count)
         found = np.empty(0, np.int64)
@@ -102,7 +102,7 @@ class Pixels:
         return found[:count]
 
     def usable_at(self, index: np.ndarray) -> np.ndarray:
-        """(R,) bool: whether masks leave these pixels in."""
+        """(R,) bool: whether masks allow these pixels."""
         if self.usable is None:
             return np.ones(len(index), bool)
         return (self.usable[index >> 3] >> (7 - (index & 7)) & 1).astype(bool)
@@ -112,7 +112,7 @@ class Pixels:
         return np.searchsorted(self.offsets, index, side="right") - 1
 
     def _in_middle(self, index: np.ndarray) -> np.ndarray:
-        """(N,) bool: whether pixels lie at least a quarter of their picture's width and height from its sides."""
+        """(N,) bool: whether pixels are at least a quarter of their image's width and height from its sides."""
         view = self.view_of(index)
         y, x = np.divmod(index - self.offsets[view], self.width[view])
         return (np.abs(2 * x + 1 - self.width[view]) < self.width[view] / 2) & (np.abs(2 * y + 1 - self.height[view]) < self.height[view] / 2)

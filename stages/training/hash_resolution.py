@@ -1,13 +1,8 @@
-"""The size of the hash field, from the photographs that it is to hold.
+"""The resolution of the hash grid and the size of its tables, from the training photographs.
 
-In normalised device coordinates photographs fill the whole box at the same number of lattice points to a pixel, and tables of the default size, made for
-a thing in the middle of its box, are shared by too many of them. Held-back views of LLFF *fern* after 1000 steps of the preset `preview` (distortion 0.002,
-one seed): at 504x378, 1024 points a side, 22.0 dB with 2^17 entries, 22.5 with 2^19, and 22.6 with 2^21, whose steps took 1.4 times as long; at 1008x756,
-20.7 dB with 2^17 entries and 1024 points, 21.0 with 2^19 and 2048. Encoding and Adam take about 10 ms more in a step with 2^19, on one core.
-
-Elsewhere matter fills little of the box, and what is seen more sharply shows finer things, for which more lattice points share an entry: tables are twice as
-large for four times as many pixels. *chair* at 800x800, 64 million pixels, after 2500 steps: 29.5 dB with 2^17 entries, 29.8 with 2^19 in 1.15 times the
-processor time, and 29.8 too with 2048 lattice points a side.
+In normalised device coordinates photographs fill the whole box with the same number of grid points to a pixel: the finest resolution is one point for a
+pixel, and the number of entries follows the number of pixels. Elsewhere surfaces fill little of the box: tables are twice as large for four times as many
+pixels. docs/experiments/hash-grid.md
 """
 
 from __future__ import annotations
@@ -25,25 +20,26 @@ from stages.baking.resolution import ndc_pixel
 if TYPE_CHECKING:
     from stages.io.scene import Scene
 
-PIXELS_AN_ENTRY = 6  # training pixels to an entry of a level's table in normalised device coordinates
-PIXELS_OF_LEAST = 2**22  # elsewhere, for which the default is enough
-LARGEST = 19  # log2 of the entries at most
-MOST = 4096  # lattice points a side
+# docs/experiments/hash-grid.md
+PIXELS_PER_ENTRY = 6  # training pixels to an entry of a level's table in normalised device coordinates
+BASE_PIXELS = 2**22  # elsewhere: training pixels for which a table of the default size is enough
+MAX_LOG2_TABLE = 19
+MAX_RESOLUTION = 4096
 
 
 def with_auto_sizes(settings: TrainSettings, s: Scene, pixels: int) -> TrainSettings:
-    """The settings with `log2_table`, `finest` and `coarse_samples` where these leave them to be chosen.
+    """The settings with numbers for `log2_hashmap_size`, `finest_resolution` and `num_coarse_samples`.
 
-    pixels  how many the training images have
+    pixels  of all training images
     """
     from stages.io.field_file import space_of
 
-    finest, entries = FINEST, LOG2_TABLE + math.log2(max(pixels, 1) / PIXELS_OF_LEAST) / 2
+    finest, entries = FINEST, LOG2_TABLE + math.log2(max(pixels, 1) / BASE_PIXELS) / 2
     if s.forward is not None:
-        entries = math.log2(max(pixels, 1) / PIXELS_AN_ENTRY)
+        entries = math.log2(max(pixels, 1) / PIXELS_PER_ENTRY)
         longest = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
-        finest = int(np.clip(math.ceil(longest / ndc_pixel(s, s.forward)), FINEST, MOST))
-    log2_table = int(np.clip(round(entries), LOG2_TABLE, LARGEST))
+        finest = int(np.clip(math.ceil(longest / ndc_pixel(s, s.forward)), FINEST, MAX_RESOLUTION))
+    log2_table = int(np.clip(round(entries), LOG2_TABLE, MAX_LOG2_TABLE))
     return replace(
         settings,
         log2_hashmap_size=given(settings.log2_hashmap_size) or log2_table,

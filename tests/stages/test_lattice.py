@@ -19,7 +19,7 @@ from stages import train
 from stages.baking.resolution import ndc_pixel
 from stages.io.field_file import load_renderer, space_of
 from stages.io.scene import load as load_scene
-from stages.training.hash_resolution import LARGEST, MOST, with_auto_sizes
+from stages.training.hash_resolution import MAX_LOG2_TABLE, MAX_RESOLUTION, with_auto_sizes
 from tests.efficientnerf.balls import BOUNDS, settings
 from tests.stages.balls import job, poses
 from tests.stages.forward_facing import forward_facing
@@ -32,7 +32,7 @@ def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
         pixels = sum(v.camera.width * v.camera.height for v in s.views)
         found = with_auto_sizes(TrainSettings(), s, pixels)
         wide = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
-        assert found.finest_resolution == max(FINEST, min(MOST, math.ceil(wide / ndc_pixel(s, s.forward))))
+        assert found.finest_resolution == max(FINEST, min(MAX_RESOLUTION, math.ceil(wide / ndc_pixel(s, s.forward))))
         # What is called a pixel is one: two points a lattice step apart, at any depth, are seen a pixel apart.
         camera = s.views[0].camera
         middle = np.array([[camera.width / 2, camera.height / 2], [camera.width / 2 + 1, camera.height / 2]])
@@ -46,7 +46,7 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
     s = forward_facing(400)
     assert with_auto_sizes(TrainSettings(), s, 1000).log2_hashmap_size == LOG2_TABLE
     assert with_auto_sizes(TrainSettings(), s, 6 << 18).log2_hashmap_size == 18
-    assert with_auto_sizes(TrainSettings(), s, 10**9).log2_hashmap_size == LARGEST
+    assert with_auto_sizes(TrainSettings(), s, 10**9).log2_hashmap_size == MAX_LOG2_TABLE
     given = with_auto_sizes(TrainSettings(log2_hashmap_size=14, finest_resolution=512, num_coarse_samples=77), s, 10**9)
     assert (given.log2_hashmap_size, given.finest_resolution, given.num_coarse_samples) == (14, 512, 77)
 
