@@ -41,7 +41,7 @@ class TrainSettings:
     )
     discretise: Annotated[int, Meta(ge=1, le=4096)] | Off = setting(
         "off",
-        "Voxels along the longest side of the box at whose centres alone the field is evaluated, so that baking with bake.lookup=nearest is exact.",
+        "Voxels along the longest side of the box at whose centres the field is evaluated, so that baking with bake.lookup=nearest is exact; off: anywhere.",
         advanced=True,
     )
     sh_degree: Annotated[int, Meta(ge=0, le=4)] = setting(2, "Degree of the spherical harmonics.", advanced=True)

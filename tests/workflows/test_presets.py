@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import UsageError
+from pipeline.stage import Stage, settings_dict, settings_from
 from stages.settings import describe_settings
 from workflows import asset
 from workflows.cli.resolve import Settings, preset_names, read_preset, table_of
@@ -99,7 +100,22 @@ def test_presets_resolve_and_hold_only_what_differs(name: str) -> None:
             assert resolved[stage][setting] != defaults[stage][setting], f"{name}: {stage}.{setting} is the default"
 
 
-def test_every_setting_says_what_it_means() -> None:
+def test_every_setting_says_what_it_means_in_one_sentence() -> None:
     for stage in asset.STAGES:
         for name, about in Settings(TYPES).about[stage.name].items():
-            assert about.doc, f"{stage.name}.{name}"
+            assert about.doc[:1].isupper(), f"{stage.name}.{name}"
+            assert about.doc.endswith("."), f"{stage.name}.{name}"
+            assert ". " not in about.doc, f"{stage.name}.{name}"
+
+
+@pytest.mark.parametrize("stage", asset.STAGES, ids=lambda stage: stage.name)
+def test_a_default_is_admitted_by_its_type(stage: Stage) -> None:
+    defaults = settings_dict(stage.settings())
+    assert settings_from(stage.settings, defaults) == stage.settings()
+
+
+def test_words_that_choose_or_switch_off_are_explained() -> None:
+    for stage in asset.STAGES:
+        for about in describe_settings(stage.settings):
+            for word in set(about.choices or ()) & {"auto", "off"}:
+                assert f"{word}:" in about.doc or f"({word})" in about.doc or about.listed, f"{stage.name}.{about.name}: {word}"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="The folder of the run.")
 @click.option("--as", "format_name", metavar="FORMAT", help="What SOURCE is, instead of finding out: see poses.format in 'enerf presets poses'.")
 @click.option("--preset", metavar="NAME",
-              help="Where settings start from: tiny, preview (default without CUDA), standard (default with), high; paper-n1 to -n4, nerf.")  # fmt: skip
+              help="Where settings start from: tiny, preview (default without CUDA), standard (default with), high; nerf, paper, paper-n1 to -n4.")  # fmt: skip
 @set_option
 @click.option("--config", type=folder_type, metavar="FILE", help="A TOML file with tables of settings, one for each stage.")
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
