@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from pipeline.stage import Stage
-from stages import bake, evaluate, mesh, points, poses, train, turntable
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,15 @@ class Workflow:
     presets: Path
 
 
-STAGES = (
-    poses.STAGE,  # the source -> cameras, images, sparse points
-    train.STAGE,  # poses -> field, density voxels
-    bake.STAGE,  # train, poses -> asset.nerftree
-    evaluate.STAGE,  # bake, train, poses -> PSNR and SSIM of the network and of the asset
-    turntable.STAGE,  # bake -> frames, video, EXR
-    mesh.STAGE,  # bake -> PLY, GLB
-    points.STAGE,  # bake -> PLY
+# Modules of `stages`, in order.
+NAMES = (
+    "poses",  # the source -> cameras, images, sparse points
+    "train",  # poses -> field, density voxels
+    "bake",  # train, poses -> asset.nerftree
+    "evaluate",  # bake, train, poses -> PSNR and SSIM of the network and of the asset
+    "turntable",  # bake -> frames, video, EXR
+    "mesh",  # bake -> PLY, GLB
+    "points",  # bake -> PLY
 )
+STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}").STAGE for name in NAMES)
 WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets")
