@@ -151,8 +151,8 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         weight = sparse_depth_weight(settings.sparse_depth_loss_weight, fraction) if m.space.unbounded else 0.0
         if sparse_depth is not None and weight > 0:
             few = max(1, count // RAYS_PER_RAY)
-            room = None if readback is None else readback.capacity(2 * few)  # these rays begin closer to the camera, and end farther away
-            loss = loss + weight * sparse_depth_loss(m, sparse_depth, few, rng, prune=prune, capacity=room, samples_per_pivot=samples_per_pivot)
+            capacity_of_few = None if readback is None else readback.capacity(2 * few)  # these rays begin closer to the camera, and end farther away
+            loss = loss + weight * sparse_depth_loss(m, sparse_depth, few, rng, prune=prune, capacity=capacity_of_few, samples_per_pivot=samples_per_pivot)
         loss.backward()
         t.adam.step(number, t.schedule.learning_rate_at(number))
         update_occupancy(m, outputs, number, rng, padded=capacity is not None, may_wait=readback is None)

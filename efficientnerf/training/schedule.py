@@ -59,8 +59,8 @@ class Schedule:
         return replace(self, iterations=iterations, aims=(*self.aims, (self.iterations, step)))
 
     @property
-    def settled(self) -> int:
-        """The step from which on the number of iterations is what it is."""
+    def revised_at(self) -> int:
+        """The last step that an earlier number of iterations still decided."""
         return self.aims[-1][1] if self.aims else self.hold
 
     def state(self) -> dict[str, Any]:

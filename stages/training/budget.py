@@ -95,7 +95,7 @@ class Budget:
             due = step >= self.schedule.hold or now >= self.budget
         else:  # a resumed run takes steps again for which the schedule was made
             enough = self.timed is not None and step - self.timed[0] >= MIN_TIMED
-            due = bool(passed) and enough and self.schedule.settled < step < self.schedule.iterations
+            due = bool(passed) and enough and self.schedule.revised_at < step < self.schedule.iterations
         if due:
             self.marks = self.marks[len(passed) :]
         return due

@@ -1,4 +1,4 @@
-"""A ball with a closed form as a scene to learn: cameras round it, its pictures, and its models."""
+"""A ball with a closed form as a scene to learn: cameras round it, its images, and its models."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def picture(camera: Camera, radius: float = RADIUS) -> np.ndarray:
 
 
 def photograph(camera: Camera) -> np.ndarray:
-    """(H, W, 3) uint8: the ball before surroundings whose colour is a smooth function of the direction."""
+    """(H, W, 3) uint8: the ball before a background whose colour is a smooth function of the direction."""
     rgba = picture(camera) / 255
     behind = (0.5 + 0.4 * np.sin(2 * rays(camera)[1])).reshape(camera.height, camera.width, 3)
     return np.round(255 * (rgba[..., :3] * rgba[..., 3:] + behind * (1 - rgba[..., 3:]))).astype(np.uint8)

@@ -199,7 +199,7 @@ def test_every_strategy_serves_every_field(field: str, strategy: str, contracted
     moved = {name.partition(".")[0] for name, grad in grads.items() if grad is not None and grad.abs().sum() > 0}
     assert moved >= ({"fine"} if strategy == "uniform" else {"coarse", "fine"})
     assert (len(first.coarse.start) == 0) == (strategy == "uniform")
-    still, too = (render_rays(m, *bundle, offset, behind) for _ in range(2))  # pictures are drawn without chance
+    still, too = (render_rays(m, *bundle, offset, behind) for _ in range(2))  # renders are not random
     assert torch.equal(still.fine_colour, too.fine_colour)
 
 

@@ -171,9 +171,9 @@ def test_settings_say_what_they_mean() -> None:
 
 
 def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
-    """No random colours behind the object, momentum voxels with threshold 0, no refresh but whole rays.
+    """No random background, momentum voxels with threshold 0, no updates at random cells but unpruned rays.
 
-    The middle of the pictures comes first, and pruning waits until the coarse network knows where matter is: without the first, or pruned after 80
+    The middle of the images comes first, and pruning waits until the coarse field has found the object: without the first, or pruned after 80
     steps, the ball fades away (opacity below 0.15 after as many steps).
     """
     paper = {
@@ -192,7 +192,7 @@ def test_thin_scenes_survive_a_white_background_the_papers_way() -> None:
     assert opacity[~on_ball].mean() < 0.02
 
 
-def test_the_middle_of_the_pictures_comes_first() -> None:
+def test_the_middle_of_the_images_comes_first() -> None:
     some = pixels(4, 16)
     rng = np.random.default_rng(0)
     chosen = some.choose(2000, rng, middle=True)
@@ -225,7 +225,7 @@ def test_a_schedule_whose_iterations_are_revised_goes_on_from_where_it_was() -> 
     first = Schedule(1000, hold=100, learning_rate=1e-2)
     second = first.with_iterations(3000, 400)
     last = second.with_iterations(2000, 700)
-    assert (last.aims, last.iterations, last.settled) == (((1000, 400), (3000, 700)), 2000, 700)
+    assert (last.aims, last.iterations, last.revised_at) == (((1000, 400), (3000, 700)), 2000, 700)
     fractions = [last.fraction(step) for step in range(2001)]
     assert all(a <= b for a, b in itertools.pairwise(fractions))
     assert max(b - a for a, b in itertools.pairwise(fractions)) < 2 / 900  # no leap

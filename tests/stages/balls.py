@@ -20,7 +20,7 @@ ORBIT = Orbit((0.0, 0.0, 0.1), 3.0, 20.0, False, 40.0)
 
 
 def poses(folder: Path, *, count: int = 8, photographs: bool = False, **changes: Any) -> Path:
-    """A scene of `count` views of 16 x 16, the last held back."""
+    """A scene of `count` views of 16 x 16, the last a test view."""
     (folder / "images").mkdir(parents=True)
     views = []
     for n, camera in enumerate(balls.cameras(count)):

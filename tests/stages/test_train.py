@@ -162,7 +162,7 @@ def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) ->
     points = SparsePoints(xyz, np.zeros((5, 3), np.uint8), np.zeros(5), seen)
 
     def rays(points: SparsePoints) -> tuple[list[tuple[int, int]], Any]:
-        """(point, camera) of each anchor, found again from the ray."""
+        """(point, camera) of each ray, found again from its ends."""
         scenes.save_points(points, folder)
         found_rays = sparse_depth_of(folder, s)
         if found_rays is None:

@@ -1,4 +1,4 @@
-"""The size of the hash field: as many entries as photographs ask for in normalised device coordinates, what the settings say wherever they do."""
+"""The size of the hash grid follows the photographs unless the settings state it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.stages.balls import job, poses
 from tests.stages.forward_facing import forward_facing
 
 
-def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
+def test_grid_points_lie_a_pixel_apart_in_forward_facing_scenes() -> None:
     for side in (400, 1000):
         s = forward_facing(side)
         assert s.forward is not None
@@ -33,7 +33,7 @@ def test_lattice_points_lie_a_pixel_apart_where_all_looks_one_way() -> None:
         found = with_auto_sizes(TrainSettings(), s, pixels)
         wide = float((s.forward.bounds[1] - s.forward.bounds[0]).max())
         assert found.finest_resolution == max(FINEST, min(MAX_RESOLUTION, math.ceil(wide / ndc_pixel(s, s.forward))))
-        # What is called a pixel is one: two points a lattice step apart, at any depth, are seen a pixel apart.
+        # What is called a pixel is one: two points a grid step apart, at any depth, project a pixel apart.
         camera = s.views[0].camera
         middle = np.array([[camera.width / 2, camera.height / 2], [camera.width / 2 + 1, camera.height / 2]])
         origins, directions = rays(camera, middle)
@@ -51,7 +51,7 @@ def test_tables_grow_with_the_photographs_between_limits() -> None:
     assert (given.log2_hashmap_size, given.finest_resolution, given.num_coarse_samples) == (14, 512, 77)
 
 
-def test_in_normalised_device_coordinates_intervals_are_longer_and_need_more_in_them_and_fog_weighs_less() -> None:
+def test_spaces_have_defaults_of_their_own() -> None:
     s = forward_facing(400)
     small = TrainSettings(log2_hashmap_size=8, num_levels=2, occupancy_resolution=8)
     m, usual = model(space_of(s), small, None), model(BoundedSpace(BOUNDS), small, None)
