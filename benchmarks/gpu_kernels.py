@@ -75,7 +75,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     samples = len(fine.start)
     field: Any = m.fine
     table, levels = field.table, len(field.sides)
-    encode = lambda: hash_grid.encode(fine.point, table, field.sides, field.dense, field.starts, int(field.mask))  # noqa: E731
+    encode = lambda: hash_grid.encode(fine.point, table, field.hash_levels)  # noqa: E731
     features = encode()
     grad_features = torch.randn(features.shape, generator=generator).to(device)
     raw = torch.randn(samples, 28, generator=generator).to(device).requires_grad_()

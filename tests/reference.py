@@ -85,10 +85,17 @@ def momentum(values: Sequence[float], cells: Sequence[int], densities: Sequence[
     return out
 
 
-def adam(value: float, gradients: Sequence[float], rates: Sequence[float], beta1: float, beta2: float, epsilon: float) -> float:
-    """Kingma and Ba's algorithm 1 on one number."""
+def maximum(values: Sequence[float], cells: Sequence[int], densities: Sequence[float]) -> list[float]:
+    """Voxels raised to the densities of samples in them; masked ones, which hold minus infinity, stay so."""
+    return [old if old == -math.inf else max([old, *(d for c, d in zip(cells, densities, strict=True) if c == voxel)]) for voxel, old in enumerate(values)]
+
+
+def adam(value: float, gradients: Sequence[float], rates: Sequence[float], beta1: float, beta2: float, epsilon: float, *, skip_zeros: bool = False) -> float:
+    """Kingma and Ba's algorithm 1 on one number; with `skip_zeros`, steps without a gradient leave it and its moments alone."""
     first = second = 0.0
     for step, (gradient, rate) in enumerate(zip(gradients, rates, strict=True), 1):
+        if skip_zeros and gradient == 0:
+            continue
         first = beta1 * first + (1 - beta1) * gradient
         second = beta2 * second + (1 - beta2) * gradient**2
         value -= rate * (first / (1 - beta1**step)) / (math.sqrt(second / (1 - beta2**step)) + epsilon)
@@ -112,6 +119,27 @@ def encode(point: Sequence[float], table: np.ndarray, sides: Sequence[int], dens
             total = [t + weight * float(v) for t, v in zip(total, table[start + slot], strict=True)]
         features += total
     return features
+
+
+def relu_network(features: Sequence[float], weights: Sequence[np.ndarray], offset: float) -> list[float]:
+    """Outputs of one point: linear layers (O, I) with a ReLU between them; `offset` is added to the first output."""
+    x = list(features)
+    for layer, weight in enumerate(weights):
+        x = [sum(float(w) * v for w, v in zip(row, x, strict=True)) for row in weight]
+        if layer < len(weights) - 1:
+            x = [max(v, 0.0) for v in x]
+    return [x[0] + offset, *x[1:]]
+
+
+def pixel_direction(lookup: np.ndarray, begin: int, knots: int, stride: int, pixel: int, width: int, rotation: np.ndarray) -> np.ndarray:
+    """Unit direction in the world of a pixel, bilinearly interpolated between those of knots `stride` pixels apart."""
+    (row, f), (column, g) = (divmod(i, stride) for i in divmod(pixel, width))
+    total = np.zeros(3)
+    for down, right in np.ndindex(2, 2):
+        weight = (f / stride if down else 1 - f / stride) * (g / stride if right else 1 - g / stride)
+        if weight > 0:
+            total += weight * lookup[begin + (row + down) * knots + column + right]
+    return rotation @ (total / math.sqrt(total @ total))
 
 
 def contract(u: Sequence[float]) -> list[float]:
@@ -171,6 +199,29 @@ def march(
             samples.append((t, extent, extent / stretch, point))
         t += step * stretch
     return March(samples, tried, margin)
+
+
+def select_pivots(weights: Sequence[float], threshold: float, most: int) -> list[bool]:
+    """One ray: samples of a weight above the threshold, at most so many, the heaviest; among equals the nearer."""
+    heaviest = sorted(range(len(weights)), key=lambda n: (-weights[n], n))[:most]
+    return [n in heaviest and weight > threshold for n, weight in enumerate(weights)]
+
+
+def pivotal_samples(
+    bounds: np.ndarray, contracted: bool, origin: Sequence[float], direction: Sequence[float], offset: float,
+    intervals: Sequence[tuple[float, float, float]], per_pivot: int,
+) -> list[tuple[float, float, float, list[float]]]:  # fmt: skip
+    """(start, extent, length, grid point) of one ray's fine samples: its pivotal intervals (start, extent, length), cut into equal slots."""
+    centre, half = (bounds[0] + bounds[1]) / 2, (bounds[1] - bounds[0]) / 2
+    reach, found = 2.0 if contracted else 1.0, []
+    for start, extent, length in intervals:
+        for slot in range(per_pivot):
+            begin = start + slot * extent / per_pivot
+            t = begin + offset * extent / per_pivot
+            u = [(origin[n] + t * direction[n] - centre[n]) / half[n] for n in range(3)]
+            point = [(x + reach) / (2 * reach) for x in (contract(u) if contracted else u)]
+            found.append((begin, extent / per_pivot, length / per_pivot, point))
+    return found
 
 
 # The tree, as FORMAT.md says a file is to be sampled.

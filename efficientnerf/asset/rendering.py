@@ -57,7 +57,7 @@ def render(
     behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
     if behind.shape != (3,):
         raise ValueError(f"background {background}: expected three numbers, red, green and blue")
-    if tree.ndc is None and tree.device != "cpu" and dispatch.triton_usable():
+    if tree.ndc is None and dispatch.tree_backend(tree) == "triton":
         from efficientnerf.backends.triton import tree as cuda_tree
 
         on_device = cuda_tree.render_image(cuda_tree.device_tree_of(tree), camera, background=background, supersample=supersample)
@@ -77,11 +77,11 @@ def render_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, *, 
     """
     if tree.ndc is None:
         return Rendering(*dispatch.tree_rays(tree, origins, directions, None, eye, columns))
-    from efficientnerf.backends.numba import ndc as cpu_ndc
+    from efficientnerf.backends.numba import rays as kernels
 
-    warped = cpu_ndc.warp_rays(tree.ndc, origins, directions)
+    warped = kernels.warp_rays(tree.ndc, origins, directions)
     colour, opacity, along, normal = dispatch.tree_rays(tree, warped.origins, warped.directions, np.asarray(directions), eye, columns)
-    return Rendering(colour, opacity, *cpu_ndc.unwarp_hits(tree.ndc, warped, along, normal))
+    return Rendering(colour, opacity, *kernels.unwarp_hits(tree.ndc, warped, along, normal))
 
 
 def _render_single_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, rays_per_band: int) -> Rendering:

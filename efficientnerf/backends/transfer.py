@@ -1,4 +1,4 @@
-"""Between the host and a device without waiting for it."""
+"""Copies between the host and a device that do not make the host wait."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from torch import Tensor
 
 
 def to_device(values: Tensor, device: torch.device) -> Tensor:
-    """A tensor of the host on `device`. Through pinned memory, from where a device fetches on its own; from other memory the host waits for it."""
+    """A tensor of the host on `device`. Through pinned memory, which a device reads on its own; for other memory the host would wait."""
     if device.type != "cuda":
         return values.to(device)
     return values.pin_memory().to(device, non_blocking=True)
 
 
-def remote(values: Tensor) -> bool:
-    """Whether a host that asks for one of these values has to wait: they are a device's."""
+def is_on_device(values: Tensor) -> bool:
+    """Whether reading one of these values on the host waits for a device."""
     return values.is_cuda
 
 
 def to_host_async(values: Tensor) -> tuple[Tensor, Any]:
-    """A tensor of a device on its way to the host, and the event at whose end it has arrived; None where there is nothing to wait for."""
+    """A copy of a device's tensor on the host, and the event after which it is complete; of a host's tensor itself, and None."""
     if not values.is_cuda:
         return values, None
     host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
@@ -34,7 +34,7 @@ def to_host_async(values: Tensor) -> tuple[Tensor, Any]:
 
 
 def constant(values: np.ndarray, like: Tensor) -> Tensor:
-    """An array that does not change, in the type and on the device of `like`: sent once, whoever asks. Not to be changed."""
+    """An array in the type and on the device of `like`, sent once and cached by its values. Not to be changed in place."""
     exact = np.ascontiguousarray(values, np.float64)
     return _constant(exact.tobytes(), exact.shape, like.dtype, like.device)
 

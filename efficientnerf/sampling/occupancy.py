@@ -83,7 +83,7 @@ def update(voxels: DensityVoxels, cell: Tensor, density: Tensor, count: Tensor |
         density = density if real is None else torch.where(real, density, -torch.inf)
         flat.scatter_reduce_(0, cell, density, reduce="amax", include_self=True)
         return
-    if real is not None or transfer.remote(flat):
+    if real is not None or transfer.is_on_device(flat):
         _blend(flat, voxels.beta, cell, density, torch.ones_like(cell, dtype=torch.bool) if real is None else real)
         return
     seen, index, counts = torch.unique(cell, return_inverse=True, return_counts=True)
@@ -152,7 +152,7 @@ def _chosen_on_device(valid: Tensor, count: int, generator: torch.Generator) -> 
 def random_cells(voxels: DensityVoxels, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Random cells (count,), half anywhere and half among the valid, and a random point in each (count, 3), grid coordinates."""
     flat = voxels.values.view(-1)
-    if transfer.remote(flat):
+    if transfer.is_on_device(flat):
         cell = _chosen_on_device(flat > voxels.threshold, count, generator)
         return cell, _point_in(cell, voxels.side, generator)
     anywhere = torch.randint(len(flat), (count - count // 2,), generator=generator).to(flat.device)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.backends import dispatch
 from efficientnerf.backends.transfer import to_device
 from efficientnerf.training.pixels import Pixels
 
@@ -43,21 +44,7 @@ class DevicePixels:
         at = self.to_device(index)
         colour = self.to_device(self.pixels.images[index]) if self.images is None else self.images[at]
         view = torch.searchsorted(self.offsets, at, right=True) - 1
-        rotation = self.rotation[view]  # (R, 3, 3)
-        directions = (rotation * self._in_camera(at - self.offsets[view], view)[:, None]).sum(dim=2)
-        slant = (directions * rotation[:, :, 2]).sum(dim=1).clamp(min=1e-3)  # near and far are measured along the view axis
-        return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, colour.float() / 255
-
-    def _in_camera(self, pixel: Tensor, view: Tensor) -> Tensor:
-        """Unit directions (R, 3) in the camera of pixels of views, from the knots of their lenses."""
-        width, knots, stride = self.width[view], self.knots[view], self.pixels.stride
-        row, column = pixel // width, pixel % width
-        at = self.lens[view] + row // stride * knots + column // stride
-        if stride == 1:
-            return self.lookup[at]
-        f, g = (column % stride)[:, None] / stride, (row % stride)[:, None] / stride
-        right, below = at + (f[:, 0] > 0), torch.where(g[:, 0] > 0, knots, 0)
-        upper = (1 - f) * self.lookup[at] + f * self.lookup[right]
-        lower = (1 - f) * self.lookup[at + below] + f * self.lookup[right + below]
-        mixed = (1 - g) * upper + g * lower
-        return mixed / mixed.norm(dim=1, keepdim=True)
+        pixel = at - self.offsets[view]
+        directions = dispatch.ray_directions(self.lookup, self.lens, self.knots, self.pixels.stride, pixel, self.width, self.rotation, view)
+        cosine = (directions * self.rotation[view, :, 2]).sum(dim=1).clamp(min=1e-3)  # near and far are measured along the view axis
+        return self.centre[view], directions, self.near[view] / cosine, self.far[view] / cosine, colour.float() / 255

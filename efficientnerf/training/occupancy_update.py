@@ -52,8 +52,8 @@ def update_at_random_cells(m: Model, number: int, rng: np.random.Generator) -> N
 
 def update_at_points(m: Model, point: Tensor, raw: Tensor, cell: Tensor | None = None, count: Tensor | None = None) -> None:
     """Update the density voxels with raw densities (N,) at points (N, 3) in grid coordinates; `cell` (N,), where it is known, and `count` as for `update`."""
-    kernel = cell is None and count is None and m.voxels.rule == "maximum"
-    if kernel and dispatch.update_occupancy_maximum(m.voxels.values, point, raw, m.coarse.activation):
+    if cell is None and count is None and m.voxels.rule == "maximum":
+        dispatch.update_occupancy_maximum(m.voxels.values, point, raw, m.coarse.activation)
         return
     cell = cell_of(point, m.voxels.side) if cell is None else cell
     update(m.voxels, cell, raw if m.voxels.rule == "momentum" else activate(raw, m.coarse.activation), count)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -62,20 +61,6 @@ class Adam:
                     group.buffers[name].mark_cleared()
 
     def _update(self, p: nn.Parameter, grad: Tensor, first: Tensor, second: Tensor, number: int, learning_rate: float, *, sparse: bool) -> None:
-        """One parameter and its moments, in place. On the CPU the gradient is cleared, too."""
-        correction1, correction2 = 1 - BETA1**number, 1 - self.beta2**number
-        if p.device.type == "cpu":
-            from efficientnerf.backends.numba import adam as cpu_adam
-
-            flat = [t.detach().view(-1).numpy() for t in (p, grad.contiguous(), first, second)]
-            cpu_adam.adam(*flat, *(np.float32(x) for x in (learning_rate, BETA1, self.beta2, correction1, correction2, self.epsilon)), sparse)
-        elif dispatch.on_device(p, grad):
-            from efficientnerf.backends.triton.adam import adam
-
-            adam(p, grad, first, second, learning_rate, BETA1, self.beta2, correction1, correction2, self.epsilon, skip_zeros=sparse)
-        else:
-            with torch.no_grad():
-                touched = (grad != 0) if sparse else torch.ones_like(grad, dtype=torch.bool)
-                first.copy_(torch.where(touched, first.lerp(grad, 1 - BETA1), first))
-                second.copy_(torch.where(touched, second.lerp(grad**2, 1 - self.beta2), second))
-                p.sub_(touched * learning_rate * (first / correction1) / ((second / correction2).sqrt() + self.epsilon))
+        """One parameter and its moments, in place. numba's kernel, the only one that fills gradient buffers, clears the gradient, too."""
+        corrections = 1 - BETA1**number, 1 - self.beta2**number
+        dispatch.adam(p.detach(), grad, first, second, learning_rate, BETA1, self.beta2, *corrections, self.epsilon, skip_zeros=sparse)

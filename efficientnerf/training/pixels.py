@@ -9,7 +9,9 @@ import itertools
 from collections.abc import Iterable
 
 import numpy as np
+import torch
 
+from efficientnerf.backends import dispatch
 from efficientnerf.geometry.cameras import Camera, rays
 
 EXACT = 2**23  # pixels of all lenses together up to which each has a direction of its own (12 bytes each)
@@ -119,12 +121,11 @@ class Pixels:
 
     def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""
-        from efficientnerf.backends.numba import rays as cpu
-
         view = self.view_of(index)
-        directions = np.empty((len(index), 3), np.float32)
-        pixel = index - self.offsets[view]
-        cpu.ray_directions(self.lookup, self.lens, self.knots, self.stride, pixel, self.width, self.rotation, view, directions)
+        lookup, lens, knots, pixel, width, rotation, of = map(
+            torch.from_numpy, (self.lookup, self.lens, self.knots, index - self.offsets[view], self.width, self.rotation, view)
+        )
+        directions = dispatch.ray_directions(lookup, lens, knots, self.stride, pixel, width, rotation, of).numpy()
         slant = np.einsum("ri,ri->r", directions, self.rotation[view, :, 2])
         slant = np.maximum(slant, 1e-3)  # near and far are measured along the view axis
         return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, self.images[index].astype(np.float32) / np.float32(255)

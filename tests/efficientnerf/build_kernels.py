@@ -65,12 +65,13 @@ def build(self: JITFunction, *args: Any, grid: Any, warmup: bool, num_warps: int
 
 
 def training_step() -> None:
+    from efficientnerf.backends.torch.hash_grid import HashLevels
     from efficientnerf.backends.triton import adam, compositing, hash_grid, sampling
     from efficientnerf.geometry.spaces import space_from
 
-    sides, dense, starts = np.array([4, 64]), np.array([True, False]), np.array([0, 64])
+    levels = HashLevels(np.array([4, 64]), np.array([True, False]), np.array([0, 64]), np.uint32(255))
     table = torch.zeros(1000, 2, requires_grad=True)
-    hash_grid.encode(torch.zeros(8, 3), table, sides, dense, starts, 255).sum().backward()
+    hash_grid.encode(torch.zeros(8, 3), table, levels).sum().backward()
     for skip_zeros in (False, True):
         adam.adam(*(torch.zeros(64) for _ in range(4)), 0.1, 0.9, 0.99, 1.0, 1.0, 1e-15, skip_zeros=skip_zeros)
     for contracted in (False, True):

@@ -43,25 +43,6 @@ def test_an_unknown_activation_is_refused() -> None:
         activate(torch.zeros(1), "relu")
 
 
-@pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])
-@pytest.mark.parametrize("degree", [0, 1, 3])
-@pytest.mark.parametrize("activation", ["exp", "softplus"])
-def test_pixels_are_those_of_the_loop(composite: object, degree: int, activation: str) -> None:
-    b = bundle(degree)
-    out = composite(*in_float32(b), activation)  # type: ignore[operator]
-    k = (degree + 1) ** 2
-    for r in range(len(b.first) - 1):
-        own = range(int(b.first[r]), int(b.first[r + 1]))
-        density = [reference.activate(float(b.raw[n, 0]), activation) for n in own]
-        rgb = [[reference.sigmoid(float(b.raw[n, 1 + c * k : 1 + (c + 1) * k] @ b.harmonics[r])) for c in range(3)] for n in own]
-        pixel = reference.composite(density, [float(b.length[n]) for n in own], rgb, b.background[r].tolist())
-        np.testing.assert_allclose(out.colour[r], pixel.colour, atol=2e-6)
-        assert float(out.opacity[r]) == pytest.approx(pixel.opacity, abs=2e-6)
-        np.testing.assert_allclose(out.weight[list(own)], pixel.weights, atol=2e-6)
-        assert float(out.distortion[r]) == pytest.approx(reference.distortion(pixel.weights, [float(b.length[n]) for n in own]), abs=2e-6)
-        np.testing.assert_allclose(out.sample_colour[list(own)], np.array(rgb).reshape(-1, 3), atol=2e-6)
-
-
 @pytest.mark.parametrize("activation", ["exp", "softplus"])
 def test_gradients_of_the_torch_function_are_finite_differences(activation: str) -> None:
     b = bundle(1, (2, 0, 3))
@@ -71,24 +52,6 @@ def test_gradients_of_the_torch_function_are_finite_differences(activation: str)
         return tuple(compositing.composite(raw, b.length, b.first, b.harmonics, background, activation))
 
     assert torch.autograd.gradcheck(outputs, (raw, background), fast_mode=True)
-
-
-@pytest.mark.parametrize("degree", [0, 2, 4])
-@pytest.mark.parametrize("activation", ["exp", "softplus"])
-def test_gradients_of_the_kernel_are_those_of_the_torch_function(degree: int, activation: str) -> None:
-    b = bundle(degree)
-    towards = torch.from_numpy(np.random.default_rng(9).normal(size=(len(b.first) - 1, 5)))
-    pull = torch.from_numpy(np.random.default_rng(8).normal(size=len(b.raw)))
-    grads = []
-    for composite, of in ((compositing.composite, b), (dispatch.composite, in_float32(b))):
-        raw, background = of.raw.clone().requires_grad_(), of.background.clone().requires_grad_()
-        out = composite(raw, of.length, of.first, of.harmonics, background, activation)
-        of_rays = torch.cat([out.colour, out.opacity[:, None], out.distortion[:, None]], dim=1)
-        ((of_rays * towards.to(raw.dtype)).sum() + (out.weight * pull.to(raw.dtype)).sum()).backward()
-        grads.append((raw.grad, background.grad))
-    for slow, fast in zip(*grads, strict=True):
-        assert slow is not None
-        torch.testing.assert_close(fast.double(), slow, rtol=1e-4, atol=2e-6)
 
 
 @pytest.mark.parametrize("composite", [compositing.composite, dispatch.composite], ids=["torch", "kernel"])

@@ -12,7 +12,7 @@ from tests.efficientnerf.device import DEVICE
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.compositing")
 
-COUNTS = {"short": (5, 1, 0, 9, 7, 3), "long": (0, 33, 100, 32, 64, 1), "one": (1,), "empty": (0, 0)}
+COUNTS = {"long": (0, 33, 100, 32, 64, 1), "one": (1,), "empty": (0, 0)}
 
 
 def there(b: Bundle) -> Bundle:
@@ -31,9 +31,7 @@ def outcome(composite: object, b: Bundle, activation: str) -> tuple[list[torch.T
     return [t.detach() for t in out], [raw.grad, background.grad]
 
 
-@pytest.mark.parametrize("degree", [0, 2, 3])
-@pytest.mark.parametrize("activation", ["exp", "softplus"])
-@pytest.mark.parametrize("counts", COUNTS)
+@pytest.mark.parametrize(("degree", "activation", "counts"), [(3, "softplus", "long"), (0, "exp", "long"), (2, "exp", "one"), (2, "exp", "empty")])
 def test_values_and_gradients_are_those_of_torch(degree: int, activation: str, counts: str) -> None:
     b = bundle(degree, COUNTS[counts])
     values, grads = outcome(cuda.composite, there(b), activation)

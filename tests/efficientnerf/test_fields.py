@@ -10,10 +10,9 @@ import pytest
 import torch
 from torch import nn
 
-from efficientnerf.fields.hash import HashField, encode, encode_reference
+from efficientnerf.fields.hash import HashField
 from efficientnerf.fields.mlp import MlpField, positional_encoding
 from efficientnerf.training.optimiser import ParameterGroup
-from tests import reference
 
 
 def hash_field(degree: int = 2, seed: int = 0) -> HashField:
@@ -39,10 +38,6 @@ def points(count: int = 200) -> torch.Tensor:
     return torch.cat([torch.rand(count, 3, generator=torch.Generator().manual_seed(4)), corners])
 
 
-def of_reference(field: HashField, at: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
-    return encode_reference(at, table, field.sides, field.dense, field.starts, int(field.mask))
-
-
 def test_the_test_field_has_levels_of_both_kinds() -> None:
     field = hash_field()
     assert field.sides.tolist() == [4, 8, 16]
@@ -50,34 +45,12 @@ def test_the_test_field_has_levels_of_both_kinds() -> None:
     assert len(field.table) == 4**3 + 8**3 + 1024
 
 
-def test_encoding_is_that_of_the_loop() -> None:
-    field, at = hash_field(), points()
-    table = field.table.detach().double()
-    levels = (field.sides.tolist(), field.dense.tolist(), field.starts.tolist(), 1024)
-    expected = np.array([reference.encode(p, table.numpy(), *levels) for p in at.double().tolist()])
-    np.testing.assert_allclose(of_reference(field, at.double(), table), expected, atol=1e-12)
-    np.testing.assert_allclose(encode(at, field).detach(), expected, atol=2e-5)
-
-
-def test_gradient_of_the_table_is_that_of_the_torch_function() -> None:
-    field, at = hash_field(), points()
-    towards = torch.from_numpy(np.random.default_rng(1).normal(size=(len(at), 6)))
-    table = field.table.detach().double().requires_grad_()
-    (of_reference(field, at.double(), table) * towards).sum().backward()
-    (encode(at, field) * towards.float()).sum().backward()
-    assert table.grad is not None
-    assert field.table.grad is None
-    assert field.table_gradient.values is not None
-    torch.testing.assert_close(field.table_gradient.values.double(), table.grad, rtol=1e-4, atol=2e-5)
-    assert torch.autograd.gradcheck(lambda t: of_reference(field, at[-6:].double(), t), (table.detach().requires_grad_(),), fast_mode=True)
-
-
 def test_encoding_is_continuous_and_hits_the_lattice() -> None:
     field = hash_field()
     lattice = torch.tensor([[1 / 3, 2 / 3, 0.0]])
-    torch.testing.assert_close(encode(lattice, field)[0, :2], field.table[(1 * 4 + 2) * 4 + 0], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(field.encode(lattice)[0, :2], field.table[(1 * 4 + 2) * 4 + 0], rtol=1e-5, atol=1e-5)
     for shift in (1e-6, -1e-6):
-        torch.testing.assert_close(encode(lattice + shift, field), encode(lattice, field), rtol=0, atol=1e-3)
+        torch.testing.assert_close(field.encode(lattice + shift), field.encode(lattice), rtol=0, atol=1e-3)
 
 
 def test_encoding_runs_in_float64_too() -> None:

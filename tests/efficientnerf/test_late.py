@@ -150,8 +150,9 @@ def interpreted(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest)
     """The path of a device on the CPU: Triton's kernels interpreted."""
     monkeypatch.setattr(dispatch, "triton_usable", lambda: True)
     if DEVICE == "cpu":
-        monkeypatch.setattr(dispatch, "on_device", lambda *tensors: all(t.dtype == torch.float32 for t in tensors))
-        monkeypatch.setattr(transfer, "remote", lambda values: True)
+        monkeypatch.setattr(dispatch, "backend_of", lambda *tensors: "triton" if all(t.dtype == torch.float32 for t in tensors) else "torch")
+        monkeypatch.setitem(dispatch.OPERATIONS["adam"], "triton", "backends.numba.operations")  # its own takes the interpreter long
+        monkeypatch.setattr(transfer, "is_on_device", lambda values: True)
         if "contracted" not in request.node.name:  # a program a ray takes the interpreter long; once is enough
             monkeypatch.setattr(dispatch, "composite", compositing.composite)
 
@@ -224,7 +225,8 @@ def test_no_line_of_a_step_waits(strategy: str, interpreted: None) -> None:
     assert lines_that_wait(running) == []
 
 
-def test_no_line_that_makes_a_bundle_waits() -> None:
+def test_no_line_that_makes_a_bundle_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch, "backend_of", lambda *tensors: "torch")
     there = DevicePixels(pixels(3, 8), "cpu")
     with Waits() as waits:
         assert len(there.bundle(np.arange(20))[0]) == 20

@@ -150,14 +150,14 @@ def test_a_space_warps_rays_and_is_not_contracted(ndc: Ndc) -> None:
 
 def test_the_kernels_are_the_functions(ndc: Ndc) -> None:
     """Rays that begin before and beyond the near plane, that never come to it, that look back, or along it; hits near, at infinity, and none."""
-    from efficientnerf.backends.numba import ndc as cpu_ndc
+    from efficientnerf.backends.numba import rays as kernels
 
     rng = np.random.default_rng(5)
     origins = ndc.world_from_camera[:3, 3] + rng.normal(size=(10_000, 3)) * 3
     directions = rng.normal(size=(10_000, 3))
     directions[:100] = ndc.world_from_camera[:3, 0]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    expected, found = ndc.rays(origins, directions), cpu_ndc.warp_rays(ndc, origins, directions)
+    expected, found = ndc.rays(origins, directions), kernels.warp_rays(ndc, origins, directions)
     nowhere = expected.origins[:, 2] == BEYOND
     assert 0.1 < nowhere.mean() < 0.9
     for one, other in zip(expected, found, strict=True):
@@ -166,7 +166,7 @@ def test_the_kernels_are_the_functions(ndc: Ndc) -> None:
     along[::7] = np.inf
     normal = rng.normal(size=(10_000, 3)).astype(np.float32)
     normal[::5] = 0
-    distance, turned = cpu_ndc.unwarp_hits(ndc, found, along, normal)
+    distance, turned = kernels.unwarp_hits(ndc, found, along, normal)
     hit = np.isfinite(along)
     assert np.isinf(distance[~hit]).all()
     assert (turned[~hit] == 0).all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 
@@ -25,41 +24,6 @@ DIVIDERS = {"torch": pivotal_sampling.pivotal_samples, "kernel": dispatch.pivota
 
 def double(rays: Rays) -> Rays:
     return Rays(*(t.double() for t in rays))
-
-
-@pytest.mark.parametrize("kind", ["outside", "inside", "missing", "parallel"])
-@pytest.mark.parametrize("contracted", [False, True])
-@pytest.mark.parametrize("threshold", [0.4, -math.inf])
-@pytest.mark.parametrize("finder", FINDERS)
-def test_valid_samples_are_those_of_the_loop(kind: str, contracted: bool, threshold: float, finder: str) -> None:
-    rays, voxels = make_rays(kind), voxels_of()
-    found = FINDERS[finder](space_from(BOUNDS, contracted=contracted), *rays, STEP, 60, voxels, threshold)
-    compared = 0
-    for r in range(len(rays.origins)):
-        o, d, near, far, offset = (t[r].double().numpy() for t in rays)
-        wanted = reference.march(BOUNDS, contracted, o, d, float(near), float(far), float(offset), STEP, 60, voxels.numpy(), threshold)
-        if wanted.margin < 1e-4:  # a decision that rounding may turn
-            continue
-        compared += 1
-        begin, end = found.first[r : r + 2].tolist()
-        assert end - begin == len(wanted.samples)
-        if wanted.samples:
-            start, extent, length, point = (np.array(column) for column in zip(*wanted.samples, strict=True))
-            np.testing.assert_allclose(found.start[begin:end], start, rtol=1e-4, atol=1e-5)
-            np.testing.assert_allclose(found.extent[begin:end], extent, rtol=1e-4, atol=1e-5)
-            np.testing.assert_allclose(found.length[begin:end], length, rtol=1e-4, atol=1e-5)
-            np.testing.assert_allclose(found.point[begin:end], point, atol=1e-5)
-    assert compared > 40
-    if kind == "missing" and not contracted:
-        assert found.first[-1] == 0
-
-
-@pytest.mark.parametrize("contracted", [False, True])
-def test_both_try_the_same_number(contracted: bool) -> None:
-    rays, space = make_rays("outside"), space_from(BOUNDS, contracted=contracted)
-    fast, slow = (find(space, *rays, STEP, 60, voxels_of(), 0.4) for find in (dispatch.valid_samples, valid_sampling.valid_samples))
-    assert fast.tried == pytest.approx(slow.tried, abs=2)
-    assert len(fast.start) < fast.tried
 
 
 @pytest.mark.parametrize("contracted", [False, True])
@@ -142,22 +106,6 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     assert reach.min() > reference.FARTHEST
 
 
-@pytest.mark.parametrize("choose", [pivotal_sampling.select_pivots, dispatch.select_pivots], ids=["torch", "kernel"])
-@pytest.mark.parametrize("most", [1, 3, 5, 100])
-def test_pivots_are_the_heaviest_of_a_ray_above_the_threshold(choose: Callable[..., torch.Tensor], most: int) -> None:
-    rng = np.random.default_rng(3)
-    counts = [0, 4, 12, 1, 7, 0, 30]
-    weight = np.round(rng.random(sum(counts)), 1).astype(np.float32)  # many equals
-    first = np.concatenate([[0], np.cumsum(counts)])
-    expected = np.zeros(len(weight), bool)
-    for begin, end in itertools.pairwise(first):
-        heaviest = sorted(range(begin, end), key=lambda n: (-weight[n], n))[:most]
-        expected[[n for n in heaviest if weight[n] > 0.3]] = True
-    found = choose(torch.from_numpy(weight), torch.from_numpy(first), float(np.float32(0.3)), most)
-    assert found.dtype == torch.bool
-    assert np.array_equal(found.numpy(), expected)
-
-
 @pytest.mark.parametrize("divider", DIVIDERS)
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("per_pivot", [1, 4, 5])
@@ -175,15 +123,6 @@ def test_pivotal_slots_tile_their_intervals(divider: str, contracted: bool, per_
     of = ray_of_sample(fine.first, len(fine.start))
     at = fine.start + rays.offset[of] * fine.extent
     torch.testing.assert_close(fine.point, space.grid(rays.origins[of] + at[:, None] * rays.directions[of]), rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("contracted", [False, True])
-def test_the_pivotal_kernel_is_the_torch_function(contracted: bool) -> None:
-    rays = make_rays("inside")
-    space, coarse, pivotal = coarse_samples_of(rays, contracted)
-    args = (space, rays.origins, rays.directions, rays.offset, coarse, pivotal, 4)
-    for fast, slow in zip(dispatch.pivotal_samples(*args)[:6], pivotal_sampling.pivotal_samples(*args)[:6], strict=True):
-        torch.testing.assert_close(torch.as_tensor(fast), torch.as_tensor(slow), rtol=1e-4, atol=1e-5)
 
 
 def test_no_point_is_evaluated_twice() -> None:

@@ -7,7 +7,8 @@ the byte.
 from __future__ import annotations
 
 import functools
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,8 +16,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from efficientnerf.backends.torch.hash_grid import HashLevels, relu_network
 from efficientnerf.backends.triton.launch import LANES, blocks
 from efficientnerf.backends.triton.vectors import Vec3
+
+if TYPE_CHECKING:
+    from efficientnerf.fields.gradient_buffer import GradientBuffer
 
 FEATURES = 2
 
@@ -91,19 +96,19 @@ def _levels(sides: bytes, dense: bytes, starts: bytes, device: torch.device) -> 
     return torch.from_numpy(np.stack(columns, axis=1)).to(device)
 
 
-def _levels_of(sides: np.ndarray, dense: np.ndarray, starts: np.ndarray, device: torch.device) -> Tensor:
-    return _levels(sides.astype(np.int64).tobytes(), dense.astype(np.bool_).tobytes(), starts.astype(np.int64).tobytes(), device)
+def _levels_of(levels: HashLevels, device: torch.device) -> Tensor:
+    return _levels(levels.sides.astype(np.int64).tobytes(), levels.dense.astype(np.bool_).tobytes(), levels.starts.astype(np.int64).tobytes(), device)
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, sides: np.ndarray, dense: np.ndarray, starts: np.ndarray, mask: int) -> Tensor:
-        points = points.detach().contiguous()
-        levels = _levels_of(sides, dense, starts, points.device)
-        out = torch.empty(len(points), FEATURES * len(sides), device=points.device)
-        _encode[(blocks(len(points)), len(sides))](points, table.detach(), levels, out, len(points), int(mask), L=len(sides), BLOCK=LANES)
-        ctx.save_for_backward(points, levels)
-        ctx.size, ctx.mask = table.shape, int(mask)
+    def forward(ctx: Any, points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
+        points, count, mask = points.detach().contiguous(), len(levels.sides), int(levels.mask)
+        on_device = _levels_of(levels, points.device)
+        out = torch.empty(len(points), FEATURES * count, device=points.device)
+        _encode[(blocks(len(points)), count)](points, table.detach(), on_device, out, len(points), mask, L=count, BLOCK=LANES)
+        ctx.save_for_backward(points, on_device)
+        ctx.size, ctx.mask = table.shape, mask
         return out
 
     @staticmethod
@@ -112,9 +117,16 @@ class _Encode(torch.autograd.Function):
         table_grad = torch.zeros(ctx.size, device=points.device)
         grad = grads[0].contiguous()
         _encode_backward[(blocks(len(points)), len(levels))](points, grad, levels, table_grad, len(points), ctx.mask, L=len(levels), BLOCK=LANES)
-        return None, table_grad, None, None, None, None
+        return None, table_grad, None
 
 
-def encode(points: Tensor, table: Tensor, sides: np.ndarray, dense: np.ndarray, starts: np.ndarray, mask: int) -> Tensor:
-    """`efficientnerf.backends.torch.hash_grid.encode` on float32 tensors; differentiable in the table."""
-    return _Encode.apply(points, table, sides, dense, starts, mask)
+def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer | None = None) -> Tensor:
+    """`efficientnerf.backends.torch.hash_grid.encode` with two features an entry; differentiable in the table."""
+    return _Encode.apply(points, table, levels)
+
+
+def hash_network(
+    points: Tensor, table: Tensor, levels: HashLevels, weights: Sequence[Tensor], offset: float, precision: torch.dtype, gradient: GradientBuffer | None = None
+) -> Tensor:
+    """`efficientnerf.backends.torch.hash_grid.hash_network` with this encoding."""
+    return relu_network(encode(points, table, levels), weights, offset, precision)

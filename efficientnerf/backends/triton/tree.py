@@ -149,6 +149,15 @@ def render_rays(t: DeviceTree, origins: Tensor, directions: Tensor, views: Tenso
     return _launch(t, len(start), (start, along, seen_along), (0.0,) * 16, (0, 0), None)
 
 
+def tree_rays(
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, views: np.ndarray | None, eye: np.ndarray | None, columns: int | None
+) -> tuple[np.ndarray, ...]:
+    """`render_rays` from and to the host; waits for the device."""
+    given = (origins, directions) if views is None else (origins, directions, views)
+    on_device = [torch.from_numpy(np.ascontiguousarray(a, np.float64)).to(tree.device) for a in given]
+    return tuple(part.cpu().numpy() for part in render_rays(device_tree_of(tree), *on_device))
+
+
 @functools.lru_cache(maxsize=4)
 def _camera_directions(width: int, height: int, model: str, params: tuple[float, ...], supersample: int, device: torch.device) -> Tensor:
     """Unit directions (rays, 3) in the camera, of all samples row by row; kept, because distortion is inverted on the host."""

@@ -1,0 +1,193 @@
+"""The numba kernels as operations on float32 tensors of the CPU: the functions that `efficientnerf.backends.dispatch` calls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from efficientnerf.rendering.compositing import Composite
+from efficientnerf.sampling.samples import Samples
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.backends.torch.hash_grid import HashLevels
+    from efficientnerf.fields.gradient_buffer import GradientBuffer
+    from efficientnerf.geometry.spaces import Space
+
+
+def _array(t: Tensor) -> np.ndarray:
+    return t.detach().contiguous().numpy()
+
+
+def _box(space: Space) -> tuple[np.ndarray, np.ndarray, bool]:
+    return space.centre.astype(np.float32), space.half.astype(np.float32), space.contracted
+
+
+def valid_samples(
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
+    *, whole: int = 0,
+) -> Samples:  # fmt: skip
+    from efficientnerf.backends.numba import sampling
+
+    given: list[Any] = [_array(t) for t in (origins, directions, near, far, offset)] + [*_box(space), step, slots, _array(voxels), threshold, whole]
+    *packed, tried = sampling.valid_samples(*given)
+    return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
+
+
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+    from efficientnerf.backends.numba import sampling
+
+    out = torch.empty(len(weight), dtype=torch.bool)
+    sampling.select_pivots(_array(weight), _array(first), np.float32(threshold), most, out.numpy())
+    return out
+
+
+def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:
+    from efficientnerf.backends.numba import sampling
+
+    columns = (coarse.first, coarse.start, coarse.extent, coarse.length, pivotal)
+    given: list[Any] = [*map(_array, (origins, directions, offset)), *_box(space), *map(_array, columns), per_pivot]
+    fine = sampling.pivotal_samples(*given)
+    return Samples._make([*(torch.from_numpy(a) for a in fine), coarse.tried, None])
+
+
+def update_occupancy_maximum(values: Tensor, point: Tensor, raw: Tensor, activation: str) -> None:
+    from efficientnerf.backends.numba import occupancy
+
+    occupancy.update_occupancy(_array(point), raw.detach().numpy(), activation == "exp", values.numpy())
+
+
+def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
+    """The samples' colours, the lengths and the harmonics carry no gradient."""
+    return Composite(*_Composite.apply(raw, length, first, harmonics, background, activation == "exp"))
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, exponential: bool) -> tuple[Tensor, ...]:
+        from efficientnerf.backends.numba import compositing
+
+        rays = len(first) - 1
+        colour, opacity, distortion = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays)
+        weight, rgb = torch.empty(len(raw)), torch.empty(len(raw), 3)
+        given, out = (raw, length, first, harmonics, background), (colour, opacity, distortion, weight, rgb)
+        compositing.composite(*map(_array, given), exponential, *(t.numpy() for t in out))
+        ctx.save_for_backward(*given, weight, rgb)
+        ctx.exponential = exponential
+        ctx.mark_non_differentiable(rgb)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        from efficientnerf.backends.numba import compositing
+
+        *given, weight, rgb = ctx.saved_tensors
+        grad_raw, grad_background = torch.empty(given[0].shape), torch.empty(given[4].shape)
+        arrays = [_array(t) for t in (weight, rgb, *grads[:4])]
+        compositing.composite_backward(*map(_array, given), ctx.exponential, *arrays, grad_raw.numpy(), grad_background.numpy())
+        return grad_raw, None, None, None, grad_background, None
+
+
+def encode(points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
+    """Differentiable in the table, whose gradient is added to the buffer `gradient`, not handed to autograd."""
+    return _Encode.apply(points, table, levels, gradient)
+
+
+def _encoded(points: Tensor, table: Tensor, levels: HashLevels) -> tuple[Tensor, Tensor]:
+    """Points (3, N) and features (F L, N): the order that the kernels want."""
+    from efficientnerf.backends.numba import hash_grid
+
+    transposed, out = torch.empty(3, len(points)), torch.empty(table.shape[1] * len(levels.sides), len(points))
+    hash_grid.transpose_points(_array(points), transposed.numpy())
+    hash_grid.encode(transposed.numpy(), table.detach().numpy(), *levels, out.numpy())
+    return transposed, out
+
+
+def _add_table_gradient(points: Tensor, grad: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> None:
+    """Add to the buffer for gradients (F L, N) of the features at points (3, N)."""
+    from efficientnerf.backends.numba import hash_grid
+
+    hash_grid.encode_backward(points.numpy(), grad.numpy(), *levels, gradient.accumulator(table).numpy())
+
+
+class _Encode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, table: Tensor, levels: HashLevels, gradient: GradientBuffer) -> Tensor:
+        at, out = _encoded(points, table, levels)
+        ctx.save_for_backward(at)
+        ctx.table, ctx.levels, ctx.gradient = table, levels, gradient
+        return out.t()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, ...]:
+        _add_table_gradient(ctx.saved_tensors[0], grad.t().contiguous(), ctx.table, ctx.levels, ctx.gradient)
+        return None, None, None, None
+
+
+def hash_network(
+    points: Tensor, table: Tensor, levels: HashLevels, weights: Sequence[Tensor], offset: float, precision: torch.dtype, gradient: GradientBuffer
+) -> Tensor:
+    """As `encode`: the gradients of the weights are autograd's, that of the table is added to the buffer."""
+    return _HashNetwork.apply(points, table, levels, offset, precision, gradient, *weights)
+
+
+class _HashNetwork(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, table: Tensor, levels: HashLevels, offset: float, precision: torch.dtype, gradient: GradientBuffer, *weights: Tensor
+    ) -> Tensor:
+        from efficientnerf.backends.numba import mlp
+
+        at, features = _encoded(points, table, levels)
+        prepared = mlp.pack_weights([weight.detach().numpy() for weight in weights], bfloat16=precision == torch.bfloat16)
+        out = torch.empty(len(points), len(weights[-1]))
+        kept = mlp.forward(features.numpy(), prepared, offset, out.numpy(), keep=any(ctx.needs_input_grad))
+        if any(ctx.needs_input_grad):
+            ctx.at, ctx.features, ctx.kept, ctx.prepared = at, features, kept, prepared
+            ctx.table, ctx.levels, ctx.gradient = table, levels, gradient
+            ctx.shapes = [tuple(weight.shape) for weight in weights]
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        from efficientnerf.backends.numba import mlp
+
+        of_features, of_weights = mlp.backward(grad.contiguous().numpy(), ctx.features.numpy(), ctx.prepared, ctx.kept, ctx.shapes)
+        ctx.kept = None
+        _add_table_gradient(ctx.at, torch.from_numpy(of_features), ctx.table, ctx.levels, ctx.gradient)
+        return None, None, None, None, None, None, *map(torch.from_numpy, of_weights)
+
+
+def adam(
+    value: Tensor, grad: Tensor, first: Tensor, second: Tensor, rate: float, beta1: float, beta2: float, correction1: float, correction2: float,
+    epsilon: float, *, skip_zeros: bool,
+) -> None:  # fmt: skip
+    """Also clears the gradient, where it is contiguous."""
+    from efficientnerf.backends.numba import adam as kernel
+
+    flat = [t.detach().view(-1).numpy() for t in (value, grad.contiguous(), first, second)]
+    kernel.adam(*flat, *(np.float32(x) for x in (rate, beta1, beta2, correction1, correction2, epsilon)), skip_zeros)
+
+
+def ray_directions(lookup: Tensor, begin: Tensor, knots: Tensor, stride: int, pixel: Tensor, width: Tensor, rotation: Tensor, view: Tensor) -> Tensor:
+    from efficientnerf.backends.numba import rays
+
+    out = torch.empty(len(view), 3)
+    rays.ray_directions(*(_array(t) for t in (lookup, begin, knots)), stride, *(_array(t) for t in (pixel, width, rotation, view)), out.numpy())
+    return out
+
+
+def tree_rays(
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, views: np.ndarray | None, eye: np.ndarray | None, columns: int | None
+) -> tuple[np.ndarray, ...]:
+    if tree.lookup == "nearest":
+        from efficientnerf.backends.numba.tree import nearest
+
+        return nearest.render_rays(tree, origins, directions, views)
+    from efficientnerf.backends.numba.tree.rendering import render_rays
+
+    return render_rays(tree, origins, directions, views, eye, columns)
