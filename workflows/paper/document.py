@@ -33,13 +33,13 @@ TABLES: dict[str, Table] = {
 }
 
 
-def make(number: str, request: Request) -> dict[str, Path]:
+def make(number: str, request: Request, tables: Mapping[str, Table] = TABLES) -> dict[str, Path]:
     """Measure one table and write it; returns the files, by kind."""
     from pipeline.errors import BadInput, UsageError
 
-    if number not in TABLES:
-        raise UsageError(f"paper {number}: no such table. There are: {', '.join(TABLES)}.")
-    table = TABLES[number]
+    if number not in tables:
+        raise UsageError(f"paper {number}: no such table. There are: {', '.join(tables)}.")
+    table = tables[number]
     if table.needs_data and request.data is None:
         raise UsageError(f"paper {number}: is measured on scenes. Give --data DIR, a data set or a folder of data sets.")
     if request.data is not None and not request.data.is_dir():
