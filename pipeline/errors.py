@@ -39,7 +39,7 @@ class UnknownSetting(UsageError):
 
 
 class StageFailed(PipelineError):
-    """A stage raised. The text is one line; `__cause__` is the original, for --debug."""
+    """A stage raised. The text is one line; `__cause__` is the original, for a traceback."""
 
     exit_code = 3
 
