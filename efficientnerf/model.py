@@ -152,6 +152,7 @@ def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[Field, Field]
     """The coarse field and the fine one, untrained."""
     log2_table, finest = given(s.log2_hashmap_size) or LOG2_TABLE, given(s.finest_resolution) or FINEST
     if s.field == "hash":
+        # The coarse field is a proposal field: lighter, and of densities alone. docs/experiments/proposal-field.md
         return HashField(
             levels=max(1, s.num_levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
             hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
