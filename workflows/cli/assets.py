@@ -15,13 +15,13 @@ LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asse
 @click.command(short_help="Compare two assets: metadata, tensors, renders.")
 @click.argument("first", metavar="A", type=folder_type)
 @click.argument("second", metavar="B", type=folder_type)
-@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, from around A.")
+@click.option("--views", type=click.IntRange(0, 1000), default=4, show_default=True, help="Number of renders to compare, on the orbit of A.")
 @click.option("--size", type=click.IntRange(16, 4096), default=400, show_default=True, help="Pixels along a side of the renders.")
 @json_option
 @quiet_option
 @common_options
 def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet: bool) -> int:
-    """Say which metadata and tensors of the assets (or the runs' assets) A and B differ, and the PSNR between their renders.
+    """Show which metadata and tensors of the assets (or runs) A and B differ, and the PSNR between their renders.
 
     Exit code 0 if they are equal, 6 if they differ, 4 if one is damaged.
     """
@@ -40,7 +40,7 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 @click.command(short_help="Write an asset in another layout, resolution or degree.")
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.argument("out", metavar="OUT", type=folder_type)
-@click.option("--layout", type=click.Choice(LAYOUTS), help="How the voxels lie in OUT; as in ASSET if it is left out.")
+@click.option("--layout", type=click.Choice(LAYOUTS), help="Layout of the voxels in OUT; by default that of ASSET.")
 @click.option("--sh-degree", "degree", type=click.IntRange(0, 4), help="Keep the spherical harmonics up to this degree.")
 @click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side; fewer than there are.")
 @json_option
@@ -50,7 +50,7 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     """Write the asset of RUN, or ASSET, to the file OUT.
 
     compact: 4 bytes a voxel and one for each harmonic above the first; small: 6; sparse: 16-bit floats; full: all voxels of each brick, 16-bit
-    floats, or 32-bit ones as full32. A file that exists is replaced, and only once the new one is whole.
+    floats, or 32-bit ones as full32. An existing file is replaced atomically.
     """
     from efficientnerf.asset.format import describe
     from pipeline.errors import UsageError

@@ -19,7 +19,7 @@ CAMERAS = ".json"
 @click.command(short_help="Write meshes, points or cameras in other formats.")
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
-@click.option("--to", "first", required=True, metavar="FILE", type=folder_type, help="The file to write; more may follow. Its extension says the format.")
+@click.option("--to", "first", required=True, metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
 @click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
 @set_option
 @json_option
@@ -28,7 +28,7 @@ CAMERAS = ".json"
 def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, sets: tuple[str, ...], as_json: bool, quiet: bool) -> None:
     """Write the surface of RUN or ASSET as .ply, .glb or .obj, with --points as .ply or .xyz; or the cameras of RUN as .json (nerfstudio).
 
-    Files that exist are replaced, and only once the new ones are whole. '--set mesh.max_faces=...' and the other settings of mesh and points hold here too.
+    Existing files are replaced atomically. Settings of the stages mesh and points apply: '--set mesh.max_faces=...'.
     """
     from pipeline.errors import UsageError
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
@@ -115,7 +115,7 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 
 @click.command(short_help="Render a turntable, or the cameras of a JSON path.")
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
-@click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder for frame_0000.png and so on; made if need be.")
+@click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder for frame_0000.png and so on; created if missing.")
 @click.option("--path", "camera_path", type=folder_type, metavar="JSON", help="A camera path as nerfstudio exports it, in the frame of the capture.")
 @click.option("--frames", type=click.IntRange(1, 9999), help="Frames of the turntable.")
 @click.option("--width", type=click.IntRange(16, 8192), help="Pixels; with --path in place of the file's.")
@@ -127,9 +127,9 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @quiet_option
 @common_options
 def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any) -> None:
-    """Render RUN's asset or ASSET from all around, or along a camera path, into DIR.
+    """Render the asset of RUN, or ASSET, on a turntable or along a camera path, into DIR.
 
-    The settings of the stage turntable hold here too: '--set turntable.elevation=30'. Frames that exist are replaced.
+    Settings of the stage turntable apply: '--set turntable.elevation=30'. Existing frames are replaced.
     """
     from dataclasses import replace
 

@@ -29,7 +29,7 @@ def enerf() -> None:
 
     \b
     enerf run photos/ --out runs/mine      everything, from photographs to asset, turntable, mesh and points
-    enerf run --out runs/mine              go on where it was left
+    enerf run --out runs/mine              resume
     """
 
 

@@ -9,19 +9,19 @@ import click
 from workflows.cli.options import common_options, device_option, folder_type, json_option, quiet_option
 
 
-@click.command(short_help="Measure a table of the paper, its figures beside ours.")
+@click.command(short_help="Reproduce a table of the paper, with its figures beside ours.")
 @click.argument("table", metavar="TABLE")
 @click.option("--data", type=folder_type, metavar="DIR", help="A data set, or a folder of data sets (table 7 needs none).")
-@click.option("--out", required=True, type=folder_type, metavar="DIR", help="Where the table goes; its runs are kept there, and gone on with.")
+@click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder of the table and its runs, which are resumed.")
 @click.option("--scale", type=click.FloatRange(1e-5, 1.0), default=1.0, show_default=True,
-              help="Shrinks iterations, resolution, networks and grids together; the table says so.")  # fmt: skip
+              help="Scale of iterations, resolution, networks and grids; stated in the table.")  # fmt: skip
 @device_option
 @json_option
 @quiet_option
 @common_options
 def paper(table: str, data: Path | None, out: Path, scale: float, device: str | None, as_json: bool, quiet: bool) -> None:
     """Reproduce TABLE of the paper: 1 shares of samples, 2 quality and speed, 3 N1 to N4, 4 sizes of the networks, 5 modules one by one, 6 sampling
-    strategies, 7 tree against other structures. Writes DIR/table_N.md, .json and, where something is trained, .png.
+    strategies, 7 NerfTree against other structures. Writes DIR/table_N.md, .json and, where something is trained, .png.
     """
     from workflows.cli.device import resolve_device
     from workflows.cli.progress import display, write_json

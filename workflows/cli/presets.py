@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @json_option
 @common_options
 def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
-    """List the presets, and the settings that most users want, with their defaults and meaning; of STAGE... all settings, the advanced ones apart."""
+    """List the presets and the main settings with their defaults and meaning; with STAGE... all settings of these stages."""
     from pipeline.errors import UsageError
     from stages.settings import describe_settings
     from workflows.cli.progress import write_json

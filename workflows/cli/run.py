@@ -15,30 +15,30 @@ if TYPE_CHECKING:
     from workflows.cli.request import Plan
 
 
-@click.command(short_help="From photographs or a data set to everything; again: go on.")
+@click.command(short_help="Run all stages on photographs or a data set, or resume a run.")
 @click.argument("source", required=False, type=folder_type)
 @click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="The folder of the run.")
-@click.option("--as", "format_name", metavar="FORMAT", help="What SOURCE is, instead of finding out: see poses.format in 'enerf presets poses'.")
+@click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE; by default it is detected. See poses.format in 'enerf presets poses'.")
 @click.option("--preset", metavar="NAME",
-              help="Where settings start from: tiny, preview (default without CUDA), standard (default with), high; nerf, paper, paper-n1 to -n4.")  # fmt: skip
+              help="Preset to start from: tiny, preview (default without CUDA), standard (default with), high; nerf, paper, paper-n1 to -n4.")  # fmt: skip
 @set_option
 @click.option("--config", type=folder_type, metavar="FILE", help="A TOML file with tables of settings, one for each stage.")
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
-@click.option("--from", "start", metavar="STAGE", help="Do this stage and those after it again, even if they are up to date.")
+@click.option("--from", "start", metavar="STAGE", help="Run this stage and those after it again, even if they are up to date.")
 @device_option
 @click.option("--seed", type=int, help="Seed of every stage with random choices.")
-@click.option("--budget", metavar="TIME", help="Train for so long, as 90s, 10m or 1h, in place of a number of steps: train.time_budget.")
-@click.option("--strict", is_flag=True, help="Refuse a source of which anything is missing or unreadable.")
-@click.option("--allow-outside", is_flag=True, help="Let a data set name files outside of its folder.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done and why; do nothing.")
+@click.option("--budget", metavar="TIME", help="Time to train for, as 90s, 10m or 1h; see train.time_budget.")
+@click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
+@click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
+@click.option("--dry-run", is_flag=True, help="Show what would be done and why; do nothing.")
 @json_option
 @quiet_option
 @common_options
 def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or go on with RUN.
+    """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or resume RUN.
 
-    SOURCE is a folder of photographs, or of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Without it, RUN goes on with the
-    settings that it recorded; options given change them. What is up to date is not done again.
+    SOURCE is a folder of photographs, or of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Without it, RUN is resumed with the
+    settings that it recorded; options change them. Stages that are up to date are skipped.
     """
     from workflows.cli.request import Options, plan_run
 
@@ -47,18 +47,18 @@ def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, a
     _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run)
 
 
-@click.command(short_help="Run one stage with what the run has.")
+@click.command(short_help="Run one stage on the artifacts of a run.")
 @click.argument("name", metavar="NAME")
 @click.argument("run_folder", metavar="RUN", type=folder_type)
 @set_option
-@click.option("--force", is_flag=True, help="Even if it is up to date.")
+@click.option("--force", is_flag=True, help="Run it even if it is up to date.")
 @device_option
-@click.option("--dry-run", is_flag=True, help="Say whether it would run and why; do nothing.")
+@click.option("--dry-run", is_flag=True, help="Show whether it would run and why; do nothing.")
 @json_option
 @quiet_option
 @common_options
 def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Run the stage NAME of RUN with what the run already has; the stages before it are never run, and named if they are stale."""
+    """Run the stage NAME of RUN on the artifacts of the stages before it, which are not run again; stale ones are named."""
     from pipeline.errors import UsageError
     from workflows.cli.request import Options, plan_run
     from workflows.cli.resolve import nearest

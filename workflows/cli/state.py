@@ -17,7 +17,7 @@ from workflows.cli.options import common_options, folder_type, json_option, quie
 def status(run_folder: Path, as_json: bool) -> None:
     """Show for each stage of RUN whether it is fresh, stale, missing, partial or corrupt, with the reason, its seconds and its size.
 
-    Files whose size and time of change are the same are taken to be the same; 'enerf verify' reads them.
+    A file of unchanged size and modification time counts as unchanged; 'enerf verify' hashes it.
     """
     from pipeline.decide import survey
     from workflows.cli.progress import duration, size, write_json
@@ -58,13 +58,13 @@ def status(run_folder: Path, as_json: bool) -> None:
         click.echo(f"It is being written by {holder.text()}.")
 
 
-@click.command(short_help="Read everything again and compare it with what was written.")
+@click.command(short_help="Check every file against its recorded hash.")
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @json_option
 @quiet_option
 @common_options
 def verify(what: Path, as_json: bool, quiet: bool) -> None:
-    """Hash every file of RUN and compare it with what was written; or read all of ASSET, which carries its own hashes, and check every rule of its
+    """Hash every file of RUN and compare it with the recorded hashes; or read ASSET, which carries its own hashes, and check every rule of its
     format. Exit code 4 if anything was altered.
     """
     if what.is_file():
