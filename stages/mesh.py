@@ -119,7 +119,7 @@ def run(job: Job) -> None:
     report = describe(mesh, frame)
     write_json(outputs.report, report)
     if not report["watertight"]:
-        job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['crowded_edges']} crowded edges")
+        job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['non_manifold_edges']} non-manifold edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}
     job.say(f"{report['faces']} faces in {report['components']} components", **facts)
 

@@ -33,7 +33,7 @@ CHUNK = 1 << 16  # points whose colours are looked up at a time
 
 
 class NoSurface(ValueError):
-    """The density nowhere reaches the level that was asked for. The message names the level and the highest density."""
+    """The density nowhere reaches the given level. The message names the level and the highest density."""
 
 
 def _silent(done: int, total: int, text: str) -> None:
@@ -45,17 +45,17 @@ def _grid(volume: Volume) -> np.ndarray:
 
 
 def _pool(volume: Volume) -> int:
-    """Voxels along a side of the cells in which enclosed space is looked for: two; more where that were over 256 cells a side, for the memory."""
+    """Voxels along a side of the cells in which enclosed space is found: two; more where that were over 256 cells a side, for the memory."""
     return 2 * max(1, -(-int(_grid(volume).max()) // 512))
 
 
 def automatic_threshold(volume: Volume, lines: int = 24) -> float:
-    """The density at which the surface is drawn where nobody says: what light entering from outside meets.
+    """The density of the surface where none is given: what light entering from outside meets.
 
         tau = min( ln 2 / s,  lower quartile over rays of max_{j <= h} sigma_j ),   h: the voxel where the ray's transmittance falls to 1/2
 
-    Rays run along the axes, both ways, through up to `lines` x `lines` columns of bricks per axis; those that stay half transparent say
-    nothing. A surface at tau lies at or in front of the depth at which a ray has lost half its light if tau <= the highest density up to
+    Rays run along the axes, both ways, through up to `lines` x `lines` columns of bricks per axis; those that stay half transparent are
+    left out. A surface at tau lies at or in front of the depth at which a ray has lost half its light if tau <= the highest density up to
     there; the lower quartile makes that true for three rays in four, so that soft, half-trained densities give a closed surface where a
     fixed level would leave holes or nothing. Where densities are hard, one voxel that swallows half the light is enough (the first term):
     a higher level would eat thin parts.
@@ -66,28 +66,28 @@ def automatic_threshold(volume: Volume, lines: int = 24) -> float:
     found, highest = [], 0.0
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
-        for i in _spread(grid[first] // brick, lines):
-            for j in _spread(grid[second] // brick, lines):
+        for i in _evenly_spaced(grid[first] // brick, lines):
+            for j in _evenly_spaced(grid[second] // brick, lines):
                 low, high = np.zeros(3, np.int64), grid.copy()
                 low[first], low[second] = i * brick, j * brick
                 high[first], high[second] = low[first] + brick, low[second] + brick
                 block = np.asarray(volume.density_block(low, high), np.float64)
                 sigma = np.moveaxis(block, axis, -1).reshape(-1, grid[axis])  # (R, S)
                 highest = max(highest, float(sigma.max()))
-                found += [_met_on_the_way(ray, voxel) for ray in (sigma, sigma[:, ::-1])]
+                found += [_densities_on_entry(ray, voxel) for ray in (sigma, sigma[:, ::-1])]
     levels = np.concatenate(found)
     if not len(levels):
         raise NoSurface(f"no ray through the volume loses half its light; the highest density seen is {highest:.3g} per unit and a voxel is {voxel:.3g} wide")
     return float(min(np.log(2) / voxel, np.quantile(levels, 0.25)))
 
 
-def _spread(count: int, most: int) -> np.ndarray:
+def _evenly_spaced(count: int, most: int) -> np.ndarray:
     """At most `most` of the numbers 0..count-1, evenly spread."""
     return np.unique((np.arange(min(count, most)) + 0.5) * count // min(count, most)).astype(np.int64)
 
 
-def _met_on_the_way(sigma: np.ndarray, voxel: float) -> np.ndarray:
-    """(R, S) densities in the order in which light meets them -> the highest up to the depth of half transmittance, of the rays that have one."""
+def _densities_on_entry(sigma: np.ndarray, voxel: float) -> np.ndarray:
+    """(R, S) densities along rays -> the highest up to the depth of half transmittance, of the rays that have one."""
     depth = np.cumsum(sigma, 1) * voxel  # (R, S) optical depth
     opaque = depth[:, -1] >= np.log(2)
     half = (depth[opaque] < np.log(2)).sum(1)  # (R,) first voxel behind which less than half is left
@@ -126,7 +126,7 @@ def _filled_block(volume: Volume, low: np.ndarray, high: np.ndarray, threshold: 
     """`volume.density_block` with infinite density in enclosed space.
 
     What is enclosed grows by a few voxels, as far as nothing dense is in the way: into the corners that its coarse cells left out, and
-    into the pinholes, which it stops up. The margin that is read makes the result the same for both blocks that share a plane.
+    into pinholes, which it fills. The margin that is read makes the result the same for both blocks that share a plane.
     """
     from scipy.ndimage import binary_dilation
 
@@ -186,10 +186,10 @@ def isosurface(
     rows, keys = np.concatenate(seams), np.concatenate(joined)
     _, first, index = np.unique(keys, return_index=True, return_inverse=True)
     target[rows] = rows[first][index]
-    lattice, triangles = compact(np.concatenate(positions), target[np.concatenate(faces)])
+    grid_points, triangles = compact(np.concatenate(positions), target[np.concatenate(faces)])
     # Sample i lies at the middle of voxel i. What closes the surface at the boundary must not stand out of the box.
-    lattice = np.clip(lattice + 0.5, 0, grid)
-    return np.asarray(volume.bounds_min, np.float64) + lattice * float(volume.voxel), triangles
+    grid_points = np.clip(grid_points + 0.5, 0, grid)
+    return np.asarray(volume.bounds_min, np.float64) + grid_points * float(volume.voxel), triangles
 
 
 def _opacity(sigma: np.ndarray, low: np.ndarray, threshold: float) -> np.ndarray:
@@ -219,13 +219,13 @@ def _on_seams(local: np.ndarray, low: np.ndarray, high: np.ndarray, grid: np.nda
 
 
 def visible_parts(vertices: np.ndarray, faces: np.ndarray, min_component: float, viewpoints: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """The closed mesh without what nobody needs: small pieces, hollows, and what lies in hollows.
+    """The closed mesh without small components, hollows, and what lies in hollows.
 
-    min_component   pieces with less than this share of the largest piece's area are removed
-    returns         vertices, faces, and how many pieces went for which reason
+    min_component   components with less than this share of the largest one's area are removed
+    returns         vertices, faces, and how many components were removed for which reason
 
-    A piece that encloses a negative volume is the wall of a hollow inside something solid. Its density is real (photographs do not say what
-    is inside a body) but it cannot be seen from anywhere outside, and neither can the pieces in it. All of this is kept where one of the
+    A component that encloses a negative volume is the wall of a hollow inside something solid. It cannot be seen from anywhere outside, and neither can
+    the components in it. All of this is kept where one of the
     `viewpoints` (N, 3) lies in a hollow: that is a room, seen from inside.
     """
     label = face_components(faces, len(vertices))
@@ -242,7 +242,7 @@ def visible_parts(vertices: np.ndarray, faces: np.ndarray, min_component: float,
     first[label[::-1]] = faces[::-1, 0]
     inside = np.zeros(len(area), bool)
     if len(walls):
-        inside[large] = [_crossings(vertices[first[piece]], walls) % 2 == 1 for piece in np.flatnonzero(large)]
+        inside[large] = [_crossings(vertices[first[component]], walls) % 2 == 1 for component in np.flatnonzero(large)]
     kept = large & ~inside
     counts = {"small_removed": ~hollow & ~large, "hollows_removed": hollow, "hidden_removed": inside}
     return *compact(vertices, faces[kept[label]]), {"components_found": len(area), **{name: int(which.sum()) for name, which in counts.items()}}
@@ -282,12 +282,12 @@ def surface_colours(
         best = np.argsort(-weight, 1, kind="stable")[:, :3]  # three samples carry nearly all
         share = np.take_along_axis(weight, best, 1)
         chosen = np.take_along_axis(samples, best[..., None], 1).reshape(-1, 3)
-        seen = []
+        views = []
         for direction in _view_directions(normal) if view_directions is None else view_directions(point, normal):
             along = np.repeat(direction, best.shape[1], 0)
             found = np.asarray(volume.colour(chosen, along), np.float64).reshape(-1, best.shape[1], 3)
-            seen.append((found * share[..., None]).sum(1) / share.sum(1, keepdims=True))
-        colours[part] = np.clip(np.median(seen, 0), 0, 1)
+            views.append((found * share[..., None]).sum(1) / share.sum(1, keepdims=True))
+        colours[part] = np.clip(np.median(views, 0), 0, 1)
     progress(len(positions), len(positions), "colours")
     return colours
 
@@ -302,7 +302,7 @@ def _view_directions(normal: np.ndarray) -> list[np.ndarray]:
     return [-normal, *slanted]
 
 
-def _shape(
+def _cleaned_surface(
     volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
     level = automatic_threshold(volume) if threshold is None else float(threshold)
@@ -317,7 +317,7 @@ def _shape(
     return vertices, faces, {"threshold": level, "threshold_chosen": "automatic" if threshold is None else "given", **facts}
 
 
-_NOBODY = np.zeros((0, 3))
+_NO_VIEWPOINTS = np.zeros((0, 3))
 
 
 def surface(
@@ -327,16 +327,16 @@ def surface(
     faces: int = 200_000,
     min_component: float = 0.01,
     rounds: int = 10,
-    viewpoints: np.ndarray = _NOBODY,
+    viewpoints: np.ndarray = _NO_VIEWPOINTS,
     progress: Progress = _silent,
 ) -> Mesh:
     """The volume's surface as a closed, coloured mesh in the training frame.
 
     threshold      density per world unit at which it is drawn; None: `automatic_threshold`
     faces          budget that it is decimated to
-    min_component  pieces with less than this share of the largest piece's area are removed
+    min_component  components with less than this share of the largest one's area are removed
     rounds         of smoothing
-    viewpoints     (N, 3) where somebody may look from who is inside the volume: what can be seen from there is not filled
+    viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
     progress       called with (done, total, text); what it raises stops the work
 
     Of an `NdcVolume` it is the surface in normalised device coordinates (budget, rounds and sizes of components count there), in the world.
@@ -344,11 +344,11 @@ def surface(
     Raises NoSurface.
     """
     ndc = volume if isinstance(volume, NdcVolume) else None
-    viewpoints = viewpoints if ndc is None else _NOBODY  # the cameras are before the near plane, outside of the volume
-    vertices, triangles, facts = _shape(volume, threshold, min_component, rounds, viewpoints, progress)
+    viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS  # the cameras are before the near plane, outside of the volume
+    vertices, triangles, facts = _cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
-    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints)  # crumbs that had hung on by an edge
+    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints)  # small components that decimation cut off
     normals = vertex_normals(vertices, triangles)
     colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
     mesh = Mesh(vertices, triangles, normals, colours, facts)
@@ -362,18 +362,18 @@ def points(
     *,
     min_component: float = 0.01,
     rounds: int = 10,
-    viewpoints: np.ndarray = _NOBODY,
+    viewpoints: np.ndarray = _NO_VIEWPOINTS,
     seed: int = 0,
     progress: Progress = _silent,
 ) -> PointCloud:
     """`count` points spread evenly over the surface (before decimation), with normals and colours. Raises NoSurface.
 
     The same for the same seed; the other arguments as for `surface`. Of an `NdcVolume` they are spread evenly in normalised device
-    coordinates, as pictures show them: sparser in the world the further they are.
+    coordinates, as images show them: sparser in the world the further they are.
     """
     ndc = volume if isinstance(volume, NdcVolume) else None
-    viewpoints = viewpoints if ndc is None else _NOBODY
-    vertices, triangles, _ = _shape(volume, threshold, min_component, rounds, viewpoints, progress)
+    viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS
+    vertices, triangles, _ = _cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
     face, weight = sample(vertices, triangles, count, seed)
     corners = triangles[face]  # (N, 3)
     normals = (vertex_normals(vertices, triangles)[corners] * weight[..., None]).sum(1)

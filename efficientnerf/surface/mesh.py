@@ -1,4 +1,4 @@
-"""Triangle meshes: measuring, cleaning, smoothing, thinning and sampling them. Arrays in, arrays out; nothing here knows a tree or a file.
+"""Triangle meshes: measuring, cleaning, smoothing, decimating and sampling them. Arrays in, arrays out.
 
 V vertices, F faces (counter-clockwise seen from outside), C connected components.
 """
@@ -39,16 +39,17 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Topology:
-    """How the faces hang together.
+    """How the faces are connected.
 
-    watertight  each edge belongs to exactly two faces that run along it in opposite directions
-    open_edges  edges with one face; crowded_edges: with more than two
-    components  pieces connected by vertices
+    watertight          each edge belongs to exactly two faces that run along it in opposite directions
+    open_edges          edges with one face
+    non_manifold_edges  edges with more than two faces
+    components          connected by vertices
     """
 
     watertight: bool
     open_edges: int
-    crowded_edges: int
+    non_manifold_edges: int
     components: int
 
 
@@ -65,7 +66,9 @@ def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F,) areas."""
-    return 0.5 * np.linalg.norm(face_vectors(vertices, faces), axis=1)
+    import trimesh
+
+    return np.asarray(trimesh.triangles.area(vertices[faces]))
 
 
 def face_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -90,29 +93,26 @@ def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def face_components(faces: np.ndarray, count: int) -> np.ndarray:
-    """(F,) the connected piece, 0..C-1, that each face belongs to; `count` is the number of vertices. Pieces are numbered by their first vertex."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    """(F,) the connected component, 0..C-1, of each face; `count` is the number of vertices. Components are numbered by their first vertex."""
+    import trimesh
 
     if not len(faces):
         return np.zeros(0, np.int64)
-    tail, head = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
-    graph = coo_matrix((np.ones(len(tail), np.int8), (tail, head)), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
-    _, label = np.unique(label[faces[:, 0]], return_inverse=True)  # only pieces that have faces
+    label = trimesh.graph.connected_component_labels(trimesh.geometry.faces_to_edges(faces), node_count=count)
+    _, label = np.unique(label[faces[:, 0]], return_inverse=True)  # only components that have faces
     return label.astype(np.int64)
 
 
 def topology(vertices: np.ndarray, faces: np.ndarray) -> Topology:
-    """Whether the mesh is closed, and its pieces."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])  # (3F, 2)
-    forward = edges[:, 0] < edges[:, 1]
-    key = edges.min(1) * np.int64(max(len(vertices), 1)) + edges.max(1)
-    _, index, uses = np.unique(key, return_inverse=True, return_counts=True)
-    balance = np.bincount(index, np.where(forward, 1, -1), minlength=len(uses))
-    label = face_components(faces, len(vertices))
-    watertight = bool(len(faces)) and bool((uses == 2).all()) and bool((balance == 0).all())
-    return Topology(watertight, int((uses == 1).sum()), int((uses > 2).sum()), int(label.max()) + 1 if len(label) else 0)
+    """Whether the mesh is closed, and its components."""
+    import trimesh
+
+    if not len(faces):
+        return Topology(False, 0, 0, 0)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    uses = np.bincount(mesh.edges_unique_inverse)
+    watertight = bool(mesh.is_watertight and mesh.is_winding_consistent)
+    return Topology(watertight, int((uses == 1).sum()), int((uses > 2).sum()), int(face_components(faces, len(vertices)).max()) + 1)
 
 
 def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -166,22 +166,22 @@ def _folded(faces: np.ndarray, count: int) -> np.ndarray:
 
 
 def separate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give sheets that touch in an edge vertices of their own, so that each edge has two faces; the surface must be closed.
+    """Split vertices of non-manifold edges, so that each edge has two faces; the surface must be closed.
 
     Around a vertex, the opposite sides of its faces form directed circuits, as many in as out of each neighbour. A circuit that passes a
     neighbour twice is cut there into simple ones, and each gets a copy of the vertex, drawn a hundredth of the way to its own neighbours:
-    readers that join equal positions would sew the sheets together again. Collapsing edges leaves such places where a surface is thin.
+    readers that merge equal positions would join the sheets again. Edge collapse leaves such edges where a surface is thin.
     """
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     pairs, uses = np.unique(edges, axis=0, return_counts=True)
-    crowded = np.unique(pairs[uses > 2])
-    if not len(crowded):
+    on_edges = np.unique(pairs[uses > 2])
+    if not len(on_edges):
         return vertices, faces
     faces, count = faces.copy(), len(vertices)
     added: list[np.ndarray] = []
     moves: dict[int, np.ndarray] = {}
-    around: dict[int, list[int]] = {int(vertex): [] for vertex in crowded}
-    touched = np.isin(faces, crowded)
+    around: dict[int, list[int]] = {int(vertex): [] for vertex in on_edges}
+    touched = np.isin(faces, on_edges)
     for row, column in zip(*np.nonzero(touched)):
         around[int(faces[row, column])].append(int(row))
     for vertex, rows in around.items():

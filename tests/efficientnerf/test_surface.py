@@ -106,7 +106,7 @@ def test_decimated_noise_stays_closed() -> None:
     vertices, faces = isosurface(Noise(), 1.0)
     vertices, faces = separate(*tidy(*decimate(smooth(vertices, faces, 3), faces, len(faces) // 3)))
     assert topology(vertices, faces).open_edges == 0
-    assert topology(vertices, faces).crowded_edges == 0
+    assert topology(vertices, faces).non_manifold_edges == 0
 
 
 def test_decimation_makes_no_spikes() -> None:
@@ -121,7 +121,7 @@ def test_touching_sheets_are_separated() -> None:
     second = np.array([[0, 1, 4], [0, 5, 1], [1, 5, 4], [4, 5, 0]])
     vertices = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]], float)
     faces = np.concatenate([first, second])
-    assert topology(vertices, faces).crowded_edges == 1
+    assert topology(vertices, faces).non_manifold_edges == 1
     apart = topology(*separate(vertices, faces))
     assert apart.watertight
     assert apart.components in (1, 2)  # one end of the edge is enough
