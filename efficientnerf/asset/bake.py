@@ -1,7 +1,7 @@
 """From a trained model to a NerfTree (EfficientNeRF, section 3.5; the choice and averaging of voxels after PlenOctree).
 
-1. `visible_voxels`: every voxel's greatest fine weight over the training pixels, both stages run as in training; and, for photographs, what these
-   pixels show before and behind the box.
+1. `visible_voxels`: the greatest fine weight of each voxel over training pixels, both stages run as in training; and, of unbounded scenes, what
+   these pixels show before and behind the box.
 2. `chosen_voxels`: those above a threshold, dilated by one voxel so that linear interpolation has all its corners.
 3. `voxel_values`: density and harmonics averaged over several jittered points of each voxel, in blocks.
 4. `efficientnerf.asset.refinement` fits the tree of these to the training images; voxels that do not show are dropped.
@@ -40,11 +40,11 @@ def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int,
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """What the network showed of the voxels, and of what lies outside of the box.
+    """The greatest weight of each voxel in training pixels, and what these show outside of the box.
 
-    cells     (B,) int64 flat coarse cells (x slowest) in which any sample fell, ascending
+    cells     (B,) int64 flat coarse cells (x slowest) that hold any sample, ascending
     greatest  (B, brick^3) float32, each voxel's greatest weight
-    chosen    (P,) int64 pixels that were looked at
+    chosen    (P,) int64 the pixels
     before    (P, 4) float16 premultiplied colour and opacity between camera and box; None on a constant background, as the next
     behind    (P, 3) float16 colour beyond the box
     """
@@ -61,9 +61,9 @@ def visible_voxels(
     m: Model, pixels: Pixels, shape: tuple[int, int, int], voxel: float, bounds_min: np.ndarray, brick: int, count: int, done: Callable[[int, int], None],
     space: Space | None = None,
 ) -> Visibility:  # fmt: skip
-    """Greatest weight of each voxel over about `count` training pixels, evenly spread. Memory grows with the cells that are met, not with the grid.
+    """Greatest weight of each voxel over about `count` training pixels, evenly spread. Memory grows with the occupied cells, not with the grid.
 
-    done   called with pixels looked at and their number
+    done   called with the number of pixels done and of all
     space  the network's, in the frame that the voxels are cubes of: see `NdcSpace.with_voxel_depth`; None: the network's own
     """
     space = space or m.space
@@ -73,18 +73,18 @@ def visible_voxels(
     rows = 0
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
     chosen = spread_pixels(pixels, count)
-    surroundings = []
+    outside = []
     for begin in range(0, len(chosen), RAYS_PER_BLOCK):
         bundle = pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])
         origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
         behind = m.behind(directions)
-        seen = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
+        outputs = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
         if m.background is None:
-            parts = split_by_box(m, origins, directions, torch.ones_like(near), seen, behind)
-            surroundings.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
-        at = torch.floor((space.world(seen.fine.point).cpu() - low) / voxel).long()
+            parts = split_by_box(m, origins, directions, torch.ones_like(near), outputs, behind)
+            outside.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
+        at = torch.floor((space.world(outputs.fine.point).cpu() - low) / voxel).long()
         inside = ((at >= 0) & (at < size)).all(dim=1)
-        at, weight = at[inside], seen.fine_weight.cpu()[inside]
+        at, weight = at[inside], outputs.fine_weight.cpu()[inside]
         cell = at // brick
         local, flat = at - cell * brick, (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
         new = torch.unique(flat[row_of[flat] < 0])
@@ -96,46 +96,46 @@ def visible_voxels(
         greatest.view(-1).scatter_reduce_(0, slot, weight, reduce="amax")
         done(min(len(chosen), begin + RAYS_PER_BLOCK), len(chosen))
     cells = torch.nonzero(row_of >= 0).squeeze(1)
-    before, beyond = (np.concatenate(part) for part in zip(*surroundings, strict=True)) if surroundings else (None, None)
+    before, beyond = (np.concatenate(part) for part in zip(*outside, strict=True)) if outside else (None, None)
     return Visibility(cells.numpy(), greatest[row_of[cells].long()].numpy(), chosen, before, beyond)
 
 
 def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
-    """About `count` usable pixels, one of each stretch of so many, at random: always the same one would visit a few columns alone where the stretch
+    """About `count` usable pixels: one at random of each run of `len(pixels) / count`. A fixed one would hit a few columns alone where the run
     divides the width."""
     total = len(pixels)
     stride = max(1, total // max(count, 1))
-    stretches = np.arange(0, total, stride)
-    chosen = np.minimum(stretches + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(stretches)), total - 1)
+    starts = np.arange(0, total, stride)
+    chosen = np.minimum(starts + np.random.Generator(np.random.Philox(key=0)).integers(stride, size=len(starts)), total - 1)
     return chosen[pixels.usable_at(chosen)]
 
 
 def coarsened(
-    seen: Visibility, shape: tuple[int, int, int], voxel: float, to_shape: tuple[int, int, int], to_voxel: float, brick: int, threshold: float
+    visibility: Visibility, shape: tuple[int, int, int], voxel: float, to_shape: tuple[int, int, int], to_voxel: float, brick: int, threshold: float
 ) -> Visibility:
-    """What was seen of a grid, for one of larger voxels of the same corner: each of these has the greatest weight of the voxels whose centres lie in it.
-    Weights that don't exceed `threshold` are left out."""
+    """The visibility of a grid of larger voxels with the same corner: each has the greatest weight of the voxels whose centres lie in it.
+    Weights that do not exceed `threshold` are left out."""
     from efficientnerf.backends.numba.bricks import resample_weights
 
     row_of = np.full(math.prod(to_shape), -1, np.int32)
-    given = seen.cells, seen.greatest, float(np.float32(threshold)), shape, to_shape, voxel / to_voxel, brick, row_of
+    given = visibility.cells, visibility.greatest, float(np.float32(threshold)), shape, to_shape, voxel / to_voxel, brick, row_of
     rows = resample_weights(*given, np.zeros((0, brick**3), np.float32), 0)
     greatest = np.zeros((rows, brick**3), np.float32)
     resample_weights(*given, greatest, rows)
     cells = np.flatnonzero(row_of >= 0)
-    return replace(seen, cells=cells, greatest=greatest[row_of[cells]])
+    return replace(visibility, cells=cells, greatest=greatest[row_of[cells]])
 
 
-def chosen_voxels(seen: Visibility, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
+def chosen_voxels(visibility: Visibility, shape: tuple[int, int, int], brick: int, threshold: float, dilate: int) -> np.ndarray:
     """Coordinates (N, 3) int32 of the voxels whose greatest weight exceeds `threshold`, and of those around them, in the order of the grid.
 
-    They are marked in the cells that they reach, so that memory grows with what is found, and neither with the grid nor with the neighbours looked at.
+    They are marked in the cells that they reach, so that memory grows with the result, and neither with the grid nor with the number of neighbours.
     """
     from efficientnerf.backends.numba.bricks import flat_indices, threshold_and_dilate
 
     threshold = float(np.float32(threshold))
     reached = np.zeros(shape, bool)
-    reached.reshape(-1)[seen.cells[(seen.greatest > threshold).any(axis=1)]] = True
+    reached.reshape(-1)[visibility.cells[(visibility.greatest > threshold).any(axis=1)]] = True
     for axis in range(3):
         for _ in range(math.ceil(dilate / brick)):
             low, high = reached.copy().swapaxes(0, axis), reached.swapaxes(0, axis)
@@ -145,7 +145,7 @@ def chosen_voxels(seen: Visibility, shape: tuple[int, int, int], brick: int, thr
     row_of = np.full(reached.size, -1, np.int32)
     row_of[cells] = np.arange(len(cells))
     into = np.zeros((len(cells), brick**3), bool)
-    threshold_and_dilate(seen.cells, seen.greatest, threshold, shape, brick, dilate, row_of, into)
+    threshold_and_dilate(visibility.cells, visibility.greatest, threshold, shape, brick, dilate, row_of, into)
     flat = np.empty(np.count_nonzero(into), np.int64)
     flat_indices(into, cells, shape, brick, flat)
     flat.sort()
@@ -162,10 +162,10 @@ def voxel_values(
     """Density (n,) and harmonics (n, K, 3) of the voxels, block by block from the `first`-th block on.
 
     points  jittered points to a voxel: one in each of so many slices along a diagonal permutation, averaged; densities as they are,
-            harmonics weighted by density; 0: the centre of the voxel alone, for fields that were trained on these (`train.discretise`)
+            harmonics weighted by density; 0: the centre of the voxel alone, for fields trained on these (`train.discretise`)
     space   as in `visible_voxels`
 
-    Where the density voxels or the coarse field say that space is empty the density is zero: the fine field is hardly asked there and may say anything.
+    The density is zero where the density voxels or the coarse field have space empty: the fine field is hardly evaluated there in training.
     """
     space = space or m.space
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
@@ -180,17 +180,17 @@ def voxel_values(
         raw = m.fine(m.snapped_points(point))
         valid = m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold
         density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
-        density = density * _looked_into(m, space.grid((block + 0.5) * voxel + low))[:, None]
+        density = density * _has_pivots(m, space.grid((block + 0.5) * voxel + low))[:, None]
         share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
         yield density.mean(dim=1).cpu().numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().cpu().numpy()
 
 
-def _looked_into(m: Model, grid: torch.Tensor) -> torch.Tensor:
-    """(n,) bool on the model's device: whether the coarse field at grid coordinates (n, 3) absorbs as much over an interval as a valid density voxel has to.
+def _has_pivots(m: Model, grid: torch.Tensor) -> torch.Tensor:
+    """(n,) bool on the model's device: whether the coarse field at grid coordinates (n, 3) absorbs as much over an interval as a valid density voxel.
 
-    Where it says less a pivot is among the lightest of its ray and dropped before the subject, but not before the sky: the network hides what
-    the fine field has there just where it would be seen, and nothing in the asset could.
+    Where it absorbs less, a sample is among the lightest of its ray: it is no pivot before the subject, though it may be one before the sky. So the
+    field hides what it has there just where it would be seen, and the asset could not.
     """
     if m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
         return torch.ones(len(grid), dtype=torch.bool, device=m.device)

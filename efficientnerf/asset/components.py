@@ -1,4 +1,4 @@
-"""Pieces of a tree that hang apart from the rest: scraps of the surroundings that the box cuts off, and specks."""
+"""Small connected components of a tree: what the box cuts off from the rest of the scene, and floaters."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
-SPECK = 0.01  # of `share`: a piece with less than that is left out wherever it hangs
+INTERIOR_RATIO = 0.01  # of `share`: the limit of components that reach no face of the grid
 
 
 def small_components(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarray:
-    """Which of the stored voxels that are to be kept, (N,) bool, belong to scraps: (N,) bool.
+    """Which of the voxels `keep`, (N,) bool, belong to small connected components: (N,) bool.
 
-    Coarse cells that hold a kept voxel and touch, at a corner too, are one piece: matter a coarse cell apart is apart. Scraps are pieces with less
-    than `share` of the largest piece's voxels if they reach a face of the grid, where the box has cut them from something outside, and pieces
-    with less than SPECK of that anywhere. In normalised device coordinates nothing lies beyond the far face, so that reaching a face says nothing.
+    A component is made of coarse cells that hold such a voxel and touch, at a corner too. It is small with less than `share` of the largest
+    one's voxels if it reaches a face of the grid, where the box may have cut it off, and with less than INTERIOR_RATIO of that elsewhere. In
+    normalised device coordinates nothing lies beyond the far face, so that reaching a face says nothing.
     """
     from scipy import ndimage
 
@@ -32,15 +32,15 @@ def small_components(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarr
     occupied = np.zeros(tree.shape, bool)
     occupied.reshape(-1)[cells] = True
     labels, count = ndimage.label(occupied, structure=np.ones((3, 3, 3), bool))
-    piece_of = np.zeros(len(count_of), np.int64)
-    piece_of[brick[cells]] = labels.reshape(-1)[cells]
-    voxels = np.bincount(piece_of, weights=count_of, minlength=count + 1)
-    cut = np.zeros(count + 1, bool)
+    component_of = np.zeros(len(count_of), np.int64)
+    component_of[brick[cells]] = labels.reshape(-1)[cells]
+    voxels = np.bincount(component_of, weights=count_of, minlength=count + 1)
+    at_face = np.zeros(count + 1, bool)
     if tree.ndc is None:
         for axis in range(3):
             for end in (0, -1):
-                cut[np.take(labels, end, axis=axis)] = True
-    scrap = voxels < share * voxels.max() * np.where(cut, 1.0, SPECK)
+                at_face[np.take(labels, end, axis=axis)] = True
+    small = voxels < share * voxels.max() * np.where(at_face, 1.0, INTERIOR_RATIO)
     out = np.zeros(len(keep), bool)
-    out[tree.voxel_index[stored]] = np.repeat(scrap[piece_of], count_of)
+    out[tree.voxel_index[stored]] = np.repeat(small[component_of], count_of)
     return out

@@ -1,6 +1,6 @@
-"""The container of an asset: a safetensors file with one metadata entry, opened without believing anything it says.
+"""The container of an asset: a safetensors file with one metadata entry, opened without trusting it.
 
-Everything that a stranger's file claims is checked against the file's size before memory for it is allocated, and nothing in it is run.
+Everything that a file states is checked against the file's size before memory for it is allocated, and nothing in it is run.
 """
 
 from __future__ import annotations
@@ -108,11 +108,11 @@ class Header:
         return values.reshape(shape)
 
     def read_verified(self, name: str) -> np.ndarray:
-        """The tensor, if its bytes have the digest that the metadata say."""
+        """The tensor, if its bytes have the digest in the metadata."""
         values, digests = self.read(name), self.meta.get("sha256")
         want = digests.get(name) if isinstance(digests, dict) else None
         found = hashlib.sha256(values.tobytes()).hexdigest()
         if found != want:
-            said = f"has SHA-256 {found[:12]}…, the file says {str(want)[:12]}…"
-            raise FormatError(f"{self.name}: tensor '{name}' {said}; the file is damaged. Bake it again or copy it anew.")
+            problem = f"has SHA-256 {found[:12]}…, the file says {str(want)[:12]}…"
+            raise FormatError(f"{self.name}: tensor '{name}' {problem}; the file is damaged. Bake it again or copy it anew.")
         return values

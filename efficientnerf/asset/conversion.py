@@ -1,4 +1,4 @@
-"""A tree made smaller: fewer harmonics, fewer voxels, or none that can't be seen.
+"""Smaller trees: fewer harmonics, larger voxels, or without voxels that cannot be seen.
 
 N voxels, K harmonics, M samples along each side of a new voxel.
 """
@@ -19,7 +19,7 @@ MOST_SAMPLES = 16  # along a side
 
 
 def with_degree(tree: NerfTree, degree: int) -> NerfTree:
-    """The harmonics up to `degree` alone: they are orthonormal, so that this is the nearest in logits that so few can come. Codes stay codes."""
+    """The harmonics up to `degree` alone: they are orthonormal, so that this is the nearest in logits. Codes stay codes."""
     if not 0 <= degree <= tree.degree:
         raise ValueError(f"harmonics of degree {degree} from an asset of degree {tree.degree}; expected 0 to {tree.degree}")
     kept = harmonics_count(degree)
@@ -38,7 +38,7 @@ def with_degree(tree: NerfTree, degree: int) -> NerfTree:
 def with_resolution(tree: NerfTree, resolution: int) -> NerfTree:
     """The same grid box in larger voxels, `resolution` of them where the longest side has more now.
 
-    A new voxel gets the density that lets as much light through as the ones in its place do, on average over the rays along the three axes that
+    A new voxel gets the density with the mean transmittance of the ones in its place, over the rays along the three axes that
     cross it; an average of densities would make a thin wall opaque all over its new voxel. Harmonics are averaged by opacity.
     """
     most = max(tree.resolution)
@@ -73,8 +73,8 @@ def _merged(tree: NerfTree, indices: np.ndarray, ratio: float, count: int) -> tu
     known: np.ndarray = np.greater_equal(voxel, 0)
     density = np.where(known, tree.density_values[np.maximum(voxel, 0)], 0).astype(np.float64)
     side = tree.voxel * ratio
-    light = [np.exp(-density.mean(axis=axis) * side).mean(axis=(1, 2)) for axis in (1, 2, 3)]
-    merged = -np.log(np.maximum(np.mean(light, axis=0), 1e-30)) / side
+    transmittance = [np.exp(-density.mean(axis=axis) * side).mean(axis=(1, 2)) for axis in (1, 2, 3)]
+    merged = -np.log(np.maximum(np.mean(transmittance, axis=0), 1e-30)) / side
     # Where nothing absorbs, what is stored has an equal say.
     share = np.where(known, -np.expm1(-density * tree.voxel) + 1e-6, 0).reshape(len(indices), count**3)
     share /= np.maximum(share.sum(axis=1, keepdims=True), 1e-12)
@@ -87,7 +87,7 @@ def _merged(tree: NerfTree, indices: np.ndarray, ratio: float, count: int) -> tu
 
 
 def pruned(tree: NerfTree) -> NerfTree:
-    """Without the voxels that no picture shows: those of density 0 among neighbours of density 0. Pictures stay as they are."""
+    """Without the voxels that cannot be seen: those of density 0 among neighbours of density 0. Renders stay as they are."""
     at = coordinates(tree)
     lit: np.ndarray = np.greater(tree.density_values, 0)
     for offset in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
@@ -101,7 +101,7 @@ def pruned(tree: NerfTree) -> NerfTree:
     # tree_from_voxels sorts: the numbers of the voxels left, in its order.
     order = lookup(tree, coordinates(left))
     held = tree.harmonics
-    harmonics = held.chosen(order) if isinstance(held, PaletteHarmonics) else held[order]
+    harmonics = held.subset(order) if isinstance(held, PaletteHarmonics) else held[order]
     return replace(tree, brick_index=left.brick_index, voxel_index=left.voxel_index, density_values=left.density_values, harmonics=harmonics)
 
 

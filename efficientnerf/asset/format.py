@@ -1,7 +1,7 @@
 """The asset file: format 1, specified in FORMAT.md beside this module.
 
-A safetensors container (`container.py`) of a few tensors (`layouts.py`) and one metadata entry (`metadata.py`). Everything that a stranger's
-file says is checked against the file's size and against the other tensors before memory for it is allocated.
+A safetensors container (`container.py`) of a few tensors (`layouts.py`) and one metadata entry (`metadata.py`). Everything that an untrusted
+file states is checked against the file's size and against the other tensors before memory for it is allocated.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ Tensors = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Layout:
-    """What one layout is made of.
+    """The tensors of one layout, and how they are read.
 
     minor    the format 1.x that brought it
     tensors  names beside `coarse.occupancy`, and the types that each may have

@@ -1,4 +1,4 @@
-"""What an asset says of itself beside its tensors, checked: the rules of FORMAT.md, section 2."""
+"""The metadata of an asset, checked: the rules of FORMAT.md, section 2."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, 
 
 
 def _check_frame(name: str, meta: dict[str, Any]) -> None:
-    """What may be said of the capture's frame and of the cameras' orbit must be sound where it is said."""
+    """The capture's frame and the cameras' orbit, where they are given."""
     for key in ("world_from_capture", "orbit"):
         if not isinstance(meta.get(key, {}), dict):
             raise FormatError(f"{name}: metadata '{key}' is {str(meta[key])[:60]}; expected an object")
@@ -65,18 +65,18 @@ def _check_frame(name: str, meta: dict[str, Any]) -> None:
 
 
 def layout_of(meta: dict[str, Any]) -> str:
-    """Which tables of tensors hold, whatever frame the grid lies in and however it is looked up."""
+    """The layout of the tensors, without the prefixes of frame and lookup."""
     return str(meta.get("layout")).removeprefix(NEAREST_PREFIX).removeprefix(NDC_PREFIX)
 
 
 def layout_name(layout: str, *, ndc: bool, lookup: str) -> tuple[str, int]:
-    """What a file of these tables calls its layout, and the minor version that knows the name; 0 where no prefix is needed."""
+    """The layout's name with its prefixes, and the minor version that brought them; 0 without prefixes."""
     name, minor = (NDC_PREFIX + layout, NDC_MINOR) if ndc else (layout, 0)
     return (NEAREST_PREFIX + name, NEAREST_MINOR) if lookup == "nearest" else (name, minor)
 
 
 def lookup_of(name: str, meta: dict[str, Any]) -> str:
-    """How the voxels are looked up; the layout's name and the key `lookup` must say the same."""
+    """How the voxels are looked up; the layout's name and the key `lookup` must agree."""
     nearest = str(meta.get("layout")).startswith(NEAREST_PREFIX)
     found, expected = meta.get("lookup", None if nearest else "trilinear"), "nearest" if nearest else "trilinear"
     if found != expected:

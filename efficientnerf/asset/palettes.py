@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-BLOCK = 2**18  # voxels that are decoded at once
+BLOCK = 2**18  # voxels decoded at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class PaletteHarmonics:
     palette     (P, K - 1, 3) float32; with 256 entries and nine harmonics 24 KiB, which a core's nearest cache holds
     groups      harmonics in each of the G groups; their sum is K - 1
 
-    Every code is below T or P: whoever builds one from what a stranger says checks that.
+    Every code is below T or P; readers of untrusted files check that.
     """
 
     base: np.ndarray
@@ -63,6 +63,6 @@ class PaletteHarmonics:
             out[block, 1:] = self.palette[codes[block][:, self.group_of], harmonic]
         return out
 
-    def chosen(self, voxels: np.ndarray) -> PaletteHarmonics:
-        """Of these voxels, in this order; tables are shared."""
+    def subset(self, voxels: np.ndarray) -> PaletteHarmonics:
+        """The codes of these voxels, in this order; tables are shared."""
         return PaletteHarmonics(np.ascontiguousarray(self.base[voxels]), self.base_table, np.ascontiguousarray(self.codes[voxels]), self.palette, self.groups)

@@ -1,6 +1,6 @@
 """From floats to codes: palettes for harmonics, a table for densities.
 
-Palettes are found by k-means over a sample of the voxels, drawn in proportion to how much each shows (its opacity), starting from k-means++
+Palettes are found by k-means over a sample of the voxels, drawn in proportion to their opacity, starting from k-means++
 (Arthur & Vassilvitskii 2007). Every draw is from a seeded generator and every sum has one order: the same tree gives the same codes.
 Vectors that are few enough to have an entry each keep their values, but for the rounding of the palette to halves.
 
@@ -21,8 +21,8 @@ from efficientnerf.rendering.harmonics import C0
 ENTRIES = 256  # of a table whose codes are bytes
 SAMPLES = 2**16
 ITERATIONS = 12
-FAINT = 1e-3  # optical depth of a voxel below which its density is nothing
-OPAQUE = 50.0  # optical depth above which a voxel shows no difference
+MIN_DEPTH = 1e-3  # optical depth of a voxel below which its density is rounded to zero
+MAX_DEPTH = 50.0  # optical depth above which a voxel looks the same
 LIMIT = 65000.0  # fits a half
 
 
@@ -33,9 +33,9 @@ def compacted(tree: NerfTree, entries: int = ENTRIES, groups: tuple[int, ...] | 
     groups   harmonics above the base that share a code, in order; one each by default
     """
     groups = (1,) * (tree.harmonics_count - 1) if groups is None else groups
-    share = -np.expm1(-tree.density_values * np.float32(tree.voxel))
+    opacity = -np.expm1(-tree.density_values * np.float32(tree.voxel))
     density = quantised_density(tree.density_values, tree.voxel)
-    return replace(tree, density_values=density, harmonics=quantised_harmonics(tree.sh, share, entries, groups))
+    return replace(tree, density_values=density, harmonics=quantised_harmonics(tree.sh, opacity, entries, groups))
 
 
 def quantised_density(density: np.ndarray, voxel: float) -> np.ndarray:
@@ -47,7 +47,7 @@ def quantised_density(density: np.ndarray, voxel: float) -> np.ndarray:
     if len(known) <= ENTRIES:
         return density
     depth = density.astype(np.float64) * voxel
-    low, high = FAINT, min(OPAQUE, float(depth.max()))
+    low, high = MIN_DEPTH, min(MAX_DEPTH, float(depth.max()))
     if high <= low:
         return np.zeros_like(density)
     level = np.rint(np.log(np.maximum(depth, low) / low) / math.log(high / low) * (ENTRIES - 2)).clip(0, ENTRIES - 2)
@@ -55,10 +55,10 @@ def quantised_density(density: np.ndarray, voxel: float) -> np.ndarray:
     return np.where(depth < low / 2, np.float32(0), table[level.astype(np.int64)])
 
 
-def quantised_harmonics(sh: np.ndarray, share: np.ndarray, entries: int, groups: tuple[int, ...]) -> PaletteHarmonics:
+def quantised_harmonics(sh: np.ndarray, opacity: np.ndarray, entries: int, groups: tuple[int, ...]) -> PaletteHarmonics:
     """Coefficients (N, K, 3) as codes.
 
-    share  (N,) how much each voxel shows, >= 0
+    opacity  (N,) of each voxel, >= 0: the weight of its vector
     """
     if sum(groups) != sh.shape[1] - 1:
         raise ValueError(f"groups {groups} hold {sum(groups)} harmonics; expected {sh.shape[1] - 1}")
@@ -69,7 +69,7 @@ def quantised_harmonics(sh: np.ndarray, share: np.ndarray, entries: int, groups:
     first = 0
     for group, size in enumerate(groups):
         vectors = np.ascontiguousarray(sh[:, 1 + first : 1 + first + size].reshape(len(sh), 3 * size))
-        centroids, codes[:, group] = clustered(vectors, share, entries, seed=group)
+        centroids, codes[:, group] = clustered(vectors, opacity, entries, seed=group)
         if len(centroids) > len(palette):
             palette = np.concatenate([palette, np.zeros((len(centroids) - len(palette), *palette.shape[1:]), np.float32)])
         palette[: len(centroids), first : first + size] = centroids.reshape(-1, size, 3)
@@ -81,7 +81,7 @@ def _base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Codes (N, 3) uint8 and table (T, 3) float32 of the base colour's coefficients (N, 3).
 
     The levels are evenly spaced on a curve that is four parts the colour that a coefficient makes by itself and one part the coefficient:
-    fine where colour changes, yet not blind where the other harmonics bring a saturated base back.
+    fine where colour changes, yet not flat where the other harmonics counter a saturated base.
     """
     codes, table = np.zeros(base.shape, np.uint8), np.zeros((ENTRIES, 3), np.float32)
     for channel in range(3) if len(base) else ():
@@ -100,12 +100,12 @@ def _base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return codes, table[: int(codes.max(initial=0)) + 1]
 
 
-def clustered(vectors: np.ndarray, share: np.ndarray, entries: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def clustered(vectors: np.ndarray, weight: np.ndarray, entries: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Centroids (P, D) float32, halves in value, P <= entries, and the code (n,) of each vector (n, D) float32."""
     from efficientnerf.backends.numba import kmeans
 
     rng = np.random.Generator(np.random.Philox(key=seed))
-    sample = _sample(vectors, share, max(SAMPLES, 16 * entries), rng)
+    sample = _sample(vectors, weight, max(SAMPLES, 16 * entries), rng)
     centroids = _seeded(sample, entries, rng)
     for _ in range(ITERATIONS):
         found, distance = _nearest(sample, centroids)
@@ -113,7 +113,7 @@ def clustered(vectors: np.ndarray, share: np.ndarray, entries: int, seed: int) -
         kmeans.sum_clusters(sample, found, total, count)
         moved = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], centroids).astype(np.float32)
         idle = np.flatnonzero(count == 0)
-        if len(idle):  # an entry that nothing chose takes the place of what is worst served
+        if len(idle):  # an empty cluster moves to the vector furthest from its centroid
             moved[idle] = sample[np.argsort(-distance, kind="stable")[: len(idle)]]
         if np.array_equal(moved, centroids):
             break
@@ -122,29 +122,29 @@ def clustered(vectors: np.ndarray, share: np.ndarray, entries: int, seed: int) -
     return centroids, _nearest(vectors, centroids)[0]
 
 
-def _sample(vectors: np.ndarray, share: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """All vectors if they are few, else `count` of them, in proportion to their share (and a hundredth of its mean, so that none is out)."""
+def _sample(vectors: np.ndarray, weight: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """All vectors if they are few, else `count` of them, in proportion to their weight (plus a hundredth of its mean, so that none is left out)."""
     if len(vectors) <= count:
         return vectors
-    weight = share.astype(np.float64)
+    weight = weight.astype(np.float64)
     weight += 0.01 * weight.mean() + 1e-12
     reached = np.cumsum(weight)
     return vectors[np.searchsorted(reached, (np.arange(count) + rng.random(count)) / count * reached[-1]).clip(0, len(vectors) - 1)]
 
 
 def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.ndarray:
-    """k-means++: each next centroid a vector drawn in proportion to its squared distance from those before; fewer where none is away."""
+    """k-means++: each next centroid a vector drawn in proportion to its squared distance from those before; fewer where all distances are zero."""
     from efficientnerf.backends.numba import kmeans
 
     if not len(sample):
         return np.zeros((0, sample.shape[1]), np.float32)
     most = max(SAMPLES // 4, 4 * entries)
     few = sample if len(sample) <= most else sample[rng.permutation(len(sample))[:most]]
-    turned = np.ascontiguousarray(few.T)
+    transposed = np.ascontiguousarray(few.T)
     chosen = [few[int(rng.integers(len(few)))]]
     distance = np.full(len(few), np.inf, np.float32)
     for _ in range(entries - 1):
-        kmeans.lower_distances(turned, chosen[-1], distance)
+        kmeans.lower_distances(transposed, chosen[-1], distance)
         reached = np.cumsum(distance, dtype=np.float64)
         if reached[-1] <= 0:
             break

@@ -1,4 +1,4 @@
-"""A tree as the tensors of a layout. WRITERS names what can be asked for:
+"""A tree as the tensors of a layout. WRITERS has them by name:
 
     compact  the file layout `compact`, a code of eight bits per harmonic       12 bytes a voxel of degree 2
     small    the same layout, one code of 16 bits for all harmonics              6
@@ -37,7 +37,7 @@ class Written:
 
 
 def written_as(tree: NerfTree, writer: str | None) -> Written:
-    """The tree's tensors as `writer` makes them; by default what loses nothing: `compact` for codes, else `sparse`."""
+    """The tree's tensors as `writer` makes them; by default the one that loses nothing: `compact` for codes, else `sparse`."""
     if writer is None:
         return _coded(tree) if isinstance(tree.harmonics, PaletteHarmonics) else _sparse(tree)
     if writer not in WRITERS:
@@ -106,7 +106,7 @@ def _coded(tree: NerfTree) -> Written:
 
     assert isinstance(tree.harmonics, PaletteHarmonics)
     order = order_of(tree)
-    codes = tree.harmonics.chosen(order)
+    codes = tree.harmonics.subset(order)
     table, density = np.unique(quantised_density(_densities(tree, order), tree.voxel), return_inverse=True)
     tensors = {
         "brick.mask": _mask(tree),

@@ -1,32 +1,32 @@
-"""Whether what is to be baked fits into memory: said before hours are spent, rather than found out when the system kills the process."""
+"""Whether a bake fits into memory, checked before it begins."""
 
 from __future__ import annotations
 
 import os
 
-COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and with the optimiser
+COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement
 
 
 def needed(voxels: int, harmonics: int) -> int:
-    """Bytes that density and K harmonics of so many voxels take while they are baked and fitted, in float32."""
+    """Bytes that density and K harmonics of so many voxels take while they are baked and refined, in float32."""
     return COPIES * 4 * (1 + 3 * harmonics) * voxels
 
 
 def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int) -> int:
-    """Bytes that such a tree takes on a device while it is fitted there (`efficientnerf.asset.refinement_device`): values and means of squares in
+    """Bytes that such a tree takes on a device while it is refined there (`efficientnerf.asset.refinement.device`): values and means of squares in
     float32, visits and stamps, sums of gradients in 64 bits; of bricks their voxels with a border; of the grid's cells three numbers while it is sent."""
     return (28 + 36 * harmonics) * voxels + 4 * (brick + 2) ** 3 * bricks + 12 * cells
 
 
 def free_on_device(device: str) -> int:
-    """Bytes that can be had on a CUDA device: those nobody has, and those that this process has reserved and not in use."""
+    """Bytes available on a CUDA device: free ones, and those that this process has reserved but not allocated."""
     import torch
 
     return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
 def installed() -> int | None:
-    """Bytes of memory that the machine has, or that its control group allows; None where that can't be told."""
+    """Bytes of memory that the machine has, or that its control group allows; None where that is unknown."""
     try:
         found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):

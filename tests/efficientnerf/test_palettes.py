@@ -35,7 +35,7 @@ def test_each_coefficient_is_its_entry(groups: tuple[int, ...], entries: int) ->
         assert decoded[n, k, c] == (codes.base_table[codes.base[n, c], c] if group is None else codes.palette[codes.codes[n, group], k - 1, c])
     some = np.array([4, 0, 9])
     assert np.array_equal(codes.decoded(some), decoded[some])
-    assert np.array_equal(codes.chosen(some).decoded(), decoded[some])
+    assert np.array_equal(codes.subset(some).decoded(), decoded[some])
 
 
 def test_a_tree_of_codes_is_asked_like_one_of_floats() -> None:

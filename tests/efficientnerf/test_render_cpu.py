@@ -426,7 +426,7 @@ def test_trees_whose_voxels_are_numbered_otherwise_look_the_same(layout: str) ->
         brick_index=np.where(tree.brick_index >= 0, np.argsort(bricks)[tree.brick_index], -1).astype(np.int32),
         voxel_index=np.where(tree.voxel_index >= 0, np.argsort(voxels)[tree.voxel_index], -1)[bricks].astype(np.int32),
         density_values=tree.density_values[voxels],
-        harmonics=tree.harmonics.chosen(voxels) if layout == "codes" else tree.sh[voxels],  # type: ignore[union-attr]
+        harmonics=tree.harmonics.subset(voxels) if layout == "codes" else tree.sh[voxels],  # type: ignore[union-attr]
     )
     for distance in (40.0, 2000.0):
         one, two = render(tree, far_camera(tree, distance)), render(other, far_camera(tree, distance))

@@ -189,7 +189,7 @@ def test_an_empty_field_says_so(inputs: dict[str, Path], tmp_path: Path) -> None
 def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is room the pixels decide, else the room, and the coarser asset is as if that resolution had been asked for."""
     fitted = dataclasses.replace(QUICK, resolution=0, samples_per_voxel=1, refine_steps=2, weight_threshold=0.0)
-    monkeypatch.setattr(resolution, "PIXELS", 0.2)
+    monkeypatch.setattr(resolution, "VOXEL_PIXELS", 0.2)
     sizes = {}
     for room in (10**7, 20_000):
         monkeypatch.setattr(serialisation, "most_voxels", lambda *asked, room=room: room)

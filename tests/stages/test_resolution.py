@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.baking.resolution import CLOSE, LEAST, Choice, affordable_resolution, finest_resolution
+from stages.baking.resolution import MIN_FILL, MIN_RESOLUTION, Choice, affordable_resolution, finest_resolution
 from stages.io.scene import load
 from tests.stages.balls import poses
 
@@ -15,7 +15,7 @@ from tests.stages.balls import poses
 def test_the_finest_follows_the_pixels(tmp_path: Path) -> None:
     s = load(poses(tmp_path))
     # A pixel covers 3 / (1.3 * 16) at the centre, a voxel half of that; the box is 2 wide; 32 at least.
-    assert finest_resolution(s, 384).resolution == LEAST
+    assert finest_resolution(s, 384).resolution == MIN_RESOLUTION
     focal = 100.0
     sharper = dataclasses.replace(s, views=tuple(dataclasses.replace(v, camera=dataclasses.replace(v.camera, params=(focal, 8.0, 8.0))) for v in s.views))
     told = round(2 / (0.5 * 3 / focal))
@@ -40,10 +40,10 @@ def test_the_room_is_used_where_voxels_grow_by_a_power(power: float, room: int) 
     assert len(asked) <= 6
     if count(800) <= room - 800:
         assert choice == finest
-    elif count(LEAST) <= room - LEAST:
-        assert CLOSE * (room - choice.resolution) - 0.1 * room <= count(choice.resolution) <= room - choice.resolution
+    elif count(MIN_RESOLUTION) <= room - MIN_RESOLUTION:
+        assert MIN_FILL * (room - choice.resolution) - 0.1 * room <= count(choice.resolution) <= room - choice.resolution
         assert "bake.max_mib" in choice.why
-    assert LEAST <= choice.resolution <= 800
+    assert MIN_RESOLUTION <= choice.resolution <= 800
 
 
 def test_counts_that_jump_end_in_a_resolution_for_which_there_is_room() -> None:
@@ -56,7 +56,7 @@ def test_counts_that_jump_end_in_a_resolution_for_which_there_is_room() -> None:
 
 
 def test_without_room_for_the_coarsest_it_is_taken_all_the_same() -> None:
-    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: resolution**2, lambda resolution: 10).resolution == LEAST
+    assert affordable_resolution(Choice(400, "pixels"), lambda resolution: resolution**2, lambda resolution: 10).resolution == MIN_RESOLUTION
 
 
 def test_nothing_at_all_is_looked_for_on_the_finest_grid() -> None:

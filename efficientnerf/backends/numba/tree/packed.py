@@ -140,7 +140,7 @@ def _in_order(tree: NerfTree) -> NerfTree:
         return tree
     index = np.full_like(tree.voxel_index, -1)
     index[there] = np.arange(len(order))
-    harmonics = tree.harmonics.chosen(order) if isinstance(tree.harmonics, PaletteHarmonics) else tree.harmonics[order]
+    harmonics = tree.harmonics.subset(order) if isinstance(tree.harmonics, PaletteHarmonics) else tree.harmonics[order]
     return replace(tree, voxel_index=index, density_values=tree.density_values[order], harmonics=harmonics)
 
 
