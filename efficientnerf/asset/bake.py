@@ -189,8 +189,8 @@ def voxel_values(
 def _has_pivots(m: Model, grid: torch.Tensor) -> torch.Tensor:
     """(n,) bool on the model's device: whether the coarse field at grid coordinates (n, 3) absorbs as much over an interval as a valid density voxel.
 
-    Where it absorbs less, a sample is among the lightest of its ray: it is no pivot before the subject, though it may be one before the sky. So the
-    field hides what it has there just where it would be seen, and the asset could not.
+    Where it absorbs less, a sample is among the lightest of its ray: it is no pivot on rays that meet the subject, and the field hides what it has
+    there. The asset, without a coarse stage, could not.
     """
     if m.settings.sampling != "efficient" or m.voxels.rule != "maximum":  # no pivots to drop, or no density that voxels have to reach
         return torch.ones(len(grid), dtype=torch.bool, device=m.device)

@@ -17,7 +17,7 @@ def small_components(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarr
 
     A component is made of coarse cells that hold such a voxel and touch, at a corner too. It is small with less than `share` of the largest
     one's voxels if it reaches a face of the grid, where the box may have cut it off, and with less than INTERIOR_RATIO of that elsewhere. In
-    normalised device coordinates nothing lies beyond the far face, so that reaching a face says nothing.
+    normalised device coordinates nothing lies beyond the far face, so that reaching a face means nothing.
     """
     from scipy import ndimage
 

@@ -151,7 +151,7 @@ def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """What an asset file says of itself, from its header alone."""
+    """The metadata of an asset file, from its header alone."""
     header = _open(path)
     meta, shapes = header.meta, {name: entry[1] for name, entry in header.tensors.items()}
     shape, brick, voxel = [int(n) for n in meta["shape"]], int(meta["brick"]), float(meta["voxel"])

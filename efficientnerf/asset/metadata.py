@@ -13,7 +13,7 @@ from efficientnerf.rendering.harmonics import MAX_DEGREE
 
 MAJOR = 1
 MAX_CELLS = 2**30
-NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not draw it
+NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not render it
 NDC_MINOR = 2  # the version that brought them
 NEAREST_PREFIX = "nearest-"  # of layouts whose voxels are not interpolated; before the other prefix where both hold
 NEAREST_MINOR = 3

@@ -4,8 +4,8 @@ Plain data: files are read and written by `efficientnerf.asset.format`, points l
 `efficientnerf.asset.rendering`.
 
 The grid has shape * brick voxels a side, cubic, of `voxel` world units. A coarse cell is either empty, and then space in it has no
-density whatever its neighbours hold, or it owns a brick of brick^3 voxels, of which those that matter are stored.
-Values sit at voxel centres and are interpolated linearly between the stored ones, or hold all over their voxels: `lookup` says which.
+density whatever its neighbours hold, or it owns a brick of brick^3 voxels, of which the visible ones are stored.
+Values sit at voxel centres and are interpolated linearly between the stored ones, or hold throughout their voxels (`lookup`).
 
 The grid lies in the tree's *frame*: the world, or the normalised device coordinates of a reference camera (`efficientnerf.geometry.ndc`) where the scene is
 forward-facing. Arguments and results of those functions are of the world, densities apart, which are per unit of the frame.
@@ -41,16 +41,14 @@ class NerfTree:
     density_values  (N,) float32, per unit of the frame, >= 0
     harmonics    what the voxels' colours are made of, one of two:
                  (N, K, 3) float32, or PaletteHarmonics: codes into palettes, as files of the layout `compact` load
-    background   sRGB colour that the training images lay on, or None for photographs with surroundings
+    background   constant sRGB background of the training images, or None
     device       where it is rendered, see `to`; not part of the asset
     ndc          the reference camera whose normalised device coordinates are the frame, or None: the frame is the world
-    lookup       what a point gets: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
+    lookup       value of a point: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
                  where that one is not stored (EfficientNeRF, section 4.1, has the field trained on such coordinates)
     derived      what renderers made of the arrays, by name; made when first rendered, so that arrays changed in place later are not seen
 
-    For renderers: `sh` is always there as plain floats, but decoding a palette costs 12 K bytes a voxel and is remembered; a kernel
-    that matters reads `harmonics` itself where it is a PaletteHarmonics, whose docstring states what its arrays mean. A kernel for codes
-    needs no second form for plain floats if it reads `sh` there.
+    `sh` has the harmonics as plain floats; decoding a palette takes 12 K bytes a voxel and is cached. Renderers read `harmonics` instead.
     """
 
     shape: tuple[int, int, int]

@@ -1,4 +1,4 @@
-"""LPIPS: how different two images look, by the features of a network trained to recognise things (Zhang et al. 2018, "The unreasonable effectiveness
+"""LPIPS: the perceptual distance of two images, by the features of a network trained to recognise things (Zhang et al. 2018, "The unreasonable effectiveness
 of deep features as a perceptual metric").
 
     d(x, y) = sum_l mean_hw sum_c h_lc (f_l(x) - f_l(y))_c^2,  f_l of unit length at each pixel
@@ -22,7 +22,7 @@ SMALLEST = 64  # pixels: with less, nothing is left of an image after the last p
 # What the networks were trained with, for images from -1 to 1.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 CHANNELS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
-TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # modules of torchvision's `features` whose output is looked at
+TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # modules of torchvision's `features` whose output is compared
 
 
 def _layers(network: str) -> nn.Sequential:

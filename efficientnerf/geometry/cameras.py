@@ -38,7 +38,7 @@ class Camera:
 
     width, height      pixels
     model, params      a name of `MODELS` and its parameters in that order, pixels where they are lengths
-    world_from_camera  (4, 4) float64; "world" is whatever frame the holder of the camera says
+    world_from_camera  (4, 4) float64; the frame of the "world" is the caller's
     """
 
     name: str
@@ -108,7 +108,7 @@ class Similarity:
         return pose
 
     def camera(self, camera: Camera) -> Camera:
-        """The same camera seen from the target frame."""
+        """The same camera in the target frame."""
         return replace(camera, world_from_camera=self.pose(camera.world_from_camera))
 
     def matrix(self) -> np.ndarray:
@@ -120,7 +120,7 @@ class Similarity:
 
 
 def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The rays that pixels see.
+    """The rays of pixels.
 
     pixels   (N, 2) x, y; None: the centres of all, row by row, N = height * width
     returns  origins (N, 3) and unit directions (N, 3), float64, in the camera's world
@@ -147,7 +147,7 @@ def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, 
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where points appear.
+    """Projections of points.
 
     points   (N, 3) in the camera's world
     returns  pixels (N, 2) and depth (N,) along the view axis, world units
@@ -163,20 +163,20 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         if camera.model == "OPENCV_FISHEYE":
             radius = np.hypot(local[:, 0], local[:, 1])
             theta = np.arctan2(radius, depth)
-            seen = theta < _fold(top, bottom, np.pi)
-            stretch = np.where(radius > 0, theta * polynomial.polyval(theta**2, top) / radius, 0.0)
-            x, y = local[:, 0] * stretch, local[:, 1] * stretch
+            visible = theta < _fold(top, bottom, np.pi)
+            radial = np.where(radius > 0, theta * polynomial.polyval(theta**2, top) / radius, 0.0)
+            x, y = local[:, 0] * radial, local[:, 1] * radial
         else:
             u, v = local[:, 0] / depth, local[:, 1] / depth
-            seen = (depth > 0) & (np.hypot(u, v) < _fold(top, bottom))
+            visible = (depth > 0) & (np.hypot(u, v) < _fold(top, bottom))
             x, y = _distorted(u, v, top, bottom, k["p1"], k["p2"])
         pixels = np.stack([k["fx"] * x + k["cx"], k["fy"] * y + k["cy"]], -1)
-    pixels[~seen] = np.nan
+    pixels[~visible] = np.nan
     return pixels, depth
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of the same picture at another size; exact also where rounding scales width and height by different amounts."""
+    """The camera of the same image at another size; exact also where rounding scales width and height by different amounts."""
     along_x, along_y = width / camera.width, height / camera.height
     if along_x == along_y == 1.0:
         return camera
@@ -187,12 +187,12 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, width=width, height=height, model=model, params=tuple(named[p] for p in MODELS[model]))
 
 
-def quarter_turned(camera: Camera) -> Camera:
-    """The camera of the picture turned clockwise by 90 degrees; width and height change places. A world point stays on its spot of the picture."""
+def rotated_clockwise(camera: Camera) -> Camera:
+    """The camera of the image rotated clockwise by 90 degrees; width and height are swapped. A world point stays at its place in the image."""
     k = camera.intrinsics
     turned = k | {"fx": k["fy"], "fy": k["fx"], "cx": camera.height - k["cy"], "cy": k["cx"], "f": k["fx"], "p1": k["p2"], "p2": -k["p1"]}
     pose = camera.world_from_camera.copy()
-    pose[:3, 0], pose[:3, 1] = -camera.world_from_camera[:3, 1], camera.world_from_camera[:3, 0]  # right of the turned picture is up of the old one
+    pose[:3, 0], pose[:3, 1] = -camera.world_from_camera[:3, 1], camera.world_from_camera[:3, 0]  # right of the rotated image is up of the old one
     params = tuple(turned[p] for p in MODELS[camera.model])
     return replace(camera, width=camera.height, height=camera.width, params=params, world_from_camera=pose)
 
@@ -240,7 +240,7 @@ def _radial_polynomials(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fold(top: np.ndarray, bottom: np.ndarray, limit: float = np.inf) -> float:
-    """The radius up to which r top(r^2) / bottom(r^2) grows: beyond it the model says nothing about the lens."""
+    """The radius up to which r top(r^2) / bottom(r^2) grows: beyond it the model does not describe the lens."""
     times_s = np.array([0.0, 1.0])
     # d/dr [r top/bottom] = (top bottom + 2 s (top' bottom - top bottom')) / bottom^2
     bend = polynomial.polysub(polynomial.polymul(polynomial.polyder(top), bottom), polynomial.polymul(top, polynomial.polyder(bottom)))

@@ -1,4 +1,4 @@
-"""Normalised device coordinates of forward-facing captures: all that lies before a reference camera, out to infinity, in a box.
+"""Normalised device coordinates of forward-facing captures: all that lies in front of a reference camera, out to infinity, in a box.
 
 Mildenhall et al. 2020, "NeRF", appendix C. With (x, y, z) in the reference camera (x right, y down, z forward: the project's axes, where the
 appendix has y up and looks along -z), focal length f, width W, height H and near plane n:
@@ -11,7 +11,7 @@ derivative at p, g = ds/dt = |J d| and k = d(log z)/dt = d_z / p_z at t0 (z as a
 
     s(t) = g (t - t0) / (1 + k (t - t0))        t(s) = t0 + s / (g - k s)
 
-Everything works on numpy arrays and on torch tensors alike; results are of the kind, type and device of what goes in. No torch is imported.
+Numpy arrays and torch tensors alike; results are of the kind, type and device of the arguments. torch is not imported.
 
 R rays, N points.
 """
@@ -102,7 +102,7 @@ class Ndc:
         return local[..., 0], local[..., 1], local[..., 2]
 
     def points(self, world: Any) -> Any:
-        """World points (..., 3) to normalised device coordinates. What does not lie before the camera comes out beyond z' = BEYOND: outside of any box."""
+        """World points (..., 3) to normalised device coordinates. Points behind the camera get z' = BEYOND, outside of any box."""
         x, y, z = self._camera(world, directions=False)
         a, b = self.slopes
         ahead = z > 1e-6 * self.near
@@ -128,7 +128,7 @@ class Ndc:
     def rays(self, origins: Any, directions: Any) -> NdcRays:
         """World rays (R, 3), unit directions, to rays in normalised device coordinates.
 
-        One that never comes before the near plane gets an origin beyond z' = BEYOND and looks away.
+        One that never reaches the near plane gets an origin at z' = BEYOND and points away.
         """
         a, b = self.slopes
         x, y, z = self._camera(origins, directions=False)

@@ -1,4 +1,4 @@
-"""sRGB and linear light (IEC 61966-2-1), and premultiplication: images here are sRGB, and what is called linear says so."""
+"""sRGB and linear light (IEC 61966-2-1), and premultiplication: images are sRGB unless their name says linear."""
 
 from __future__ import annotations
 

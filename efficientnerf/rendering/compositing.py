@@ -17,7 +17,7 @@ LARGEST_LOGIT = 15.0
 
 
 def activate(raw: Tensor, activation: str) -> Tensor:
-    """Density, >= 0, from what a field says before its activation ("exp" or "softplus").
+    """Density, >= 0, from a field's output before its activation ("exp" or "softplus").
 
     exp is capped at e^15, far beyond opaque. softplus is shifted by one so that an untrained field is thin: with it, and a density that never
     dies, thin scenes do not collapse to the background as they do with ReLU.
@@ -68,7 +68,7 @@ class Composite(NamedTuple):
 
 
 def ray_distortion(weight: Tensor, length: Tensor, first: Tensor) -> Tensor:
-    """How far a ray's weights are spread along it: large for fog, small for one thin surface.
+    """How far a ray's weights are spread along it: large for semi-transparent volumes, small for one thin surface.
 
         sum_i sum_j w_i w_j |s_i - s_j| + 1/3 sum_i w_i^2 l_i
 
@@ -89,7 +89,7 @@ def ray_distortion(weight: Tensor, length: Tensor, first: Tensor) -> Tensor:
 
 
 def composite(raw: Tensor, length: Tensor, first: Tensor, harmonics: Tensor, background: Tensor, activation: str) -> Composite:
-    """Colours of rays from what a field says at their samples.
+    """Colours of rays from a field's output at their samples.
 
     raw         (N, 1 + 3K) density before its activation, then K coefficients for red, green and blue each
     length      (N,) extent of each sample

@@ -77,7 +77,7 @@ def automatic_threshold(volume: Volume, lines: int = 24) -> float:
                 found += [_densities_on_entry(ray, voxel) for ray in (sigma, sigma[:, ::-1])]
     levels = np.concatenate(found)
     if not len(levels):
-        raise NoSurface(f"no ray through the volume loses half its light; the highest density seen is {highest:.3g} per unit and a voxel is {voxel:.3g} wide")
+        raise NoSurface(f"no ray through the volume loses half its light; the highest density found is {highest:.3g} per unit and a voxel is {voxel:.3g} wide")
     return float(min(np.log(2) / voxel, np.quantile(levels, 0.25)))
 
 
@@ -265,7 +265,7 @@ def surface_colours(
 
     Along the inward normal, from one voxel in front of the point to two behind it, colours are weighted as a ray would weigh them: a single
     sample on the surface mixes with the colour of empty voxels. Each is the median over six viewing directions, one head on and five at
-    45 degrees, so that neither a highlight nor a direction that no camera looked along decides; or over those that `view_directions` gives for
+    45 degrees, so that neither a highlight nor a direction without training views decides; or over those that `view_directions` gives for
     points and normals.
     """
     colours = np.empty((len(positions), 3), np.float32)
@@ -332,7 +332,7 @@ def surface(
 ) -> Mesh:
     """The volume's surface as a closed, coloured mesh in the training frame.
 
-    threshold      density per world unit at which it is drawn; None: `automatic_threshold`
+    threshold      density per world unit of the surface; None: `automatic_threshold`
     faces          budget that it is decimated to
     min_component  components with less than this share of the largest one's area are removed
     rounds         of smoothing

@@ -14,7 +14,7 @@ import numpy as np
 class Mesh:
     """A triangle mesh with colours.
 
-    vertices (V, 3) float64, the frame that the holder says
+    vertices (V, 3) float64, in the caller's frame
     faces    (F, 3) int64, counter-clockwise seen from outside
     normals  (V, 3) float64 unit, outward
     colours  (V, 3) float32 sRGB, 0-1
@@ -119,7 +119,7 @@ def tidy(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """The mesh without degenerate faces; one that was closed stays closed.
 
     A face of no area is removed by joining the ends of its shortest edge, which takes the face on the other side of that edge with it; just
-    to leave it out would open the surface. Two faces on the same corners that look in opposite directions go together.
+    to leave it out would open the surface. Two faces on the same corners with opposite normals go together.
     """
     for _ in range(8):
         distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
@@ -169,7 +169,7 @@ def separate(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nd
     """Split vertices of non-manifold edges, so that each edge has two faces; the surface must be closed.
 
     Around a vertex, the opposite sides of its faces form directed circuits, as many in as out of each neighbour. A circuit that passes a
-    neighbour twice is cut there into simple ones, and each gets a copy of the vertex, drawn a hundredth of the way to its own neighbours:
+    neighbour twice is cut there into simple ones, and each gets a copy of the vertex, moved a hundredth of the way to its own neighbours:
     readers that merge equal positions would join the sheets again. Edge collapse leaves such edges where a surface is thin.
     """
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)

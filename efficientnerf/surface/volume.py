@@ -2,7 +2,7 @@
 
 `WorldVolume` is a tree in the world. `NdcVolume` is a forward-facing tree: its surface is found in normalised device coordinates and handed out in the
 world. There a voxel is about a pixel wide at any depth, so that marching cubes, smoothing and decimation treat near and far as images do. What lies
-beyond the far limit is a backdrop and left out: it reaches to infinity.
+beyond the far limit is left out, for it reaches to infinity.
 """
 
 from __future__ import annotations

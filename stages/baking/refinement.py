@@ -69,8 +69,8 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
     if job.device == "cpu" or needed <= (free := free_on_device(job.device)):
         return targets.to(job.device)
     job.warn(
-        f"fitting {len(tree.density_values):,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} are free there:"
-        " they are fitted on the CPU, which takes longer (lower bake.max_mib or bake.resolution for the device)"
+        f"refining {len(tree.density_values):,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} are free there:"
+        " they are refined on the CPU, which takes longer (lower bake.max_mib or bake.resolution for the device)"
     )
     return targets
 
@@ -102,7 +102,7 @@ def _take_steps(job: Job, state: RefinementState, targets: Targets, steps: int, 
     )  # fmt: skip
     for error in run:
         smooth = error if not smooth else 0.9 * smooth + 0.1 * error
-        job.progress(state.step, steps, "fitting to the images", psnr=round(_psnr(smooth), 2), voxels=len(state.density))
+        job.progress(state.step, steps, "refining", psnr=round(_psnr(smooth), 2), voxels=len(state.density))
         if time.monotonic() - written > CHECKPOINT_SECONDS:
             _save_checkpoint(job, state, pruned)
             written = time.monotonic()
@@ -125,7 +125,7 @@ def _prune(job: Job, state: RefinementState, targets: Targets, most: int) -> Ref
     count = min(max(settings.visibility_rays, int(per_voxel * len(state.density))), 4 * len(targets.pixels))
 
     def progress(done: int, total: int) -> None:
-        job.progress(done, total, "dropping what does not show")
+        job.progress(done, total, "rendering for voxel weights")
         job.safe_point()
 
     greatest = fit.max_weights(state.tree, targets, count, settings.seed, progress)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stages.baking.resolution import Choice
     from stages.io.scene import Scene
 
-MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: the refined tree shows which of them matter
+MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: of which the refinement keeps the heaviest
 OVERSHOOT = 1.7  # the same where the resolution is chosen: few of the dilated voxels show. docs/experiments/bake-resolution.md
 
 
@@ -98,7 +98,7 @@ def _visibility(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], v
         return bake.Visibility(**{name: None if name in ("before", "behind") and not len(part) else part for name, part in stored.items()})  # type: ignore[arg-type]
 
     def progress(done: int, total: int) -> None:
-        job.progress(done, total, "finding the voxels that matter")
+        job.progress(done, total, "rendering for visible voxels")
         job.safe_point()
 
     visibility = bake.visible_voxels(m, pixels, shape, voxel, low, settings.brick_size, settings.visibility_rays, progress, space)

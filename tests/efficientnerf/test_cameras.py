@@ -14,7 +14,7 @@ from efficientnerf.geometry.cameras import (
     pose_from_llff,
     pose_from_opengl,
     project,
-    quarter_turned,
+    rotated_clockwise,
     rays,
     resized,
 )
@@ -119,14 +119,14 @@ def test_a_resized_camera_sees_the_same_picture(model: str, size: tuple[int, int
 @pytest.mark.parametrize("model", MODELS)
 def test_a_quarter_turn_turns_the_picture(model: str) -> None:
     camera = camera_of(model)
-    turned = quarter_turned(camera)
+    turned = rotated_clockwise(camera)
     pixels = np.random.default_rng(5).uniform((0, 0), (640, 480), (100, 2))
     points = rays(camera, pixels)[0] + rays(camera, pixels)[1]
     assert (turned.width, turned.height) == (480, 640)
     np.testing.assert_allclose(project(turned, points)[0], np.stack([480 - pixels[:, 1], pixels[:, 0]], -1), atol=1e-7)
     back = camera
     for _ in range(4):
-        back = quarter_turned(back)
+        back = rotated_clockwise(back)
     np.testing.assert_allclose(back.params, camera.params)
     np.testing.assert_allclose(back.world_from_camera, camera.world_from_camera)
 

@@ -83,7 +83,7 @@ def test_the_fit_takes_deep_voxels_to_the_photographs(inputs: dict[str, Path], t
     baked(tmp_path, inputs, told, refine_steps=20, refine_rays_per_batch=2048, visibility_rays=1000)
     fitted = json.loads((tmp_path / "out" / "report.json").read_text())["optimisation"]
     assert fitted["psnr_after"] > fitted["psnr_before"] + 0.5
-    looked = {event["total"] for event in told if event.get("text") == "dropping what does not show"}
+    looked = {event["total"] for event in told if event.get("text") == "rendering for voxel weights"}
     assert looked == {min(int(NDC_RAYS_PER_VOXEL * fitted["voxels_baked"]), 4 * 8 * 32 * 24)}
     assert max(looked) > 1000
     assert not [event for event in told if event["event"] == "warning"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import opengl_from_pose, project, quarter_turned
+from efficientnerf.geometry.cameras import opengl_from_pose, project, rotated_clockwise
 from stages.io import importers
 from stages.io.capture import Capture
 from stages.io.importers import colmap_model
@@ -209,7 +209,7 @@ def test_cameras_stated_for_the_pixels_as_stored_turn_with_them(tmp_path: Path, 
     turns = {6: 1, 8: 3}[orientation]
     truth = captures.cameras()
     for _ in range(turns):
-        truth = [quarter_turned(camera) for camera in truth]
+        truth = [rotated_clockwise(camera) for camera in truth]
     assert_same_rays(capture, truth)
 
 

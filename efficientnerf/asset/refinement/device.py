@@ -39,11 +39,11 @@ class DeviceArrays:
         """The arrays on the host."""
         return {name: values.cpu().numpy() for name, values in self.values.items()}
 
-    def step(self, number: int, rays: Rays, seen: Any, density_lr: float, sh_lr: float, view_dependent_lr_ratio: float = 1.0) -> Tensor:
+    def step(self, number: int, rays: Rays, wanted: Any, density_lr: float, sh_lr: float, view_dependent_lr_ratio: float = 1.0) -> Tensor:
         """Losses (R,) of the rays before the step."""
         v, sums = self.values, (self.by_thickness, self.by_sh)
         outputs = tree_gradients.forward(self.grid, rays, v["density"], v["sh"])
-        loss, *by = tree_gradients.loss_and_gradients(*outputs, seen)
+        loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
         tree_gradients.backward(self.grid, rays, v["density"], v["sh"], outputs, (by[0], by[1]), sums, self.stamp, number)
         tree_gradients.rmsprop_step(
             self.grid, (v["density"], v["sh"]), sums, (v["square_density"], v["square_sh"]), v["visits"], self.stamp,
@@ -71,9 +71,9 @@ def optimise(
     error = None
     while state.step < until:
         number = state.step + 1
-        origins, directions, seen = targets.draw(rays, step_rng(seed, number))
+        origins, directions, wanted = targets.draw(rays, step_rng(seed, number))
         fall = lr_final_ratio ** (number / steps)
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), seen, density_lr * fall, sh_lr * fall, view_dependent_lr_ratio)
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, density_lr * fall, sh_lr * fall, view_dependent_lr_ratio)
         pending.append(to_host_async(loss.mean() / 3))
         state.step = number
         if error is None or len(pending) > LAG:
@@ -95,8 +95,8 @@ def total_loss(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> f
     assert isinstance(targets.pixels, DevicePixels)
     grid, density, sh = values_of(tree, targets.pixels.device)
     total = torch.zeros((), dtype=torch.float64, device=density.device)
-    for origins, directions, seen in bundles:
-        loss, _, _ = tree_gradients.loss_and_gradients(*tree_gradients.forward(grid, rays_in_voxels(tree, origins, directions), density, sh), seen)
+    for origins, directions, wanted in bundles:
+        loss, _, _ = tree_gradients.loss_and_gradients(*tree_gradients.forward(grid, rays_in_voxels(tree, origins, directions), density, sh), wanted)
         total += loss.double().sum()
     return float(total)
 
@@ -106,6 +106,6 @@ def max_weights(tree: NerfTree, targets: Targets, bundles: Iterable[Bundle]) -> 
     assert isinstance(targets.pixels, DevicePixels)
     grid, density, _ = values_of(tree, targets.pixels.device)
     greatest = torch.zeros_like(density)
-    for origins, directions, seen in bundles:
-        tree_gradients.max_contributions(grid, rays_in_voxels(tree, origins, directions), density, seen.transmittance.contiguous(), greatest)
+    for origins, directions, wanted in bundles:
+        tree_gradients.max_contributions(grid, rays_in_voxels(tree, origins, directions), density, wanted.transmittance.contiguous(), greatest)
     return greatest.cpu().numpy()

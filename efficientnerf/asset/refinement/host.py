@@ -43,9 +43,9 @@ def optimise(
     rates[3:] *= view_dependent_lr_ratio
     while state.step < until:
         number = state.step + 1
-        origins, directions, seen = targets.draw(rays, step_rng(seed, number))
+        origins, directions, wanted = targets.draw(rays, step_rng(seed, number))
         start, along, bases = in_voxels(state.tree, origins, directions)
-        loss, counts = gradients.forward_backward(grid, start, along, bases, state.density, state.sh, seen, records)
+        loss, counts = gradients.forward_backward(grid, start, along, bases, state.density, state.sh, wanted, records)
         fall = lr_final_ratio ** (number / steps)
         gradients.rmsprop_step(
             records, counts, bases, (state.density, state.sh), (by_density, by_sh), (state.square_density, state.square_sh), state.visits, stamp,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, quarter_turned, resized
+from efficientnerf.geometry.cameras import Camera, rotated_clockwise, resized
 from pipeline.errors import BadInput
 from stages.io.importers.source import abbreviated
 from stages.io.photo import same_aspect
@@ -135,7 +135,7 @@ def fit_to_image(camera: Camera, header: Header, where: str) -> tuple[Camera, st
             raise BadInput(f"{where}: the image is mirrored by its EXIF orientation ({header.orientation}) and the camera is not. Write the image upright.")
         camera = resized(camera, height, width)
         for _ in range(_QUARTER_TURNS[header.orientation]):
-            camera = quarter_turned(camera)
+            camera = rotated_clockwise(camera)
         return camera, "turned"
     if stated == (width, height):
         return camera, "upright?" if header.orientation != 1 and (header.orientation < 5 or width == height) else None
