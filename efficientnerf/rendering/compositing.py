@@ -30,7 +30,7 @@ def activate(raw: Tensor, activation: str) -> Tensor:
 
 
 def ray_of_sample(first: Tensor, samples: int) -> Tensor:
-    """(N,) which ray each packed sample belongs to; first (R + 1,) offsets. Padding, beyond the last offset, is told to belong to the last ray."""
+    """(N,) which ray each packed sample belongs to; first (R + 1,) offsets. Padding, beyond the last offset, counts for the last ray."""
     if transfer.is_on_device(first) or int(first[-1]) != samples:
         at = torch.arange(samples, device=first.device)
         return (torch.searchsorted(first, at, right=True) - 1).clamp(max=len(first) - 2)

@@ -14,9 +14,9 @@ from efficientnerf.geometry.cameras import (
     pose_from_llff,
     pose_from_opengl,
     project,
-    rotated_clockwise,
     rays,
     resized,
+    rotated_clockwise,
 )
 
 LENSES = {

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera, rotated_clockwise, resized
+from efficientnerf.geometry.cameras import Camera, resized, rotated_clockwise
 from pipeline.errors import BadInput
 from stages.io.importers.source import abbreviated
 from stages.io.photo import same_aspect
