@@ -113,6 +113,6 @@ class Header:
         want = digests.get(name) if isinstance(digests, dict) else None
         found = hashlib.sha256(values.tobytes()).hexdigest()
         if found != want:
-            problem = f"has SHA-256 {found[:12]}…, its metadata {str(want)[:12]}…"
+            problem = f"has SHA-256 {found[:12]}…, the file says {str(want)[:12]}…"
             raise FormatError(f"{self.name}: tensor '{name}' {problem}; the file is damaged. Bake it again or copy it anew.")
         return values
