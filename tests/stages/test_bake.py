@@ -172,7 +172,7 @@ def test_a_device_without_room_leaves_the_fit_to_the_host(tmp_path: Path, monkey
     for free, where in ((needed, there), (needed - 1, targets)):
         monkeypatch.setattr(memory, "free_on_device", lambda device, free=free: free)
         assert refinement.targets_on_device(made, tree, targets) is where
-    assert ["fitted on the CPU" in event["text"] for event in events if event["event"] == "warning"] == [True]
+    assert ["refined on the CPU" in event["text"] for event in events if event["event"] == "warning"] == [True]
     made.device = "cpu"
     assert refinement.targets_on_device(made, tree, targets) is targets
 
