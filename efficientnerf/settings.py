@@ -1,6 +1,6 @@
-"""Fields of settings dataclasses: their types with limits, and what they say about themselves.
+"""Fields of settings dataclasses: their types with limits, and their descriptions.
 
-`auto` leaves a value to be chosen, `off` switches something off. A limit is a `msgspec.Meta` in the annotation, which the engine heeds when it reads
+`auto` leaves a value to be chosen, `off` switches something off. A limit is a `msgspec.Meta` in the annotation, which the engine checks when it decodes
 settings (`pipeline.stage.settings_from`). Imports nothing heavy.
 """
 

@@ -1,6 +1,6 @@
-"""Names and values of settings before release 0.1: the one table of what became of them.
+"""Settings from before release 0.1: their present names and values.
 
-Where a user gives an old name it is answered with the new one; what a run or a field recorded is read with `updated`.
+An old name on the command line or in a file is answered with `moved`; recorded settings are read with `updated`.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ REMOVED: dict[str, dict[str, str]] = {
     },
 }
 
-# Words for what 0, none or an empty text meant.
+# Words that replace 0, none and empty texts.
 WORDS = ("auto", "off", "all")
 
 
 def moved(stage: str, name: str) -> str | None:
-    """What became of an old setting, as a sentence; None where the name is none of the old ones."""
+    """The present name of an old setting, as a sentence; None where the name is none of the old ones."""
     if new := RENAMED.get(stage, {}).get(name):
         return f"{stage}.{name} is now {stage}.{new}."
     if why := REMOVED.get(stage, {}).get(name):
@@ -59,12 +59,12 @@ def moved(stage: str, name: str) -> str | None:
 
 
 def moved_in(table: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """`moved` for every setting of {stage: {setting: value}} that has another name today, or none."""
+    """`moved` for every setting of {stage: {setting: value}} that was renamed or removed."""
     return [sentence for stage, entries in table.items() for name in entries if (sentence := moved(stage, name)) is not None]
 
 
 def updated(stage: str, settings_type: type, recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """Recorded settings of a stage under their names of today.
+    """Recorded settings of a stage under their present names.
 
     Values that meant "choose" or "off" become `auto`, `off` or `all` where the setting admits the word and not the value; settings that were removed
     are left out; everything else stays as it is.

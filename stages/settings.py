@@ -1,4 +1,4 @@
-"""Settings of stages: fields of frozen dataclasses that say what they mean and what they may be.
+"""Descriptions of settings: types, limits, defaults and meaning, from the fields of settings dataclasses.
 
 A default stands once, in the dataclass; presets, the command line and the documentation are derived from it, and the engine checks
 values against it (`pipeline.stage.settings_from`).
@@ -19,11 +19,11 @@ __all__ = ["SettingInfo", "describe_settings", "setting"]
 
 @dataclasses.dataclass(frozen=True)
 class SettingInfo:
-    """What a settings field says about itself.
+    """Description of a settings field.
 
     type      its annotation, evaluated
-    choices   the values it may take, where they can be listed; else the words it may be besides, such as auto
-    minimum   of its numbers, exclusive ones included; maximum likewise
+    choices   the words it may be, such as auto; all its values where `listed`
+    minimum   of its numbers, inclusive or exclusive; maximum likewise
     advanced  whether it is listed apart from the settings that most users want
     """
 
@@ -36,7 +36,7 @@ class SettingInfo:
 
     @property
     def type_name(self) -> str:
-        """What it may be, in words: `a whole number, at least 8, or auto`."""
+        """Its type in words: `a whole number, at least 8, or auto`."""
         return type_in_words(self.type)
 
     @property
@@ -45,7 +45,7 @@ class SettingInfo:
 
     @property
     def listed(self) -> bool:
-        """Whether it is one of its choices and nothing else."""
+        """Whether its choices are all that it may be."""
         return all(typing.get_origin(arm) is typing.Literal for arm in _arms(self.type))
 
     @property

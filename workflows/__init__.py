@@ -1,4 +1,4 @@
-"""Composes the stages into workflows, and gives them a command line."""
+"""Workflows of stages, and their command line."""
 
 import os
 

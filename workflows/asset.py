@@ -1,4 +1,4 @@
-"""From photographs to everything: the stages, in order."""
+"""The workflow from photographs to assets: its stages in order."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.stage import Stage
 
 @dataclass(frozen=True)
 class Workflow:
-    """What the command line runs.
+    """Stages and presets of a command line.
 
     stages   in order
     presets  the folder of its presets, TOML files

@@ -11,7 +11,7 @@ from pipeline.errors import UsageError
 
 
 def torch_has_cuda() -> bool:
-    """Whether the installed torch was built for CUDA: torch/version.py says so in plain text."""
+    """Whether the installed torch was built for CUDA: read from torch/version.py."""
     spec = importlib.util.find_spec("torch")
     if spec is None or spec.origin is None:
         return False
@@ -24,7 +24,7 @@ def torch_has_cuda() -> bool:
 
 
 def cuda_device_count() -> int:
-    """CUDA devices that the driver's management library knows of and that the environment does not hide."""
+    """Number of CUDA devices that the driver's management library lists and CUDA_VISIBLE_DEVICES does not hide."""
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None and visible.strip() in ("", "-1"):
         return 0

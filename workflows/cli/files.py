@@ -99,7 +99,7 @@ def _export_surface(what: Path, files: list[Path], as_points: bool, sets: tuple[
 
 
 def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> Settings:
-    """Settings of the stages named: as the run recorded them, or the defaults for a bare asset; then `--set`."""
+    """Settings of some stages: those that the run recorded, or the defaults for an asset file; then `--set`."""
     from pipeline.run import Run
     from workflows.cli.resolve import Settings
     from workflows.cli.target import is_run

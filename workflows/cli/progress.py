@@ -1,7 +1,6 @@
 """Displays of a run: bars on a terminal, lines in a log, one JSON object per event, or nothing but warnings.
 
-Each display is a callable that takes the engine's events. Everything for people goes to standard error; standard output is left to
-results.
+Each display is a callable that takes the engine's events. Text goes to standard error; standard output is for results.
 """
 
 from __future__ import annotations
@@ -109,7 +108,7 @@ class Lines:
 
 
 class Bars:
-    """A bar with the time left for the stage at work, on a terminal."""
+    """A bar with the remaining time of the running stage, on a terminal."""
 
     def __init__(self) -> None:
         from rich.console import Console
@@ -196,7 +195,7 @@ class Quiet:
 
 
 def write_json(value: Any, *, indent: int | None = None) -> None:
-    """One JSON object on standard output; a reader that went away is no reason to stop a run."""
+    """One JSON object on standard output; a closed pipe does not stop a run."""
     try:
         print(json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False), flush=True)
     except BrokenPipeError:
@@ -207,7 +206,7 @@ def write_json(value: Any, *, indent: int | None = None) -> None:
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON can hold it: paths and arrays become text and lists, numbers that are not finite become null."""
+    """`value` in types of JSON: paths and arrays become text and lists, numbers that are not finite become null."""
     if isinstance(value, Mapping):
         return {str(name): plain(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -222,7 +221,7 @@ def plain(value: Any) -> Any:
 
 
 def display(*, as_json: bool, quiet: bool) -> Lines | Bars | JsonLines | Quiet:
-    """The display that fits where the output goes."""
+    """The display for the options and the kind of output."""
     if as_json:
         return JsonLines(quiet)
     if quiet:

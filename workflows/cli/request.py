@@ -1,4 +1,4 @@
-"""From the options of `enerf run` to a Run: its source, its settings, its device."""
+"""The run that the options of `enerf run` request: source, settings and device."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Plan:
 
     run       a Run with the new settings
     new       whether its folder has yet to be made
-    device    "auto", "cpu" or "cuda" as wanted
+    device    "auto", "cpu" or "cuda" as requested
     warnings  for the user
     """
 
@@ -46,7 +46,7 @@ class Plan:
     warnings: list[str] = field(default_factory=list)
 
     def write(self) -> Run:
-        """Make the run, or change what the standing one records."""
+        """Create the run, or update the existing one."""
         if self.new:
             facts = {"preset": self.run.preset, "seed": self.run.seed, "device": self.run.device, "resume_text": resume_command}
             return Run.create(self.run.path, self.run.source, self.run.settings, **facts)
@@ -56,7 +56,7 @@ class Plan:
 
 
 def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
-    """What `enerf run` with these options means for the folder `path`. Writes nothing. Raises BadInput and UsageError."""
+    """The run in the folder `path` with these options; writes nothing. Raises BadInput and UsageError."""
     config = read_config(options.config) if options.config is not None else Config({})
     seed = options.seed if options.seed is not None else config.options.get("seed")
     device = options.device or config.options.get("device")
@@ -113,7 +113,7 @@ def _standing(path: Path) -> Run | None:
 
 
 def _source(given: Path | None, standing: Run | None) -> Path | None:
-    """The source to record. A run stays with its source unless that is gone or nothing has been made of it yet."""
+    """The source to record. It cannot change once poses have been made of it, unless it no longer exists."""
     recorded = standing.source if standing is not None else None
     if given is None:
         return recorded

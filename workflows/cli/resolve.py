@@ -1,7 +1,7 @@
 """Settings of all stages from presets, files and options: names and values are checked, later sources override earlier ones.
 
-The order is: the defaults of the dataclasses, the preset, the configuration file, `--set`, the dedicated options. A table here is
-what TOML gives: `{stage: {setting: value}}`.
+The order is: the defaults of the dataclasses, the preset, the configuration file, `--set`, the dedicated options. A table is a
+mapping `{stage: {setting: value}}`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Preset:
     """A preset, read.
 
     inherits  the preset that it changes, or None
-    own       what its file says
+    own       the table of its file
     table     `own` over the table of the preset that it inherits from
     """
 
@@ -61,7 +61,7 @@ def preset_names(folder: Path = WORKFLOW.presets) -> list[str]:
 
 
 def read_preset(name: str, folder: Path = WORKFLOW.presets) -> Preset:
-    """A preset with what it inherits. Raises UsageError for one that is not there and for one that inherits from itself."""
+    """A preset with what it inherits. Raises UsageError for an unknown name and for a cycle."""
     return _read_preset(name, folder, ())
 
 
@@ -101,7 +101,7 @@ def read_config(path: Path) -> Config:
 
 
 def parse_value(text: str) -> list[Any]:
-    """What the text of a `--set` may mean, the likeliest first: a TOML value, a list without its brackets, the text itself."""
+    """Readings of the text of a `--set`, the likeliest first: a TOML value, a list without its brackets, the text itself."""
     readings: list[Any] = []
     for candidate in (text, f"[{text}]") if "," in text else (text,):
         try:
@@ -123,7 +123,7 @@ def seconds_of(text: str) -> float:
 
 
 class Settings:
-    """The settings of all stages while they are put together; every value is checked as it comes.
+    """Builder of the settings of all stages; every value is checked when it is put.
 
     types   {stage: its settings dataclass}
     """
@@ -168,7 +168,7 @@ class Settings:
                 self.put(stage, name, [value], origin)
 
     def put_recorded(self, table: Table) -> list[str]:
-        """Take over what a run recorded, under names of today; returns those that this version no longer has, or no longer admits."""
+        """Put recorded settings under their current names; returns those that this version does not have or does not admit."""
         dropped = []
         for stage, entries in table.items():
             for name, value in (updated(stage, self.types[stage], entries) if stage in self.types else entries).items():
@@ -198,7 +198,7 @@ class Settings:
 
 
 def table_of(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Resolved settings as plain values that JSON can hold."""
+    """Resolved settings as plain values of JSON."""
     return {stage: settings_dict(instance) for stage, instance in settings.items()}
 
 

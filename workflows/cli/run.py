@@ -76,7 +76,7 @@ def stage(name: str, run_folder: Path, force: bool, dry_run: bool, as_json: bool
 
 
 def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection: Any) -> None:
-    """Carry a plan out, show it, and sum it up."""
+    """Run a plan, display its progress, and print the summary."""
     import time
 
     from pipeline.runner import run_stages
@@ -107,7 +107,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
 
 
 def _describe(run: Run) -> None:
-    """The page about the run: made anew whenever a stage was."""
+    """Write the page about the run."""
     from pipeline.decide import survey
     from workflows.report.page import write_report
 
@@ -115,7 +115,7 @@ def _describe(run: Run) -> None:
 
 
 def _check_stages(selection: dict[str, Any]) -> None:
-    """Refuse a stage that does not exist before a run is made."""
+    """UsageError for a stage that does not exist, before a run is created."""
     from pipeline.errors import UsageError
     from workflows.cli.resolve import nearest
 

@@ -19,7 +19,7 @@ ASSET = BakeOutputs.asset  # the file's name
 
 
 def resume_command(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
-    """What to type to go on with a run; see `pipeline.run.ResumeText`."""
+    """The command that resumes a run; see `pipeline.run.ResumeText`."""
     folder = shlex.quote(str(run))
     if only is not None:
         return f"enerf stage {only} {folder}"
@@ -38,7 +38,7 @@ def is_run(path: Path) -> bool:
 
 
 def check_names(run: Run) -> None:
-    """UnknownSetting where a run recorded settings under names of before release 0.1, and how to go on."""
+    """UnknownSetting, with the command to run, where a run recorded settings under names from before release 0.1."""
     found = moved_in(run.settings)
     if not found:
         return
@@ -48,7 +48,7 @@ def check_names(run: Run) -> None:
 
 
 def asset_of(path: Path) -> Path:
-    """The asset file that is meant by a run, by its folder `bake`, or by the file itself. Raises BadInput."""
+    """The asset file of a run, of its folder `bake`, or the file itself. Raises BadInput."""
     if path.is_file():
         return path
     if not path.exists():

@@ -1,4 +1,4 @@
-"""An asset file from another."""
+"""Conversion of asset files."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 
 def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None) -> None:
-    """Write the asset of `what` (a run or an asset) to `out`, whole or not at all; None keeps what it has.
+    """Write the asset of `what` (a run or an asset) to `out`, atomically; None keeps the value of the source.
 
-    Raises UsageError for a degree or a resolution that it does not have, BadInput and CorruptArtifact as `load_asset`.
+    Raises UsageError for a degree or a resolution above its own, BadInput and CorruptArtifact as `load_asset`.
     """
     from efficientnerf.asset import conversion, format
     from efficientnerf.asset.metadata import layout_of
@@ -38,7 +38,7 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
 
 
 def writer_of(about: dict[str, Any]) -> str:
-    """The writer that made a file of this description, or the one that comes nearest."""
+    """The writer that made a file of this description, or the nearest one."""
     from efficientnerf.asset.metadata import layout_of
 
     layout = layout_of(about)

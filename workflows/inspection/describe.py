@@ -1,4 +1,4 @@
-"""What `enerf inspect` finds out about a path, and how it says so."""
+"""Facts about a path for `enerf inspect`, and their text."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def _describe_mesh(path: Path) -> dict[str, Any]:
 
 
 def in_words(found: dict[str, Any]) -> str:
-    """The facts as lines of `name  value`; lists of cameras are left to --json."""
+    """The facts as lines of `name  value`; lists of cameras are shown with --json only."""
     return "\n".join(_lines(plain(found), ""))
 
 

@@ -26,9 +26,9 @@ class Request:
     out     where tables and runs go
     scale   1: as in the paper; less: iterations, resolution, networks and grids shrunk together
     device  "cpu" or "cuda"
-    say     tells the user what is going on
+    say     takes sentences for the user
     report  takes the events of the stages; None: they are dropped
-    timings repetitions of what is timed
+    timings repetitions of timings
     """
 
     data: Path | None
@@ -46,7 +46,7 @@ class Result:
 
     columns  in order; those that end in PAPER are the paper's figures
     rows     column -> text, number or None
-    notes    what a reader must know to trust the figures
+    notes    conditions under which the figures hold
     curves   name -> (seconds of training, PSNR in decibels), for the plot
     """
 

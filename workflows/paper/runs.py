@@ -31,7 +31,7 @@ class Row:
 
     name     of its run folder
     changes  to the train settings of PRESET, as they are in the paper; `scaled` shrinks them like the rest
-    bakes    whether its tree is wanted too
+    bakes    whether its tree is baked and measured too
     """
 
     name: str
@@ -41,7 +41,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Figures:
-    """What a row's run came to; seconds are of training steps alone, evaluation excluded, as in the paper.
+    """Results of a row's run; seconds are of training steps alone, evaluation excluded, as in the paper.
 
     psnr             of the network, mean over the test views that were rendered, decibels; ssim likewise
     step             seconds of a step, mean over the run
@@ -50,7 +50,7 @@ class Figures:
     coarse, fine     samples of a training ray that went through the coarse and the fine network, over the last fifth
     valid, pivotal   shares over rays x N_c of the test views (equations 5 and 12)
     curve            (seconds of training, PSNR of a validation view)
-    tree             figures of the baked tree, where wanted: psnr, ssim, frames a second, size of a frame
+    tree             figures of the baked tree, where baked: psnr, ssim, frames a second, size of a frame
     """
 
     psnr: float
@@ -134,7 +134,7 @@ def settings_of(row: Row, scale: float) -> dict[str, dict[str, Any]]:
 
 
 def measured(request: Request, scene: Path, row: Row) -> Figures:
-    """Train a row on a scene, or go on with it, and measure it."""
+    """Train a row on a scene, or resume its run, and measure it."""
     from pipeline.run import NAME, Run
     from pipeline.runner import run_stages
     from workflows import asset
@@ -183,7 +183,7 @@ def _pace(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _quality(run: Run, digest: str, settings: Mapping[str, Mapping[str, Any]], device: str) -> dict[str, Any]:
-    """PSNR, SSIM and shares of the network on test views; kept beside the run, and measured anew when the field or the views change."""
+    """PSNR, SSIM and shares of the network on test views; cached beside the run until the field or the views change."""
     import numpy as np
 
     from efficientnerf.evaluation.metrics import psnr, ssim

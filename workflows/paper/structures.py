@@ -1,4 +1,4 @@
-"""Table 7 of the paper: what dense voxels, a sparse tensor, an octree and NerfTree take to cache and to look up the same voxels.
+"""Table 7 of the paper: memory, caching and query times of dense voxels, a sparse tensor, an octree and NerfTree on the same voxels.
 
 On the CPU the kernels of `efficientnerf.structures`, on CUDA their plain torch versions. The structures take turns within each repetition, so that
 other load on the machine affects all of them equally.
@@ -40,7 +40,7 @@ SEED = 7
 
 @dataclass(frozen=True)
 class Case:
-    """Which voxels are cached: how they lie, their share of the grid, and whether they are listed in the order of the grid."""
+    """A set of voxels: clustered or scattered, their fraction of the grid, and whether they are listed in the order of the grid."""
 
     side: int
     share: float
@@ -238,7 +238,7 @@ class _OtherLoad:
 
 
 def _machine(load: _OtherLoad) -> str:
-    """Threads, caches, and what memory can do: reads at random and in a row."""
+    """Threads, caches, and memory bandwidth: random reads and sequential writes."""
     import numpy as np
 
     from efficientnerf.backends.numba.runtime import numba

@@ -1,4 +1,4 @@
-"""Tables 1 to 6 of the paper: which trainings each compares, what the paper printed, and what is shown of ours."""
+"""Tables 1 to 6 of the paper: the trainings that each compares, the figures printed in the paper, and the columns of ours."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FIT = "The tree's values were fitted to the training images after they were bake
 
 
 def shares(request: Request) -> Result:
-    """Table 1: of a trained NeRF, as section 3.3 says that the paper measured them, and of EfficientNeRF."""
+    """Table 1: shares of valid and pivotal samples of a trained NeRF (as in section 3.3) and of EfficientNeRF."""
     columns = ["scene", "method", "valid %", "valid %" + PAPER, "pivotal %", "pivotal %" + PAPER, "PSNR"]
     cases = [Row("nerf", NERF), Row("n4")]
     rows, curves = [], {}
@@ -176,7 +176,7 @@ def _means(request: Request, rows: Sequence[Row]) -> tuple[list[list[Figures]], 
 
 
 def _notes(request: Request, rows: Sequence[Row]) -> list[str]:
-    """What holds for every table that trains."""
+    """Notes of every table that trains."""
     found = scenes(_data(request))
     train = settings_of(rows[-1], request.scale)["train"]
     poses = settings_of(rows[-1], request.scale)["poses"]

@@ -1,7 +1,7 @@
 """A page about a run, RUN/report.html: renders, figures and settings.
 
-It is made from what the run holds and points to the images there by relative paths, so it may be opened from wherever the run is moved to. It
-belongs to no stage's artifact: it can be thrown away and made again. No script, nothing from the network. The template is report.html.j2.
+It refers to the images of the run by relative paths, so that the run may be moved. It belongs to no stage's artifact and can be made again. No script,
+nothing from the network. The template is report.html.j2.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ TEMPLATE = "report.html.j2"
 
 
 def write_report(run: Run, decisions: Sequence[Decision]) -> Path:
-    """Make RUN/report.html, whole or not at all; returns its path. Raises DiskFull, and BadInput where the folder can't be written."""
+    """Write RUN/report.html atomically; returns its path. Raises DiskFull, and BadInput where the folder cannot be written."""
     from pipeline.files import write_atomically
     from pipeline.run import cannot_write
 
@@ -92,7 +92,7 @@ def _stage(decision: Decision) -> tuple[str, ...]:
 
 
 def _json(path: Path) -> Any:
-    """A JSON file's value, or None: a page can be made of a run that is damaged, too."""
+    """A JSON file's value, or None where it cannot be read: the page of a damaged run can be made too."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -100,7 +100,7 @@ def _json(path: Path) -> Any:
 
 
 def _cameras(folder: Path) -> dict[str, Any] | None:
-    """What the report of the poses stage says: a sentence, the images that were not used, warnings."""
+    """Facts from the report of the poses stage: a sentence, the images that were not used, warnings."""
     report = _json(folder / POSES.report)
     if not isinstance(report, dict):
         return None

@@ -1,4 +1,4 @@
-"""What a run has made, where, and how good it is."""
+"""Summary of a run: its files and metrics."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ TITLES = {"asset": "asset", "turntable": "turntable", "mesh_glb": "mesh", "mesh_
 
 
 def artifacts(run: Path) -> dict[str, str]:
-    """Name -> absolute path of what there is."""
+    """Name -> absolute path of the files that exist."""
     return {name: str(run / path) for name, path in ARTIFACTS.items() if (run / path).exists()}
 
 
 def metrics(run: Path) -> dict[str, Any] | None:
-    """RUN/evaluate/metrics.json, or None where there is none, or none that can be read."""
+    """RUN/evaluate/metrics.json, or None where it is missing or unreadable."""
     try:
         found = json.loads(EvaluateOutputs.of_run(run).metrics.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -57,7 +57,7 @@ def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def in_words(run: Path, outcomes: Sequence[Outcome]) -> str:
-    """The same for people."""
+    """The summary as text."""
     ran = [outcome for outcome in outcomes if outcome.action == "ran"]
     spent = sum(outcome.seconds for outcome in ran)
     if ran:
