@@ -1,9 +1,9 @@
-"""Chains of linear layers with ReLUs, forward and backward by hand: where nearly all of the paper's arithmetic is.
+"""Chains of linear layers with ReLUs, with a backward pass of their own.
 
-What autograd would do, with less traffic: rows go through all layers in chunks that stay in the cache, bias and ReLU are fused into the product
-(oneDNN on the CPU), and the masks of the ReLUs are read off the activations. In "bfloat16" products and kept activations have 8 significant bits and
-sums 24; parameters, gradients and whatever leaves the chain stay float32, so that small steps are not lost (Micikevicius et al. 2018, "Mixed precision
-training"; bfloat16 has float32's range and needs no scaling of the loss).
+The sums are autograd's, with less memory traffic: rows go through all layers in chunks that stay in the cache, bias and ReLU are fused into the product
+(oneDNN on the CPU), and the ReLUs' masks are those of the stored activations. In bfloat16 products and stored activations have 8 significant bits and sums
+24; parameters, gradients and outputs are float32 (Micikevicius et al. 2018, "Mixed precision training"; bfloat16 has float32's range and needs no loss
+scaling).
 
 N rows.
 """
@@ -20,9 +20,9 @@ from torch import Tensor
 
 ROWS = 4096  # in a chunk: 2 MiB of bfloat16 activations a layer of 256
 DEVICE_ROWS = 2**18  # on CUDA, whose caches are small and whose launches cost more than small products: nearly always all
-ROW_STEP = 256  # on the CPU, to a multiple of which the last chunk is filled with zeros: oneDNN prepares code for each new shape, which costs more than the
-# product itself, and each step of pruned sampling has another number of samples
-COLUMN_STEP = 8  # to a multiple of which widths are filled, so that rows of bfloat16 begin at whole 16 bytes: the paper's 63 inputs and 49 outputs do not
+ROW_STEP = 256  # on the CPU, to a multiple of which the last chunk is padded with zeros: oneDNN prepares code for each new shape, which costs more than
+# the product itself, and each step of pruned sampling has another number of samples
+COLUMN_STEP = 8  # to a multiple of which widths are padded, so that rows of bfloat16 begin at whole 16 bytes: the paper's 63 inputs and 49 outputs do not
 
 
 @cache
@@ -50,10 +50,10 @@ def precision_of(setting: str, device: str) -> torch.dtype:
 
 def chain_reference(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], skip: int | None, relu_last: bool) -> Tensor:
     """`chain` in plain torch: any type, any device, differentiable in everything."""
-    again = x
+    skipped = x
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if layer == skip:
-            x = torch.cat([x, again], dim=-1)
+            x = torch.cat([x, skipped], dim=-1)
         x = torch.nn.functional.linear(x, weight, bias)
         if relu_last or layer < len(weights) - 1:
             x = torch.relu(x)
@@ -67,7 +67,7 @@ def chain(
 
     x          (N, I) float32
     weights    (O, I) each, biases (O,) each
-    skip       the layer at which x enters again, after what the layer before gave; x carries no gradient then
+    skip       the layer at which x enters again, behind the outputs of the layer before; x carries no gradient then
     relu_last  a ReLU after the last too
     returns    (N, O) of the last, float32
     """
@@ -98,24 +98,24 @@ class _Chain(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, skip: int | None, relu_last: bool, precision: torch.dtype, layers: int, *parameters: Tensor) -> Tensor:
         inputs, outputs = x.shape[1], parameters[layers - 1].shape[0]
         split = [None if layer != skip else len(parameters[layer - 1]) for layer in range(layers)]
-        weights = [_filled_weight(w.detach(), at, precision) for w, at in zip(parameters[:layers], split, strict=True)]
-        biases = [_filled(b.detach()[None], 1, _up(len(b), COLUMN_STEP), precision)[0] for b in parameters[layers:]]
+        weights = [_padded_weight(w.detach(), at, precision) for w, at in zip(parameters[:layers], split, strict=True)]
+        biases = [_padded(b.detach()[None], 1, _round_up(len(b), COLUMN_STEP), precision)[0] for b in parameters[layers:]]
         out = torch.empty(len(x), outputs, device=x.device)
-        keep = any(ctx.needs_input_grad)
-        kept: list[list[Tensor]] = []
+        store = any(ctx.needs_input_grad)
+        activations: list[list[Tensor]] = []
         rows = ROWS if x.device.type == "cpu" else DEVICE_ROWS
         for begin in range(0, len(x), rows):
             part = x[begin : begin + rows]
-            first = _filled(part, _rows(part), _up(inputs, COLUMN_STEP), precision)
+            first = _padded(part, _rows(part), _round_up(inputs, COLUMN_STEP), precision)
             given, y = [], first
             for layer in range(layers):
                 y = torch.cat([y, first], dim=1) if layer == skip else y
                 given.append(y)
                 y = product(y, weights[layer], biases[layer], relu_last or layer < layers - 1)
             out[begin : begin + rows] = y[: len(part), :outputs]
-            if keep:
-                kept.append([*given, y] if relu_last else given)
-        ctx.kept, ctx.weights, ctx.relu_last, ctx.split, ctx.rows = kept, weights, relu_last, split, rows
+            if store:
+                activations.append([*given, y] if relu_last else given)
+        ctx.activations, ctx.weights, ctx.relu_last, ctx.split, ctx.rows = activations, weights, relu_last, split, rows
         ctx.shapes = [p.shape for p in parameters]
         return out
 
@@ -128,36 +128,36 @@ class _Chain(torch.autograd.Function):
         bias_grads = [torch.zeros(len(w), device=grad.device) for w in weights]
         inputs = ctx.shapes[0][1]
         x_grad = torch.empty(len(grad), inputs, device=grad.device) if ctx.needs_input_grad[0] else None
-        for number, kept in enumerate(ctx.kept):
+        for number, activations in enumerate(ctx.activations):
             begin = number * ctx.rows
             part = grad[begin : begin + ctx.rows]
-            g = _filled(part, len(kept[0]), len(weights[-1]), weights[0].dtype)
+            g = _padded(part, len(activations[0]), len(weights[-1]), weights[0].dtype)
             if ctx.relu_last:
-                g = _through_relu(g, kept[layers])
+                g = _relu_backward(g, activations[layers])
             for layer in reversed(range(layers)):
-                y = kept[layer]
+                y = activations[layer]
                 weight_grads[layer] += outer(g, y)
                 bias_grads[layer] += g.sum(0)  # summed in float32, and rounded once
                 if layer:
                     hidden = len(weights[layer - 1])  # what x adds at the skip needs no gradient
-                    g = _through_relu(product(g, transposed[layer][:hidden], None, False), y[:, :hidden])
+                    g = _relu_backward(product(g, transposed[layer][:hidden], None, False), y[:, :hidden])
                 elif x_grad is not None:
                     x_grad[begin : begin + ctx.rows] = product(g, transposed[0], None, False)[: len(part), :inputs]
-        ctx.kept = None
-        of_weights = [_emptied(g, shape, at) for g, shape, at in zip(weight_grads, ctx.shapes[:layers], ctx.split, strict=True)]
+        ctx.activations = None
+        of_weights = [_unpadded(g, shape, at) for g, shape, at in zip(weight_grads, ctx.shapes[:layers], ctx.split, strict=True)]
         return (x_grad, None, None, None, None, *of_weights, *(g[: shape[0]] for g, shape in zip(bias_grads, ctx.shapes[layers:], strict=True)))
 
 
-def _up(count: int, step: int) -> int:
+def _round_up(count: int, step: int) -> int:
     return -(-count // step) * step
 
 
 def _rows(part: Tensor) -> int:
-    return min(ROWS, _up(len(part), ROW_STEP)) if part.device.type == "cpu" else len(part)
+    return min(ROWS, _round_up(len(part), ROW_STEP)) if part.device.type == "cpu" else len(part)
 
 
-def _filled(x: Tensor, rows: int, columns: int, precision: torch.dtype) -> Tensor:
-    """x in the top left of a matrix of zeros."""
+def _padded(x: Tensor, rows: int, columns: int, precision: torch.dtype) -> Tensor:
+    """x as the upper left part of a matrix of zeros."""
     if x.shape == (rows, columns):
         return x.to(precision)
     out = torch.zeros(rows, columns, dtype=precision, device=x.device)
@@ -165,23 +165,23 @@ def _filled(x: Tensor, rows: int, columns: int, precision: torch.dtype) -> Tenso
     return out
 
 
-def _filled_weight(weight: Tensor, split: int | None, precision: torch.dtype) -> Tensor:
-    """A weight (O, I) for filled rows; at the skip, its columns from `split` on meet the input, which begins after the filled width before it."""
-    rows, step = _up(len(weight), COLUMN_STEP), COLUMN_STEP
+def _padded_weight(weight: Tensor, split: int | None, precision: torch.dtype) -> Tensor:
+    """A weight (O, I) for padded rows; at the skip, its columns from `split` on meet the input, which begins after the padded width before it."""
+    rows, step = _round_up(len(weight), COLUMN_STEP), COLUMN_STEP
     if split is None:
-        return _filled(weight, rows, _up(weight.shape[1], step), precision)
+        return _padded(weight, rows, _round_up(weight.shape[1], step), precision)
     before, after = weight[:, :split], weight[:, split:]
-    return torch.cat([_filled(part, rows, _up(part.shape[1], step), precision) for part in (before, after)], dim=1)
+    return torch.cat([_padded(part, rows, _round_up(part.shape[1], step), precision) for part in (before, after)], dim=1)
 
 
-def _emptied(grad: Tensor, shape: torch.Size, split: int | None) -> Tensor:
-    """The gradient of a filled weight as that of the weight."""
+def _unpadded(grad: Tensor, shape: torch.Size, split: int | None) -> Tensor:
+    """The gradient of a padded weight as that of the weight."""
     if split is None:
         return grad[: shape[0], : shape[1]]
-    after = _up(split, COLUMN_STEP)
+    after = _round_up(split, COLUMN_STEP)
     return torch.cat([grad[: shape[0], :split], grad[: shape[0], after : after + shape[1] - split]], dim=1)
 
 
-def _through_relu(grad: Tensor, out: Tensor) -> Tensor:
+def _relu_backward(grad: Tensor, out: Tensor) -> Tensor:
     """The gradient before a ReLU that gave `out`."""
     return torch.ops.aten.threshold_backward(grad, out, 0)
