@@ -28,6 +28,8 @@ def contact_sheet(
     """
     from PIL import Image, ImageDraw, ImageFont
 
+    from stages.io.png import write_png
+
     if not any(len(row) for row in rows):
         raise ValueError(f"{path}: a contact sheet of no images")
     thumbnails = [[None if image is None else thumbnail_of(image, thumbnail) for image in row] for row in rows]
@@ -49,7 +51,7 @@ def contact_sheet(
             if labels is not None and labels[i][j]:
                 draw.text((x, top + heights[i] + 2), _fitted(labels[i][j], cell_w, draw, font), TEXT, font)
         top += heights[i] + label_h + MARGIN
-    sheet.save(path, "PNG", compress_level=6)
+    write_png(np.asarray(sheet), path)
 
 
 def grid_sheet(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, thumbnail: int = 160, title: str = "") -> None:

@@ -246,15 +246,15 @@ def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest
     def find_cameras(folder: Path, names: list[str], **options: Any) -> Capture:
         asked.update(options, names=names)
         found = tuple(Photo(camera, folder / camera.name, options["masks"].get(camera.name)) for camera in made[:5])
-        options["warn"]("one found no place")
-        return Capture(kind="photographs", photos=found, background=None, rejected=(("img_5.png", "overlaps no other"),), warnings=("one found no place",))
+        options["warn"]("one was not registered")
+        return Capture(kind="photographs", photos=found, background=None, rejected=(("img_5.png", "overlaps no other"),), warnings=("one was not registered",))
 
     monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find_cameras)
     whole, warnings = run(source, tmp_path / "a", max_features=1000, matching="sequential", feature_image_size=800, seed=3)
     assert (asked["features"], asked["matching"], asked["max_side"], asked["seed"]) == (1000, "sequential", 800, 3)
     assert asked["names"] == [camera.name for camera in made]
     assert asked["work"].is_relative_to(tmp_path / "a/work")
-    assert warnings == ["one found no place"]
+    assert warnings == ["one was not registered"]
     assert len(whole.views) == 5
     assert whole.views[1].mask == "masks/img_1.png"
     assert json.loads((tmp_path / "a/poses/report.json").read_text())["rejected"] == [{"name": "img_5.png", "reason": "overlaps no other"}]

@@ -147,7 +147,7 @@ def test_no_voxel_is_baked_that_few_photographs_have_in_view(tmp_path: Path, min
 def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_the_box(tmp_path: Path) -> None:
     narrow_scene(tmp_path / "poses")
     anywhere = job(tmp_path / "anywhere", balls.settings(iterations=2, min_views="off"), poses=tmp_path / "poses")
-    cut_out = job(tmp_path / "cut_out", balls.settings(iterations=2), poses=poses(tmp_path / "cut", count=10))
-    for made in (anywhere, cut_out):
+    bounded = job(tmp_path / "bounded", balls.settings(iterations=2), poses=poses(tmp_path / "cut", count=10))
+    for made in (anywhere, bounded):
         train.run(made)
         assert not torch.isneginf(load_renderer(made.out).model.voxels.values).any()
