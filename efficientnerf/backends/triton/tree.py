@@ -145,8 +145,8 @@ def render_rays(t: DeviceTree, origins: Tensor, directions: Tensor, views: Tenso
     """
     start = ((origins.double() - constant(t.low, origins.double())) / t.voxel).float().contiguous()
     along = directions.float().contiguous()
-    seen_along = along if views is None else views.float().contiguous()
-    return _launch(t, len(start), (start, along, seen_along), (0.0,) * 16, (0, 0), None)
+    view_directions = along if views is None else views.float().contiguous()
+    return _launch(t, len(start), (start, along, view_directions), (0.0,) * 16, (0, 0), None)
 
 
 def tree_rays(
