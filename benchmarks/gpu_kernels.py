@@ -66,7 +66,7 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     directions = torch.nn.functional.normalize(target - 3 * outward, dim=-1).to(device)
     origins = (3 * outward).to(device)
     near, far, offset = (torch.full((rays_,), x, device=device) for x in (1.0, 6.0, 0.5))
-    march = (m.space, origins, directions, near, far, offset, m.step, m.slots, voxels, 0.5)
+    march = (m.space, origins, directions, near, far, offset, m.step, m.max_intervals, voxels, 0.5)
     coarse = sampling.valid_samples(*march)
     count = len(coarse.start)
     weight = torch.rand(count, generator=generator).to(device)

@@ -47,7 +47,7 @@ class Model:
     """See the module. The settings are those that it was made with, and do not change.
 
     step        length of a coarse interval in the box, world units
-    slots       intervals on a ray at most
+    max_intervals  intervals on a ray at most
     background  constant colour behind the scene, or None: then `sky` is
     """
 
@@ -60,7 +60,7 @@ class Model:
     sky: Sky
     background: tuple[float, float, float] | None
     step: float
-    slots: int
+    max_intervals: int
 
     @property
     def prunes(self) -> bool:
@@ -145,7 +145,7 @@ def model(
     voxels = _voxels(settings, space, step, device)
     intervals = Intervals(space, voxels, step, space.max_intervals(step), coarse_samples, span is not None, settings.field != "hash")
     strategy = _strategy(settings, intervals)
-    return Model(space, settings, coarse.to(device), fine.to(device), voxels, strategy, Sky().to(device), background, step, intervals.most)
+    return Model(space, settings, coarse.to(device), fine.to(device), voxels, strategy, Sky().to(device), background, step, intervals.max_intervals)
 
 
 def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[Field, Field]:

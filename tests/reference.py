@@ -157,7 +157,7 @@ class March(NamedTuple):
 
 def march(
     bounds: np.ndarray, contracted: bool, origin: Sequence[float], direction: Sequence[float], near: float, far: float, offset: float,
-    step: float, slots: int, voxels: np.ndarray, threshold: float,
+    step: float, max_intervals: int, voxels: np.ndarray, threshold: float,
 ) -> March:  # fmt: skip
     """The valid samples of one ray, interval by interval (equation 9)."""
     centre, half = (bounds[0] + bounds[1]) / 2, (bounds[1] - bounds[0]) / 2
@@ -178,7 +178,7 @@ def march(
             enter, leave = max(enter, crossings[0]), min(leave, crossings[1])
         margin = abs(leave - enter)
     t, samples, tried = enter, [], 0
-    for _ in range(slots):
+    for _ in range(max_intervals):
         margin = min(margin, abs(t - leave))
         stretch = 1.0
         if contracted:
@@ -201,9 +201,9 @@ def march(
     return March(samples, tried, margin)
 
 
-def select_pivots(weights: Sequence[float], threshold: float, most: int) -> list[bool]:
+def select_pivots(weights: Sequence[float], threshold: float, max_pivots: int) -> list[bool]:
     """One ray: samples of a weight above the threshold, at most so many, the heaviest; among equals the nearer."""
-    heaviest = sorted(range(len(weights)), key=lambda n: (-weights[n], n))[:most]
+    heaviest = sorted(range(len(weights)), key=lambda n: (-weights[n], n))[:max_pivots]
     return [n in heaviest and weight > threshold for n, weight in enumerate(weights)]
 
 

@@ -105,19 +105,19 @@ def _capacity(backend: Backend, capacity: int | None) -> dict[str, int | None]:
 
 
 def valid_samples(
-    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
-    capacity: int | None = None, *, whole: int = 0,
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, max_intervals: int,
+    voxels: Tensor, threshold: float, capacity: int | None = None, *, unpruned: int = 0,
 ) -> Samples:  # fmt: skip
     """See `efficientnerf.sampling.valid.valid_samples`; `capacity` is for Triton alone, see `efficientnerf.backends.triton.sampling`."""
     rays = (origins, directions, near, far, offset)
     backend = backend_of(*rays, voxels)
     find = implementation("valid_samples", backend)
-    return find(space, *rays, step, slots, voxels, threshold, whole=whole, **_capacity(backend, capacity))
+    return find(space, *rays, step, max_intervals, voxels, threshold, unpruned=unpruned, **_capacity(backend, capacity))
 
 
-def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: int) -> Tensor:
     """See `efficientnerf.sampling.pivotal.select_pivots`."""
-    return implementation("select_pivots", backend_of(weight))(weight, first, threshold, most)
+    return implementation("select_pivots", backend_of(weight))(weight, first, threshold, max_pivots)
 
 
 def pivotal_samples(

@@ -9,8 +9,8 @@ from efficientnerf.geometry.spaces import Space
 from efficientnerf.sampling.samples import Samples
 
 
-def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
-    """Which coarse samples are pivotal: (N,) bool, those with a weight above `threshold`, the `most` heaviest of a ray.
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: int) -> Tensor:
+    """Which coarse samples are pivotal: (N,) bool, those with a weight above `threshold`, the `max_pivots` heaviest of a ray.
 
     The cap bounds the work while densities are still spread out. The lowest weights are dropped, in training and in rendering alike; among equals the
     nearer is kept. (The authors' release drops a random subset.)
@@ -22,7 +22,7 @@ def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) ->
     order = order[torch.argsort(ray[order], stable=True)]  # ray by ray, heaviest first
     rank = torch.empty_like(order)
     rank[order] = torch.arange(len(order), device=weight.device) - first[ray[order]]
-    return pivotal & (rank < most)
+    return pivotal & (rank < max_pivots)
 
 
 def pivotal_samples(space: Space, origins: Tensor, directions: Tensor, offset: Tensor, coarse: Samples, pivotal: Tensor, per_pivot: int) -> Samples:

@@ -74,7 +74,7 @@ class Intervals:
     """How rays are cut into coarse intervals.
 
     step           length of an interval in the box, units of the frame
-    most           intervals on a ray at most
+    max_intervals  intervals on a ray at most
     count          N_c
     within_planes  whether they run from near to far plane instead of through the box
     keep_outside   whether samples outside of the space are kept: a network can be evaluated there, a hash grid cannot
@@ -83,7 +83,7 @@ class Intervals:
     space: Space
     voxels: DensityVoxels
     step: float
-    most: int
+    max_intervals: int
     count: int
     within_planes: bool
     keep_outside: bool
@@ -94,15 +94,15 @@ class Intervals:
         unpruned = math.ceil(unpruned_fraction * len(request.offset)) if request.rng is not None else 0
         capacity = None if request.capacity is None else request.capacity.coarse
         bundle = (*request.rays[:4], request.offset)
-        return dispatch.valid_samples(self.space, *bundle, self.step, self.most, self.voxels.values, threshold, capacity, whole=unpruned)
+        return dispatch.valid_samples(self.space, *bundle, self.step, self.max_intervals, self.voxels.values, threshold, capacity, unpruned=unpruned)
 
     def stratified(self, request: SamplingRequest, count: int, capacity: int | None) -> CoarseStage:
         """`count` samples between near and far, or between where the ray enters the box and leaves it, whatever the density voxels hold."""
         origins, directions, near, far = request.rays[:4]
         if self.space.contracted:  # intervals that grow with the distance, all of them
-            step, most = self.step * self.count / count, math.ceil(self.most * count / self.count)
+            step, max_intervals = self.step * self.count / count, math.ceil(self.max_intervals * count / self.count)
             bundle = (origins, directions, near, far, request.offset)
-            samples = dispatch.valid_samples(self.space, *bundle, step, most, self.voxels.values, -math.inf, capacity)
+            samples = dispatch.valid_samples(self.space, *bundle, step, max_intervals, self.voxels.values, -math.inf, capacity)
             return CoarseStage(samples, distances_at(samples, request.offset))
         if not self.within_planes:
             near, far = self.space.clip(origins, directions, near, far)

@@ -92,7 +92,7 @@ def trainer(m: Model, views: int = 0, schedule: Schedule | None = None) -> Train
     if exposure is not None:
         groups.append(ParameterGroup({"exposure": exposure}))
     # Until it is known better, every interval is sampled, and as many pivots as there may be.
-    samples = float(m.slots + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
+    samples = float(m.max_intervals + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
     return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure)
 
 

@@ -51,10 +51,10 @@ def test_a_capacity_cuts_off_the_end_or_pads_it(contracted: bool, room: int) -> 
 
 @pytest.mark.parametrize("room", [None, 300, 4000])
 @pytest.mark.parametrize("contracted", [False, True])
-def test_the_first_rays_can_be_looked_at_whole(contracted: bool, room: int | None) -> None:
+def test_the_first_rays_can_be_left_unpruned(contracted: bool, room: int | None) -> None:
     rays, space = there(make_rays("outside")), space_from(BOUNDS, contracted=contracted)
     args = (space, *rays, STEP, 60, voxels_of().to(DEVICE))
-    some = here(cuda.valid_samples(*args, 0.4, room, whole=5))
+    some = here(cuda.valid_samples(*args, 0.4, room, unpruned=5))
     every, pruned = (here(cuda.valid_samples(*args, threshold)) for threshold in (-math.inf, 0.4))
     for r in range(len(rays.origins)):
         begin, end = some.first[r : r + 2].tolist()

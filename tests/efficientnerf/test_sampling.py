@@ -29,7 +29,7 @@ def double(rays: Rays) -> Rays:
 @pytest.mark.parametrize("contracted", [False, True])
 @pytest.mark.parametrize("lost", [float("nan"), float("inf"), 3e38])
 def test_a_ray_that_is_nowhere_leaves_its_neighbours_alone(contracted: bool, lost: float) -> None:
-    """The kernel takes rays sixteen at a time; none may make it look at voxels that there are not."""
+    """The kernel takes rays sixteen at a time; none may make it read voxels that do not exist."""
     rays, space = make_rays("outside"), space_from(BOUNDS, contracted=contracted)
     alone = dispatch.valid_samples(space, *rays, STEP, 60, voxels_of(), 0.4)
     odd = Rays(rays.origins.clone(), rays.directions.clone(), *rays[2:])
@@ -43,9 +43,9 @@ def test_a_ray_that_is_nowhere_leaves_its_neighbours_alone(contracted: bool, los
 
 @pytest.mark.parametrize("finder", FINDERS)
 @pytest.mark.parametrize("contracted", [False, True])
-def test_the_first_rays_can_be_looked_at_whole(contracted: bool, finder: str) -> None:
+def test_the_first_rays_can_be_left_unpruned(contracted: bool, finder: str) -> None:
     rays, space, find = make_rays("outside"), space_from(BOUNDS, contracted=contracted), FINDERS[finder]
-    some = find(space, *rays, STEP, 60, voxels_of(), 0.4, whole=7)
+    some = find(space, *rays, STEP, 60, voxels_of(), 0.4, unpruned=7)
     parts = [find(space, *(t[which] for t in rays), STEP, 60, voxels_of(), threshold) for which, threshold in ((slice(7), -math.inf), (slice(7, None), 0.4))]
     assert torch.equal(some.first, torch.cat([parts[0].first, parts[1].first[1:] + parts[0].first[-1]]))
     for ours, *theirs in zip(some[1:5], parts[0][1:5], parts[1][1:5], strict=True):
@@ -80,7 +80,7 @@ def test_intervals_lie_end_to_end_and_samples_in_them(finder: str, contracted: b
     torch.testing.assert_close(found.length[~last], torch.full_like(found.length[~last], STEP))
     assert (found.length[last] <= STEP * 1.0001).all()
     if not contracted:
-        assert found.point.min() >= -1e-5  # nothing beyond the box is asked for
+        assert found.point.min() >= -1e-5  # nothing beyond the box
         assert found.point.max() <= 1 + 1e-5
         chord = (found.start + found.extent)[last] - found.start[found.first[:-1][found.first[1:] > found.first[:-1]]]
         torch.testing.assert_close(torch.zeros(len(rays.far)).index_add(0, ray, found.extent)[ray[last]], chord, rtol=1e-4, atol=1e-5)
@@ -100,7 +100,7 @@ def test_a_ray_through_all_of_contracted_space_fits_its_slots(coarse_samples: in
     origins = torch.from_numpy((rng.uniform(-1.5, 1.5, (300, 3)) - 3 * directions).astype(np.float32))
     along = torch.from_numpy(directions.astype(np.float32))
     ones = torch.ones(300)
-    found = dispatch.valid_samples(space, origins, along, 0.01 * ones, 1e9 * ones, 0.5 * ones, m.step, m.slots, m.voxels.values, -math.inf)
+    found = dispatch.valid_samples(space, origins, along, 0.01 * ones, 1e9 * ones, 0.5 * ones, m.step, m.max_intervals, m.voxels.values, -math.inf)
     last = found.first[1:] - 1
     reach = space.unit(origins + (found.start + found.extent)[last][:, None] * along).abs().amax(dim=1)
     assert reach.min() > reference.FARTHEST

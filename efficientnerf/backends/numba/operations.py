@@ -28,21 +28,21 @@ def _box(space: Space) -> tuple[np.ndarray, np.ndarray, bool]:
 
 
 def valid_samples(
-    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
-    *, whole: int = 0,
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, max_intervals: int,
+    voxels: Tensor, threshold: float, *, unpruned: int = 0,
 ) -> Samples:  # fmt: skip
     from efficientnerf.backends.numba import sampling
 
-    given: list[Any] = [_array(t) for t in (origins, directions, near, far, offset)] + [*_box(space), step, slots, _array(voxels), threshold, whole]
+    given: list[Any] = [_array(t) for t in (origins, directions, near, far, offset)] + [*_box(space), step, max_intervals, _array(voxels), threshold, unpruned]
     *packed, tried = sampling.valid_samples(*given)
     return Samples._make([*(torch.from_numpy(a) for a in packed), tried, None])
 
 
-def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: int) -> Tensor:
     from efficientnerf.backends.numba import sampling
 
     out = torch.empty(len(weight), dtype=torch.bool)
-    sampling.select_pivots(_array(weight), _array(first), np.float32(threshold), most, out.numpy())
+    sampling.select_pivots(_array(weight), _array(first), np.float32(threshold), max_pivots, out.numpy())
     return out
 
 

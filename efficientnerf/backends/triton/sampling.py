@@ -98,10 +98,10 @@ def _store(buffers, at, t, size, length, point, live):  # type: ignore[no-untype
     store_vec3(buffers.point, at, point, live)
 
 
-@triton.jit(do_not_specialize=["whole"])
+@triton.jit(do_not_specialize=["unpruned"])
 def _march(  # type: ignore[no-untyped-def]
     origins, directions, near, far, offset, cx, cy, cz, hx, hy, hz, voxels, first, counts, tried, start, extent, length, point,
-    rays, slots, step, threshold, whole, side, CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
+    rays, max_intervals, step, threshold, unpruned, side, CONTRACTED: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Counts the valid samples of each ray, or writes them from `first` on."""
     r = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -117,14 +117,14 @@ def _march(  # type: ignore[no-untyped-def]
     if WRITE:
         at = tl.load(first + r, live, other=0)
         end = tl.load(first + r + 1, live, other=0)
-    limit = tl.where(r < whole, float("-inf"), threshold)
+    limit = tl.where(r < unpruned, float("-inf"), threshold)
     valid = tl.zeros((BLOCK,), tl.int32)
     passed = tl.zeros((BLOCK,), tl.int32)
     alive = live & (t < leave)
     if WRITE:
         alive = alive & (at < end)
     n = 0
-    while (n < slots) & (tl.max(alive.to(tl.int32), 0) > 0):
+    while (n < max_intervals) & (tl.max(alive.to(tl.int32), 0) > 0):
         scale = tl.full((BLOCK,), 1.0, tl.float32)  # world length of a contracted one
         if CONTRACTED:
             reach = tl.maximum(tl.maximum(tl.abs(u.x + t * v.x), tl.abs(u.y + t * v.y)), tl.maximum(tl.abs(u.z + t * v.z), 1.0))
@@ -160,8 +160,8 @@ def _offsets(counts: Tensor) -> Tensor:
 
 
 def valid_samples(
-    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, slots: int, voxels: Tensor, threshold: float,
-    capacity: int | None = None, *, whole: int = 0,
+    space: Space, origins: Tensor, directions: Tensor, near: Tensor, far: Tensor, offset: Tensor, step: float, max_intervals: int,
+    voxels: Tensor, threshold: float, capacity: int | None = None, *, unpruned: int = 0,
 ) -> Samples:  # fmt: skip
     """See `efficientnerf.sampling.valid.valid_samples`; with `capacity` see the module, and `tried` is then a tensor on the device."""
     origins, directions, near, far, offset, voxels = (t.detach().contiguous() for t in (origins, directions, near, far, offset, voxels))
@@ -169,7 +169,7 @@ def valid_samples(
     device = origins.device
     counts, tried = (torch.zeros(rays, dtype=torch.int32, device=device) for _ in range(2))
     bundle = (origins, directions, near, far, offset, *_box(space), voxels)
-    rest = (rays, slots, float(step), float(threshold), whole, side)
+    rest = (rays, max_intervals, float(step), float(threshold), unpruned, side)
     grid, shape = (blocks(rays, RAYS),), {"CONTRACTED": space.contracted, "BLOCK": RAYS, "num_warps": 1}
     nothing = origins.new_empty(0)
     _march[grid](*bundle, counts, counts, tried, nothing, nothing, nothing, nothing, *rest, WRITE=False, **shape)
@@ -201,7 +201,7 @@ def _ray_of(first, n, rays, BITS: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _pivots(weight, first, out, rays, samples, threshold, most, BITS: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _pivots(weight, first, out, rays, samples, threshold, max_pivots, BITS: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
     """Each lane counts the heavier samples of its ray; among equals the nearer counts as heavier."""
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = n < samples
@@ -211,24 +211,25 @@ def _pivots(weight, first, out, rays, samples, threshold, most, BITS: tl.constex
     other = tl.load(first + ray, chosen, other=0)
     end = tl.load(first + ray + 1, chosen, other=0)
     rank = tl.zeros((BLOCK,), tl.int32)
-    going = chosen & (end - other > most)
+    going = chosen & (end - other > max_pivots)
     while tl.max(going.to(tl.int32), 0) > 0:
         theirs = tl.load(weight + other, going, other=0.0)
         rank += (going & ((theirs > w) | ((theirs == w) & (other < n)))).to(tl.int32)
         other += 1
-        going = going & (other < end) & (rank < most)
-    tl.store(out + n, (chosen & (rank < most)).to(tl.int8), live)
+        going = going & (other < end) & (rank < max_pivots)
+    tl.store(out + n, (chosen & (rank < max_pivots)).to(tl.int8), live)
 
 
-def select_pivots(weight: Tensor, first: Tensor, threshold: float, most: int) -> Tensor:
+def select_pivots(weight: Tensor, first: Tensor, threshold: float, max_pivots: int) -> Tensor:
     """See `efficientnerf.sampling.pivotal.select_pivots`; padding is never pivotal."""
     weight, rays, samples = weight.detach().contiguous(), len(first) - 1, len(weight)
     out = torch.zeros(samples, dtype=torch.bool, device=weight.device)
     if rays and samples:
         block = LANES if INTERPRETED else 32
         _pivots[(blocks(samples, block),)](
-            weight, first, out.view(torch.int8), rays, samples, float(threshold), most, BITS=rays.bit_length(), BLOCK=block, num_warps=1 if block == 32 else 4
-        )
+            weight, first, out.view(torch.int8), rays, samples, float(threshold), max_pivots,
+            BITS=rays.bit_length(), BLOCK=block, num_warps=1 if block == 32 else 4,
+        )  # fmt: skip
     return out
 
 

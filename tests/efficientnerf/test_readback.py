@@ -27,37 +27,37 @@ from tests.efficientnerf.balls import BOUNDS, pixels, settings
 from tests.efficientnerf.device import DEVICE
 
 
-def samples(counts: list[int], tried: int = 50, room: int | None = None) -> Samples:
-    """Of rays with so many samples; where there is room for some alone, the others are lost."""
+def samples(counts: list[int], tried: int = 50, capacity: int | None = None) -> Samples:
+    """Of rays with so many samples; with a capacity, those that do not fit are lost."""
     first = torch.tensor([0, *counts]).cumsum(0)
-    empty = torch.zeros(int(first[-1]) if room is None else room)
-    complete = None if room is None else first[1:] <= room
+    empty = torch.zeros(int(first[-1]) if capacity is None else capacity)
+    complete = None if capacity is None else first[1:] <= capacity
     return Samples(first.clamp(max=len(empty)), empty, empty, empty, torch.zeros(len(empty), 3), tried, complete)
 
 
 def test_counts_arrive_late_once_the_averages_are_known() -> None:
     kept = AsyncReadback(lag=2, exact_steps=3)
-    arrived, rooms = [], []
+    arrived, capacities = [], []
     for step in range(1, 9):
-        rooms.append(kept.capacity(4))
+        capacities.append(kept.capacity(4))
         counted = kept.record(4, torch.tensor(float(step)), samples([step, 0, 0, 0]), torch.ones(step, dtype=torch.bool), samples([2 * step, 0, 0, 0]))
         arrived.append((counted.loss, counted.valid, counted.fine))
     assert [loss for loss, _, _ in arrived] == [1, 2, 2, 2, 3, 4, 5, 6]
     assert all(fine == 2 * valid for _, valid, fine in arrived)
-    assert rooms[:3] == [None] * 3
-    assert rooms[3] == SampleCapacity(readback.GRANULARITY, readback.GRANULARITY)
+    assert capacities[:3] == [None] * 3
+    assert capacities[3] == SampleCapacity(readback.GRANULARITY, readback.GRANULARITY)
     assert kept.fine_per_ray == pytest.approx(2 * kept.valid_per_ray)
     big = kept.capacity(10**6)
     assert big is not None
     assert big.fine >= readback.MARGIN * kept.fine_per_ray * 10**6 > big.fine - readback.GRANULARITY - 1
 
 
-def test_rays_without_room_are_left_out() -> None:
-    whole = complete_rays(samples([2, 3, 4, 0], room=6), samples([1, 1, 1, 0], room=10))
+def test_rays_whose_samples_do_not_fit_are_left_out() -> None:
+    whole = complete_rays(samples([2, 3, 4, 0], capacity=6), samples([1, 1, 1, 0], capacity=10))
     assert whole is not None
     assert whole.tolist() == [True, True, False, False]
     assert complete_rays(samples([2, 4]), samples([2, 4])) is None  # counted, not padded
-    one = complete_rays(samples([2, 4]), samples([2, 4], room=6))
+    one = complete_rays(samples([2, 4]), samples([2, 4], capacity=6))
     assert one is not None
     assert one.all()  # it is full, and nothing was lost
     values = torch.tensor([[1.0, 3.0], [5.0, 5.0], [float("nan"), 1.0], [1e9, 0.0]], requires_grad=True)
@@ -70,13 +70,13 @@ def test_rays_without_room_are_left_out() -> None:
     assert float(mean_over(values.detach(), torch.zeros(4, dtype=torch.bool))) == 0
 
 
-def test_rays_that_were_left_out_are_counted_and_room_is_made_for_them() -> None:
+def test_rays_that_were_left_out_are_counted_and_the_capacity_grows() -> None:
     """All of a sudden rays have ten times as many samples: what is lost is not known, but how many those have whose samples fit is."""
     kept, left_out = AsyncReadback(lag=0, exact_steps=2, granularity=10), []
     for step in range(40):
         each = 3 if step < 4 else 30
-        room = kept.capacity(100) or SampleCapacity(3000, 3000)
-        found = samples([each] * 100, room=room.coarse), samples([each] * 100, room=room.fine)
+        capacity = kept.capacity(100) or SampleCapacity(3000, 3000)
+        found = samples([each] * 100, capacity=capacity.coarse), samples([each] * 100, capacity=capacity.fine)
         left_out.append(kept.record(100, torch.tensor(0.0), found[0], torch.ones(len(found[0].start), dtype=torch.bool), found[1]).left_out)
     assert left_out[:4] == [0] * 4
     assert left_out[4] == 100 - int(1.3 * 300) // 30
@@ -84,7 +84,7 @@ def test_rays_that_were_left_out_are_counted_and_room_is_made_for_them() -> None
     assert kept.valid_per_ray == pytest.approx(30, rel=0.2)
 
 
-def test_a_share_is_told_late_on_a_device_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_occupied_fraction_is_read_late_on_a_device_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     voxels = density_voxels(2, "momentum")
     share, arrived = AsyncOccupancy(voxels), []
     assert share() == 1
@@ -168,19 +168,19 @@ def test_padded_steps_learn_what_counted_ones_do(strategy: str, interpreted: Non
     for ours, theirs in zip(steps[2], [*steps[1000][:2], *steps[1000][1:-1]], strict=True):
         assert ours.loss == pytest.approx(theirs.loss, rel=1e-3)
         assert (ours.rays, ours.tried, ours.valid, ours.pivotal, ours.fine) == (theirs.rays, theirs.tried, theirs.valid, theirs.pivotal, theirs.fine)
-        assert ours.left_out == 0  # there was room for all
+        assert ours.left_out == 0  # all fit
     torch.testing.assert_close(voxels[2], voxels[1000], rtol=1e-3, atol=1e-3)
     whole = STRATEGIES[strategy].get("occupancy_update_ray_fraction", 0) > 0
     if m.prunes:
         assert all(0.3 < step.valid / step.tried < 0.9 for step in steps[2][1:])
-        # Only whole rays, and what is asked about at random, tell of what is pruned.
+        # Only unpruned rays and updates at random cells query pruned voxels.
         assert (voxels[2] != EMPTY).float().mean() > (0.502 if whole else 0.5)
     else:
         assert torch.equal(voxels[2], model_of(strategy).voxels.values)
 
 
 class Waits(TorchDispatchMode):
-    """Lines of ours that ask for what a device alone knows: a number, how many of something there are."""
+    """Lines of ours that need a number that a device alone has."""
 
     ALWAYS = ("_local_scalar_dense", "nonzero", "masked_select", "_unique", "_unique2", "unique_dim", "unique_consecutive", "equal", "bincount")
 

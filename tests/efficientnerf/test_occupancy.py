@@ -36,7 +36,7 @@ def test_momentum_is_equation_seven_with_one_update_to_a_voxel() -> None:
         update(voxels, cell, density)
         expected = reference.momentum(expected, cell.tolist(), density.tolist(), 0.1)
     np.testing.assert_allclose(voxels.values.reshape(-1), expected, rtol=1e-5)
-    assert voxels.values.reshape(-1)[-1] == 10.0  # never asked about
+    assert voxels.values.reshape(-1)[-1] == 10.0  # never updated
 
 
 @pytest.mark.parametrize("activation", ["exp", "softplus"])
@@ -47,7 +47,7 @@ def test_samples_tell_the_largest_in_one_go_as_they_do_step_by_step(activation: 
     for voxels in (ours, theirs):
         mask_cells(voxels, torch.arange(side**3).reshape(side, side, side) % 5 == 0)
     for count in (0, 1, 3000):
-        point = torch.from_numpy(rng.uniform(-0.05, 1.05, (count, 3)).astype(np.float32))  # beyond the faces, too: the outermost voxels are told
+        point = torch.from_numpy(rng.uniform(-0.05, 1.05, (count, 3)).astype(np.float32))  # beyond the faces, too: these are of the outermost voxels
         raw = torch.from_numpy(rng.normal(size=(count, 4)).astype(np.float32) * 6)[:, 0]
         dispatch.update_occupancy_maximum(ours.values, point, raw, activation)
         update(theirs, cell_of(point, side), activate(raw, activation))
@@ -57,7 +57,7 @@ def test_samples_tell_the_largest_in_one_go_as_they_do_step_by_step(activation: 
 @pytest.mark.parametrize("rule", ["momentum", "maximum"])
 @pytest.mark.parametrize("padding", [0, 1, 30])
 def test_padding_tells_the_voxels_nothing(rule: str, padding: int) -> None:
-    """Neither those that nothing else was told of, nor those that were."""
+    """Neither those that nothing else updates, nor those that something does."""
     plain, padded = (density_voxels(SIDE, rule, initial=10.0, beta=0.1, threshold=1.0) for _ in range(2))
     for count in (80, 1, 200):
         cell, density = samples(count)
@@ -105,34 +105,34 @@ def test_fresh_voxels_are_all_valid_and_those_at_the_threshold_are_not() -> None
 
 @pytest.mark.parametrize("padded", [False, True])
 @pytest.mark.parametrize(("rule", "beta", "decay"), [("momentum", 1.0, 0.5), ("momentum", 0.1, 0.5), ("maximum", 0.1, 0.0), ("maximum", 0.1, 0.95)])
-def test_closed_voxels_stay_closed_whatever_they_are_told_and_others_do_not_notice(rule: str, beta: float, decay: float, padded: bool) -> None:
+def test_masked_voxels_stay_masked_and_updates_of_others_do_not_depend_on_them(rule: str, beta: float, decay: float, padded: bool) -> None:
     voxels, plain = (density_voxels(SIDE, rule, threshold=1.0, beta=beta, decay=decay) for _ in range(2))
-    closed = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
-    closed[1] = True
-    mask_cells(voxels, closed)
+    masked = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
+    masked[1] = True
+    mask_cells(voxels, masked)
     for _ in range(3):
         cell, density = samples()
         for each in (voxels, plain):
             update(each, cell, density, torch.tensor(len(cell)) if padded else None)
             apply_decay(each)
-    assert torch.isneginf(voxels.values[closed]).all()
-    assert torch.equal(voxels.values[~closed], plain.values[~closed])
-    assert voxels.occupied == float((plain.values[~closed] > plain.threshold).sum()) / SIDE**3
+    assert torch.isneginf(voxels.values[masked]).all()
+    assert torch.equal(voxels.values[~masked], plain.values[~masked])
+    assert voxels.occupied == float((plain.values[~masked] > plain.threshold).sum()) / SIDE**3
 
 
-def test_beginning_anew_leaves_closed_voxels_closed() -> None:
+def test_a_reset_leaves_masked_voxels_masked() -> None:
     voxels = density_voxels(SIDE, "maximum", threshold=1.0)
-    closed = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
-    closed[0, 1] = True
-    mask_cells(voxels, closed)
-    voxels.values[~closed] = 0.25
+    masked = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
+    masked[0, 1] = True
+    mask_cells(voxels, masked)
+    voxels.values[~masked] = 0.25
     reset_cells(voxels, torch.tensor(False))
-    assert (voxels.values[~closed] == 0.25).all()
+    assert (voxels.values[~masked] == 0.25).all()
     for wanted in (None, torch.tensor(True)):
-        voxels.values[~closed] = 0.25
+        voxels.values[~masked] = 0.25
         reset_cells(voxels, wanted)
-        assert (voxels.values[~closed] == voxels.start).all()
-        assert torch.isneginf(voxels.values[closed]).all()
+        assert (voxels.values[~masked] == voxels.start).all()
+        assert torch.isneginf(voxels.values[masked]).all()
 
 
 def test_an_unknown_rule_is_refused() -> None:
@@ -145,7 +145,7 @@ def test_cells_hold_their_points_and_the_borders_belong_to_the_grid() -> None:
     assert cell_of(point, SIDE).tolist() == [0, 19, 26, 5]
 
 
-def test_refreshed_points_lie_in_their_cells_half_of_them_valid() -> None:
+def test_random_points_lie_in_their_cells_half_of_them_valid() -> None:
     voxels = density_voxels(8, "maximum", threshold=1.0)
     voxels.values.zero_()
     voxels.values[2, 3, 4] = 5.0
@@ -158,7 +158,7 @@ def test_refreshed_points_lie_in_their_cells_half_of_them_valid() -> None:
     assert torch.equal(cell_of(point, 8), cell)
 
 
-def test_a_sweep_asks_about_every_cell_once() -> None:
+def test_a_sweep_has_every_cell_once() -> None:
     voxels = density_voxels(5, "momentum")
     parts = [sweep_cells(voxels, part, 8, torch.Generator().manual_seed(part)) for part in range(3, 11)]
     assert sorted(torch.cat([cell for cell, _ in parts]).tolist()) == list(range(125))
@@ -166,8 +166,8 @@ def test_a_sweep_asks_about_every_cell_once() -> None:
 
 
 @pytest.mark.parametrize(("rule", "empty", "full", "threshold"), [("momentum", -40.0, 40.0, 0.0), ("maximum", 0.0, 40.0, 1.0)])
-def test_refreshing_lets_pruned_space_return(rule: str, empty: float, full: float, threshold: float) -> None:
-    """A field says empty until all is pruned, then full: no ray asks any more, and yet the voxels learn of it."""
+def test_updates_at_random_cells_let_pruned_space_return(rule: str, empty: float, full: float, threshold: float) -> None:
+    """The field is empty until all is pruned, then full: no ray is sampled any more, and yet voxels become valid again."""
     voxels = density_voxels(6, rule, threshold=threshold)
     generator = torch.Generator().manual_seed(0)
     shares = []
