@@ -90,9 +90,9 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
     """Means over the rays of some renders: what the kernel looks up, and the bytes that it reads, most of them from caches."""
     import numpy as np
 
-    from efficientnerf.backends.numba.tree.rendering import image_work
+    from efficientnerf.backends.numba.tree.rendering import ray_statistics
 
-    work = np.concatenate([image_work(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
+    work = np.concatenate([ray_statistics(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
     cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
     # A cell is 4 bytes; a tested sample reads one density; an interpolated one the four numbers of eight voxels, colours among them.
     read = 4 * cells + 4 * tested + 8 * 16 * mixed

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.backends.numba.tree import rendering
+from efficientnerf.backends.numba.tree import queries
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     """Density at points (N, 3) of the world: (N,) float32, per unit of the frame."""
-    return rendering.density_at(tree, tree.frame.points(np.asarray(points, np.float64)))
+    return queries.density_at(tree, tree.frame.points(np.asarray(points, np.float64)))
 
 
 def normal_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     """Unit vectors down the density's gradient at points (N, 3); (N, 3) float32, zero where it is flat."""
     at = tree.frame.points(np.asarray(points, np.float64))
-    return np.asarray(tree.frame.world_normals(at, rendering.normal_at(tree, at).astype(np.float64)), np.float32)
+    return np.asarray(tree.frame.world_normals(at, queries.normal_at(tree, at).astype(np.float64)), np.float32)
 
 
 def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None = None) -> np.ndarray:
@@ -31,7 +31,7 @@ def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None 
 
     Grey where no voxel is stored.
     """
-    return rendering.colour_at(tree, tree.frame.points(np.asarray(points, np.float64)), directions)
+    return queries.colour_at(tree, tree.frame.points(np.asarray(points, np.float64)), directions)
 
 
 def density_block(tree: NerfTree, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:

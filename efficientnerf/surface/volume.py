@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from efficientnerf.asset import queries
-from efficientnerf.backends.numba.tree import rendering
+from efficientnerf.backends.numba.tree import queries as frame_queries
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
 
@@ -73,10 +73,10 @@ class WorldVolume:
         return queries.density_block(self.tree, low, high)
 
     def density(self, points: np.ndarray) -> np.ndarray:
-        return rendering.density_at(self.tree, points)
+        return frame_queries.density_at(self.tree, points)
 
     def colour(self, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        return rendering.colour_at(self.tree, points, directions)
+        return frame_queries.colour_at(self.tree, points, directions)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,9 +87,9 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
     # Voxels that have nothing in common with their neighbours.
     tree = tree.with_values(tree.density_values, np.random.default_rng(3).normal(0, 0.1, tree.sh.shape).astype(np.float32))
     camera = camera_at(*PLACES[place])
-    toward = rendering._sights_of_voxels(tree, camera.centre)
-    away = np.linalg.norm(voxel_coordinates(tree) @ toward[:, :3].T + toward[:, 3], axis=1) / np.linalg.norm(toward[:, :3], 2)
-    assert (away > rendering._nearest_painted(tree)).mean() == pytest.approx(0 if place == "close" else 1, abs=0.1)
+    direction = rendering._view_direction(tree, camera.centre)
+    away = np.linalg.norm(voxel_coordinates(tree) @ direction[:, :3].T + direction[:, 3], axis=1) / np.linalg.norm(direction[:, :3], 2)
+    assert (away > rendering._min_distance(tree)).mean() == pytest.approx(0 if place == "close" else 1, abs=0.1)
     y, x = np.mgrid[: camera.height, : camera.width]
     origins, directions = rays(camera, np.stack([x.ravel(), y.ravel()], -1) + 0.5)
     colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))

@@ -19,6 +19,7 @@ from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
+from efficientnerf.backends.numba.tree import rmsprop
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
@@ -45,7 +46,7 @@ def test_float32_and_the_early_stop_change_little() -> None:
     tree = random_tree(3, brick=4, degree=2)
     rays = rays_at(tree, 500)
     exact = gradients(tree, *rays, seen_at_random(500, 0.3))
-    usual = gradients(tree, *rays, seen_at_random(500, 0.3, np.float32), np.float32, kernels.STOP)
+    usual = gradients(tree, *rays, seen_at_random(500, 0.3, np.float32), np.float32, kernels.EARLY_STOP)
     for a, b in zip(exact, usual, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3 * np.abs(a).max())
 
@@ -78,7 +79,7 @@ def test_the_pictures_are_those_of_the_renderer() -> None:
     tree = random_tree(2, brick=4, degree=2, share=0.6)
     origins, directions = rays_at(tree, 400)
     black = RayTargets(*(np.zeros(shape, np.float32) for shape in ((400, 3), (400, 3))), np.ones(400, np.float32), np.zeros(400, np.float32), 0.0)
-    loss = gradients(tree, origins, directions, black, np.float32, kernels.STOP)[0]
+    loss = gradients(tree, origins, directions, black, np.float32, kernels.EARLY_STOP)[0]
     np.testing.assert_allclose(loss, (render_rays(tree, origins, directions).colour ** 2).sum(axis=1), atol=2e-3)
 
 
@@ -86,15 +87,15 @@ def test_records_grow_until_all_samples_fit() -> None:
     tree = uniform_tree((12, 12, 12), brick=2, sigma=0.05)
     origins, directions = rays_at(tree, 300)
     records = SampleRecords()
-    records.room = 7
+    records.capacity = 7
     start, along, bases = in_voxels(tree, origins, directions)
     o = initial_state(tree)
     seen = seen_at_random(300, 0.0, np.float32)
     _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
-    assert 7 < counts.max() <= records.room
+    assert 7 < counts.max() <= records.capacity
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
     kernels.sum_gradients(records, counts, bases, by_density, by_sh)
-    expected = gradients(tree, origins, directions, seen, np.float32, kernels.STOP)
+    expected = gradients(tree, origins, directions, seen, np.float32, kernels.EARLY_STOP)
     np.testing.assert_array_equal(by_density, expected[1])
 
 
@@ -263,16 +264,16 @@ def test_steps_are_those_of_the_formula() -> None:
         origins, directions = rays_at(tree, 100, seed=number)
         seen = seen_at_random(100, 0.2, np.float32)
         start, along, bases = in_voxels(tree, origins, directions)
-        _, by_density, by_sh = gradients(o.result(), origins, directions, seen, np.float32, kernels.STOP)
+        _, by_density, by_sh = gradients(o.result(), origins, directions, seen, np.float32, kernels.EARLY_STOP)
         _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
-        kernels.rmsprop_step(
-            records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp,
-            number=number, thickness=tree.voxel, density_rate=0.1, sh_rates=rates, decay=0.9, epsilon=1e-12,
-        )  # fmt: skip
-        named = np.unique(records.index[np.concatenate([np.arange(c) + b * records.room for b, c in enumerate(counts)])])
+        hyperparameters = rmsprop.Hyperparameters(tree.voxel, 0.1, rates, 0.9, 1e-12)
+        rmsprop.rmsprop_step(
+            records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp, number, hyperparameters
+        )
+        named = np.unique(records.index[np.concatenate([np.arange(c) + b * records.capacity for b, c in enumerate(counts)])])
         met = np.isin(np.arange(len(density)), named)
         visits += met
-        slope, flat = by_density * np.maximum(density, kernels.MIN_THICKNESS / tree.voxel), by_sh.reshape(sh.shape)
+        slope, flat = by_density * np.maximum(density, rmsprop.MIN_THICKNESS / tree.voxel), by_sh.reshape(sh.shape)
         square_density = np.where(met, 0.9 * square_density + 0.1 * slope**2, square_density)
         square_sh = np.where(met, 0.9 * square_sh + 0.1 * (flat**2).mean(axis=1), square_sh)
         right = np.maximum(1 - 0.9**visits, 1e-30)

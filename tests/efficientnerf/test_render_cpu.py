@@ -15,8 +15,9 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, sigmoid, split16, trilinear4, unpack4
 from efficientnerf.backends.numba.tree import blocks as cpu_blocks
 from efficientnerf.backends.numba.tree import march
-from efficientnerf.backends.numba.tree.blocks import Pool, View, fill, grid_of, paint
+from efficientnerf.backends.numba.tree.blocks import Pool, fill_block
 from efficientnerf.backends.numba.tree.packed import packed_of
+from efficientnerf.backends.numba.tree.view_colours import View, compute_view_colours, packed_pointers, sh_basis
 from efficientnerf.geometry.cameras import Camera, rays, resized
 from efficientnerf.rendering.harmonics import basis_numpy
 from tests.efficientnerf.balls import pose
@@ -47,7 +48,7 @@ def test_the_kernels_harmonics_are_those_of_the_project(degree: int) -> None:
     expected = basis_numpy(directions.astype(np.float64), degree)
     for d, row in zip(directions, expected, strict=True):
         out = np.zeros(len(row), np.float32)
-        cpu_blocks.basis_into(*d, degree, out)
+        sh_basis(*d, degree, out)
         np.testing.assert_allclose(out, row, atol=2e-6)
 
 
@@ -101,18 +102,18 @@ def test_four_points_are_interpolated_at_once_over_what_is_there() -> None:
 
 
 @numba.njit
-def laid_out(packed, painted, brick, toward, nearest, degree, owners, kind, values):  # type: ignore[no-untyped-def]
+def laid_out(packed, colours, brick, direction, nearest, degree, owners, kind, values):  # type: ignore[no-untyped-def]
     """Blocks of some bricks, one after the other, as a thread lays them out: what they hold, and their kinds."""
     blocks, size = values.shape
-    slot, owner, after = np.full(len(packed.place), -1, np.int32), np.full(blocks, -1, np.int32), np.zeros(1, np.int64)
+    slot, owner, after = np.full(len(packed.cells), -1, np.int32), np.full(blocks, -1, np.int32), np.zeros(1, np.int64)
     words, voxels, waiting = values.view(np.int32), np.zeros(size // 4, np.int32), np.full(4, blocks * size)
     pool = Pool(
-        size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(painted), len(painted) - 1,
+        size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(colours), len(colours) - 1,
         pointer(voxels), pointer(waiting),
     )  # fmt: skip
-    grid, view = grid_of(packed, brick), View(pointer(toward), 1.0, nearest, np.float32(2), degree)
+    grid, view = packed_pointers(packed, brick), View(pointer(direction), 1.0, nearest, np.float32(2), degree)
     for brick_number in owners:
-        fill(brick_number, grid, view, pool)
+        fill_block(brick_number, grid, view, pool)
     # They must outlive the pointers to them.
     return slot[0] + owner[0] + after[0] + words[0, 0] + voxels[0] + waiting[0]
 
@@ -121,9 +122,9 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
     """(B, side, side, side, 4) and kinds (B,) of the blocks of all bricks, densities times 2."""
     side, owners = tree.brick + 2, np.random.default_rng(0).permutation(len(tree.voxel_index))
     values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
-    toward, painted = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
-    paint(packed_of(tree), tree.brick, toward, np.float32(2), tree.degree, painted)
-    laid_out(packed_of(tree), painted, tree.brick, toward, nearest, tree.degree, owners, kind, values)
+    direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
+    compute_view_colours(packed_of(tree), tree.brick, direction, np.float32(2), tree.degree, colours)
+    laid_out(packed_of(tree), colours, tree.brick, direction, nearest, tree.degree, owners, kind, values)
     back = np.argsort(owners)
     return values[back].reshape(-1, side, side, side, 4), kind[back]
 
@@ -134,8 +135,8 @@ def test_blocks_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
     side = brick + 2
     whole = 2 * density_block(tree, (-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
     values, kind = blocks_of(tree, np.zeros(3), nearest=np.inf)
-    assert (kind == cpu_blocks.EXACT).all()
-    for block, place, live in zip(values, packed_of(tree).place, packed_of(tree).live, strict=True):
+    assert (kind == cpu_blocks.VOXEL_INDICES).all()
+    for block, place, live in zip(values, packed_of(tree).cells, packed_of(tree).has_density, strict=True):
         assert tree.brick_index[tuple(place)] >= 0
         expected = whole[tuple(slice(a, a + side) for a in place * brick)]
         density, stored = block[..., 0], block[..., 1].copy().view(np.int32)
@@ -158,10 +159,10 @@ def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_
         tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
     centre = np.array([-31.0, 12.5, 57.0])
     values, kind = blocks_of(tree, centre)
-    assert (kind == cpu_blocks.COLOURS).all()
+    assert (kind == cpu_blocks.VIEW_COLOURS).all()
     side = brick + 2
     cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
-    for block, place in zip(values, packed_of(tree).place, strict=True):
+    for block, place in zip(values, packed_of(tree).cells, strict=True):
         at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
         local = (at - 1) % brick @ [brick**2, brick, 1]
         owner = cells[tuple(at.reshape(-1, 3).T)].reshape(local.shape)
@@ -177,11 +178,11 @@ def test_blocks_near_the_camera_keep_their_voxels() -> None:
     tree = random_tree(3, shape=(12, 12, 12), brick=4, degree=2, share=0.3)
     centre = np.array([-20.0, 24.0, 24.0])
     values, kind = blocks_of(tree, centre, nearest=40.0)
-    away = np.linalg.norm((packed_of(tree).place + 0.5) * 4 - centre, axis=1)
-    assert np.array_equal(kind == cpu_blocks.COLOURS, away >= 52)
-    assert 0.1 < (kind == cpu_blocks.COLOURS).mean() < 0.9
+    away = np.linalg.norm((packed_of(tree).cells + 0.5) * 4 - centre, axis=1)
+    assert np.array_equal(kind == cpu_blocks.VIEW_COLOURS, away >= 52)
+    assert 0.1 < (kind == cpu_blocks.VIEW_COLOURS).mean() < 0.9
     voxels, _ = blocks_of(tree, centre, nearest=np.inf)
-    assert np.array_equal(values[kind == cpu_blocks.EXACT].view(np.int32), voxels[kind == cpu_blocks.EXACT].view(np.int32))
+    assert np.array_equal(values[kind == cpu_blocks.VOXEL_INDICES].view(np.int32), voxels[kind == cpu_blocks.VOXEL_INDICES].view(np.int32))
 
 
 def test_bricks_near_which_nothing_absorbs_light_are_empty_to_the_kernel() -> None:
@@ -270,11 +271,11 @@ def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytes
 
 
 def test_the_work_of_a_picture_is_counted() -> None:
-    from efficientnerf.backends.numba.tree.rendering import image_work
+    from efficientnerf.backends.numba.tree.rendering import ray_statistics
 
     tree = uniform_tree(sigma=0.5)
     camera = camera_of(tree)
-    cells, tested, mixed, colours = np.moveaxis(image_work(tree, camera), -1, 0)
+    cells, tested, mixed, colours = np.moveaxis(ray_statistics(tree, camera), -1, 0)
     seen = render(tree, camera).opacity > 0
     assert ((mixed > 0) == seen).all()
     assert (tested >= mixed).all()
@@ -361,11 +362,11 @@ def test_a_camera_inside_and_one_that_looks_away() -> None:
     np.testing.assert_allclose(seen.depth[11, 13], np.log(2) / 40, rtol=0.05)
     away = inside.world_from_camera.copy()
     away[:3, 3] += 30 * away[:3, 2]
-    zeros16 = render(tree, replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
-    assert not zeros16.opacity.any()
-    assert np.isinf(zeros16.depth).all()
-    assert not zeros16.normal.any()
-    np.testing.assert_allclose(zeros16.colour, np.broadcast_to(np.float32([0.2, 0.4, 0.6]), zeros16.colour.shape))
+    empty = render(tree, replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
+    assert not empty.opacity.any()
+    assert np.isinf(empty.depth).all()
+    assert not empty.normal.any()
+    np.testing.assert_allclose(empty.colour, np.broadcast_to(np.float32([0.2, 0.4, 0.6]), empty.colour.shape))
 
 
 def test_normals_are_those_of_the_tree_where_half_of_the_light_is_gone() -> None:

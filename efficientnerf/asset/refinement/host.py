@@ -13,14 +13,17 @@ from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients
-from efficientnerf.backends.numba.tree.gradients import SampleRecords, TreeGrid
+from efficientnerf.backends.numba.tree.gradients import SampleRecords
+from efficientnerf.backends.numba.tree.march import STEP
+from efficientnerf.backends.numba.tree.rmsprop import Hyperparameters, rmsprop_step
+from efficientnerf.backends.numba.tree.walk import TreeGrid
 from efficientnerf.rendering.harmonics import basis_numpy
 
 DECAY, EPSILON = 0.99, 1e-10  # of RMSprop
 
 
 def grid_of(tree: NerfTree) -> TreeGrid:
-    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, gradients.STEP * tree.voxel, tree.lookup == "nearest")
+    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, STEP * tree.voxel, tree.lookup == "nearest")
 
 
 def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -47,9 +50,9 @@ def optimise(
         start, along, bases = in_voxels(state.tree, origins, directions)
         loss, counts = gradients.forward_backward(grid, start, along, bases, state.density, state.sh, wanted, records)
         fall = lr_final_ratio ** (number / steps)
-        gradients.rmsprop_step(
-            records, counts, bases, (state.density, state.sh), (by_density, by_sh), (state.square_density, state.square_sh), state.visits, stamp,
-            number=number, thickness=state.tree.voxel, density_rate=density_lr * fall, sh_rates=rates * np.float32(fall), decay=DECAY, epsilon=EPSILON,
+        rmsprop_step(
+            records, counts, bases, (state.density, state.sh), (by_density, by_sh), (state.square_density, state.square_sh), state.visits, stamp, number,
+            Hyperparameters(state.tree.voxel, density_lr * fall, rates * np.float32(fall), DECAY, EPSILON),
         )  # fmt: skip
         state.step = number
         yield float(loss.mean()) / 3
@@ -67,7 +70,7 @@ def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:
 
 def max_weights(tree: NerfTree, bundles: Iterable[Bundle]) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to a ray of the bundles."""
-    grid, greatest = grid_of(tree), np.zeros((gradients.contribution_parts(), len(tree.density_values)), np.float32)
+    grid, greatest = grid_of(tree), np.zeros((gradients.contribution_shares(), len(tree.density_values)), np.float32)
     for origins, directions, wanted in bundles:
         start, along, _ = in_voxels(tree, origins, directions)
         gradients.max_contributions(grid, start, along, tree.density_values, wanted.transmittance, greatest)

@@ -20,7 +20,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from efficientnerf.backends.numba.tree.gradients import MAX_THICKNESS, MIN_THICKNESS, RayTargets
+from efficientnerf.backends.numba.tree.gradients import RayTargets
+from efficientnerf.backends.numba.tree.rmsprop import MAX_THICKNESS, MIN_THICKNESS
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import brick_arrays
@@ -250,7 +251,7 @@ def _rmsprop_step(  # type: ignore[no-untyped-def]
     voxels, number, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, min_thickness, max_thickness, max_visits,
     WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`efficientnerf.backends.numba.tree.gradients.rmsprop_step` from gradients as integers, of `unit` each."""
+    """`efficientnerf.backends.numba.tree.rmsprop.rmsprop_step` from gradients as integers, of `unit` each."""
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     met = tl.load(stamp + v, v < voxels, other=-1) == number
     if tl.max(met.to(tl.int32), 0) > 0:
@@ -333,7 +334,7 @@ def rmsprop_step(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], squares: tuple[Tensor, Tensor], visits: Tensor, stamp: Tensor, *,
     number: int, rays: int, density_rate: float, sh_rate: float, view_share: float, decay: float, epsilon: float,
 ) -> None:  # fmt: skip
-    """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree.gradients.rmsprop_step`."""
+    """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree.rmsprop.rmsprop_step`."""
     voxels = len(visits)
     _rmsprop_step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
         *values, *sums, *squares, visits, stamp, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel), density_rate, sh_rate, float(view_share),

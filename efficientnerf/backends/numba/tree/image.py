@@ -1,0 +1,240 @@
+"""Images from packed trees (numba): rays of a camera, or given rays, in tiles of neighbours."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.tree.blocks import QUEUE, Pool
+from efficientnerf.backends.numba.tree.march import STEP, Ray, RayScratch, march
+from efficientnerf.backends.numba.tree.normals import normal_into
+from efficientnerf.backends.numba.tree.ray_batch import clear_distance, ray_at, ray_pointers
+from efficientnerf.backends.numba.tree.view_colours import View, packed_pointers
+
+TILE = 8  # rays along each side of a tile
+SUBTILE = 4  # rays along each side of a subdivision of one
+RUNS = 32  # rectangles of neighbouring tiles per thread
+
+
+class Outputs(NamedTuple):
+    """The images that `render_batch` writes, as pointers, and whether the last two are wanted."""
+
+    width: int
+    colour: Any
+    opacity: Any
+    depth: Any
+    normal: Any
+    statistics: Any
+    with_normal: bool
+    with_statistics: bool
+
+
+class TileScratch(NamedTuple):
+    """Working memory for the rays of a tile: that of `march`, its result, and a normal."""
+
+    ray: RayScratch
+    result: Any
+    normal: Any
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _intersect_box(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Distances at which a ray enters and leaves the box from 0 to (nx, ny, nz), at least 0; exit before entry where it misses."""
+    t0, t1 = 0.0, np.inf
+    if dx != 0:
+        inverse = 1 / dx
+        t_low, t_high = -ox * inverse, (nx - ox) * inverse
+        t0, t1 = max(t0, min(t_low, t_high)), min(t1, max(t_low, t_high))
+    elif not 0 <= ox <= nx:
+        t1 = -1.0
+    if dy != 0:
+        inverse = 1 / dy
+        t_low, t_high = -oy * inverse, (ny - oy) * inverse
+        t0, t1 = max(t0, min(t_low, t_high)), min(t1, max(t_low, t_high))
+    elif not 0 <= oy <= ny:
+        t1 = -1.0
+    if dz != 0:
+        inverse = 1 / dz
+        t_low, t_high = -oz * inverse, (nz - oz) * inverse
+        t0, t1 = max(t0, min(t_low, t_high)), min(t1, max(t_low, t_high))
+    elif not 0 <= oz <= nz:
+        t1 = -1.0
+    return t0, t1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _render_ray(row, column, clear, rays, grid, view, pool, scratch, result, normal):  # type: ignore[no-untyped-def]
+    """Renders a ray that is clear up to `clear` into result (9,), see `march`, with the depth from the origin, and its normal into (3,)."""
+    ox, oy, oz, dx, dy, dz, cosine = ray_at(row, column, rays)
+    sh_x, sh_y, sh_z = np.float32(dx), np.float32(dy), np.float32(dz)
+    if rays.has_sh_directions:
+        p = 3 * (row * rays.width + column)
+        sh_x, sh_y, sh_z = rays.sh_directions[p], rays.sh_directions[p + 1], rays.sh_directions[p + 2]
+    t0, t1 = _intersect_box(ox, oy, oz, dx, dy, dz, grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick)
+    last = int(np.ceil((t1 - t0) / STEP - 0.5)) if t1 > t0 else 0
+    begin = int(min(max((clear - t0) / STEP - 0.5, 0.0), last))
+    ex, ey, ez = np.float32(ox + t0 * dx), np.float32(oy + t0 * dy), np.float32(oz + t0 * dz)
+    ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
+    march(Ray(ex, ey, ez, ax, ay, az, sh_x, sh_y, sh_z), begin, last, grid, view, pool, scratch, result)
+    distance = result[4]
+    result[4] = (t0 + distance) * cosine
+    if distance < np.inf:
+        normal_into(ex + distance * ax, ey + distance * ay, ez + distance * az, grid, view, pool, normal)
+    else:
+        normal[0] = normal[1] = normal[2] = np.float32(0)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _run_size(down, across, threads):  # type: ignore[no-untyped-def]
+    """Rows and columns of tiles in a run, a rectangle of them that a thread takes."""
+    tiles = down * across // (threads * RUNS)
+    tall = min(down, max(1, int(np.sqrt(tiles))))
+    return tall, min(across, max(1, tiles // tall))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs):  # type: ignore[no-untyped-def]
+    """Renders rows top to low and columns left to right."""
+    result, normal = scratch.result, scratch.normal
+    known = clear_distance(top, low, left, right, 0.0, rays, grid)
+    columns = (right - left + SUBTILE - 1) // SUBTILE
+    for part in range((low - top + SUBTILE - 1) // SUBTILE * columns):
+        upper, first = top + part // columns * SUBTILE, left + part % columns * SUBTILE
+        lower, last = min(upper + SUBTILE, low), min(first + SUBTILE, right)
+        clear = clear_distance(upper, lower, first, last, known, rays, grid) if known < np.inf else known
+        for row in range(upper, lower):
+            for column in range(first, last):
+                if clear == np.inf:
+                    for m in range(9):
+                        result[m] = np.float32(0)
+                    result[4] = np.float32(np.inf)
+                    normal[0] = normal[1] = normal[2] = np.float32(0)
+                else:
+                    _render_ray(row, column, clear, rays, grid, view, pool, scratch.ray, result, normal)
+                pixel = row * outputs.width + column
+                transmittance = np.float32(1) - result[3]
+                for c in range(3):
+                    outputs.colour[3 * pixel + c] = result[c] + transmittance * background[c]
+                    if outputs.with_normal:
+                        outputs.normal[3 * pixel + c] = normal[c]
+                outputs.opacity[pixel], outputs.depth[pixel] = result[3], result[4] * voxel
+                if outputs.with_statistics:
+                    for m in range(4):
+                        outputs.statistics[4 * pixel + m] = np.int32(result[5 + m])
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def render_batch(  # type: ignore[no-untyped-def]
+    batch, background, packed, brick, view_colours, direction_rate, min_distance, density_scale, degree, voxel, tile, threads, blocks,
+    colour, opacity, depth, normal, statistics,
+):  # fmt: skip
+    """Renders a RayBatch.
+
+    background     (3,) float32 colour to composite over
+    packed         see `Packed`
+    view_colours   (N + 1, 4) float32: see `compute_view_colours`; not read where `min_distance` is infinity
+    direction_rate, min_distance, density_scale, degree  see `View`
+    voxel          size of a voxel, world units
+    tile           (rows, columns) of a tile
+    blocks         in a thread's pool
+    colour         (H, W, 3) float32
+    opacity        (H, W) float32
+    depth          (H, W) float32, world units: along the view axis for a camera, along the ray for given rays
+    normal         (H, W, 3) float32, or (0, 0, 3) where none is wanted
+    statistics     (H, W, 4) int32, or (0, 0, 4): coarse cells visited, samples tested, samples interpolated, colours looked up
+    """
+    # numba removes writes to arrays that come out of a tuple argument: outputs are arguments of their own.
+    height, width = opacity.shape
+    down, across = (height + tile[0] - 1) // tile[0], (width + tile[1] - 1) // tile[1]
+    # Each thread takes runs of tiles from all over the image, for tiles of background are cheap; neighbouring tiles share bricks.
+    tall, wide = _run_size(down, across, threads)
+    columns = (across + wide - 1) // wide
+    runs = (down + tall - 1) // tall * columns
+    bricks, size = len(packed.cells), 4 * (brick + 2) ** 3
+    slot_of, brick_of = np.full((threads, bricks), -1, np.int32), np.full((threads, blocks), -1, np.int32)
+    kind, integers = np.zeros((threads, blocks), np.uint8), np.zeros((threads, 16), np.int64)
+    values, voxels = np.empty((threads, (blocks + 1) * size), np.float32), np.empty((threads, size // 4), np.int32)
+    floats, ints = np.zeros((threads, 256), np.float32), values.view(np.int32)
+    for worker in numba.prange(threads):
+        values[worker, blocks * size :] = 0
+        integers[worker, 8 : 8 + QUEUE] = blocks * size
+        pool = Pool(
+            size,
+            blocks,
+            pointer(slot_of[worker]),
+            pointer(brick_of[worker]),
+            pointer(kind[worker]),
+            pointer(integers[worker, :8]),
+            pointer(values[worker]),
+            pointer(ints[worker]),
+            pointer(view_colours),
+            len(view_colours) - 1,
+            pointer(voxels[worker]),
+            pointer(integers[worker, 8:]),
+        )
+        ray_scratch = RayScratch(
+            pointer(floats[worker, 32:48]),
+            pointer(floats[worker, 48:64]),
+            pointer(floats[worker, 64:80]),
+            pointer(floats[worker, 80:96]),
+            pointer(floats[worker, 96:128]),
+            pointer(floats[worker, 128:160]),
+        )
+        scratch = TileScratch(ray_scratch, pointer(floats[worker, 160:192]), pointer(floats[worker, 192:]))
+        outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), pointer(statistics), len(normal) > 0, len(statistics) > 0)
+        grid, rays = packed_pointers(packed, brick), ray_pointers(batch)
+        view = View(pointer(batch.view_direction), direction_rate, min_distance, density_scale, degree)
+        for run in range(runs):
+            # Neighbouring runs, along rows and columns, go to different threads.
+            if (run // columns + run % columns) % threads != worker:
+                continue
+            for n in range(tall * wide):
+                row, column = run // columns * tall + n // wide, run % columns * wide + n % wide
+                if row < down and column < across:
+                    top, left = row * tile[0], column * tile[1]
+                    low, right = min(top + tile[0], height), min(left + tile[1], width)
+                    _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def downsample(supersample, fine_colour, fine_opacity, fine_depth, fine_normal, colour, opacity, depth, normal):  # type: ignore[no-untyped-def]
+    """Pixels from their supersample^2 rays: mean colour and opacity, median depth, mean normal.
+
+    The median is over all rays, those without a hit last; a mean of the depths of two surfaces would lie on neither.
+    """
+    count = supersample * supersample
+    one = np.float32(1 / count)
+    for row in numba.prange(opacity.shape[0]):
+        sorted_depth = np.empty(count, np.float32)
+        for column in range(opacity.shape[1]):
+            r = g = b = o = x = y = z = np.float32(0)
+            hits = 0
+            for n in range(count):
+                i, j = row * supersample + n // supersample, column * supersample + n % supersample
+                r += fine_colour[i, j, 0]
+                g += fine_colour[i, j, 1]
+                b += fine_colour[i, j, 2]
+                o += fine_opacity[i, j]
+                if len(normal) > 0:
+                    x += fine_normal[i, j, 0]
+                    y += fine_normal[i, j, 1]
+                    z += fine_normal[i, j, 2]
+                if fine_depth[i, j] < np.inf:
+                    at = hits
+                    while at > 0 and sorted_depth[at - 1] > fine_depth[i, j]:
+                        sorted_depth[at] = sorted_depth[at - 1]
+                        at -= 1
+                    sorted_depth[at] = fine_depth[i, j]
+                    hits += 1
+            colour[row, column, 0], colour[row, column, 1], colour[row, column, 2] = r * one, g * one, b * one
+            opacity[row, column] = o * one
+            opaque = o * one >= np.float32(0.5) and hits > 0
+            # Fewer than half of the rays may hit where others are half transparent.
+            depth[row, column] = sorted_depth[min(hits - 1, (count - 1) // 2)] if opaque else np.float32(np.inf)
+            if len(normal) > 0:
+                length = np.sqrt(x * x + y * y + z * z)
+                scale = np.float32(1) / length if opaque and length > 0 else np.float32(0)
+                normal[row, column, 0], normal[row, column, 1], normal[row, column, 2] = x * scale, y * scale, z * scale

@@ -1,0 +1,154 @@
+"""Density, normal and colour of a tree at points (numba, all cores), from the tree's own arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.tree.walk import TreeGrid, corner_voxels, walk_pointers
+from efficientnerf.rendering.harmonics import basis_numpy
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+BLOCK = 1024  # points per task
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _corners(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
+    """The eight stored voxels around a point, voxel coordinates, and their trilinear weights."""
+    x, y, z = u - np.float32(0.5), v - np.float32(0.5), w - np.float32(0.5)
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+    one = np.float32(1)
+    corner_voxels(i, j, k, tree, index, 0)
+    for n in range(8):
+        weight[n] = (fx if n & 4 else one - fx) * (fy if n & 2 else one - fy) * (fz if n & 1 else one - fz)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _density(u, v, w, tree, index, weight):  # type: ignore[no-untyped-def]
+    """Density at a point, voxel coordinates; zero in an empty coarse cell. Leaves the corners in `index` and `weight`."""
+    # Compared before conversion to integers: NaN and what is too large must not become an index.
+    brick = tree.brick
+    if not (0 <= u < tree.nx * brick and 0 <= v < tree.ny * brick and 0 <= w < tree.nz * brick):
+        return np.float32(0)
+    if tree.brick_index[(int(u) // brick * tree.ny + int(v) // brick) * tree.nz + int(w) // brick] < 0:
+        return np.float32(0)
+    _corners(u, v, w, tree, index, weight)
+    total = np.float32(0)
+    for n in range(8):
+        if index[n] >= 0:
+            total += weight[n] * tree.density[index[n]]
+    return total
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _normal(u, v, w, tree, index, weight, out):  # type: ignore[no-untyped-def]
+    """Unit normal, down the density's gradient by central differences of one voxel, into `out`; zero where the density is flat."""
+    h = np.float32(1)
+    gx = _density(u + h, v, w, tree, index, weight)
+    gx -= _density(u - h, v, w, tree, index, weight)
+    gy = _density(u, v + h, w, tree, index, weight)
+    gy -= _density(u, v - h, w, tree, index, weight)
+    gz = _density(u, v, w + h, tree, index, weight)
+    gz -= _density(u, v, w - h, tree, index, weight)
+    length = np.sqrt(gx * gx + gy * gy + gz * gz)
+    if length > 0:
+        out[0], out[1], out[2] = -gx / length, -gy / length, -gz / length
+    else:
+        out[0] = out[1] = out[2] = np.float32(0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _colour(index, weight, sh, basis, out):  # type: ignore[no-untyped-def]
+    """Sigmoid of the harmonics' sum, coefficients interpolated over the corners that are stored."""
+    r = g = b = total = np.float32(0)
+    for n in range(8):
+        voxel = index[n]
+        if voxel < 0:
+            continue
+        share = weight[n]
+        total += share
+        vr = vg = vb = np.float32(0)
+        for k in range(basis.shape[0]):
+            y = basis[k]
+            vr += y * sh[voxel, k, 0]
+            vg += y * sh[voxel, k, 1]
+            vb += y * sh[voxel, k, 2]
+        r += share * vr
+        g += share * vg
+        b += share * vb
+    if total > 0:
+        r, g, b = r / total, g / total, b / total
+    one = np.float32(1)
+    out[0] = one / (one + np.exp(-r))
+    out[1] = one / (one + np.exp(-g))
+    out[2] = one / (one + np.exp(-b))
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
+    for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
+        index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
+        tree = walk_pointers(grid, density)
+        for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
+            out[n] = _density(points[n, 0], points[n, 1], points[n, 2], tree, index, weight)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
+    for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
+        index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
+        tree = walk_pointers(grid, density)
+        for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
+            _normal(points[n, 0], points[n, 1], points[n, 2], tree, index, weight, out[n])
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _colours(points, bases, grid, density, sh, out):  # type: ignore[no-untyped-def]
+    for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
+        index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
+        tree = walk_pointers(grid, density)
+        for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
+            _corners(points[n, 0], points[n, 1], points[n, 2], tree, index, weight)
+            _colour(index, weight, sh, bases[n], out[n])
+
+
+def _voxel_coordinates(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+    """Voxel coordinates of points of the tree's frame, float32; for nearest lookup those of voxel centres, where interpolation gives the voxel's own values."""
+    at = np.ascontiguousarray((np.asarray(points, np.float64) - tree.bounds_min) / tree.voxel, np.float32)
+    return np.floor(at) + np.float32(0.5) if tree.lookup == "nearest" else at
+
+
+def _grid(tree: NerfTree) -> TreeGrid:
+    """The structure without its leaps, which points do not need."""
+    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, np.zeros((1, 1, 1), np.uint8), float(tree.voxel), tree.lookup == "nearest")
+
+
+def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+    """(N,) float32 at points (N, 3) of the tree's frame."""
+    out = np.empty(len(points), np.float32)
+    _densities(_voxel_coordinates(tree, points), _grid(tree), tree.density_values, out)
+    return out
+
+
+def normal_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 unit normals at points (N, 3) of the tree's frame; zero where the density is flat."""
+    out = np.empty((len(points), 3), np.float32)
+    _normals(_voxel_coordinates(tree, points), _grid(tree), tree.density_values, out)
+    return out
+
+
+def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None) -> np.ndarray:
+    """(N, 3) float32 sRGB at points (N, 3) of the tree's frame along directions (N, 3), or the part that does not depend on the direction."""
+    if directions is None:
+        bases = np.zeros((len(points), tree.harmonics_count), np.float32)
+        bases[:, 0] = basis_numpy(np.array([0, 0, 1], np.float32), 0)[0]
+    else:
+        bases = basis_numpy(np.ascontiguousarray(directions, np.float32), tree.degree)
+    out = np.empty((len(points), 3), np.float32)
+    _colours(_voxel_coordinates(tree, points), np.ascontiguousarray(bases), _grid(tree), tree.density_values, tree.sh, out)
+    return out

@@ -1,0 +1,199 @@
+"""Rays in rows and columns (numba): of a pinhole camera, of a camera with a table of directions, or given one by one; and how far a tile of them is clear.
+
+The rays of a tile lie in a cone. As long as the ball in which the cone widens meets only empty cells, no ray of the tile can meet density: all start where it
+first may, and a tile that never may is done. That skips samples of density zero and changes no value.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer
+
+MIN_ADVANCE = 0.5  # voxels: a cone that advances by less has arrived
+MAX_ADVANCES = 64
+PINHOLE, DIRECTION_TABLE, GIVEN_RAYS = 0, 1, 2
+
+
+class RayBatch(NamedTuple):
+    """Rays in H rows and W columns; see the module.
+
+    lens               (4,) fx, fy, cx, cy, pixels: read where neither `camera_directions` nor `origins` are given
+    pitch              distance of neighbouring rays, pixels; the first ray lies half of it from the left and upper border of the image
+    first_row          row of the first ray
+    rotation           (3, 3) world from camera
+    centre             (3,) of the camera, voxel coordinates
+    view_direction     (3, 4) direction along which points are seen, see `View`
+    camera_directions  (H, W, 3) float32 unit directions in the camera's frame, or (0, 0, 3)
+    origins            (H, W, 3) voxel coordinates, or (0, 0, 3)
+    directions         (H, W, 3) unit directions, with `origins`
+    sh_directions      (H, W, 3) float32 directions that harmonics are evaluated along, or (0, 0, 3): those of the rays
+    """
+
+    lens: np.ndarray
+    pitch: float
+    first_row: int
+    rotation: np.ndarray
+    centre: np.ndarray
+    view_direction: np.ndarray
+    camera_directions: np.ndarray
+    origins: np.ndarray
+    directions: np.ndarray
+    sh_directions: np.ndarray
+
+
+class RayPointers(NamedTuple):
+    """A RayBatch with its arrays as pointers; `kind` is PINHOLE, DIRECTION_TABLE or GIVEN_RAYS."""
+
+    kind: int
+    width: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    pitch: float
+    first_row: int
+    rotation: Any
+    x: float
+    y: float
+    z: float
+    camera_directions: Any
+    origins: Any
+    directions: Any
+    has_sh_directions: bool
+    sh_directions: Any
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def ray_pointers(batch):  # type: ignore[no-untyped-def]
+    """See `RayPointers`."""
+    kind = GIVEN_RAYS if len(batch.origins) > 0 else DIRECTION_TABLE if len(batch.camera_directions) > 0 else PINHOLE
+    width = batch.origins.shape[1] if kind == GIVEN_RAYS else batch.camera_directions.shape[1]
+    lens, centre = batch.lens, batch.centre
+    return RayPointers(
+        kind, width, lens[0], lens[1], lens[2], lens[3], batch.pitch, batch.first_row, pointer(batch.rotation), centre[0], centre[1], centre[2],
+        pointer(batch.camera_directions), pointer(batch.origins), pointer(batch.directions), len(batch.sh_directions) > 0, pointer(batch.sh_directions),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _rotate(r, x, y, z):  # type: ignore[no-untyped-def]
+    return r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _pinhole_direction(x, y, rays):  # type: ignore[no-untyped-def]
+    """Unit direction through (x, y), pixels, and its component along the view axis."""
+    u, v = (x - rays.cx) / rays.fx, (y - rays.cy) / rays.fy
+    cosine = 1 / np.sqrt(u * u + v * v + 1)
+    dx, dy, dz = _rotate(rays.rotation, u * cosine, v * cosine, cosine)
+    return dx, dy, dz, cosine
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def ray_at(row, column, rays):  # type: ignore[no-untyped-def]
+    """Origin, direction, and cosine to the view axis, by which a distance along the ray becomes a depth; 1 for given rays."""
+    p = 3 * (row * rays.width + column)
+    if rays.kind == GIVEN_RAYS:
+        o, d = rays.origins, rays.directions
+        return o[p], o[p + 1], o[p + 2], d[p], d[p + 1], d[p + 2], 1.0
+    if rays.kind == DIRECTION_TABLE:
+        dx, dy, dz = _rotate(rays.rotation, rays.camera_directions[p], rays.camera_directions[p + 1], rays.camera_directions[p + 2])
+        return rays.x, rays.y, rays.z, dx, dy, dz, np.float64(rays.camera_directions[p + 2])
+    dx, dy, dz, cosine = _pinhole_direction((column + 0.5) * rays.pitch, (rays.first_row + row + 0.5) * rays.pitch, rays)
+    return rays.x, rays.y, rays.z, dx, dy, dz, cosine
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _empty_radius(x, y, z, grid):  # type: ignore[no-untyped-def]
+    """Radius of a ball around a point, voxel coordinates, that touches no occupied cell."""
+    brick = grid.brick
+    nx, ny, nz = grid.nx * brick, grid.ny * brick, grid.nz * brick
+    # Anything in the box is at least as far from the point as from its nearest point in the box, q, and that far from q.
+    qx, qy, qz = min(max(x, 0.0), nx), min(max(y, 0.0), ny), min(max(z, 0.0), nz)
+    outside = (x - qx) ** 2 + (y - qy) ** 2 + (z - qz) ** 2
+    per_brick = 1 / brick
+    a, e, c = min(int(qx * per_brick), grid.nx - 1), min(int(qy * per_brick), grid.ny - 1), min(int(qz * per_brick), grid.nz - 1)
+    leap = np.int64(grid.leap[(a * grid.ny + e) * grid.nz + c])
+    inner = 0.0
+    if leap > 0:
+        ux, uy, uz = qx - a * brick, qy - e * brick, qz - c * brick
+        inner = (leap - 1) * brick + min(min(ux, brick - ux), min(uy, brick - uy), min(uz, brick - uz))
+    return np.sqrt(outside + inner * inner)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _clear_cone(origin, direction, radius, widening, t, grid):  # type: ignore[no-untyped-def]
+    """Distance up to which all rays of a cone are clear; infinity where they never meet an occupied cell.
+
+    origin, direction  (x, y, z) of its axis, voxel coordinates
+    radius             distance of the rays' origins from `origin`, at most
+    widening           distance of their unit directions from `direction`, at most
+    t                  distance up to which they are known to be clear
+    """
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    nx, ny, nz = grid.nx * grid.brick / 2, grid.ny * grid.brick / 2, grid.nz * grid.brick / 2
+    beyond = np.sqrt((ox - nx) ** 2 + (oy - ny) ** 2 + (oz - nz) ** 2) + np.sqrt(nx * nx + ny * ny + nz * nz) + 2 * radius
+    for _ in range(MAX_ADVANCES):
+        # At t + a a ray is within radius + (t + a) * widening + a of the point here.
+        advance = (_empty_radius(ox + t * dx, oy + t * dy, oz + t * dz, grid) - radius - t * widening) / (1 + widening)
+        if not advance > MIN_ADVANCE:
+            return t
+        t += advance
+        if t > beyond:
+            return np.inf
+    return t
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _clear_pinhole(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+    """`clear_distance` for a pinhole camera: the corners of the tile are farthest from its middle."""
+    ax, ay, az, _ = _pinhole_direction((left + right) / 2 * rays.pitch, (top + low) / 2 * rays.pitch, rays)
+    widening = 0.0
+    for n in range(4):
+        row, column = top if n & 1 else low, left if n & 2 else right
+        dx, dy, dz, _ = _pinhole_direction(column * rays.pitch, row * rays.pitch, rays)
+        widening = max(widening, (dx - ax) ** 2 + (dy - ay) ** 2 + (dz - az) ** 2)
+    return _clear_cone((rays.x, rays.y, rays.z), (ax, ay, az), 0.0, np.sqrt(widening), since, grid)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _clear_directions(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+    """The same for a table of directions."""
+    d = rays.camera_directions
+    m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
+    widening = 0.0
+    for row in range(top, low):
+        for column in range(left, right):
+            s = 3 * (row * rays.width + column)
+            widening = max(widening, (d[s] - d[m]) ** 2 + (d[s + 1] - d[m + 1]) ** 2 + (d[s + 2] - d[m + 2]) ** 2)
+    ax, ay, az = _rotate(rays.rotation, d[m], d[m + 1], d[m + 2])
+    return _clear_cone((rays.x, rays.y, rays.z), (ax, ay, az), 0.0, np.sqrt(widening), since, grid)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _clear_rays(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+    """The same for given rays."""
+    o, d = rays.origins, rays.directions
+    m = 3 * ((top + low) // 2 * rays.width + (left + right) // 2)
+    radius = widening = 0.0
+    for row in range(top, low):
+        for column in range(left, right):
+            s = 3 * (row * rays.width + column)
+            radius = max(radius, (o[s] - o[m]) ** 2 + (o[s + 1] - o[m + 1]) ** 2 + (o[s + 2] - o[m + 2]) ** 2)
+            widening = max(widening, (d[s] - d[m]) ** 2 + (d[s + 1] - d[m + 1]) ** 2 + (d[s + 2] - d[m + 2]) ** 2)
+    return _clear_cone((o[m], o[m + 1], o[m + 2]), (d[m], d[m + 1], d[m + 2]), np.sqrt(radius), np.sqrt(widening), since, grid)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def clear_distance(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
+    """Distance up to which the rays of rows top to low and columns left to right are clear, at least `since`."""
+    if rays.kind == GIVEN_RAYS:
+        return _clear_rays(top, low, left, right, since, rays, grid)
+    if rays.kind == DIRECTION_TABLE:
+        return _clear_directions(top, low, left, right, since, rays, grid)
+    return _clear_pinhole(rays.first_row + top + 0.5, rays.first_row + low - 0.5, left + 0.5, right - 0.5, since, rays, grid)

@@ -1,0 +1,267 @@
+"""Colours of a packed tree's voxels as one camera sees them (numba, all cores).
+
+All rays of an image pass the camera's centre, so each voxel is seen along one direction: its spherical harmonics are summed once, before the first ray, and
+not at every sample. Voxels are visited in memory order.
+
+B bricks, N stored voxels, K harmonics; b = brick.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import (
+    add_scaled4,
+    add_scaled_gathered16,
+    broadcast_like,
+    load4,
+    pack4,
+    pointer,
+    rsqrt4,
+    scale4,
+    split16,
+    store,
+    store4,
+    unpack4,
+    zeros16,
+)
+from efficientnerf.rendering import harmonics
+
+BRICKS_PER_TASK = 256
+
+# Sums may be reordered and products fused; infinities and NaN keep their meaning.
+FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
+
+_ONE = np.float32(1)
+_C0 = np.float32(harmonics.C0)
+_C1 = np.float32(harmonics.C1)
+_C2 = tuple(np.float32(c) for c in harmonics.C2)
+_C3 = tuple(np.float32(c) for c in harmonics.C3)
+_C4 = tuple(np.float32(c) for c in harmonics.C4)
+
+
+class View(NamedTuple):
+    """What of a view its voxels' colours depend on.
+
+    direction       12 numbers, (3, 4): maps a point (x, y, z, 1), voxel coordinates, to the direction along which it is seen, of any length, in the
+                    harmonics' frame
+    direction_rate  change of that direction per voxel, at most
+    min_distance    voxels from the point whose direction is zero, on the scale of `direction_rate`, within which a voxel's direction differs too much from that
+                    of the samples beside it: blocks there hold voxel indices and no colours. Infinity where rays have no common point.
+    density_scale   float32 factor of densities
+    degree          of the harmonics
+    """
+
+    direction: Any
+    direction_rate: float
+    min_distance: float
+    density_scale: np.float32
+    degree: int
+
+
+class PackedPointers(NamedTuple):
+    """A `Packed` with its arrays as pointers, and its sizes: cells along each axis, mask words of a block, rank words of a brick, bricks, harmonics, code
+    groups and palette entries; `coded` is whether there are codes.
+    """
+
+    brick: int
+    nx: int
+    ny: int
+    nz: int
+    leap: Any
+    has_density: Any
+    mask_words: int
+    stored_ranks: Any
+    rank_words: int
+    bricks: int
+    cells: Any
+    brick_index: Any
+    voxel_index: Any
+    density: Any
+    terms: int
+    coded: bool
+    sh: Any
+    base: Any
+    base_table: Any
+    codes: Any
+    groups: int
+    palette: Any
+    entries: int
+    code_columns: Any
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def packed_pointers(packed, brick):  # type: ignore[no-untyped-def]
+    """See `PackedPointers`."""
+    return PackedPointers(
+        brick, packed.leap.shape[0], packed.leap.shape[1], packed.leap.shape[2], pointer(packed.leap), pointer(packed.has_density), packed.has_density.shape[1],
+        pointer(packed.stored_ranks), packed.stored_ranks.shape[1], len(packed.cells), pointer(packed.cells), pointer(packed.brick_index),
+        pointer(packed.voxel_index), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh), pointer(packed.base),
+        pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1],
+        pointer(packed.code_columns),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+def sh_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
+    """`efficientnerf.rendering.harmonics.basis` of one direction into (K,), or of four, given as Float32x4, into (K, 4)."""
+    two, three, four, seven = np.float32(2), np.float32(3), np.float32(4), np.float32(7)
+    xx, yy, zz = x * x, y * y, z * z
+    store(out, 0, broadcast_like(_C0, x))
+    if degree > 0:
+        store(out, 1, y * -_C1)
+        store(out, 2, z * _C1)
+        store(out, 3, x * -_C1)
+    if degree > 1:
+        store(out, 4, x * y * _C2[0])
+        store(out, 5, y * z * _C2[1])
+        store(out, 6, (zz * two - xx - yy) * _C2[2])
+        store(out, 7, x * z * _C2[3])
+        store(out, 8, (xx - yy) * _C2[4])
+    if degree > 2:
+        store(out, 9, y * (xx * three - yy) * _C3[0])
+        store(out, 10, x * y * z * _C3[1])
+        store(out, 11, y * (zz * four - xx - yy) * _C3[2])
+        store(out, 12, z * (zz * two - xx * three - yy * three) * _C3[3])
+        store(out, 13, x * (zz * four - xx - yy) * _C3[4])
+        store(out, 14, z * (xx - yy) * _C3[5])
+        store(out, 15, x * (xx - yy * three) * _C3[6])
+    if degree > 3:
+        store(out, 16, x * y * (xx - yy) * _C4[0])
+        store(out, 17, y * z * (xx * three - yy) * _C4[1])
+        store(out, 18, x * y * (zz * seven - _ONE) * _C4[2])
+        store(out, 19, y * z * (zz * seven - three) * _C4[3])
+        store(out, 20, (zz * (zz * np.float32(35) - np.float32(30)) + three) * _C4[4])
+        store(out, 21, x * z * (zz * seven - three) * _C4[5])
+        store(out, 22, (xx - yy) * (zz * seven - _ONE) * _C4[6])
+        store(out, 23, x * z * (xx - yy * three) * _C4[7])
+        store(out, 24, (xx * (xx - yy * three) - yy * (xx * three - yy)) * _C4[8])
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
+    """Red, green and blue of stored voxel n before the sigmoid; the harmonics of the direction are basis[lane :: lanes]."""
+    y = basis[lane]
+    if grid.coded:
+        table, base, code = grid.base_table, 3 * n, n * grid.groups
+        r, g, b = y * table[3 * np.int64(grid.base[base])], y * table[3 * np.int64(grid.base[base + 1]) + 1], y * table[3 * np.int64(grid.base[base + 2]) + 2]
+        if grid.terms > 1:
+            total = scale4(basis[lanes + lane], load4(grid.palette, 4 * np.int64(grid.codes[code + grid.code_columns[0]])))
+            for k in range(1, grid.terms - 1):
+                e = k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])
+                total = add_scaled4(total, basis[(k + 1) * lanes + lane], load4(grid.palette, 4 * e))
+            _, red, green, blue = unpack4(total)
+            r, g, b = r + red, g + green, b + blue
+    else:
+        e = 3 * grid.terms * n
+        r, g, b = y * grid.sh[e], y * grid.sh[e + 1], y * grid.sh[e + 2]
+        for k in range(1, grid.terms):
+            y = basis[k * lanes + lane]
+            r += y * grid.sh[e + 3 * k]
+            g += y * grid.sh[e + 3 * k + 1]
+            b += y * grid.sh[e + 3 * k + 2]
+    return r, g, b
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+def _palette_colours(a, b, c, d, grid, basis):  # type: ignore[no-untyped-def]
+    """(0, red, green, blue) of the harmonics above degree 0 of four stored voxels, as four Float32x4; `basis` (K, 4) is of their directions."""
+    codes, total = grid.codes, zeros16()
+    for k in range(grid.terms - 1):
+        e, g = k * grid.entries, grid.code_columns[k]
+        total = add_scaled_gathered16(
+            total, load4(basis, 4 * k + 4), grid.palette, 4 * (e + np.int64(codes[a * grid.groups + g])), 4 * (e + np.int64(codes[b * grid.groups + g])),
+            4 * (e + np.int64(codes[c * grid.groups + g])), 4 * (e + np.int64(codes[d * grid.groups + g])),
+        )  # fmt: skip
+    return split16(total)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+def _palette_base(n, grid, scale, y):  # type: ignore[no-untyped-def]
+    """Density, and red, green and blue of degree 0; y is the first harmonic."""
+    table, base = grid.base_table, 3 * n
+    r, g, b = table[3 * np.int64(grid.base[base])], table[3 * np.int64(grid.base[base + 1]) + 1], table[3 * np.int64(grid.base[base + 2]) + 2]
+    return pack4(grid.density[n] * scale, y * r, y * g, y * b)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+def _float_colours(n, grid, scale, basis, lane):  # type: ignore[no-untyped-def]
+    """Density, red, green and blue of a stored voxel whose harmonics are floats."""
+    r, g, b = sh_colour(n, grid, basis, lane, 4)
+    return pack4(grid.density[n] * scale, r, g, b)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def view_direction(x, y, z, direction):  # type: ignore[no-untyped-def]
+    """Direction, of any length, along which a point (x, y, z), voxel coordinates, is seen; see `View`."""
+    return (
+        direction[0] * x + direction[1] * y + direction[2] * z + direction[3],
+        direction[4] * x + direction[5] * y + direction[6] * z + direction[7],
+        direction[8] * x + direction[9] * y + direction[10] * z + direction[11],
+    )
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+def _brick_colours(owner, grid, view, steps, stored, basis, out):  # type: ignore[no-untyped-def]
+    """Densities and colours of a brick's voxels, four at a time, into their rows of out (N, 4).
+
+    steps   (b^3, 3) float32: see `_voxel_steps`
+    stored  (b^3 + 3,) int64, scratch
+    basis   (K, 4) float32, scratch
+    """
+    brick, cells, index, count = grid.brick, grid.cells, grid.voxel_index, 0
+    first = owner * brick * brick * brick
+    for local in range(brick * brick * brick):
+        stored[count] = local
+        count += index[first + local] >= 0
+    for n in range(count, count + 3):  # the last group of four is filled up with its last voxel
+        stored[n] = stored[max(count - 1, 0)]
+    x, y, z = view_direction(cells[3 * owner] * brick + 0.5, cells[3 * owner + 1] * brick + 0.5, cells[3 * owner + 2] * brick + 0.5, view.direction)
+    for n in range(0, count, 4):
+        i, j, k, l = stored[n], stored[n + 1], stored[n + 2], stored[n + 3]
+        dx = pack4(steps[3 * i], steps[3 * j], steps[3 * k], steps[3 * l]) + np.float32(x)
+        dy = pack4(steps[3 * i + 1], steps[3 * j + 1], steps[3 * k + 1], steps[3 * l + 1]) + np.float32(y)
+        dz = pack4(steps[3 * i + 2], steps[3 * j + 2], steps[3 * k + 2], steps[3 * l + 2]) + np.float32(z)
+        inverse = rsqrt4(dx * dx + dy * dy + dz * dz)
+        sh_basis(dx * inverse, dy * inverse, dz * inverse, view.degree, basis)
+        a, b, c, d = np.int64(index[first + i]), np.int64(index[first + j]), np.int64(index[first + k]), np.int64(index[first + l])
+        if grid.coded:
+            ca, cb, cc, cd = _palette_colours(a, b, c, d, grid, basis)
+            store4(out, 4 * a, ca + _palette_base(a, grid, view.density_scale, basis[0]))
+            store4(out, 4 * b, cb + _palette_base(b, grid, view.density_scale, basis[0]))
+            store4(out, 4 * c, cc + _palette_base(c, grid, view.density_scale, basis[0]))
+            store4(out, 4 * d, cd + _palette_base(d, grid, view.density_scale, basis[0]))
+        else:
+            store4(out, 4 * a, _float_colours(a, grid, view.density_scale, basis, 0))
+            store4(out, 4 * b, _float_colours(b, grid, view.density_scale, basis, 1))
+            store4(out, 4 * c, _float_colours(c, grid, view.density_scale, basis, 2))
+            store4(out, 4 * d, _float_colours(d, grid, view.density_scale, basis, 3))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
+    """Difference of the view direction of each voxel of a brick to that of the brick's first, see `View`, into (b^3, 3)."""
+    for n in range(brick * brick * brick):
+        i, j, k = n // (brick * brick), n // brick % brick, n % brick
+        for m in range(3):
+            out[3 * n + m] = direction[4 * m] * i + direction[4 * m + 1] * j + direction[4 * m + 2] * k
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def compute_view_colours(packed, brick, direction, density_scale, degree, out):  # type: ignore[no-untyped-def]
+    """Scaled density, and red, green and blue before the sigmoid, of each stored voxel along `direction` (see `View`) into out (N + 1, 4).
+
+    The last row stands for voxels that are not stored: density 0, colour NaN.
+    """
+    bricks, cube = len(packed.cells), brick * brick * brick
+    out[len(out) - 1, 0] = 0
+    out[len(out) - 1, 1:] = np.nan
+    for task in numba.prange((bricks + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
+        steps, stored, basis = np.empty(3 * cube, np.float32), np.empty(cube + 3, np.int64), np.empty(128, np.float32)
+        grid, view = packed_pointers(packed, brick), View(pointer(direction), 0.0, 0.0, density_scale, degree)
+        _voxel_steps(brick, view.direction, pointer(steps))
+        for owner in range(BRICKS_PER_TASK * task, min(bricks, BRICKS_PER_TASK * task + BRICKS_PER_TASK)):
+            _brick_colours(owner, grid, view, pointer(steps), pointer(stored), pointer(basis), pointer(out))
