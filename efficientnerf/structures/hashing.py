@@ -1,9 +1,8 @@
 """Sparse tensor: a hash map from coordinates to values.
 
-Open addressing with linear probing over 64-bit keys, murmur3's finaliser as the hash and at most half of the slots in use, as in
-MinkowskiEngine (concurrent_unordered_map, hashtable_occupancy 50) and spconv (tensorview's LinearHashTable). Those keep the number of a row of the
-feature matrix beside the key; here the four values themselves lie there, being no longer than the number and what aligns it, which
-saves the second access to memory.
+Open addressing with linear probing over 64-bit keys, murmur3's finaliser as the hash, and a load factor of at most one half, as in MinkowskiEngine
+(concurrent_unordered_map, hashtable_occupancy 50) and spconv (tensorview's LinearHashTable). Those keep the row of the feature matrix beside the key; here the
+four values lie there, which take as much room as the row and its alignment, and save the second memory access.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.structures.bits import CHUNK, ONE, TASK, ZERO, compare_and_swap, fill, floor_to_uint64, in_grid
 from efficientnerf.structures.voxels import Voxels
-from efficientnerf.structures.words import CHUNK, ONE, TASK, ZERO, compare_and_swap, fill, whole, within
 
-LOAD = 0.5  # most of the slots that are in use
-EMPTY = np.uint64(0xFFFFFFFFFFFFFFFF)  # no key: keys have 63 bits
+LOAD_FACTOR = 0.5  # at most
+EMPTY = np.uint64(0xFFFFFFFFFFFFFFFF)  # not a key: keys have 63 bits
 
 
 @numba.njit(cache=True, inline="always")
@@ -28,7 +27,7 @@ def _key(x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, inline="always")
 def _home(key, slots):  # type: ignore[no-untyped-def]
-    """The slot where the search for a key begins: murmur3's 64-bit finaliser, its upper half scaled to the table."""
+    """First slot of a key's probe sequence: murmur3's 64-bit finaliser, its upper half scaled to the table."""
     key ^= key >> np.uint64(33)
     key *= np.uint64(0xFF51AFD7ED558CCD)
     key ^= key >> np.uint64(33)
@@ -43,46 +42,46 @@ def _next(slot, slots):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _store(coordinates, words, slots, table):  # type: ignore[no-untyped-def]
+def _store(coordinates, packed, slots, table):  # type: ignore[no-untyped-def]
     n = len(coordinates)
     for task in numba.prange((n + TASK - 1) // TASK):
-        key, slot, seen = np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64), ZERO
+        key, slot, union = np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64), ZERO
         for begin in range(task * TASK, min(n, (task + 1) * TASK), CHUNK):
             end = min(begin + CHUNK, n)
-            many, voxel, word = np.uint64(end - begin), coordinates[begin:end], words[begin:end]
-            for i in range(many):
-                key[i] = _key(whole(voxel[i, 0]), whole(voxel[i, 1]), whole(voxel[i, 2]))
+            size, voxel, word = np.uint64(end - begin), coordinates[begin:end], packed[begin:end]
+            for i in range(size):
+                key[i] = _key(floor_to_uint64(voxel[i, 0]), floor_to_uint64(voxel[i, 1]), floor_to_uint64(voxel[i, 2]))
                 slot[i] = _home(key[i], slots)
-            for i in range(many):
-                seen |= table[slot[i] << ONE]  # brings the slots near, all at once: an atomic operation would wait for each
-            for i in range(many):
+            for i in range(size):
+                union |= table[slot[i] << ONE]  # prefetches the slots; atomic operations would miss one after the other
+            for i in range(size):
                 at = slot[i]
                 while table[at << ONE] != EMPTY or compare_and_swap(table, at << ONE, EMPTY, key[i]) != EMPTY:
                     at = _next(at, slots)
                 table[(at << ONE) | ONE] = word[i]
-        if seen == ZERO:  # never, for an empty slot has all bits; but the compiler cannot know, and keeps the loop above
-            table[0] = seen
+        if union == ZERO:  # never true, since empty slots have all bits set; keeps the compiler from removing the loads
+            table[0] = union
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _look_up(points, side, slots, table, words, found):  # type: ignore[no-untyped-def]
-    """Probe by probe for a chunk of points: those that find their key or an empty slot are left out of the probes after."""
+def _query(points, side, slots, table, packed, occupied):  # type: ignore[no-untyped-def]
+    """Probes a chunk of points in lockstep; points that find their key or an empty slot drop out."""
     n, top = len(points), np.float32(side)
     for task in numba.prange((n + TASK - 1) // TASK):
         key, slot, held = np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64)
         active, still = np.empty(CHUNK, np.uint64), np.empty(CHUNK, np.uint64)
         for begin in range(task * TASK, min(n, (task + 1) * TASK), CHUNK):
             end = min(begin + CHUNK, n)
-            point, out, there = points[begin:end], words[begin:end], found[begin:end]
-            many = np.uint64(end - begin)
-            for i in range(many):
+            point, out, there = points[begin:end], packed[begin:end], occupied[begin:end]
+            size = np.uint64(end - begin)
+            for i in range(size):
                 x, y, z = point[i, 0], point[i, 1], point[i, 2]
-                key[i] = _key(whole(x), whole(y), whole(z)) if within(x, y, z, top) else EMPTY
+                key[i] = _key(floor_to_uint64(x), floor_to_uint64(y), floor_to_uint64(z)) if in_grid(x, y, z, top) else EMPTY
                 slot[i] = _home(key[i], slots) << ONE
-            for i in range(many):
+            for i in range(size):
                 held[i] = table[slot[i]]
             count = ZERO
-            for i in range(many):
+            for i in range(size):
                 active[count] = i
                 count += np.uint64((held[i] != key[i]) & (held[i] != EMPTY))
             while count != ZERO:
@@ -96,7 +95,7 @@ def _look_up(points, side, slots, table, words, found):  # type: ignore[no-untyp
                     still[left] = i
                     left += np.uint64((held[i] != key[i]) & (held[i] != EMPTY))
                 active, still, count = still, active, left
-            for i in range(many):
+            for i in range(size):
                 hit = held[i] != EMPTY
                 out[i] = table[slot[i] | ONE] & (ZERO - np.uint64(hit))
                 there[i] = hit
@@ -104,7 +103,7 @@ def _look_up(points, side, slots, table, words, found):  # type: ignore[no-untyp
 
 @dataclass(frozen=True, eq=False)
 class HashMap:
-    """side voxels along each side of the grid; table (2 slots,) uint64: key and word of each slot."""
+    """side voxels along each side of the grid; table (2 slots,) uint64: key and packed value of each slot."""
 
     side: int
     slots: int
@@ -112,16 +111,16 @@ class HashMap:
 
     @staticmethod
     def cache(voxels: Voxels) -> HashMap:
-        slots = max(int(np.ceil(len(voxels.words) / LOAD)), 1)
+        slots = max(int(np.ceil(len(voxels.packed) / LOAD_FACTOR)), 1)
         table = np.empty(2 * slots, np.uint64)
         fill(table, EMPTY)
-        _store(voxels.coordinates, voxels.words, np.uint64(slots), table)
+        _store(voxels.coordinates, voxels.packed, np.uint64(slots), table)
         return HashMap(voxels.side, slots, table)
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
         return {"table": self.table}
 
-    def query(self, points: np.ndarray, words: np.ndarray, found: np.ndarray) -> None:
+    def query(self, points: np.ndarray, packed: np.ndarray, occupied: np.ndarray) -> None:
         """See `efficientnerf.structures.dense.DenseVoxels.query`."""
-        _look_up(points, self.side, np.uint64(self.slots), self.table, words, found)
+        _query(points, self.side, np.uint64(self.slots), self.table, packed, occupied)

@@ -10,33 +10,33 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from efficientnerf.structures import bricks, on_device
+from efficientnerf.structures import bricks, torch_structures
 from efficientnerf.structures.bricks import BrickTree, FullBricks
 from efficientnerf.structures.dense import DenseVoxels
 from efficientnerf.structures.hashing import HashMap
-from efficientnerf.structures.occupancy import clustered, random_points, ray_points, scattered, shuffled
 from efficientnerf.structures.octree import Octree
-from efficientnerf.structures.voxels import Voxels, values_from_words, voxels_from_values, words_from_values
+from efficientnerf.structures.synthetic import clustered, random_points, ray_points, scattered, shuffled
+from efficientnerf.structures.voxels import Voxels, pack_values, unpack_values, voxels_from_values
 
 KERNELS = (DenseVoxels, HashMap, Octree, BrickTree, FullBricks)
-TORCH = (on_device.DenseVoxels, on_device.HashMap, on_device.Octree, on_device.BrickTree, on_device.FullBricks)
+TORCH = (torch_structures.DenseVoxels, torch_structures.HashMap, torch_structures.Octree, torch_structures.BrickTree, torch_structures.FullBricks)
 
 
-def asked(structure: type, voxels: Voxels, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cache and query; the answers are written over noise."""
-    words, found = np.full(len(points), 7, np.uint64), np.ones(len(points), bool)
-    structure.cache(voxels).query(points, words, found)
-    return words, found
+def query(structure: type, voxels: Voxels, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cache and query; results overwrite garbage."""
+    packed, occupied = np.full(len(points), 7, np.uint64), np.ones(len(points), bool)
+    structure.cache(voxels).query(points, packed, occupied)
+    return packed, occupied
 
 
-def asked_in_torch(structure: type, voxels: Voxels, points: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
-    coordinates, words = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.words.view(np.int64)).to(device)
-    words, found = structure.cache(voxels.side, coordinates, words).query(torch.from_numpy(points).to(device))
-    return words.cpu().numpy().view(np.uint64), found.cpu().numpy()
+def query_in_torch(structure: type, voxels: Voxels, points: np.ndarray, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
+    coordinates, packed = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.packed.view(np.int64)).to(device)
+    packed, occupied = structure.cache(voxels.side, coordinates, packed).query(torch.from_numpy(points).to(device))
+    return packed.cpu().numpy().view(np.uint64), occupied.cpu().numpy()
 
 
-def of_a_dict(voxels: Voxels, points: np.ndarray) -> np.ndarray:
-    held = {tuple(at): word for at, word in zip(voxels.coordinates.tolist(), voxels.words.tolist(), strict=True)}
+def query_dict(voxels: Voxels, points: np.ndarray) -> np.ndarray:
+    held = {tuple(at): word for at, word in zip(voxels.coordinates.tolist(), voxels.packed.tolist(), strict=True)}
     return np.array([held.get(tuple(math.floor(c) for c in p), 0) if np.isfinite(p).all() else 0 for p in points.tolist()], np.uint64)
 
 
@@ -58,28 +58,28 @@ def grids(draw: st.DrawFn) -> tuple[Voxels, np.ndarray]:
 @given(grids())
 def test_every_structure_gives_what_a_dict_gives(case: tuple[Voxels, np.ndarray]) -> None:
     voxels, points = case
-    expected = of_a_dict(voxels, points)
+    expected = query_dict(voxels, points)
     for structure in KERNELS:
-        words, found = asked(structure, voxels, points)
-        np.testing.assert_array_equal(words, expected, err_msg=str(structure))
-        np.testing.assert_array_equal(found, expected != 0, err_msg=str(structure))
+        packed, occupied = query(structure, voxels, points)
+        np.testing.assert_array_equal(packed, expected, err_msg=str(structure))
+        np.testing.assert_array_equal(occupied, expected != 0, err_msg=str(structure))
     for structure in TORCH:
-        words, found = asked_in_torch(structure, voxels, points)
-        np.testing.assert_array_equal(words, expected, err_msg=str(structure))
-        np.testing.assert_array_equal(found, expected != 0, err_msg=str(structure))
+        packed, occupied = query_in_torch(structure, voxels, points)
+        np.testing.assert_array_equal(packed, expected, err_msg=str(structure))
+        np.testing.assert_array_equal(occupied, expected != 0, err_msg=str(structure))
 
 
 @pytest.mark.parametrize("make", [clustered, scattered])
 def test_structures_agree_along_rays_of_a_larger_grid(make) -> None:  # type: ignore[no-untyped-def]
     voxels = make(70, 0.2, 3)
     points = np.concatenate([ray_points(70, 20_000, 1), random_points(70, 20_000, 2)])
-    expected, found = asked(DenseVoxels, voxels, points)
-    assert 0.1 < found.mean() < 0.5
+    expected, occupied = query(DenseVoxels, voxels, points)
+    assert 0.1 < occupied.mean() < 0.5
     for structure in KERNELS[1:]:
         for listed in (voxels, shuffled(voxels, 5)):
-            np.testing.assert_array_equal(asked(structure, listed, points)[0], expected, err_msg=str(structure))
+            np.testing.assert_array_equal(query(structure, listed, points)[0], expected, err_msg=str(structure))
     for structure in TORCH:
-        np.testing.assert_array_equal(asked_in_torch(structure, voxels, points)[0], expected, err_msg=str(structure))
+        np.testing.assert_array_equal(query_in_torch(structure, voxels, points)[0], expected, err_msg=str(structure))
 
 
 @pytest.mark.gpu
@@ -88,23 +88,23 @@ def test_structures_agree_on_cuda(structure: type) -> None:
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device that torch can use")
     voxels, points = clustered(70, 0.2, 3), random_points(70, 20_000, 2)
-    np.testing.assert_array_equal(asked_in_torch(structure, voxels, points, "cuda")[0], asked(DenseVoxels, voxels, points)[0])
+    np.testing.assert_array_equal(query_in_torch(structure, voxels, points, "cuda")[0], query(DenseVoxels, voxels, points)[0])
 
 
 def test_more_points_than_one_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(on_device, "PART", 1000)
+    monkeypatch.setattr(torch_structures, "CHUNK", 1000)
     voxels, points = clustered(32, 0.2, 0), random_points(32, 2500, 0)
-    np.testing.assert_array_equal(asked_in_torch(on_device.BrickTree, voxels, points)[0], asked(DenseVoxels, voxels, points)[0])
+    np.testing.assert_array_equal(query_in_torch(torch_structures.BrickTree, voxels, points)[0], query(DenseVoxels, voxels, points)[0])
 
 
 def test_a_hash_map_stays_half_empty_and_an_octree_shares_its_rows() -> None:
     voxels = clustered(64, 0.2, 0)
     table = HashMap.cache(voxels).table
-    assert np.count_nonzero(table[::2] != np.uint64(0xFFFFFFFFFFFFFFFF)) == len(voxels.words)
-    assert len(table) // 2 >= 2 * len(voxels.words)
+    assert np.count_nonzero(table[::2] != np.uint64(0xFFFFFFFFFFFFFFFF)) == len(voxels.packed)
+    assert len(table) // 2 >= 2 * len(voxels.packed)
     tree = Octree.cache(voxels)
     assert len(tree.child) == len(tree.data)
-    np.testing.assert_array_equal(np.sort(tree.data[tree.data != 0]), np.sort(voxels.words))
+    np.testing.assert_array_equal(np.sort(tree.data[tree.data != 0]), np.sort(voxels.packed))
     inner = np.flatnonzero(tree.child)
     np.testing.assert_array_equal(np.sort(inner // 8 + tree.child[inner]), np.arange(1, len(tree.child) // 8))  # each node has one parent
 
@@ -112,7 +112,7 @@ def test_a_hash_map_stays_half_empty_and_an_octree_shares_its_rows() -> None:
 def test_a_tree_of_bricks_takes_less_than_a_quarter_of_dense_voxels_at_a_fifth() -> None:
     for voxels in (clustered(128, 0.2, 0), scattered(128, 0.2, 0)):
         tree = BrickTree.cache(voxels)
-        assert len(tree.values) == len(voxels.words)
+        assert len(tree.values) == len(voxels.packed)
         assert 4 * sum(a.nbytes for a in tree.arrays.values()) < DenseVoxels.cache(voxels).grid.nbytes
 
 
@@ -120,13 +120,13 @@ def test_a_tree_of_bricks_takes_less_than_a_quarter_of_dense_voxels_at_a_fifth()
 @pytest.mark.parametrize("share", [0, 0.05, 0.2, 1])
 def test_shares_are_exact_and_repeat(make, share: float) -> None:  # type: ignore[no-untyped-def]
     voxels = make(33, share, 7)
-    assert len(voxels.words) == round(share * 33**3)
+    assert len(voxels.packed) == round(share * 33**3)
     order = (voxels.coordinates.astype(np.int64) * (33**2, 33, 1)).sum(axis=1)
     assert (np.diff(order) > 0).all()
     assert np.isfinite(voxels.values).all()
     again = make(33, share, 7)
     np.testing.assert_array_equal(voxels.coordinates, again.coordinates)
-    np.testing.assert_array_equal(voxels.words, again.words)
+    np.testing.assert_array_equal(voxels.packed, again.packed)
 
 
 def test_clusters_leave_most_bricks_empty_and_scattering_does_not() -> None:
@@ -146,7 +146,7 @@ def test_rays_run_through_the_grid_one_voxel_at_a_time() -> None:
 
 def test_words_carry_the_values() -> None:
     values = np.array([[1, -2, 0.5, 1e-3], [0, 0, 0, 6e-8]], np.float16)
-    np.testing.assert_array_equal(values_from_words(words_from_values(values)), values)
+    np.testing.assert_array_equal(unpack_values(pack_values(values)), values)
 
 
 @pytest.mark.parametrize(
@@ -167,10 +167,10 @@ def test_lists_that_no_grid_has_are_refused(coordinates: list[list[int]], values
 
 def test_bricks_are_the_same_whichever_way_they_are_stored(monkeypatch: pytest.MonkeyPatch) -> None:
     for voxels, apart in ((scattered(40, 0.2, 1), True), (clustered(40, 0.2, 1), False), (shuffled(clustered(40, 0.2, 1), 2), True)):
-        assert bricks._lie_apart(voxels.coordinates) == apart
+        assert bricks._is_scattered(voxels.coordinates) == apart
         made = []
         for way in (True, False):
-            monkeypatch.setattr(bricks, "_lie_apart", lambda coordinates, way=way: way)
+            monkeypatch.setattr(bricks, "_is_scattered", lambda coordinates, way=way: way)
             made.append(bricks.BrickTree.cache(voxels).arrays)
         monkeypatch.undo()
         assert all(np.array_equal(made[0][name], made[1][name]) for name in made[0])

@@ -53,7 +53,7 @@ class Case:
         return f"{self.side}³, {self.share:.0%} {how}{', listed at random' if self.shuffled else ''}"
 
     def voxels(self) -> Voxels:
-        from efficientnerf.structures.occupancy import clustered, scattered, shuffled
+        from efficientnerf.structures.synthetic import clustered, scattered, shuffled
 
         made = (scattered if self.scattered else clustered)(self.side, self.share, SEED)
         return shuffled(made, SEED) if self.shuffled else made
@@ -92,7 +92,7 @@ def structures(request: Request) -> Result:
 
 def _measure(case: Case, points: int, backend: Backend, timings: Repetitions) -> tuple[list[dict[str, Any]], str]:
     """All structures in turn, repetition by repetition: a row for each, and a note on the voxels."""
-    from efficientnerf.structures.occupancy import random_points, ray_points
+    from efficientnerf.structures.synthetic import random_points, ray_points
 
     voxels = case.voxels()
     sets = {"random": random_points(case.side, points, SEED), "rays": ray_points(case.side, points, SEED)}
@@ -122,7 +122,7 @@ def _measure(case: Case, points: int, backend: Backend, timings: Repetitions) ->
     rows = [_row(case, name, size, middle, PRINTED.get(name) if printed else None) for name in NAMES]
     bricks = _brick_share(voxels)
     note = (
-        f"{case.name}: {len(voxels.words):,} voxels in {bricks:.1%} of the bricks of 4³; points: "
+        f"{case.name}: {len(voxels.packed):,} voxels in {bricks:.1%} of the bricks of 4³; points: "
         f"{len(sets['random']):,} at random, {len(sets['rays']):,} along rays."
     )
     return rows, note
@@ -152,8 +152,8 @@ def _in_numba() -> Backend:
     from efficientnerf.structures.bricks import BrickTree, FullBricks
     from efficientnerf.structures.dense import DenseVoxels
     from efficientnerf.structures.hashing import HashMap
-    from efficientnerf.structures.occupancy import scattered
     from efficientnerf.structures.octree import Octree
+    from efficientnerf.structures.synthetic import scattered
 
     kinds: dict[str, Any] = {kind.__name__: kind for kind in (DenseVoxels, HashMap, Octree, FullBricks, BrickTree)}
     for kind in kinds.values():  # compiles
@@ -161,10 +161,10 @@ def _in_numba() -> Backend:
 
     def prepare(voxels: Voxels, sets: Mapping[str, np.ndarray]) -> tuple[Callable[[str], Any], Callable[[Any, str], None], Callable[[], None]]:
         longest = max(len(points) for points in sets.values())
-        words, found = np.zeros(longest, np.uint64), np.zeros(longest, bool)
+        packed, occupied = np.zeros(longest, np.uint64), np.zeros(longest, bool)
 
         def query(structure: Any, what: str) -> None:
-            structure.query(sets[what], words[: len(sets[what])], found[: len(sets[what])])
+            structure.query(sets[what], packed[: len(sets[what])], occupied[: len(sets[what])])
 
         return lambda name: kinds[name].cache(voxels), query, lambda: None
 
@@ -175,16 +175,16 @@ def _in_torch(device: str) -> Backend:
     import numpy as np
     import torch
 
-    from efficientnerf.structures import on_device
+    from efficientnerf.structures import torch_structures
     from pipeline.errors import StageFailed
 
     def prepare(voxels: Voxels, sets: Mapping[str, np.ndarray]) -> tuple[Callable[[str], Any], Callable[[Any, str], None], Callable[[], None]]:
-        coordinates, words = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.words.view(np.int64)).to(device)
+        coordinates, packed = torch.from_numpy(voxels.coordinates).to(device), torch.from_numpy(voxels.packed.view(np.int64)).to(device)
         points = {what: torch.from_numpy(array).to(device) for what, array in sets.items()}
 
         def cache(name: str) -> Any:
             try:
-                return getattr(on_device, name).cache(voxels.side, coordinates, words)
+                return getattr(torch_structures, name).cache(voxels.side, coordinates, packed)
             except torch.OutOfMemoryError as error:
                 raise StageFailed(f"table 7: {NAMES[name]} of {voxels.side}³ voxels: the device has too little memory. Give --scale 0.5.") from error
 
@@ -242,7 +242,7 @@ def _machine(load: _OtherLoad) -> str:
     import numpy as np
 
     from efficientnerf.backends.numba.runtime import numba
-    from efficientnerf.structures.words import fill, gather
+    from efficientnerf.structures.bits import fill, gather
 
     table = np.empty(1 << 27, np.uint64)
     where = np.random.default_rng(SEED).integers(0, len(table), 1 << 21, np.uint64)

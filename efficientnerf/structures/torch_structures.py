@@ -1,7 +1,7 @@
-"""The structures of table 7 in plain torch, on any device: the same arrays, built and read by gathers, scatters and scans.
+"""The structures of table 7 in plain torch, on any device: the same arrays, built and queried by gathers, scatters and scans.
 
-They say what the structures cost where nobody has written kernels for them, and stand in for the kernels on CUDA. Words are int64 here, of the same
-bits, for torch computes little with unsigned ones.
+They show the cost of the structures without kernels of their own, and are what runs on CUDA. Packed values are int64 of the same bits, for torch has few
+operations on uint64.
 
 N voxels, M points.
 """
@@ -15,57 +15,57 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-PART = 1 << 24  # points that are looked up at a time: temporary tensors of 128 MiB
-LOAD = 0.5  # most of the slots of the hash map that are in use
+CHUNK = 1 << 24  # points of a query that are processed at a time: temporary tensors of 128 MiB
+LOAD_FACTOR = 0.5  # of the hash map, at most
 
 
-def population(word: Tensor) -> Tensor:
-    """How many bits of each int64 are set."""
+def popcount(word: Tensor) -> Tensor:
+    """Number of set bits of each int64."""
     word = word - ((word >> 1) & 0x5555555555555555)
     word = (word & 0x3333333333333333) + ((word >> 2) & 0x3333333333333333)
     return (((word + (word >> 4)) & 0x0F0F0F0F0F0F0F0F) * 0x0101010101010101) >> 56
 
 
 def _rank(masks: Tensor, first: Tensor, at: Tensor, bit: Tensor) -> tuple[Tensor, Tensor]:
-    """Number that a bit of a mask has, and whether it is set."""
+    """Index of a bit of a mask among all set bits, and whether it is set."""
     mask = masks[at]
-    return first[at] + population(mask & ((1 << bit) - 1)), ((mask >> bit) & 1).bool()
+    return first[at] + popcount(mask & ((1 << bit) - 1)), ((mask >> bit) & 1).bool()
 
 
-def _lowest(voxel: Tensor) -> Tensor:
-    """Which of 4^3 a voxel (..., 3) is in its cell."""
+def _local_index(voxel: Tensor) -> Tensor:
+    """Index among 4^3 of a voxel (..., 3) in its cell."""
     low = voxel & 3
     return (low[:, 0] << 4) | (low[:, 1] << 2) | low[:, 2]
 
 
-def _in_row_order(voxel: Tensor, side: int) -> Tensor:
+def _flat_index(voxel: Tensor, side: int) -> Tensor:
     return (voxel[:, 0] * side + voxel[:, 1]) * side + voxel[:, 2]
 
 
-def _parts(points: Tensor, side: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
+def _chunks(points: Tensor, side: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
     """Slices of the points, their voxels (m, 3) int64, and whether they lie in the grid."""
-    for begin in range(0, len(points), PART):
-        part = slice(begin, begin + PART)
+    for begin in range(0, len(points), CHUNK):
+        part = slice(begin, begin + CHUNK)
         inside = ((points[part] >= 0) & (points[part] < side)).all(dim=1)
         yield part, torch.where(inside[:, None], points[part], torch.zeros_like(points[part])).long(), inside
 
 
 class _Structure(ABC):
-    """side voxels along each side; `tensors` are what it consists of."""
+    """A structure of `tensors` with `side` voxels along each side."""
 
     side: int
     tensors: dict[str, Tensor]
 
     def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Words (M,) int64 and found (M,) bool at points (M, 3), in voxels."""
-        words = torch.empty(len(points), dtype=torch.int64, device=points.device)
-        for part, voxel, inside in _parts(points, self.side):
-            words[part] = torch.where(inside, self._at(voxel), 0)
-        return words, words != 0
+        """Packed values (M,) int64 and occupied (M,) bool at points (M, 3), voxel coordinates."""
+        packed = torch.empty(len(points), dtype=torch.int64, device=points.device)
+        for part, voxel, inside in _chunks(points, self.side):
+            packed[part] = torch.where(inside, self._at(voxel), 0)
+        return packed, packed != 0
 
     @abstractmethod
     def _at(self, voxel: Tensor) -> Tensor:
-        """Words at voxels (m, 3) int64 of the grid, 0 where there is none."""
+        """Packed values at voxels (m, 3) int64 of the grid, 0 where there is none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,49 +76,49 @@ class DenseVoxels(_Structure):
     tensors: dict[str, Tensor]
 
     @staticmethod
-    def cache(side: int, coordinates: Tensor, words: Tensor) -> DenseVoxels:
-        grid = torch.zeros(side**3, dtype=torch.int64, device=words.device)
-        grid[_in_row_order(coordinates.long(), side)] = words
+    def cache(side: int, coordinates: Tensor, packed: Tensor) -> DenseVoxels:
+        grid = torch.zeros(side**3, dtype=torch.int64, device=packed.device)
+        grid[_flat_index(coordinates.long(), side)] = packed
         return DenseVoxels(side, {"grid": grid})
 
     def _at(self, voxel: Tensor) -> Tensor:
-        return self.tensors["grid"][_in_row_order(voxel, self.side)]
+        return self.tensors["grid"][_flat_index(voxel, self.side)]
 
 
 @dataclass(frozen=True, eq=False)
 class BrickTree(_Structure):
-    """See `efficientnerf.structures.bricks.BrickTree`; masks and first numbers in tensors of their own."""
+    """See `efficientnerf.structures.bricks.BrickTree`; masks and ranks in tensors of their own."""
 
     side: int
     tensors: dict[str, Tensor]
 
     @staticmethod
-    def cache(side: int, coordinates: Tensor, words: Tensor) -> BrickTree:
-        blocks_side, device = -(-side // 16), words.device
+    def cache(side: int, coordinates: Tensor, packed: Tensor) -> BrickTree:
+        blocks_side, device = -(-side // 16), packed.device
         masks = torch.zeros(64 * blocks_side**3, dtype=torch.int64, device=device)
         voxel = coordinates.long()
-        cell, bit = (_in_row_order(voxel >> 4, blocks_side) << 6) | _lowest(voxel >> 2), _lowest(voxel)
+        cell, bit = (_flat_index(voxel >> 4, blocks_side) << 6) | _local_index(voxel >> 2), _local_index(voxel)
         masks.index_add_(0, cell, torch.ones_like(bit) << bit)  # each bit once: the sum is the union
         occupied = (masks != 0).view(-1, 64)
         blocks = (occupied.long() << torch.arange(64, device=device)).sum(dim=1)
         cells = masks[occupied.view(-1)]
-        tensors = {"blocks": blocks, "blocks_first": _begins(population(blocks)), "cells": cells, "cells_first": _begins(population(cells))}
+        tensors = {"blocks": blocks, "blocks_first": _exclusive_sum(popcount(blocks)), "cells": cells, "cells_first": _exclusive_sum(popcount(cells))}
         record, _ = _rank(blocks, tensors["blocks_first"], cell >> 6, cell & 63)
         number, _ = _rank(cells, tensors["cells_first"], record, bit)
-        tensors["values"] = torch.empty_like(words).index_copy_(0, number, words)
+        tensors["values"] = torch.empty_like(packed).index_copy_(0, number, packed)
         return BrickTree(side, tensors)
 
     def _at(self, voxel: Tensor) -> Tensor:
         t = self.tensors
         out = torch.zeros(len(voxel), dtype=torch.int64, device=voxel.device)
-        record, occupied = _rank(t["blocks"], t["blocks_first"], _in_row_order(voxel >> 4, -(-self.side // 16)), _lowest(voxel >> 2))
+        record, occupied = _rank(t["blocks"], t["blocks_first"], _flat_index(voxel >> 4, -(-self.side // 16)), _local_index(voxel >> 2))
         rest = occupied.nonzero()[:, 0]
-        number, found = _rank(t["cells"], t["cells_first"], record[rest], _lowest(voxel[rest]))
-        out[rest[found]] = t["values"][number[found]]
+        number, occupied = _rank(t["cells"], t["cells_first"], record[rest], _local_index(voxel[rest]))
+        out[rest[occupied]] = t["values"][number[occupied]]
         return out
 
 
-def _begins(counts: Tensor) -> Tensor:
+def _exclusive_sum(counts: Tensor) -> Tensor:
     return counts.cumsum(0) - counts
 
 
@@ -130,37 +130,37 @@ class FullBricks(_Structure):
     tensors: dict[str, Tensor]
 
     @staticmethod
-    def cache(side: int, coordinates: Tensor, words: Tensor) -> FullBricks:
+    def cache(side: int, coordinates: Tensor, packed: Tensor) -> FullBricks:
         cells_side, voxel = -(-side // 4), coordinates.long()
-        cell = _in_row_order(voxel >> 2, cells_side)
-        occupied = torch.zeros(cells_side**3, dtype=torch.int32, device=words.device)
+        cell = _flat_index(voxel >> 2, cells_side)
+        occupied = torch.zeros(cells_side**3, dtype=torch.int32, device=packed.device)
         occupied[cell] = 1
         index = occupied.cumsum(0, dtype=torch.int32) * occupied
-        bricks = torch.zeros(64 * (1 + int(occupied.sum())), dtype=torch.int64, device=words.device)
-        bricks[(index[cell].long() << 6) | _lowest(voxel)] = words
+        bricks = torch.zeros(64 * (1 + int(occupied.sum())), dtype=torch.int64, device=packed.device)
+        bricks[(index[cell].long() << 6) | _local_index(voxel)] = packed
         return FullBricks(side, {"index": index, "bricks": bricks})
 
     def _at(self, voxel: Tensor) -> Tensor:
-        brick = self.tensors["index"][_in_row_order(voxel >> 2, -(-self.side // 4))].long()
-        return self.tensors["bricks"][(brick << 6) | _lowest(voxel)]
+        brick = self.tensors["index"][_flat_index(voxel >> 2, -(-self.side // 4))].long()
+        return self.tensors["bricks"][(brick << 6) | _local_index(voxel)]
 
 
 @dataclass(frozen=True, eq=False)
 class HashMap(_Structure):
-    """See `efficientnerf.structures.hashing`. All keys are inserted, and looked up, at once, probe by probe: of those that write to
-    one free slot one stays, whichever it is, and the others go on to the next slot.
+    """See `efficientnerf.structures.hashing`. All keys are inserted, and queried, in lockstep: of those that write to one free slot one wins, and the others
+    probe the next.
     """
 
     side: int
     tensors: dict[str, Tensor]
 
     @staticmethod
-    def cache(side: int, coordinates: Tensor, words: Tensor) -> HashMap:
-        slots = max(-(-len(words) * 100 // round(100 * LOAD)), 1)
-        keys = torch.full((slots,), -1, dtype=torch.int64, device=words.device)
-        values = torch.zeros(slots, dtype=torch.int64, device=words.device)
+    def cache(side: int, coordinates: Tensor, packed: Tensor) -> HashMap:
+        slots = max(-(-len(packed) * 100 // round(100 * LOAD_FACTOR)), 1)
+        keys = torch.full((slots,), -1, dtype=torch.int64, device=packed.device)
+        values = torch.zeros(slots, dtype=torch.int64, device=packed.device)
         key = _keys(coordinates.long())
-        slot, word = _home(key, slots), words
+        slot, word = _home(key, slots), packed
         while len(key):
             free = keys[slot] == -1
             keys[slot[free]] = key[free]
@@ -188,13 +188,13 @@ def _keys(voxel: Tensor) -> Tensor:
 
 def _home(key: Tensor, slots: int) -> Tensor:
     """murmur3's 64-bit finaliser, its upper half scaled to the table."""
-    key = (key ^ _down(key, 33)) * (0xFF51AFD7ED558CCD - (1 << 64))
-    key = (key ^ _down(key, 33)) * (0xC4CEB9FE1A85EC53 - (1 << 64))
-    return (_down(key ^ _down(key, 33), 32) * slots) >> 32
+    key = (key ^ _shift_right(key, 33)) * (0xFF51AFD7ED558CCD - (1 << 64))
+    key = (key ^ _shift_right(key, 33)) * (0xC4CEB9FE1A85EC53 - (1 << 64))
+    return (_shift_right(key ^ _shift_right(key, 33), 32) * slots) >> 32
 
 
-def _down(word: Tensor, by: int) -> Tensor:
-    """Shift to the right as if unsigned."""
+def _shift_right(word: Tensor, by: int) -> Tensor:
+    """Logical right shift."""
     return (word >> by) & ((1 << (64 - by)) - 1)
 
 
@@ -207,25 +207,25 @@ class Octree(_Structure):
     tensors: dict[str, Tensor]
 
     @staticmethod
-    def cache(side: int, coordinates: Tensor, words: Tensor) -> Octree:
+    def cache(side: int, coordinates: Tensor, packed: Tensor) -> Octree:
         depth = max((side - 1).bit_length(), 1)
         code = _morton(coordinates.long())
         levels = [torch.unique(code >> 3)]  # codes of the nodes of a level, in order; the lowest first
         while len(levels) < depth:
             levels.append(torch.unique_consecutive(levels[-1] >> 3))
-        if not len(words):
-            levels = [*levels[:-1], torch.zeros(1, dtype=torch.int64, device=words.device)]
+        if not len(packed):
+            levels = [*levels[:-1], torch.zeros(1, dtype=torch.int64, device=packed.device)]
         levels.reverse()
         begins = [0]
         for level in levels:
             begins.append(begins[-1] + len(level))
-        child = torch.zeros(8 * begins[-1], dtype=torch.int32, device=words.device)
-        data = torch.zeros(8 * begins[-1], dtype=torch.int64, device=words.device)
+        child = torch.zeros(8 * begins[-1], dtype=torch.int32, device=packed.device)
+        data = torch.zeros(8 * begins[-1], dtype=torch.int64, device=packed.device)
         for number in range(1, depth):
             parent = begins[number - 1] + torch.searchsorted(levels[number - 1], levels[number] >> 3)
-            node = begins[number] + torch.arange(len(levels[number]), device=words.device)
+            node = begins[number] + torch.arange(len(levels[number]), device=packed.device)
             child[(parent << 3) | (levels[number] & 7)] = (node - parent).int()
-        data[((begins[-2] + torch.searchsorted(levels[-1], code >> 3)) << 3) | (code & 7)] = words
+        data[((begins[-2] + torch.searchsorted(levels[-1], code >> 3)) << 3) | (code & 7)] = packed
         return Octree(side, depth, {"child": child, "data": data})
 
     def _at(self, voxel: Tensor) -> Tensor:
