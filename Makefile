@@ -17,10 +17,10 @@ demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -q -n auto -m "not slow"
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow"
 
 test-slow: $(INSTALLED)
-	$(BIN)/python -m pytest -q -n auto -m slow
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m slow
 
 torture: $(INSTALLED)
 	$(BIN)/python benchmarks/torture.py

@@ -174,6 +174,7 @@ np.savez(sys.argv[1], *passes(features, weights, grad, True))
 """
 
 
+@pytest.mark.slow
 def test_a_processor_without_wide_registers_gives_the_same(tmp_path: Path) -> None:
     """Compiled for the oldest there is of this kind: pairs are multiplied in float32, and tiles are small."""
     environment = {**os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_NUM_THREADS": "1"}

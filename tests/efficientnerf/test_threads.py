@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
 import hashlib
@@ -46,6 +48,7 @@ def lines(threads: int, layer: str = "default") -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_the_number_of_threads_changes_no_byte() -> None:
     (one, *alone), (two, *together), (queued, *in_queue) = lines(1), lines(2), lines(2, "workqueue")
     assert (one, two, queued) == ("1", "2", "2")
