@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,9 +14,6 @@ from torch import Tensor, nn
 from efficientnerf.backends import dispatch
 from efficientnerf.fields import Field
 from efficientnerf.fields.gradient_buffer import GradientBuffer
-from efficientnerf.fields.hash import HashField
-from efficientnerf.fields.mlp import MlpField
-from efficientnerf.fields.nerf import NerfField
 from efficientnerf.geometry.spaces import RayBundle, Space, voxel_centres
 from efficientnerf.rendering.compositing import Composite
 from efficientnerf.rendering.harmonics import basis, harmonics_count
@@ -23,10 +21,9 @@ from efficientnerf.sampling.occupancy import DensityVoxels, density_voxels
 from efficientnerf.sampling.samples import SampleCapacity, Samples
 from efficientnerf.sampling.strategies import Efficient, Hierarchical, Intervals, SamplingRequest, Strategy, Uniform, Valid
 from efficientnerf.settings import given
-from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
+from efficientnerf.training.settings import TrainSettings
 
 SKY_DEGREE = 2
-COARSEST = 16  # hash grids: resolution of the coarsest level
 UNSEEN = 0.5  # grey: what is drawn behind a space that reaches to infinity, where nothing can lie
 
 
@@ -148,27 +145,10 @@ def model(
     return Model(space, settings, coarse.to(device), fine.to(device), voxels, strategy, Sky().to(device), background, step, intervals.max_intervals)
 
 
-def _fields(s: TrainSettings, generator: torch.Generator) -> tuple[Field, Field]:
+def _fields(settings: TrainSettings, generator: torch.Generator) -> tuple[Field, Field]:
     """The coarse field and the fine one, untrained."""
-    log2_table, finest = given(s.log2_hashmap_size) or LOG2_TABLE, given(s.finest_resolution) or FINEST
-    if s.field == "hash":
-        # The coarse field is a proposal field: lighter, and of densities alone. docs/experiments/proposal-field.md
-        return HashField(
-            levels=max(1, s.num_levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
-            hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
-        ), HashField(
-            levels=s.num_levels, log2_table=log2_table, coarsest=COARSEST, finest=finest,
-            hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree, initial_density=s.initial_density, generator=generator, precision=s.precision,
-        )  # fmt: skip
-    if s.field == "nerf":
-        return (
-            NerfField(hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, generator=generator, precision=s.precision),
-            NerfField(hidden=s.hidden_dim, layers=s.num_layers, generator=generator, precision=s.precision),
-        )
-    return (
-        MlpField(hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=s.sh_degree, generator=generator, precision=s.precision),
-        MlpField(hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree, generator=generator, precision=s.precision),
-    )
+    pair: tuple[Field, Field] = import_module(f"efficientnerf.fields.{settings.field}").coarse_and_fine(settings, generator)
+    return pair
 
 
 def _voxels(s: TrainSettings, space: Space, step: float, device: str) -> DensityVoxels:

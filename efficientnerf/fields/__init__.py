@@ -1,6 +1,8 @@
 """Fields: from a point of space to density and colour. One contract, one module a field.
 
 hash  multiresolution hash grid        mlp  the paper's networks        nerf  the original NeRF's, for comparison
+
+`train.field` names the module, whose coarse_and_fine(settings, generator) makes both fields of a model, untrained.
 """
 
 from __future__ import annotations

@@ -19,7 +19,10 @@ from efficientnerf.backends.torch.linear_chain import precision_of
 from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.rendering.harmonics import harmonics_count
+from efficientnerf.settings import given
+from efficientnerf.training.settings import FINEST, LOG2_TABLE, TrainSettings
 
+COARSEST = 16  # resolution of the coarsest level
 FEATURES = 2
 
 
@@ -78,3 +81,15 @@ class HashField(BakeableField):
         training = torch.is_grad_enabled() and dispatch.backend_of(points, self.table) != "torch"
         precision = precision_of(self.precision, points.device.type) if training else points.dtype
         return dispatch.hash_network(points, self.table, self.hash_levels, weights, self.log_initial_density, precision, self.table_gradient)
+
+
+def coarse_and_fine(s: TrainSettings, generator: torch.Generator) -> tuple[HashField, HashField]:
+    """The coarse field is a proposal field: lighter, and of densities alone. docs/experiments/proposal-field.md"""
+    log2_table, finest = given(s.log2_hashmap_size) or LOG2_TABLE, given(s.finest_resolution) or FINEST
+    return HashField(
+        levels=max(1, s.num_levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
+        hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
+    ), HashField(
+        levels=s.num_levels, log2_table=log2_table, coarsest=COARSEST, finest=finest,
+        hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree, initial_density=s.initial_density, generator=generator, precision=s.precision,
+    )  # fmt: skip

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from efficientnerf.backends.torch.linear_chain import chain, precision_of
 from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.rendering.harmonics import harmonics_count
+from efficientnerf.training.settings import TrainSettings
 
 FREQUENCIES = 10
 
@@ -73,3 +74,11 @@ class MlpField(BakeableField):
         weights, biases = [*list(self.weights)[:-1], weight], [*list(self.biases)[:-1], bias]
         precision = precision_of(self.precision, points.device.type)
         return chain(positional_encoding(points * 2 - 1), weights, biases, skip=self.skip, precision=precision)
+
+
+def coarse_and_fine(s: TrainSettings, generator: torch.Generator) -> tuple[MlpField, MlpField]:
+    """The paper's lightweight and standard networks (EfficientNeRF, section 3.2)."""
+    return (
+        MlpField(hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=s.sh_degree, generator=generator, precision=s.precision),
+        MlpField(hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree, generator=generator, precision=s.precision),
+    )

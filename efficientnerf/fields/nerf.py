@@ -15,6 +15,7 @@ from efficientnerf.backends.torch.linear_chain import chain, precision_of
 from efficientnerf.fields.gradient_buffer import GradientBuffer
 from efficientnerf.fields.mlp import FREQUENCIES, linear_layers, positional_encoding
 from efficientnerf.rendering.compositing import ray_of_sample
+from efficientnerf.training.settings import TrainSettings
 
 DIRECTION_FREQUENCIES = 4
 
@@ -55,3 +56,11 @@ class NerfField(nn.Module):
         weights, biases = [*list(self.weights)[:-1], self.weights[-1][:1]], [*list(self.biases)[:-1], self.biases[-1][:1]]
         precision = precision_of(self.precision, points.device.type)
         return chain(positional_encoding(points * 2 - 1), weights, biases, skip=self.skip, precision=precision)[:, 0]
+
+
+def coarse_and_fine(s: TrainSettings, generator: torch.Generator) -> tuple[NerfField, NerfField]:
+    """NeRF's coarse and fine network (Mildenhall et al. 2020, section 5.2)."""
+    return (
+        NerfField(hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, generator=generator, precision=s.precision),
+        NerfField(hidden=s.hidden_dim, layers=s.num_layers, generator=generator, precision=s.precision),
+    )
