@@ -57,3 +57,22 @@ def ball_tree(side: int = 20) -> NerfTree:
     tree = uniform_tree((side // 4,) * 3, voxel=2 / side, sigma=0.5, logit=0.0)
     sh = np.zeros((len(tree.density_values), 4, 3), np.float32)
     return replace(tree, bounds_min=BOUNDS[0], harmonics=sh, background=(1.0, 1.0, 1.0))
+
+
+def device_gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str) -> tuple[np.ndarray, ...]:
+    """`gradients` by Triton's kernels, and the voxels that rays meet are stamped."""
+    from efficientnerf.asset.refinement.device import rays_in_voxels, values_of
+    from efficientnerf.backends.triton import tree_gradients
+
+    rays = rays_in_voxels(tree, *(torch.from_numpy(a).to(device) for a in (origins, directions)))
+    grid, density, sh = values_of(tree, torch.device(device))
+    outputs = tree_gradients.forward(grid, rays, density, sh)
+    sent = RayTargets(*(torch.from_numpy(np.asarray(part, np.float32)).to(device) for part in targets[:4]), targets.opacity_weight)
+    loss, *by = tree_gradients.loss_and_gradients(*outputs, sent)
+    sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
+    stamp = torch.zeros(len(density), dtype=torch.int32, device=device)
+    tree_gradients.backward(grid, rays, density, sh, outputs, (by[0], by[1]), sums, stamp, 3)
+    by_thickness, by_sh = (part.cpu().double().numpy() / tree_gradients.fixed_point_scale(len(origins)) for part in sums)
+    assert set(stamp.tolist()) <= {0, 3}
+    assert not (by_sh.any(axis=1) & (stamp.cpu().numpy() != 3)).any()
+    return loss.cpu().numpy(), by_thickness * tree.voxel, by_sh.reshape(tree.sh.shape)

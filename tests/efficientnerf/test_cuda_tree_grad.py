@@ -19,7 +19,7 @@ from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.refinements import ball_tree, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.refinements import ball_tree, device_gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 from tests.efficientnerf.walls import camera_at, wall
 
@@ -27,51 +27,28 @@ kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
 device = pytest.importorskip("efficientnerf.asset.refinement.device")
 
 
-def to_device(seen: RayTargets) -> RayTargets:
-    return RayTargets(*(torch.from_numpy(np.asarray(part, np.float32)).to(DEVICE) for part in seen[:4]), seen.opacity_weight)
-
-
-def gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets) -> tuple[np.ndarray, ...]:
-    """Loss of each ray, and the gradients of their sum by density and harmonics."""
-    rays = device.rays_in_voxels(tree, *(torch.from_numpy(a).to(DEVICE) for a in (origins, directions)))
-    grid, density, sh = device.values_of(tree, torch.device(DEVICE))
-    outputs = kernels.forward(grid, rays, density, sh)
-    loss, *by = kernels.loss_and_gradients(*outputs, to_device(seen))
-    sums = torch.zeros(density.shape, dtype=torch.int64, device=DEVICE), torch.zeros(sh.shape, dtype=torch.int64, device=DEVICE)
-    stamp = torch.zeros(len(density), dtype=torch.int32, device=DEVICE)
-    kernels.backward(grid, rays, density, sh, outputs, tuple(by), sums, stamp, 3)
-    by_thickness, by_sh = (part.cpu().double().numpy() / kernels.fixed_point_scale(len(origins)) for part in sums)
-    assert set(stamp.tolist()) <= {0, 3}
-    assert np.array_equal(by_sh.any(axis=1) & (stamp.cpu().numpy() != 3), np.zeros(len(by_sh), bool))
-    return loss.cpu().numpy(), by_thickness * tree.voxel, by_sh.reshape(tree.sh.shape)
-
-
-@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
 @pytest.mark.parametrize(("brick", "degree", "opacity_weight"), [(1, 0, 0.7), (4, 2, 0.0), (2, 3, 0.25)])
-def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opacity_weight: float, lookup: str) -> None:
-    # Rays that stop early or graze a voxel's face part from the exact sums: low densities, and rays at no angle of the grid.
-    tree = random_tree(brick, brick=brick, degree=degree, sigma=4.0, lookup=lookup)
+def test_values_and_gradients_are_those_of_autograd(brick: int, degree: int, opacity_weight: float) -> None:
+    # Rays that stop early or run along a voxel's face depart from the exact sums: low densities, and rays at no angle of the grid.
+    tree = random_tree(brick, brick=brick, degree=degree, sigma=4.0)
     origins, directions = (a[np.arange(160) % 4 != 2] for a in rays_at(tree, 160))
     seen = seen_at_random(len(origins), opacity_weight)
-    loss, by_density, by_sh = gradients(tree, origins, directions, seen)
-    wanted, wanted_by_density, wanted_by_sh = gradients_by_autograd(tree, origins, directions, seen)
-    np.testing.assert_allclose(loss, wanted, atol=2e-5 if lookup == "trilinear" else 1e-2)
-    for ours, theirs in ((by_density, wanted_by_density), (by_sh, wanted_by_sh)):
-        scale = np.abs(theirs).max()
-        off = np.abs(ours - theirs)
-        if lookup == "trilinear":
-            assert off.max() < 2e-4 * scale
+    found, wanted = device_gradients(tree, origins, directions, seen, DEVICE), gradients_by_autograd(tree, origins, directions, seen)
+    np.testing.assert_allclose(found[0], wanted[0], atol=2e-5)
+    for ours, theirs in zip(found[1:], wanted[1:], strict=True):
+        off, scale = np.abs(ours - theirs), np.abs(theirs).max()
+        assert off.max() < 2e-4 * scale
         assert (off > 1e-4 * scale).mean() < 0.02  # in float32 a sample may lie in the voxel on the other side of a face
-    assert (by_density != 0).mean() > 0.15
+    assert (found[1] != 0).mean() > 0.15
 
 
 def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
     tree = random_tree(4, brick=4, degree=1, share=0.6)
     origins, directions = rays_at(tree, 60)
     seen = seen_at_random(60, 0.3, np.float32)
-    _, by_density, by_sh = gradients(tree, origins, directions, seen)
+    _, by_density, by_sh = device_gradients(tree, origins, directions, seen, DEVICE)
     order = np.random.default_rng(0).permutation(60)
-    again = gradients(tree, origins[order], directions[order], RayTargets(*(part[order] for part in seen[:4]), seen.opacity_weight))
+    again = device_gradients(tree, origins[order], directions[order], RayTargets(*(part[order] for part in seen[:4]), seen.opacity_weight), DEVICE)
     assert np.array_equal(by_density, again[1])
     assert np.array_equal(by_sh, again[2])
 
@@ -87,7 +64,7 @@ def test_sums_of_the_most_rays_cannot_overflow() -> None:
     origins = np.tile(middle - [0, 0, 2.0], (count, 1))
     directions = np.tile([0.0, 0, 1], (count, 1))
     seen = RayTargets(np.full((count, 3), -1.0), np.ones((count, 3)), np.ones(count), np.ones(count), 0.25)
-    _, by_density, _ = gradients(tree, origins, directions, seen)
+    _, by_density, _ = device_gradients(tree, origins, directions, seen, DEVICE)
     per_ray = by_density[0] / tree.voxel / count
     assert -25 < per_ray < -4
 
@@ -96,14 +73,14 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
     tree = random_tree(1, brick=2)
     origins, directions = rays_at(tree, 40)
     away = origins + 100.0
-    loss, by_density, by_sh = gradients(tree, away, directions, seen_at_random(40, 0.0))
+    loss, by_density, by_sh = device_gradients(tree, away, directions, seen_at_random(40, 0.0), DEVICE)
     assert not by_density.any()
     assert not by_sh.any()
     assert (loss > 0).any()
     bare = replace(
         tree, brick_index=np.full_like(tree.brick_index, -1), voxel_index=tree.voxel_index[:0], density_values=tree.density_values[:0], harmonics=tree.sh[:0]
     )
-    assert (gradients(bare, origins, directions, seen_at_random(40, 0.0))[0] > 0).any()
+    assert (device_gradients(bare, origins, directions, seen_at_random(40, 0.0), DEVICE)[0] > 0).any()
 
 
 def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 4) -> tuple[RefinementState, list[float]]:
