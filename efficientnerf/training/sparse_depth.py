@@ -14,6 +14,7 @@ from efficientnerf.rendering.compositing import ray_of_sample
 from efficientnerf.sampling.samples import SampleCapacity, complete_rays
 from efficientnerf.training.losses import mean_over
 
+# docs/experiments/losses.md
 RAYS_PER_RAY = 8  # one ray to a sparse point for so many rays of pixels
 WIDTH = 2.0  # coarse intervals on either side of a sparse point that count as at the point
 

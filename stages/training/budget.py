@@ -21,6 +21,7 @@ from efficientnerf.training.settings import TrainSettings
 from pipeline.files import write_json
 
 FILE = "schedule.json"
+# docs/experiments/schedule.md
 TIMED = 48  # steps after the warm-up that are timed
 MARKS = (0.15, 0.3, 0.5, 0.7, 0.85, 0.95)  # fractions of the budget at which the number of iterations is set again
 MIN_TIMED = 8  # steps that have to be timed before that
