@@ -115,8 +115,8 @@ def fit() -> None:
         outputs = tree_gradients.forward(g, rays, *values)
         tree_gradients.backward(g, rays, *values, outputs, (outputs[0], outputs[1]), sums, stamp, 7)
         tree_gradients.max_contributions(g, rays, values[0], outputs[1], squares[0])
-        rates = {"number": 7, "rays": 8, "density_rate": 0.1, "sh_rate": 0.1, "view_share": 0.5, "decay": 0.9, "epsilon": 1e-10}
-        tree_gradients.rmsprop_step(g, values, sums, squares, visits, stamp, **rates)
+        rates = tree_gradients.LearningRates(0.1, 0.1, 0.5)
+        tree_gradients.rmsprop_step(g, values, sums, squares, visits, stamp, number=7, rays=8, rates=rates, decay=0.9, epsilon=1e-10)
 
 
 if __name__ == "__main__":

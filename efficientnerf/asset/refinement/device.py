@@ -19,7 +19,7 @@ from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
-from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
+from efficientnerf.backends.triton.tree_gradients import DeviceGrid, LearningRates, Rays, device_grid
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.readback import LAG
 
@@ -47,7 +47,7 @@ class DeviceArrays:
         tree_gradients.backward(self.grid, rays, v["density"], v["sh"], outputs, (by[0], by[1]), sums, self.stamp, number)
         tree_gradients.rmsprop_step(
             self.grid, (v["density"], v["sh"]), sums, (v["square_density"], v["square_sh"]), v["visits"], self.stamp,
-            number=number, rays=len(loss), density_rate=density_lr, sh_rate=sh_lr, view_share=view_dependent_lr_ratio, decay=DECAY, epsilon=EPSILON,
+            number=number, rays=len(loss), rates=LearningRates(density_lr, sh_lr, view_dependent_lr_ratio), decay=DECAY, epsilon=EPSILON,
         )  # fmt: skip
         return loss
 

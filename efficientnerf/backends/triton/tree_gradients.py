@@ -50,6 +50,14 @@ class Rays(NamedTuple):
     views: Tensor
 
 
+class LearningRates(NamedTuple):
+    """Of the logarithm of the optical thickness, of the harmonics, and the share of the latter for those of degree 1 and above."""
+
+    density: float
+    sh: float
+    view_share: float
+
+
 @dataclass(frozen=True, eq=False)
 class DeviceGrid:
     """Where the voxels of a tree lie; `grid` and `index` as in `efficientnerf.backends.triton.tree.DeviceTree`."""
@@ -332,11 +340,11 @@ def max_contributions(g: DeviceGrid, rays: Rays, density: Tensor, transmittance:
 
 def rmsprop_step(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], squares: tuple[Tensor, Tensor], visits: Tensor, stamp: Tensor, *,
-    number: int, rays: int, density_rate: float, sh_rate: float, view_share: float, decay: float, epsilon: float,
+    number: int, rays: int, rates: LearningRates, decay: float, epsilon: float,
 ) -> None:  # fmt: skip
     """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree.rmsprop.rmsprop_step`."""
     voxels = len(visits)
     _rmsprop_step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
-        *values, *sums, *squares, visits, stamp, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel), density_rate, sh_rate, float(view_share),
+        *values, *sums, *squares, visits, stamp, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel), *map(float, rates),
         decay, math.log(decay), epsilon, MIN_THICKNESS, MAX_THICKNESS, MAX_VISITS, WIDTH=3 * g.terms, ROW=g.row, BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip
