@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
@@ -201,19 +201,6 @@ def _has_pivots(m: Model, grid: torch.Tensor) -> torch.Tensor:
 def blocks_of(count: int, points: int) -> int:
     """How many blocks `voxel_values` yields for so many voxels."""
     return math.ceil(count / max(1, POINTS_PER_BLOCK // max(1, points)))
-
-
-def voxel_coordinates(tree: NerfTree) -> np.ndarray:
-    """Coordinates (N, 3) int32 of the stored voxels, in their order."""
-    owner = np.full(len(tree.voxel_index), 0, np.int64)
-    cells = np.flatnonzero(tree.brick_index.reshape(-1) >= 0)
-    owner[tree.brick_index.reshape(-1)[cells]] = cells
-    brick, local = np.nonzero(tree.voxel_index >= 0)
-    cell = np.stack(np.unravel_index(owner[brick], tree.shape), axis=-1)
-    index = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
-    out = np.empty((len(tree.density_values), 3), np.int32)
-    out[tree.voxel_index[brick, local]] = index
-    return out
 
 
 def with_voxels(tree: NerfTree, keep: np.ndarray) -> NerfTree:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from efficientnerf.asset.palettes import PaletteHarmonics
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from efficientnerf.rendering.harmonics import harmonics_count
 
 SAMPLES_AT_ONCE = 2**20
@@ -48,7 +48,7 @@ def with_resolution(tree: NerfTree, resolution: int) -> NerfTree:
     side = tree.voxel * ratio
     size = [max(1, math.ceil(round(n / ratio, 6))) for n in tree.resolution]
     x, y, z = (math.ceil(n / tree.brick) for n in size)
-    at = coordinates(tree)
+    at = voxel_coordinates(tree).astype(np.int64)
     # Every new voxel that a stored one reaches into.
     low = np.floor(at / ratio + 1e-9).astype(np.int64)
     high = np.ceil((at + 1) / ratio - 1e-9).astype(np.int64) - 1
@@ -88,7 +88,7 @@ def _merged(tree: NerfTree, indices: np.ndarray, ratio: float, count: int) -> tu
 
 def pruned(tree: NerfTree) -> NerfTree:
     """Without the voxels that cannot be seen: those of density 0 among neighbours of density 0. Renders stay as they are."""
-    at = coordinates(tree)
+    at = voxel_coordinates(tree).astype(np.int64)
     lit: np.ndarray = np.greater(tree.density_values, 0)
     for offset in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
         beside = lookup(tree, at + offset)
@@ -99,21 +99,10 @@ def pruned(tree: NerfTree) -> NerfTree:
         tree.shape, tree.voxel, tree.bounds_min, at[lit], tree.density_values[lit], np.zeros((int(lit.sum()), 1, 3), np.float32), brick=tree.brick
     )
     # tree_from_voxels sorts: the numbers of the voxels left, in its order.
-    order = lookup(tree, coordinates(left))
+    order = lookup(tree, voxel_coordinates(left).astype(np.int64))
     held = tree.harmonics
     harmonics = held.subset(order) if isinstance(held, PaletteHarmonics) else held[order]
     return replace(tree, brick_index=left.brick_index, voxel_index=left.voxel_index, density_values=left.density_values, harmonics=harmonics)
-
-
-def coordinates(tree: NerfTree) -> np.ndarray:
-    """Voxel coordinates (N, 3) int64 of the stored voxels."""
-    out = np.empty((len(tree.density_values), 3), np.int64)
-    cells = np.argwhere(tree.brick_index >= 0)
-    owner = tree.brick_index[tree.brick_index >= 0]
-    local = np.argwhere(np.ones((tree.brick,) * 3, bool))
-    brick, slot = np.nonzero(tree.voxel_index[owner] >= 0)
-    out[tree.voxel_index[owner][brick, slot]] = cells[brick] * tree.brick + local[slot]
-    return out
 
 
 def lookup(tree: NerfTree, at: np.ndarray) -> np.ndarray:

@@ -193,3 +193,16 @@ def tree_from_voxels(
         ndc=ndc,
         lookup=lookup,
     )
+
+
+def voxel_coordinates(tree: NerfTree) -> np.ndarray:
+    """Coordinates (N, 3) int32 of the stored voxels, in their order."""
+    owner = np.full(len(tree.voxel_index), 0, np.int64)
+    cells = np.flatnonzero(tree.brick_index.reshape(-1) >= 0)
+    owner[tree.brick_index.reshape(-1)[cells]] = cells
+    brick, local = np.nonzero(tree.voxel_index >= 0)
+    cell = np.stack(np.unravel_index(owner[brick], tree.shape), axis=-1)
+    index = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
+    out = np.empty((len(tree.density_values), 3), np.int32)
+    out[tree.voxel_index[brick, local]] = index
+    return out

@@ -148,12 +148,12 @@ def _prune(job: Job, state: RefinementState, targets: Targets, most: int) -> Ref
 def _save_checkpoint(job: Job, state: RefinementState, pruned: bool) -> None:
     from safetensors.numpy import save_file
 
-    from efficientnerf.asset import bake
     from efficientnerf.asset.refinement.state import STATE
+    from efficientnerf.asset.tree import voxel_coordinates
 
     state.fetch()
     tensors = {name: np.ascontiguousarray(getattr(state, name)) for name in STATE}
-    tensors["coordinates"] = bake.voxel_coordinates(state.tree)
+    tensors["coordinates"] = voxel_coordinates(state.tree)
     tensors["progress"] = np.array([state.step, pruned], np.int64)
     with atomic(job.work / CHECKPOINT, durable=False) as temporary:
         save_file(tensors, str(temporary))

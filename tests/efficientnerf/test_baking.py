@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset import bake
-from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_coordinates, voxel_values
+from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_of, spread_pixels, visible_voxels, voxel_values
 from efficientnerf.asset.queries import density_at, density_block
-from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
 from efficientnerf.fields.bakeable import BakeableField
 from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import Model, render_rays

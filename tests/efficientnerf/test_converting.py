@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.conversion import coordinates, lookup, pruned, with_degree, with_resolution
+from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
 from efficientnerf.asset.quantisation import compacted
 from efficientnerf.asset.rendering import render_rays
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
 
@@ -23,7 +23,7 @@ def same_pictures(a: NerfTree, b: NerfTree, tolerance: float = 1e-5) -> None:
 @pytest.mark.parametrize("brick", [1, 3, 4])
 def test_coordinates_and_their_voxels(brick: int) -> None:
     tree = random_tree(brick, brick=brick)
-    at = coordinates(tree)
+    at = voxel_coordinates(tree)
     assert np.array_equal(lookup(tree, at), np.arange(len(tree.density_values)))
     there = {tuple(row) for row in at.tolist()}
     every = np.argwhere(np.ones(np.array(tree.resolution) + 2, bool)) - 1
@@ -53,7 +53,7 @@ def test_an_even_block_stays_what_it_is_in_any_resolution(resolution: int) -> No
     tree = uniform_tree(sigma=3.0)
     fewer = with_resolution(tree, resolution)
     assert fewer.voxel == pytest.approx(tree.voxel * 16 / resolution)
-    at = coordinates(fewer)
+    at = voxel_coordinates(fewer)
     assert ((at >= 0) & (at < resolution)).all()
     assert len(at) == resolution**3
     np.testing.assert_allclose(fewer.density_values, 3.0, rtol=1e-5)

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from efficientnerf.asset import format
-from efficientnerf.asset.bake import voxel_coordinates
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
+from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.geometry.cameras import rays
 from tests.efficientnerf.walls import DEPTH, NEAR, camera_at, wall

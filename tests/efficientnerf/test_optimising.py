@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset.bake import voxel_coordinates, with_voxels
+from efficientnerf.asset.bake import with_voxels
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement import state
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
@@ -17,7 +17,7 @@ from efficientnerf.asset.refinement.host import grid_of, in_voxels
 from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from efficientnerf.backends.numba.tree import gradients as kernels
 from efficientnerf.backends.numba.tree import rmsprop
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords

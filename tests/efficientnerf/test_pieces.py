@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.bake import voxel_coordinates
 from efficientnerf.asset.components import small_components
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from efficientnerf.geometry.ndc import Ndc
 from tests.efficientnerf.walls import looking_along_y
 

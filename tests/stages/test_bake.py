@@ -15,6 +15,7 @@ import torch
 from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format, serialisation
 from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.rendering.compositing import activate
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
@@ -248,7 +249,7 @@ def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: 
     assert tree.lookup == "nearest"
     assert tree.resolution == (20, 20, 20)  # train.discretise
     m = load_renderer(given["train"]).model
-    centre = tree.bounds_min + (baking.voxel_coordinates(tree) + 0.5) * tree.voxel
+    centre = tree.bounds_min + (voxel_coordinates(tree) + 0.5) * tree.voxel
     with torch.no_grad():
         raw = m.fine(m.space.grid(torch.from_numpy(centre).float()))[:, 0]
     said = activate(raw, m.fine.activation).numpy()

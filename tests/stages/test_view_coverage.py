@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from efficientnerf.asset import format
-from efficientnerf.asset.bake import voxel_coordinates
+from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import render_rays
