@@ -31,7 +31,7 @@ def nearest(brick: int, degree: int = 1, **more: object) -> NerfTree:
 
 
 @pytest.mark.parametrize(("brick", "degree"), TREES)
-def test_points_get_what_their_voxel_holds(brick: int, degree: int) -> None:
+def test_points_get_the_values_of_their_voxel(brick: int, degree: int) -> None:
     tree = nearest(brick, degree)
     rng = np.random.default_rng(0)
     points = rng.uniform(tree.bounds_min - 0.1, tree.bounds_max + 0.1, (800, 3))
@@ -59,20 +59,20 @@ def test_normals_are_those_of_the_voxels_centre() -> None:
 
 
 @pytest.mark.parametrize(("brick", "degree"), TREES)
-def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
+def test_the_kernel_matches_the_torch_reference(brick: int, degree: int) -> None:
     tree = nearest(brick, degree)
     origins, directions = rays_at(tree, 400)
     colour, opacity = render_reference(tree, *tensors(origins, directions))
-    seen = render_rays(tree, origins, directions)
-    np.testing.assert_allclose(seen.opacity, opacity, atol=1e-3)
-    np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
-    assert 0.2 < (seen.opacity > 0.05).mean() < 0.9
+    outputs = render_rays(tree, origins, directions)
+    np.testing.assert_allclose(outputs.opacity, opacity, atol=1e-3)
+    np.testing.assert_allclose(outputs.colour, colour, atol=1e-3)
+    assert 0.2 < (outputs.opacity > 0.05).mean() < 0.9
     other = render_rays(replace(tree, lookup="trilinear"), origins, directions)
-    assert np.abs(other.colour - seen.colour).max() > 0.05
+    assert np.abs(other.colour - outputs.colour).max() > 0.05
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3])
-def test_leaping_changes_no_value(share: float) -> None:
+def test_skipping_changes_no_value(share: float) -> None:
     tree = nearest(2, share=share, shape=(7, 6, 8))
     origins, directions = rays_at(tree, 400)
     usual, timid = render_rays(tree, origins, directions), replace(tree)
@@ -85,37 +85,37 @@ def test_leaping_changes_no_value(share: float) -> None:
 def test_a_uniform_box_has_its_closed_form_to_its_very_face() -> None:
     tree = replace(uniform_tree(sigma=2.0), lookup="nearest")
     middle = (tree.bounds_min + tree.bounds_max) / 2
-    seen = render_rays(tree, (middle - [4, 0, 0])[None], np.array([[1.0, 0, 0]]))
+    outputs = render_rays(tree, (middle - [4, 0, 0])[None], np.array([[1.0, 0, 0]]))
     width = float(tree.bounds_max[0] - tree.bounds_min[0])
-    assert float(seen.opacity[0]) == pytest.approx(1 - math.exp(-2 * width), abs=1e-3)
-    assert float(seen.depth[0]) == pytest.approx(4 - width / 2 + math.log(2) / 2, abs=1e-4)
-    np.testing.assert_allclose(seen.colour[0], seen.opacity[0] * reference.sigmoid(0.7), atol=1e-3)
+    assert float(outputs.opacity[0]) == pytest.approx(1 - math.exp(-2 * width), abs=1e-3)
+    assert float(outputs.depth[0]) == pytest.approx(4 - width / 2 + math.log(2) / 2, abs=1e-4)
+    np.testing.assert_allclose(outputs.colour[0], outputs.opacity[0] * reference.sigmoid(0.7), atol=1e-3)
 
 
-def test_pictures_are_their_rays() -> None:
+def test_images_match_single_rays() -> None:
     from efficientnerf.geometry.cameras import rays
 
     tree = nearest(3, share=0.7)
     camera = looking(tree)
-    picture, flat = render(tree, camera, background=(1.0, 0.5, 0.0)), render_rays(tree, *rays(camera))
+    image, flat = render(tree, camera, background=(1.0, 0.5, 0.0)), render_rays(tree, *rays(camera))
     over = flat.colour + (1 - flat.opacity[:, None]) * [1.0, 0.5, 0.0]
-    np.testing.assert_allclose(picture.colour.reshape(-1, 3), over, atol=1e-6)
-    assert np.array_equal(picture.opacity.reshape(-1), flat.opacity)
-    assert np.array_equal(np.isinf(picture.depth), picture.opacity < 0.5)
-    assert render(tree, camera, supersample=2).colour.shape == picture.colour.shape
+    np.testing.assert_allclose(image.colour.reshape(-1, 3), over, atol=1e-6)
+    assert np.array_equal(image.opacity.reshape(-1), flat.opacity)
+    assert np.array_equal(np.isinf(image.depth), image.opacity < 0.5)
+    assert render(tree, camera, supersample=2).colour.shape == image.colour.shape
 
 
 def test_in_normalised_device_coordinates_too() -> None:
     tree = replace(wall(), lookup="nearest")
     camera = camera_at(0, 0, 0)
-    seen, other = render(tree, camera), render(wall(), camera)
-    np.testing.assert_allclose(seen.opacity, other.opacity, atol=0.01)
-    assert not np.array_equal(seen.colour, other.colour)
+    outputs, other = render(tree, camera), render(wall(), camera)
+    np.testing.assert_allclose(outputs.opacity, other.opacity, atol=0.01)
+    assert not np.array_equal(outputs.colour, other.colour)
     from efficientnerf.geometry.cameras import rays
 
     colour, opacity = render_reference(tree, *tensors(*rays(camera)))
-    np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour, atol=1e-3)
-    np.testing.assert_allclose(seen.opacity.reshape(-1), opacity, atol=1e-3)
+    np.testing.assert_allclose(outputs.colour.reshape(-1, 3), colour, atol=1e-3)
+    np.testing.assert_allclose(outputs.opacity.reshape(-1), opacity, atol=1e-3)
 
 
 @pytest.mark.parametrize(("layout", "name"), [(None, "nearest-sparse"), ("compact", "nearest-compact"), ("full32", "nearest-full")])
@@ -130,14 +130,14 @@ def test_a_file_keeps_the_lookup_and_the_short_reader_sees_the_same(tmp_path: Pa
     origins, directions = rays_at(ours, 100)
     np.testing.assert_allclose(density_at(ours, points), [theirs.density(p) for p in points], atol=2e-3)
     np.testing.assert_allclose(colour_at(ours, points, directions), [theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], atol=1e-3)
-    seen = render_rays(ours, origins[:12], directions[:12])
+    outputs = render_rays(ours, origins[:12], directions[:12])
     for r in range(12):
         colour, opacity = theirs.ray(origins[r], directions[r])
-        np.testing.assert_allclose(seen.colour[r], colour, atol=1.5e-3)
-        assert float(seen.opacity[r]) == pytest.approx(opacity, abs=1.5e-3)
+        np.testing.assert_allclose(outputs.colour[r], colour, atol=1.5e-3)
+        assert float(outputs.opacity[r]) == pytest.approx(opacity, abs=1.5e-3)
 
 
-def test_trilinear_files_are_as_they_were(tmp_path: Path) -> None:
+def test_trilinear_files_are_unchanged(tmp_path: Path) -> None:
     """The lookup is no word of theirs, whatever a tree's own metadata say."""
     path = tmp_path / "a.nerftree"
     save(random_tree(3), path)
@@ -148,7 +148,7 @@ def test_trilinear_files_are_as_they_were(tmp_path: Path) -> None:
     assert path.read_bytes() == plain
 
 
-def test_trees_made_of_it_keep_the_lookup() -> None:
+def test_derived_trees_keep_the_lookup() -> None:
     tree = nearest(4, 2)
     made = [with_degree(tree, 1), with_resolution(tree, 10), pruned(tree), tree.with_values(tree.density_values, tree.sh), initial_state(tree).result()]
     assert [each.lookup for each in made] == ["nearest"] * 5
@@ -172,12 +172,12 @@ def test_a_surface_has_colours_where_no_voxel_is_stored() -> None:
 
 
 @pytest.mark.parametrize(("brick", "degree"), [(1, 0), (4, 2)])
-def test_the_fits_gradients_are_those_of_autograd(brick: int, degree: int) -> None:
+def test_gradients_of_refinement_match_autograd(brick: int, degree: int) -> None:
     tree = nearest(brick, degree)
     origins, directions = rays_at(tree, 200)
-    seen = seen_at_random(200, 0.7)
-    loss, by_density, by_sh = gradients(tree, origins, directions, seen)
-    wanted, wanted_by_density, wanted_by_sh = gradients_by_autograd(tree, origins, directions, seen)
+    outputs = seen_at_random(200, 0.7)
+    loss, by_density, by_sh = gradients(tree, origins, directions, outputs)
+    wanted, wanted_by_density, wanted_by_sh = gradients_by_autograd(tree, origins, directions, outputs)
     np.testing.assert_allclose(loss, wanted, atol=1e-6)
     np.testing.assert_allclose(by_density, wanted_by_density, atol=1e-6)
     np.testing.assert_allclose(by_sh, wanted_by_sh, atol=1e-6)

@@ -1,4 +1,4 @@
-"""The marching kernel and its packed tree: parts against their definitions, pictures of every camera model, and what skipping may not change."""
+"""The marching kernel and its packed tree: parts against their definitions, images of every camera model, and what skipping may not change."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def between(values, starts, x, y, z):  # type: ignore[no-untyped-def]
     return unpack4(first), (unpack4(a), unpack4(b), unpack4(c), unpack4(d))
 
 
-def test_four_points_are_interpolated_at_once_over_what_is_there() -> None:
+def test_four_points_are_interpolated_over_the_stored_corners() -> None:
     rng = np.random.default_rng(2)
     values = rng.normal(size=(3, 3, 3, 4)).astype(np.float32)
     values[..., 1:][rng.random((3, 3, 3)) < 0.4] = np.nan
@@ -130,7 +130,7 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
 
 
 @pytest.mark.parametrize("brick", [1, 2, 3, 4, 5])
-def test_blocks_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
+def test_blocks_hold_a_brick_and_the_layer_around_it(brick: int) -> None:
     tree = random_tree(brick, brick=brick, degree=2)
     side = brick + 2
     whole = 2 * density_block(tree, (-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
@@ -153,7 +153,7 @@ def test_blocks_hold_a_brick_and_the_layer_round_it(brick: int) -> None:
 @pytest.mark.parametrize("brick", [1, 2, 4, 5])
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("layout", ["floats", "codes"])
-def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_sees_them(brick: int, degree: int, layout: str) -> None:
+def test_view_colours_of_blocks_are_the_sums_of_their_voxels_harmonics(brick: int, degree: int, layout: str) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, share=0.5)
     if layout == "codes":
         tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
@@ -174,7 +174,7 @@ def test_colours_of_blocks_are_the_sums_of_their_voxels_harmonics_as_the_camera_
         np.testing.assert_allclose(block[stored >= 0][:, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[stored[stored >= 0]]), atol=1e-4)
 
 
-def test_blocks_near_the_camera_keep_their_voxels() -> None:
+def test_blocks_near_the_camera_hold_voxel_indices() -> None:
     tree = random_tree(3, shape=(12, 12, 12), brick=4, degree=2, share=0.3)
     centre = np.array([-20.0, 24.0, 24.0])
     values, kind = blocks_of(tree, centre, nearest=40.0)
@@ -185,7 +185,7 @@ def test_blocks_near_the_camera_keep_their_voxels() -> None:
     assert np.array_equal(values[kind == cpu_blocks.VOXEL_INDICES].view(np.int32), voxels[kind == cpu_blocks.VOXEL_INDICES].view(np.int32))
 
 
-def test_bricks_near_which_nothing_absorbs_light_are_empty_to_the_kernel() -> None:
+def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> None:
     tree = random_tree(7, shape=(8, 7, 6), brick=2, share=0.2)
     dark = tree.density_values * (np.random.default_rng(1).random(len(tree.density_values)) < 0.1)
     tree = replace(tree, density_values=dark.astype(np.float32))
@@ -211,15 +211,15 @@ def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTr
 
 
 @pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((8,), 1000), ((3, 5), 17), ((), 1)])
-def test_codes_into_palettes_are_drawn_as_what_they_decode_to(groups: tuple[int, ...], entries: int) -> None:
+def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], entries: int) -> None:
     tree = in_palettes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
     origins, directions = rays_at(tree, 300)
     colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    seen = render_rays(tree, origins, directions)
+    outputs = render_rays(tree, origins, directions)
     assert packed_of(tree).codes is tree.harmonics.codes  # type: ignore[union-attr]
-    np.testing.assert_allclose(seen.opacity, opacity, atol=1.01e-3)
-    np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
-    assert seen.opacity.max() > 0.5
+    np.testing.assert_allclose(outputs.opacity, opacity, atol=1.01e-3)
+    np.testing.assert_allclose(outputs.colour, colour, atol=1e-3)
+    assert outputs.opacity.max() > 0.5
 
 
 @pytest.mark.parametrize("brick", [1, 2, 4, 5])
@@ -231,7 +231,7 @@ def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
 
 
 def far_camera(tree: NerfTree, voxels: float) -> Camera:
-    """Sees the tree from that many voxels away, large in the picture."""
+    """A camera that many voxels away whose image the tree fills."""
     at = pose(0.7, 0.4, voxels * tree.voxel)
     at[:3, 3] += (tree.bounds_min + tree.bounds_max) / 2
     return Camera("far", 40, 36, "SIMPLE_PINHOLE", (30 * voxels / max(tree.resolution), 20.0, 18.0), at)
@@ -240,21 +240,21 @@ def far_camera(tree: NerfTree, voxels: float) -> Camera:
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("distance", [0.0, 30.0, 300.0, 1000.0, 3000.0])
 @pytest.mark.parametrize("layout", ["floats", "codes"])
-def test_pictures_are_the_torch_functions_from_near_and_far(degree: int, distance: float, layout: str) -> None:
-    """Whether colours are summed once for a voxel or at each sample: the harmonics of neighbours have nothing in common here, surfaces are opaque."""
+def test_images_match_the_torch_reference_from_near_and_far(degree: int, distance: float, layout: str) -> None:
+    """View colours and colours at each sample: the harmonics of neighbours are independent here, and surfaces opaque."""
     tree = random_tree(degree, shape=(6, 5, 7), brick=4, degree=degree, share=0.6, sigma=300.0)
     if layout == "codes":
         tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 256)
     camera = far_camera(tree, distance) if distance else replace(camera_of(tree, distance=0.02), params=(8.0, 8.0, 13.0, 11.0))
     origins, directions = rays(camera)
     colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    seen = render(tree, camera)
-    np.testing.assert_allclose(seen.colour.reshape(-1, 3), colour, atol=1e-3)
-    np.testing.assert_allclose(seen.opacity.reshape(-1), opacity, atol=1.01e-3)
-    assert (seen.opacity > 0.9).mean() > 0.1
+    outputs = render(tree, camera)
+    np.testing.assert_allclose(outputs.colour.reshape(-1, 3), colour, atol=1e-3)
+    np.testing.assert_allclose(outputs.opacity.reshape(-1), opacity, atol=1.01e-3)
+    assert (outputs.opacity > 0.9).mean() > 0.1
 
 
-def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_depend_neither_on_threads_nor_on_the_pools_size(monkeypatch: pytest.MonkeyPatch) -> None:
     from efficientnerf.backends.numba.tree import rendering
 
     tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=0.6, sigma=100.0)
@@ -270,35 +270,35 @@ def test_pictures_do_not_depend_on_threads_and_the_pools_size(monkeypatch: pytes
             assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
-def test_the_work_of_a_picture_is_counted() -> None:
+def test_ray_statistics_are_consistent() -> None:
     from efficientnerf.backends.numba.tree.rendering import ray_statistics
 
     tree = uniform_tree(sigma=0.5)
     camera = camera_of(tree)
-    cells, tested, mixed, colours = np.moveaxis(ray_statistics(tree, camera), -1, 0)
-    seen = render(tree, camera).opacity > 0
-    assert ((mixed > 0) == seen).all()
-    assert (tested >= mixed).all()
-    assert (mixed >= colours).all()
-    assert (cells[seen] > 0).all()
+    visited, tested, interpolated, lookups = np.moveaxis(ray_statistics(tree, camera), -1, 0)
+    hit = render(tree, camera).opacity > 0
+    assert ((interpolated > 0) == hit).all()
+    assert (tested >= interpolated).all()
+    assert (interpolated >= lookups).all()
+    assert (visited[hit] > 0).all()
     # A chord of the box in half voxels, at most its diagonal.
     assert tested.max() <= 2 * np.linalg.norm(tree.resolution) + 1
 
 
 @pytest.mark.parametrize(("sigma", "share", "stop"), [(0.3, 0.9, 0.0), (3.0, 0.6, 0.0), (300.0, 0.6, 1e-3)])
-def test_fog_and_solids_are_the_torch_functions(sigma: float, share: float, stop: float) -> None:
-    """The kernel may differ by what it leaves of the light, by 1e-4 for colours that are owed, and by rounding: 1e-3 together."""
+def test_thin_and_opaque_media_match_the_torch_reference(sigma: float, share: float, stop: float) -> None:
+    """The kernel may differ by the early stop, by 1e-4 for the weight of samples without a colour, and by rounding: 1e-3 together."""
     tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=share, sigma=sigma)
     origins, directions = rays_at(tree, 500)
     colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
-    seen = render_rays(tree, origins, directions)
-    np.testing.assert_allclose(seen.opacity, opacity, atol=max(1e-4, 1.01 * stop))
-    np.testing.assert_allclose(seen.colour, colour, atol=1e-3)
-    assert np.abs(seen.colour - colour.numpy()).mean() < 1e-4
-    assert seen.opacity.mean() > 0.05
+    outputs = render_rays(tree, origins, directions)
+    np.testing.assert_allclose(outputs.opacity, opacity, atol=max(1e-4, 1.01 * stop))
+    np.testing.assert_allclose(outputs.colour, colour, atol=1e-3)
+    assert np.abs(outputs.colour - colour.numpy()).mean() < 1e-4
+    assert outputs.opacity.mean() > 0.05
 
 
-def test_coefficients_as_large_as_a_file_can_hold_are_drawn_like_others() -> None:
+def test_the_largest_coefficients_of_a_file_render_like_others() -> None:
     tree = random_tree(2, degree=2, share=0.7)
     sh = tree.sh.copy()
     sh[::7, 0] = 65000.0
@@ -313,23 +313,23 @@ def test_coefficients_as_large_as_a_file_can_hold_are_drawn_like_others() -> Non
 
 @pytest.mark.parametrize("model", LENSES)
 @pytest.mark.parametrize("supersample", [1, 2])
-def test_pictures_of_every_camera_model_are_their_rays(model: str, supersample: int) -> None:
+def test_images_of_every_camera_model_match_single_rays(model: str, supersample: int) -> None:
     tree = random_tree(0, share=0.7, degree=2)
     camera = camera_of(tree, model)
     fine = resized(camera, camera.width * supersample, camera.height * supersample)
     flat = render_rays(tree, *rays(fine))
-    picture = render(tree, camera, supersample=supersample)
+    image = render(tree, camera, supersample=supersample)
 
     def mean(values: np.ndarray) -> np.ndarray:
         return values.reshape(camera.height, supersample, camera.width, supersample, -1).mean((1, 3))
 
-    np.testing.assert_allclose(picture.colour, mean(flat.colour), atol=1e-4)
-    np.testing.assert_allclose(picture.opacity, mean(flat.opacity)[..., 0], atol=1e-4)
-    assert 0.1 < (picture.opacity > 0.1).mean() < 1
+    np.testing.assert_allclose(image.colour, mean(flat.colour), atol=1e-4)
+    np.testing.assert_allclose(image.opacity, mean(flat.opacity)[..., 0], atol=1e-4)
+    assert 0.1 < (image.opacity > 0.1).mean() < 1
     if supersample == 1:
-        slant = (rays(camera)[1] @ camera.forward).reshape(picture.depth.shape)
-        solid = picture.opacity > 0.501
-        np.testing.assert_allclose(picture.depth[solid], (flat.depth.reshape(solid.shape) * slant)[solid], rtol=1e-3)
+        slant = (rays(camera)[1] @ camera.forward).reshape(image.depth.shape)
+        solid = image.opacity > 0.501
+        np.testing.assert_allclose(image.depth[solid], (flat.depth.reshape(solid.shape) * slant)[solid], rtol=1e-3)
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
@@ -345,7 +345,7 @@ def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, d
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
-def test_rays_that_belong_to_no_camera_may_come_in_any_order() -> None:
+def test_given_rays_may_come_in_any_order() -> None:
     tree = random_tree(3, shape=(9, 8, 7), brick=4, share=0.1)
     origins, directions = rays_at(tree, 700)
     order = np.random.default_rng(0).permutation(len(origins))
@@ -354,12 +354,12 @@ def test_rays_that_belong_to_no_camera_may_come_in_any_order() -> None:
         assert np.array_equal(getattr(one, name)[order], getattr(other, name)), name
 
 
-def test_a_camera_inside_and_one_that_looks_away() -> None:
+def test_a_camera_inside_and_one_facing_away() -> None:
     tree = uniform_tree(sigma=40.0)
     inside = camera_of(tree, distance=0.05)
-    seen = render(tree, inside)
-    assert (seen.opacity > 0.99).all()
-    np.testing.assert_allclose(seen.depth[11, 13], np.log(2) / 40, rtol=0.05)
+    outputs = render(tree, inside)
+    assert (outputs.opacity > 0.99).all()
+    np.testing.assert_allclose(outputs.depth[11, 13], np.log(2) / 40, rtol=0.05)
     away = inside.world_from_camera.copy()
     away[:3, 3] += 30 * away[:3, 2]
     empty = render(tree, replace(inside, world_from_camera=away), background=(0.2, 0.4, 0.6))
@@ -369,18 +369,18 @@ def test_a_camera_inside_and_one_that_looks_away() -> None:
     np.testing.assert_allclose(empty.colour, np.broadcast_to(np.float32([0.2, 0.4, 0.6]), empty.colour.shape))
 
 
-def test_normals_are_those_of_the_tree_where_half_of_the_light_is_gone() -> None:
+def test_normals_are_those_of_the_tree_where_the_transmittance_is_one_half() -> None:
     tree = random_tree(6, shape=(5, 6, 4), brick=4, share=0.7, sigma=60.0)
     origins, directions = rays_at(tree, 400)
-    seen = render_rays(tree, origins, directions)
-    hit = np.isfinite(seen.depth)
+    outputs = render_rays(tree, origins, directions)
+    hit = np.isfinite(outputs.depth)
     assert hit.sum() > 50
-    at = origins[hit] + seen.depth[hit, None] * directions[hit]
+    at = origins[hit] + outputs.depth[hit, None] * directions[hit]
     # The gradient bends where a difference reaches from one voxel to the next; rounding may put it on either side.
-    assert np.quantile(np.abs(seen.normal[hit] - normal_at(tree, at)), 0.98) < 1e-3
+    assert np.quantile(np.abs(outputs.normal[hit] - normal_at(tree, at)), 0.98) < 1e-3
 
 
-def test_harmonics_may_be_asked_for_other_directions_than_the_rays() -> None:
+def test_harmonics_may_be_evaluated_along_other_directions_than_the_rays() -> None:
     from efficientnerf.backends.numba.tree.rendering import render_rays
 
     tree = uniform_tree(sigma=80.0)
@@ -388,18 +388,18 @@ def test_harmonics_may_be_asked_for_other_directions_than_the_rays() -> None:
     sh[:, 2] = 1.0  # brighter the more z a direction has
     tree = replace(tree, harmonics=sh)
     origins, directions = rays_at(tree, 40)
-    looking = np.random.default_rng(1).normal(size=directions.shape)
-    looking /= np.linalg.norm(looking, axis=1, keepdims=True)
-    colour, opacity, _, _ = render_rays(tree, origins, directions, looking)
-    expected = 1 / (1 + np.exp(-0.4886025119029199 * looking[:, 2]))
+    sh_directions = np.random.default_rng(1).normal(size=directions.shape)
+    sh_directions /= np.linalg.norm(sh_directions, axis=1, keepdims=True)
+    colour, opacity, _, _ = render_rays(tree, origins, directions, sh_directions)
+    expected = 1 / (1 + np.exp(-0.4886025119029199 * sh_directions[:, 2]))
     np.testing.assert_allclose(colour, (opacity * expected)[:, None] * np.ones(3), atol=1e-4)
 
 
-def test_a_tree_without_voxels_has_pictures() -> None:
+def test_a_tree_without_voxels_renders() -> None:
     tree = tree_from_voxels((2, 3, 1), 0.1, np.zeros(3), np.zeros((0, 3), int), np.zeros(0), np.zeros((0, 4, 3)))
-    seen = render(tree, camera_of(tree), supersample=2)
-    assert not seen.opacity.any()
-    assert not seen.colour.any()
+    outputs = render(tree, camera_of(tree), supersample=2)
+    assert not outputs.opacity.any()
+    assert not outputs.colour.any()
 
 
 def test_a_background_has_three_numbers() -> None:
@@ -408,15 +408,15 @@ def test_a_background_has_three_numbers() -> None:
         render(tree, camera_of(tree), background=(1.0, 1.0))  # type: ignore[arg-type]
 
 
-def test_directions_that_are_no_numbers_see_nothing() -> None:
+def test_nan_directions_render_as_empty() -> None:
     tree = random_tree(0)
     bad = np.array([[np.nan, 0, 1], [0, 0, 0], [np.inf, 0, 0]])
-    seen = render_rays(tree, np.zeros((3, 3)), bad)
-    assert np.isfinite(seen.opacity).all()
+    outputs = render_rays(tree, np.zeros((3, 3)), bad)
+    assert np.isfinite(outputs.opacity).all()
 
 
 @pytest.mark.parametrize("layout", ["floats", "codes"])
-def test_trees_whose_voxels_are_numbered_otherwise_look_the_same(layout: str) -> None:
+def test_the_order_of_voxels_does_not_change_images(layout: str) -> None:
     tree = random_tree(1, brick=4, degree=2, share=0.6)
     if layout == "codes":
         tree = in_palettes(tree, (1,) * 8, 200)
