@@ -242,7 +242,7 @@ def test_cameras_that_look_outwards_are_framed() -> None:
 
 # ------------------------------------------------------------------------------------------------------------- real captures
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 
 def real(name: str, form: str) -> Capture:

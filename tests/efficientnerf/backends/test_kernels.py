@@ -18,7 +18,7 @@ from efficientnerf.training.optimiser import BETA1, Adam, ParameterGroup
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.steps import RATES, gradients
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def stepped(grads: list[torch.Tensor], *, sparse: bool = False) -> nn.Parameter:

@@ -21,7 +21,7 @@ from stages.io.capture import Capture
 from stages.sfm import matches
 from stages.sfm.reconstruction import find_cameras
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE = ROOT / "examples" / "still_life"
 TRUTH = ROOT / "tests" / "data" / "still_life_cameras.json"
 SIDE = 360  # px: enough for exact cameras, quick enough for a test

@@ -20,7 +20,7 @@ from efficientnerf.fields import hash
 from efficientnerf.training.optimiser import ParameterGroup
 from tests.efficientnerf.networks import passes, weights_of
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SHAPES = [(24, 64, 2, 28), (24, 32, 1, 1), (6, 8, 1, 13), (2, 40, 3, 4), (10, 20, 4, 49), (34, 100, 2, 16)]  # inputs, width, hidden layers, outputs
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "fuzz_format.py"
+SCRIPT = Path(__file__).resolve().parents[3] / "benchmarks" / "fuzz_format.py"
 
 
 def fuzz() -> ModuleType:

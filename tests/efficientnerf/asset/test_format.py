@@ -29,7 +29,7 @@ from tests.efficientnerf.hostile import HOSTILE, METADATA, ORBIT, added, blob, h
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.trees import random_tree, rays_at
 
-GOLDEN = Path(__file__).parents[1] / "data" / "golden"
+GOLDEN = Path(__file__).parents[2] / "data" / "golden"
 
 
 def refusal(data: bytes, folder: Path) -> str:
