@@ -3,6 +3,7 @@
 # make test-slow install, then run the tests marked slow
 # make torture   kill -9 a run at 30 moments and compare its artifacts with those of an undisturbed run
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
+# make gpu-packages   the packages that `make gpu` needs beside torch, Triton and numba, into build/gpu-packages: for a machine without a package index
 # make docs      rewrite the pages under docs/ that are made from the code
 # make lint      ruff and mypy
 
@@ -11,7 +12,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-slow torture gpu docs lint install clean
+.PHONY: demo test test-slow torture gpu gpu-packages docs lint install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
@@ -26,13 +27,23 @@ torture: $(INSTALLED)
 	$(BIN)/python benchmarks/torture.py
 
 # A machine with a device often has a python whose torch sees it, and no way to a package index: then that one is used, and nothing is installed.
+# What it lacks beside them is read from build/gpu-packages, which `make gpu-packages` fills elsewhere, for python GPU_PYTHON.
 # GPU_OPTIONS go to benchmarks/gpu.py, which ends within ten minutes.
+GPU_PACKAGES := build/gpu-packages
+GPU_PYTHON ?= 3.12
 gpu:
-	@if $(PYTHON) -c "import sys, numba, torch, triton; sys.exit(not torch.cuda.is_available())" 2>/dev/null; then \
+	@export PYTHONPATH="$(GPU_PACKAGES)$${PYTHONPATH:+:$$PYTHONPATH}"; \
+	if $(PYTHON) -c "import sys, numba, torch, triton; sys.exit(not torch.cuda.is_available())" 2>/dev/null; then \
+		$(PYTHON) -c "import msgspec, platformdirs" || { echo "fill $(GPU_PACKAGES) with 'make gpu-packages' where there is a package index, and bring it here"; exit 1; }; \
 		$(PYTHON) benchmarks/gpu.py $(GPU_OPTIONS); \
 	else \
-		$(MAKE) --no-print-directory install && $(BIN)/python benchmarks/gpu.py $(GPU_OPTIONS); \
+		unset PYTHONPATH; $(MAKE) --no-print-directory install && $(BIN)/python benchmarks/gpu.py $(GPU_OPTIONS); \
 	fi
+
+gpu-packages:
+	rm -rf $(GPU_PACKAGES)
+	$(PYTHON) -m pip install --quiet --target $(GPU_PACKAGES) --no-deps --only-binary=:all: --python-version $(GPU_PYTHON) --implementation cp \
+		--platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 -c constraints.txt msgspec platformdirs trimesh OpenEXR av fast_simplification
 
 docs: $(INSTALLED)
 	$(BIN)/python docs/make_pages.py
