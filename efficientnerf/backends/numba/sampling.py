@@ -32,7 +32,7 @@ def _unit_to_grid(x, y, z, contracted):  # type: ignore[no-untyped-def]
     return (x + shift) * scale, (y + shift) * scale, (z + shift) * scale
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _init_lane(origins, directions, near, far, centre, half, contracted, r, state, lane):  # type: ignore[no-untyped-def]
     """Write ray r, clipped to the box of a bounded space, to a lane of the state of `next_intervals`."""
     ux, uy, uz = (origins[r, 0] - centre[0]) / half[0], (origins[r, 1] - centre[1]) / half[1], (origins[r, 2] - centre[2]) / half[2]

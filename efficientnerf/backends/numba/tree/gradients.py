@@ -123,7 +123,7 @@ def _forward_backward(  # type: ignore[no-untyped-def]
     """Block b writes its records from b * capacity on, and to counts[b] how many there are; more than `capacity`: the last ones were left out."""
     rays, terms, step_length, opacity_weight = len(origins), sh.shape[1], grid.step_length, targets.opacity_weight
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
-        b_index, b_fraction = np.empty((max_samples, 8), np.int32), np.empty((max_samples, 3), density.dtype)
+        b_index, b_fraction = np.full((max_samples, 8), -1, np.int32), np.zeros((max_samples, 3), density.dtype)
         alpha, light, distance = np.empty(max_samples, np.float64), np.empty(max_samples, np.float64), np.empty(max_samples, np.float64)
         rgb, mixed, grad_colour, accumulated = np.empty((max_samples, 3), np.float64), np.empty(terms, sh.dtype), np.empty(3), np.empty(3)
         tree = walk_pointers(grid, density)
@@ -218,7 +218,7 @@ def _max_contributions(grid, origins, directions, density, stop, max_samples, tr
     """Share p of the rays raises visibility[p]: no races, and a maximum does not depend on the order."""
     shares, rays = len(visibility), len(origins)
     for share in numba.prange(shares):
-        index, fraction = np.empty((max_samples, 8), np.int32), np.empty((max_samples, 3), density.dtype)
+        index, fraction = np.full((max_samples, 8), -1, np.int32), np.zeros((max_samples, 3), density.dtype)
         alpha, light, distance = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
         tree = walk_pointers(grid, density)
         buffer = SampleBuffer(max_samples, pointer(index), pointer(fraction), pointer(alpha), pointer(light), pointer(distance))

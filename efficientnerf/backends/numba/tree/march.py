@@ -78,7 +78,8 @@ def _weights(fx, fy, fz):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 def _voxel_colours(ints, at, j, i, fx, fy, fz, grid, basis):  # type: ignore[no-untyped-def]
     """(0, red, green, blue) before the sigmoid from a block of voxel indices, by the harmonics `basis` of the ray; weights of stored voxels are normalised."""
-    weight = _weights(fx, fy, fz)
+    w0, w1, w2, w3, w4, w5, w6, w7 = _weights(fx, fy, fz)
+    weight = w0, w1, w2, w3, w4, w5, w6, w7
     total = red = green = blue = np.float32(0)
     for n in range(8):
         voxel = ints[at + (i if n & 4 else 0) + (j if n & 2 else 0) + (5 if n & 1 else 1)]

@@ -53,7 +53,7 @@ def _composite(count, buffer, tree, basis, sh, rgb, colour):  # type: ignore[no-
 def _render(grid, density, sh, origins, directions, bases, max_samples, colour, opacity, half_distance):  # type: ignore[no-untyped-def]
     rays = len(origins)
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
-        index, fraction = np.empty((max_samples, 8), np.int32), np.empty((max_samples, 3), np.float32)
+        index, fraction = np.full((max_samples, 8), -1, np.int32), np.zeros((max_samples, 3), np.float32)
         alpha, transmittance, distance, rgb = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples), np.empty(3)
         buffer = SampleBuffer(max_samples, pointer(index), pointer(fraction), pointer(alpha), pointer(transmittance), pointer(distance))
         tree = walk_pointers(grid, density)

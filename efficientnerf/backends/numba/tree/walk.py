@@ -57,8 +57,8 @@ class SampleBuffer(NamedTuple):
     """Samples of a ray that have density, arrays as pointers.
 
     capacity       S
-    index          (S, 8) int32 stored voxels of the corners, z fastest, -1 where none is stored; nearest lookup has the first alone
-    fraction       (S, 3) place between the corners, 0 to 1, in the densities' type
+    index          (S, 8) int32 stored voxels of the corners, z fastest, -1 where none is stored; nearest lookup writes the first alone, the others must be -1
+    fraction       (S, 3) place between the corners, 0 to 1, in the densities' type; nearest lookup writes none, they must be 0
     alpha          (S,) float64
     transmittance  (S,) float64 at which light arrives
     distance       (S,) float64 from the origin, voxels
@@ -124,13 +124,9 @@ def corner_weight(n, fx, fy, fz):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _lookup_nearest(u, v, w, tree, buffer, count):  # type: ignore[no-untyped-def]
-    """Density of the voxel that holds a point; writes corners and fractions of sample `count`."""
-    at = 8 * count
-    for n in range(1, 8):
-        buffer.index[at + n] = -1
+    """Density of the voxel that holds a point; writes the first corner of sample `count`."""
     voxel = stored_voxel(int(u), int(v), int(w), tree)
-    buffer.index[at] = voxel
-    buffer.fraction[3 * count] = buffer.fraction[3 * count + 1] = buffer.fraction[3 * count + 2] = 0.0
+    buffer.index[8 * count] = voxel
     return np.float64(tree.density[voxel]) if voxel >= 0 else 0.0
 
 
