@@ -22,9 +22,6 @@ ALLOWED = {
 }
 KERNELS = ("efficientnerf/backends/numba", "efficientnerf/backends/triton", "efficientnerf/structures")  # compiled code, and what launches it
 MODULES_A_FOLDER, LINES, ARGUMENTS = 15, 60, 12
-# To be mended; nothing is to be added here.
-IN_RINGS: set[str] = set()
-LONG: set[str] = set()
 HEAVY = ("torch", "pycolmap", "cv2", "numba", "matplotlib")
 
 
