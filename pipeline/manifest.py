@@ -91,6 +91,7 @@ class Manifest:
     cores        that the process might use; 0 where it is not known
     resumed      whether it went on from the scratch of an earlier process
     made         seconds since 1970
+    facts        what the stage recorded (`Job.record`), as JSON holds it
     """
 
     request: Request
@@ -102,6 +103,7 @@ class Manifest:
     versions: dict[str, str] = field(default_factory=lambda: dict(tool_versions()))
     cpu_seconds: float = 0.0
     cores: int = 0
+    facts: dict[str, Any] = field(default_factory=dict)
 
     @property
     def cores_busy(self) -> float:
@@ -129,6 +131,7 @@ class Manifest:
             "peak_memory": self.peak_memory,
             "cpu_seconds": self.cpu_seconds,
             "cores": self.cores,
+            "facts": self.facts,
             "resumed": self.resumed,
             "made": self.made,
             "versions": self.versions,
@@ -184,6 +187,7 @@ def _parsed(value: Any) -> Manifest:
         versions={_typed(k, str, "versions"): _typed(v, str, "versions") for k, v in _typed(value.get("versions"), dict, "versions").items()},
         cpu_seconds=float(_typed(value.get("cpu_seconds", 0.0), (int, float), "cpu_seconds")),  # manifests of 2026 before release 0.1.0 have none
         cores=_typed(value.get("cores", 0), int, "cores"),
+        facts=_typed(value.get("facts", {}), dict, "facts"),
     )
     if value.get("digest") != manifest.digest or value.get("request_digest") != manifest.request.digest:
         raise _Bad("its digests are not those of what it lists")

@@ -158,7 +158,7 @@ class _Runner:
         )
         usage = self.execute(stage, job)
         outputs = artifact.outputs_of(place.out, stage, self.hashes)
-        made = Manifest(request, outputs, usage.seconds, usage.peak_memory, resumed, cpu_seconds=usage.cpu_seconds, cores=usage.cores)
+        made = Manifest(request, outputs, usage.seconds, usage.peak_memory, resumed, cpu_seconds=usage.cpu_seconds, cores=usage.cores, facts=job.facts)
         artifact.seal(place.out, made)
         return made
 

@@ -92,6 +92,7 @@ class Job:
         self._stop = stop
         self._last_progress = -math.inf
         self._last_text: str | None = None
+        self.facts: dict[str, Any] = {}
         self.out.mkdir(parents=True, exist_ok=True)
         self.work.mkdir(parents=True, exist_ok=True)
 
@@ -115,6 +116,10 @@ class Job:
     def warn(self, text: str, **facts: Any) -> None:
         """A sentence about a problem that was worked around."""
         self._emit("warning", text=text, **facts)
+
+    def record(self, name: str, value: Any) -> None:
+        """Put a value that JSON can hold into the manifest, outside of every digest: what a stage decided that is no setting."""
+        self.facts[name] = value
 
     def safe_point(self) -> None:
         """Raise Interrupted if a signal has arrived. Call it where `work` holds all that is needed to resume."""

@@ -88,6 +88,7 @@ def run(job: Job) -> None:
             raise
         log.begin_step()
     log.flush()
+    job.record("schedule", t.schedule.state())
     field_file.save_model(m, near, far, outputs.field, gains_of(t, views), t.schedule)
     write_report(outputs.report, job, t, log.seconds, previews.psnr)
     shutil.copyfile(log.path, outputs.log)

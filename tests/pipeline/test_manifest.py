@@ -17,7 +17,8 @@ A, B, C = ("a" * 64, "b" * 64, "c" * 64)
 
 def example() -> Manifest:
     request = Request("train", 2, {"rate": 0.5, "sizes": [1, 2]}, {"poses": A}, {"0.jpg": B, "gone.jpg": "absent"})
-    return Manifest(request, {"field.bin": Output(A, 10), "log.jsonl": Output(B, 5, True)}, 1.5, 1000, True, cpu_seconds=3.0, cores=4)
+    outputs = {"field.bin": Output(A, 10), "log.jsonl": Output(B, 5, True)}
+    return Manifest(request, outputs, 1.5, 1000, True, cpu_seconds=3.0, cores=4, facts={"schedule": [1, 2]})
 
 
 def write(folder: Path, change: Callable[[dict[str, Any]], Any] = lambda value: None, *, checked: bool = True) -> None:
@@ -39,9 +40,9 @@ def test_there_and_back(tmp_path: Path) -> None:
 
 
 def test_a_manifest_from_before_processor_time_was_recorded_is_read(tmp_path: Path) -> None:
-    write(tmp_path, lambda value: [value.pop("cpu_seconds"), value.pop("cores")])
+    write(tmp_path, lambda value: [value.pop(name) for name in ("cpu_seconds", "cores", "facts")])
     made = read_manifest(tmp_path)
-    assert (made.cpu_seconds, made.cores, made.cores_busy) == (0.0, 0, 0.0)
+    assert (made.cpu_seconds, made.cores, made.cores_busy, made.facts) == (0.0, 0, 0.0, {})
     assert (made.digest, made.request.digest) == (example().digest, example().request.digest)
 
 

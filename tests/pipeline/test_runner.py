@@ -60,6 +60,7 @@ def test_the_manifest_says_what_made_it(run: Run) -> None:
     assert made.peak_memory > 2**20
     assert made.cpu_seconds >= 0
     assert made.cores >= 1
+    assert made.facts == {"counted": {"steps": 6}}
     assert not made.resumed
     assert sorted(read_manifest(run.folder("list")).request.source or {}) == ["0.jpg", "1.jpg", "2.jpg"]
 

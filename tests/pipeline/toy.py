@@ -55,6 +55,7 @@ def run_count(job: Job) -> None:
         aside.rename(checkpoint)
         job.progress(step + 1, job.settings.steps)
         job.safe_point()
+    job.record("counted", {"steps": len(lines)})
     (job.out / "count.txt").write_text("\n".join(lines))
     (job.out / "log.jsonl").write_text(str(time.time_ns()))
 
