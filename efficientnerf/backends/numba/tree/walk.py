@@ -1,6 +1,6 @@
 """Ray marching over a tree's own arrays (numba), specialised by lookup; rendering of nearest-lookup trees and refinement share it.
 
-Samples lie as FORMAT.md says, section 6. Interpolated trees are rendered from their packed form, many times as fast: `efficientnerf.backends.numba.tree.march`.
+Samples lie as FORMAT.md says, section 6. Interpolated trees are rendered from their packed form: `efficientnerf.backends.numba.tree.march`.
 
 N stored voxels, S samples of a ray.
 """
