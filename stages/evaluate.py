@@ -219,7 +219,7 @@ def evaluate_view(
     stride      of the pixels that the field renders
     perceptual  LPIPS networks by the name of their metric
     """
-    from stages.pictures.plots import error_map, to_uint8
+    from stages.figures.plots import error_map, to_uint8
 
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     background = constant_background(scene)
@@ -326,16 +326,16 @@ def _clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
 
 
 def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> None:
+    from stages.figures.plots import thumbnail_of
     from stages.io.png import write_png
-    from stages.pictures.plots import thumbnail_of
 
     for column, image in enumerate(images):
         write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), folder / f"picture_{k:05d}_{column}.png")
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
+    from stages.figures.plots import contact_sheet
     from stages.io.png import read_png
-    from stages.pictures.plots import contact_sheet
 
     def figure(found: dict[str, Any]) -> str:
         psnr = "no PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"

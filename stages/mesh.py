@@ -97,10 +97,10 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
+    from stages.figures.shading import IN_FRONT, render_sides
     from stages.io.exporters import MESH_EXPORTERS
     from stages.io.exporters.writing import source_frame
     from stages.io.png import write_png
-    from stages.pictures.shading import IN_FRONT, render_sides
 
     outputs = MeshOutputs(job.out)
     tree = load(inputs_of(MeshInputs, job.inputs).bake.asset)

@@ -75,9 +75,9 @@ class PosesSettings:
 
 def run(job: Job) -> None:
     """Write scene.json, images/, masks/, points.safetensors, contact_sheet.png and report.json. Raises BadInput."""
+    from stages.figures.contact_sheet import write_contact_sheet
     from stages.framing import training_frame
     from stages.io import working_images
-    from stages.pictures.contact_sheet import write_contact_sheet
 
     settings: PosesSettings = job.settings
     if job.source is None:

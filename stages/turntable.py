@@ -65,7 +65,7 @@ def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:
 
 def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None) -> None:
     """Write frames and video. Frames are kept in job.work, so that a kill costs at most one; the video is encoded from the PNGs."""
-    from stages.pictures.frames import RenderOptions, encode_frames, render_frames
+    from stages.figures.frames import RenderOptions, encode_frames, render_frames
 
     s: TurntableSettings = job.settings
     cameras = cameras_of(tree, s)

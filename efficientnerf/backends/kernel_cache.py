@@ -6,7 +6,7 @@ holds as well, nor those of constants. Here a change to any of these leads to an
 The first of these that can be written by the user alone is taken:
 
     $ENERF_CACHE_DIR/kernels
-    $NUMBA_CACHE_DIR/efficientnerf   where numba was told a folder
+    $NUMBA_CACHE_DIR/efficientnerf   where that is set
     kernels in the user's cache folder (platformdirs: ~/.cache/efficientnerf on Linux)
     efficientnerf-UID in the folder for temporary files
     a new folder there, removed at exit

@@ -99,7 +99,7 @@ class TrainLog:
 
     def draw_curve(self, path: Path) -> None:
         """PSNR over steps, of the training rays and of the previews."""
-        from stages.pictures.plots import curve
+        from stages.figures.plots import curve
 
         lines = [*read_lines(self.path), *map(json.loads, self.unwritten)]
         series = {"training rays, running mean": ([x["step"] for x in lines], [x["psnr"] for x in lines])}

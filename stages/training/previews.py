@@ -37,8 +37,8 @@ class Previews:
             return None
         from efficientnerf.evaluation.metrics import psnr
         from stages.evaluate import ground_truth, subsample, subsample_camera
+        from stages.figures.plots import to_uint8
         from stages.io.png import write_png
-        from stages.pictures.plots import to_uint8
 
         stride = max(1, math.ceil(max(self.view.camera.width, self.view.camera.height) / SIDE))
         truth = subsample(ground_truth(self.poses, self.view, self.renderer.model.background).colour, stride)

@@ -17,11 +17,11 @@ from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from pipeline.errors import Interrupted
 from pipeline.stage import Job
 from stages.evaluate import EvaluateSettings, background_stride, evaluate, evenly_spaced, subsample, subsample_camera, upsample
+from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.exporters.frames import frame_from_rendering
 from stages.io.png import write_png
 from stages.io.scene import Orbit, Scene, View, save
-from stages.pictures.plots import to_uint8
 from tests.fakes import WHITE, BallField, BallTree
 
 TREE = BallTree()

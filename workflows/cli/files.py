@@ -134,10 +134,10 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
     from dataclasses import replace
 
     from pipeline.errors import UsageError
+    from stages.figures.frames import RenderOptions, encode_frames, render_frames
     from stages.framing.camera_paths import similarity_of
     from stages.io.camera_path import read_camera_path
     from stages.io.exporters.frames import background_from_text
-    from stages.pictures.frames import RenderOptions, encode_frames, render_frames
     from stages.turntable import TurntableSettings, cameras_of
     from workflows.cli.progress import write_json
     from workflows.cli.target import load_asset

@@ -30,7 +30,7 @@ def frame_from_rendering(colour: np.ndarray, opacity: np.ndarray, background: tu
     returns     (H, W, 3) or, without a background, (H, W, 4) uint8
     """
     from efficientnerf.rendering.colour import straight_from_premultiplied
-    from stages.pictures.plots import to_uint8
+    from stages.figures.plots import to_uint8
 
     if background is not None:
         return to_uint8(colour + (1.0 - opacity[..., None]) * np.asarray(background, np.float32))
@@ -42,7 +42,7 @@ def over_background(frame: np.ndarray, background: tuple[float, float, float]) -
     """(H, W, 4) uint8 over a colour -> (H, W, 3) uint8; RGB passes through."""
     if frame.shape[2] == 3:
         return frame
-    from stages.pictures.plots import to_uint8
+    from stages.figures.plots import to_uint8
 
     values = frame.astype(np.float32) / 255.0
     alpha = values[..., 3:]

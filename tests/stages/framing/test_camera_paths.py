@@ -13,10 +13,10 @@ import pytest
 
 from efficientnerf.geometry.cameras import Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError
+from stages.figures.frames import RenderOptions, render_path
 from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
-from stages.pictures.frames import RenderOptions, render_path
 from tests.fakes import BallTree
 
 ROTATION = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

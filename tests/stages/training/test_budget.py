@@ -47,7 +47,7 @@ def made_time(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(train, "clock", lambda: now[0])
     monkeypatch.setattr(loop, "train", timed)
-    monkeypatch.setattr("stages.pictures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
+    monkeypatch.setattr("stages.figures.plots.curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def report(made: Job) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stages.pictures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, error_map, grid_sheet, to_uint8
+from stages.figures.plots import LABEL_HEIGHT, MARGIN, contact_sheet, curve, error_map, grid_sheet, to_uint8
 
 
 def test_sheet_holds_each_image_at_its_place(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.surface.mesh import Mesh
-from stages.pictures.shading import IN_FRONT, render_sides
+from stages.figures.shading import IN_FRONT, render_sides
 
 PAPER = 237  # the background, of 255
 

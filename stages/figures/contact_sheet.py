@@ -20,7 +20,7 @@ COLOURS = {"train": (70, 130, 180), "val": (218, 165, 32), "test": (60, 160, 75)
 
 def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str, str]], source: Path) -> None:
     """Write the contact sheet of the folder of a scene: thumbnails framed in the colour of their split, names below; rejected ones crossed out, at the end."""
-    from stages.pictures.plots import contact_sheet
+    from stages.figures.plots import contact_sheet
 
     entries: list[tuple[Path | None, str, str]] = [(folder / view.image, view.name, view.split) for view in scene.views]
     every = -(-len(entries) // MAX_THUMBNAILS)
