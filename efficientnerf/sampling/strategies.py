@@ -157,10 +157,7 @@ class Valid:
         return CoarseStage(self.intervals.valid(request, self.unpruned_fraction))
 
     def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
-        assert coarse is not None
-        assert weight is not None
-        pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
-        return pivotal, _importance(self.intervals.space, request, coarse, weight, self.num_importance_samples)
+        return _by_importance(self, request, coarse, weight)
 
 
 @dataclass(frozen=True)
@@ -177,10 +174,7 @@ class Hierarchical:
         return self.intervals.stratified(request, self.intervals.count, None if request.capacity is None else request.capacity.coarse)
 
     def fine(self, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
-        assert coarse is not None
-        assert weight is not None
-        pivotal = dispatch.select_pivots(weight, coarse.samples.first, self.pivotal_threshold, self.max_pivots)
-        return pivotal, _importance(self.intervals.space, request, coarse, weight, self.num_importance_samples)
+        return _by_importance(self, request, coarse, weight)
 
 
 @dataclass(frozen=True)
@@ -203,6 +197,14 @@ class Uniform:
 def distances_at(samples: Samples, offset: Tensor) -> Tensor:
     """(N,) distances of samples that lie at `offset` (R,) in their intervals."""
     return samples.start + offset[ray_of_sample(samples.first, len(samples.start))] * samples.extent
+
+
+def _by_importance(strategy: Valid | Hierarchical, request: SamplingRequest, coarse: CoarseStage | None, weight: Tensor | None) -> tuple[Tensor, Samples]:
+    """Pivots, which are counted only, and importance samples."""
+    assert coarse is not None
+    assert weight is not None
+    pivotal = dispatch.select_pivots(weight, coarse.samples.first, strategy.pivotal_threshold, strategy.max_pivots)
+    return pivotal, _importance(strategy.intervals.space, request, coarse, weight, strategy.num_importance_samples)
 
 
 def _importance(space: Space, request: SamplingRequest, coarse: CoarseStage, weight: Tensor, count: int) -> Samples:
