@@ -1,0 +1,33 @@
+"""Text that comes from files, as it may be shown: a name, a licence, a lock's command may hold terminal escapes, line ends, or bytes of no encoding.
+
+All that a stranger wrote goes through `printable` where it enters a message; every line goes through it once more on its way to a terminal.
+"""
+
+from __future__ import annotations
+
+_SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
+
+
+def printable(text: object, limit: int | None = None, *, keep: str = "") -> str:
+    """`text` with every character that is no letter, mark, number, punctuation, symbol or plain space as an escape: \\n, \\x1b, \\u202e, \\udcff.
+
+    limit  most characters returned, of which the last is an ellipsis where something was cut; None: all
+    keep   characters that stay as they are, such as line ends of our own
+
+    The result encodes in UTF-8: bytes of a file name that no encoding explains (surrogateescape) come out as \\udc80 to \\udcff.
+    """
+    shown = str(text)
+    if limit is not None:
+        shown = shown[: limit + 1]  # an escape is never shorter than what it stands for
+    if not shown.isprintable():
+        shown = "".join(character if character.isprintable() or character in keep else _escaped(character) for character in shown)
+    if limit is not None and len(shown) > limit:
+        shown = shown[: max(limit - 1, 0)] + "…"
+    return shown
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    if character in _SHORT:
+        return _SHORT[character]
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
