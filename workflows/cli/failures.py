@@ -63,6 +63,8 @@ def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
     facts: dict[str, Any] = {}
     if isinstance(error, Reported):
         facts, error = error.facts, error.error
+    if isinstance(error, click.Abort) and isinstance(error.__cause__, EOFError):
+        error = error.__cause__  # click takes the end of any file for that of the terminal; only a prompt's is an interrupt, and there are none
     if isinstance(error, SystemExit):
         raise error
     code = exit_code(error)

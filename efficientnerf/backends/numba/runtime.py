@@ -5,13 +5,18 @@ Threads: OpenMP; where numba's OpenMP pool cannot be loaded (no libgomp on Linux
 numba ends the process where two threads call kernels at once. The stages call kernels from one thread; a program that does not needs OpenMP
 or a lock of its own. NUMBA_THREADING_LAYER and NUMBA_THREADING_LAYER_PRIORITY, where set, hold.
 
-Cache: `kernel_cache.folder()`, for functions of this package alone.
+Cache: `kernel_cache.folder()`, for functions of this package alone. It only saves time: files in it that are damaged are removed and compiled again, and a
+disk that takes or gives no file is not an error. Both are said in a RuntimeWarning.
 """
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import os
+import pickle
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,6 +55,79 @@ class KernelLocator(caching._CacheLocator):
         found.ensure_cache_path()
         return found
 
+    def ensure_cache_path(self) -> None:
+        try:
+            super().ensure_cache_path()
+        except OSError as error:
+            _warn_once(f"{self._folder}: {error.strerror or error}; compiled kernels are not kept.")
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    warnings.warn(text, RuntimeWarning, stacklevel=2)
+
+
+class KernelFiles(caching.IndexDataCacheFile):
+    """The files of a function's compiled forms, those of this package behind their SHA-256.
+
+    A file that a power cut left empty, cut short or full of zeros would else end the program: numba unpickles what it finds, and runs the machine code.
+    """
+
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
+        super().__init__(cache_path, filename_base, source_stamp)
+        self._own = source_stamp == kernel_cache.key()
+
+    def save(self, key: Any, data: Any) -> None:
+        try:
+            super().save(key, data)
+        except OSError as error:
+            if not self._own:
+                raise
+            _warn_once(f"{self._cache_path}: {error.strerror or error}; compiled kernels are not kept.")
+
+    def load(self, key: Any) -> Any:
+        try:
+            return super().load(key)
+        except OSError:
+            if not self._own:
+                raise
+            return None
+
+    def _load_index(self) -> dict[Any, str]:
+        return (self._verified(self._index_path) or {}) if self._own else super()._load_index()
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        if self._own:
+            self._write(self._index_path, overloads)
+        else:
+            super()._save_index(overloads)
+
+    def _load_data(self, name: str) -> Any:
+        return self._verified(self._data_path(name)) if self._own else super()._load_data(name)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        if self._own:
+            self._write(self._data_path(name), data)
+        else:
+            super()._save_data(name, data)
+
+    def _write(self, path: str, value: Any) -> None:
+        content = self._dump(value)
+        with self._open_for_write(path) as file:
+            file.write(hashlib.sha256(content).digest() + content)
+
+    def _verified(self, path: str) -> Any:
+        """What a file holds; None where there is none, or a damaged one, which is removed."""
+        try:
+            content = Path(path).read_bytes()
+        except FileNotFoundError:
+            return None
+        if hashlib.sha256(content[32:]).digest() != content[:32]:
+            Path(path).unlink(missing_ok=True)
+            warnings.warn(f"{path}: damaged, as by a power cut; removed, and compiled again.", RuntimeWarning, stacklevel=2)
+            return None
+        return pickle.loads(content[32:])  # noqa: S301 -- of a private folder, see kernel_cache
+
 
 class _Compilations(event.Listener):
     """Passes on what numba compiles; a function compiled for the sake of another counts with that one."""
@@ -71,6 +149,7 @@ class _Compilations(event.Listener):
 
 
 caching.CacheImpl._locator_classes.insert(0, KernelLocator)
+caching.IndexDataCacheFile = KernelFiles
 event.register("numba:compile", _Compilations())
 
 __all__ = ["numba"]

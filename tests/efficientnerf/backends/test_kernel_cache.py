@@ -64,12 +64,12 @@ def package(tmp_path: Path) -> Path:
     return copy
 
 
-def run(package: Path, **environment: str) -> dict[str, Any]:
+def run(package: Path, program: str = PROGRAM, **environment: str) -> dict[str, Any]:
     kept = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
     environment = {**kept, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": str(package.parent), "PYTHONSAFEPATH": "1", **environment}
-    done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, cwd=package.parent, capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, cwd=package.parent, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return {**json.loads(done.stdout), "stderr": done.stderr}
 
 
 def test_a_kernel_is_compiled_once_for_the_same_sources_wherever_they_lie_and_anew_when_one_that_it_calls_changes(package: Path, tmp_path: Path) -> None:
@@ -87,6 +87,59 @@ def test_a_kernel_is_compiled_once_for_the_same_sources_wherever_they_lie_and_an
     changed = run(elsewhere, ENERF_CACHE_DIR=str(cache))
     assert (changed["result"], changed["functions"]) == (9, 1)
     assert changed["folder"] != first["folder"]
+
+
+def damaged(content: bytes) -> dict[str, bytes]:
+    middle = len(content) // 2
+    flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+    return {"empty": b"", "cut": content[:middle], "zeros": bytes(len(content)), "garbage": b"\x80\x05K\x01.", "flipped": flipped}
+
+
+def test_an_empty_kernel_index_is_removed_and_compiled_again(package: Path, tmp_path: Path) -> None:
+    """As a power cut leaves it; numba alone would end with EOFError."""
+    cache = tmp_path / "cache"
+    folder = Path(run(package, ENERF_CACHE_DIR=str(cache))["folder"])
+    for path in folder.rglob("*.nbi"):
+        path.write_bytes(b"")
+    again = run(package, ENERF_CACHE_DIR=str(cache))
+    assert (again["result"], again["functions"]) == (6, 1)
+    assert "removed, and compiled again" in again["stderr"]
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -> None:
+    from efficientnerf.backends.numba.runtime import KernelFiles
+
+    files = KernelFiles(str(tmp_path), "kernel", kernel_cache.key())
+    files.save("signature", ["code"])
+    assert files.load("signature") == ["code"]
+    path = next(tmp_path.glob(f"*{suffix}"))
+    content = path.read_bytes()
+    for damage in damaged(content).values():
+        path.write_bytes(damage)
+        with pytest.warns(RuntimeWarning, match="removed, and compiled again"):
+            assert files.load("signature") is None
+        assert not path.exists()
+        assert files.load("signature") is None
+        files.save("signature", ["code"])
+        assert files.load("signature") == ["code"]
+
+
+def test_a_disk_that_takes_no_kernels_is_no_error(package: Path, tmp_path: Path) -> None:
+    full = PROGRAM.replace(
+        "started = []",
+        """
+import errno
+from numba.core import caching
+def refuse(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+caching.IndexDataCacheFile._open_for_write = refuse
+started = []
+""",
+    )
+    found = run(package, full, ENERF_CACHE_DIR=str(tmp_path / "cache"))
+    assert found["result"] == 6
+    assert "No space left on device; compiled kernels are not kept" in found["stderr"]
 
 
 def test_threads_are_those_of_openmp_whatever_else_is_installed(package: Path, tmp_path: Path) -> None:
