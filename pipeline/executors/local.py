@@ -20,7 +20,7 @@ class Usage:
     """What a stage cost.
 
     seconds      wall clock
-    peak_memory  resident memory of the process, bytes
+    peak_memory  resident memory of the process, bytes; or of a child that has ended meanwhile, if it took more
     cpu_seconds  processor time of the process and of its children that have ended; 0 where it is not known
     cores        that the process may use; 0 where it is not known
     """
@@ -34,9 +34,10 @@ class Usage:
 def execute(stage: Stage, job: Job) -> Usage:
     """Run the stage to its end."""
     _reset_peak()
-    started, busy = time.monotonic(), cpu_seconds()
+    started, busy, child = time.monotonic(), cpu_seconds(), peak_memory_of_children()
     stage.run(job)
-    return Usage(time.monotonic() - started, peak_memory(), cpu_seconds() - busy, cores())
+    grown = peak_memory_of_children()  # of all children so far: known to be of this stage's only where it has grown
+    return Usage(time.monotonic() - started, max(peak_memory(), grown if grown > child else 0), cpu_seconds() - busy, cores())
 
 
 def cpu_seconds() -> float:
@@ -64,6 +65,18 @@ def peak_memory() -> int:
     with contextlib.suppress(ImportError):
         import resource  # not on Windows
 
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
+        return _bytes(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
     return 0
+
+
+def peak_memory_of_children() -> int:
+    """Bytes of the largest child that has ended; 0 where the system does not say."""
+    with contextlib.suppress(ImportError):
+        import resource
+
+        return _bytes(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+    return 0
+
+
+def _bytes(resident: int) -> int:
+    return resident if sys.platform == "darwin" else resident * 1024

@@ -64,10 +64,18 @@ _SIGACTION_BYTES = 1024  # bytes; a struct sigaction takes 152 on Linux
 
 
 def import_pycolmap() -> Any:
-    """pycolmap, the only place that imports it. Signal handlers are restored afterwards, by sigaction(2): Python's signal module knows nothing of
-    handlers that faulthandler or another library has set, and works in the main thread only.
+    """pycolmap, the only place that imports it.
+
+    zlib, numpy and Pillow come first: the libraries inside of pycolmap 4 hide those of the same names that are loaded later, and zlib then frees what
+    it never had. Signal handlers are restored afterwards, by sigaction(2): Python's signal module knows nothing of handlers that faulthandler or
+    another library has set, and works in the main thread only.
     """
     if "pycolmap" not in sys.modules:
+        import zlib  # noqa: F401
+
+        import numpy  # noqa: F401
+        import PIL.Image  # noqa: F401
+
         libc = ctypes.CDLL(None)
         handlers = [(number, ctypes.create_string_buffer(_SIGACTION_BYTES)) for number in _GLOG_SIGNALS]
         for number, handler in handlers:

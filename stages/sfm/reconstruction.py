@@ -5,24 +5,28 @@ The capture's frame is COLMAP's: its scale and axes are arbitrary.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import errno
+import fcntl
 import os
 import shutil
 import sqlite3
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import resized
+from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
 from stages.io.capture import Capture, Photo, SparsePoints
-from stages.sfm import mapping, matches
+from stages.sfm import mapping, matches, process
 from stages.sfm.matches import WorkImage
 
 MAX_EXHAUSTIVE = 100  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
+WAIT = 0.05  # seconds between two looks at a lock
 MAX_NAMES = 8  # photographs that an error lists by name
 
 
@@ -50,9 +54,65 @@ def find_cameras(
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
 
-    Raises BadInput where fewer than 3 or less than half of the photographs are registered.
+    It is done in a process of its own (`stages.sfm.process`), whose callables are called here.
+
+    Raises BadInput where fewer than 3 or less than half of the photographs are registered, StageFailed where the process aborts.
     """
     masks = masks or {}
+    arguments = {"folder": os.path.abspath(folder), "names": [*names], "max_side": max_side, "features": features, "matching": matching, "seed": seed}
+    arguments |= {"masks": {name: os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
+    resumed = matches.database_path(work).exists()
+    try:
+        found = process.run(arguments, progress=progress, safe_point=safe_point, warn=warn)
+    except process.ChildAborted:
+        if resumed:  # what was left by an earlier attempt may be what COLMAP cannot bear
+            matches.remove_database(work)
+        raise
+    return _capture_from(found, folder, masks)
+
+
+def capture_for(arguments: Mapping[str, Any], **callables: Callable[..., None]) -> dict[str, Any]:
+    """`reconstruct` for arguments that have come through JSON; the capture as JSON can hold it."""
+    paths = {"folder": Path(arguments["folder"]), "work": Path(arguments["work"]), "masks": {name: Path(path) for name, path in arguments["masks"].items()}}
+    with _alone(Path(arguments["work"]), callables["safe_point"]):
+        return _plain(reconstruct(**{**arguments, **paths}, **callables))  # type: ignore[arg-type]
+
+
+@contextlib.contextmanager
+def _alone(work: Path, safe_point: Callable[[], None]) -> Iterator[None]:
+    """Wait until the process of a run that was killed, which ends a moment after it, writes into the scratch folder no more."""
+    work.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                safe_point()
+                time.sleep(WAIT)
+            except OSError:  # a file system without locks
+                break
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def reconstruct(
+    folder: Path,
+    names: Sequence[str],
+    *,
+    max_side: int,
+    features: int,
+    matching: str,
+    seed: int,
+    masks: Mapping[str, Path],
+    work: Path,
+    progress: Callable[..., None],
+    safe_point: Callable[[], None],
+    warn: Callable[..., None],
+) -> Capture:
+    """`find_cameras` in this process."""
     work.mkdir(parents=True, exist_ok=True)
     images, unreadable = matches.prepare_images(
         folder, names, max_side=max_side, features=features, seed=seed, masks=masks, work=work, progress=progress, safe_point=safe_point, warn=warn
@@ -76,6 +136,40 @@ def find_cameras(
     for sentence in capture.warnings:
         warn(sentence)
     return capture
+
+
+def _plain(capture: Capture) -> dict[str, Any]:
+    """The capture of `reconstruct` as JSON can hold it, bit for bit: floats by their shortest spelling, arrays by their bytes."""
+    assert capture.points is not None
+    cameras = [photo.camera for photo in capture.photos]
+    lenses = [[c.name, c.width, c.height, c.model, [float(p) for p in c.params]] for c in cameras]
+    points = (capture.points.xyz, capture.points.rgb, capture.points.error, np.array([camera.world_from_camera for camera in cameras], np.float64))
+    return {
+        "lenses": lenses,
+        "arrays": [[array.dtype.str, array.shape, base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()] for array in points],
+        "tracks": capture.points.tracks,
+        "rejected": capture.rejected,
+        "warnings": capture.warnings,
+        "reprojection_error": capture.reprojection_error,
+        "facts": capture.facts,
+    }
+
+
+def _capture_from(found: Mapping[str, Any], folder: Path, masks: Mapping[str, Path]) -> Capture:
+    """The inverse of `_plain`."""
+    xyz, rgb, error, poses = (np.frombuffer(base64.b64decode(data), dtype).reshape(shape).copy() for dtype, shape, data in found["arrays"])
+    lenses = zip(found["lenses"], poses, strict=True)
+    cameras = [Camera(name, width, height, model, tuple(params), pose) for (name, width, height, model, params), pose in lenses]
+    return Capture(
+        kind="photographs",
+        photos=tuple(Photo(camera=camera, image=folder / camera.name, mask=masks.get(camera.name)) for camera in cameras),
+        background=None,
+        points=SparsePoints(xyz, rgb, error, tuple(tuple(track) for track in found["tracks"])),
+        rejected=tuple((name, reason) for name, reason in found["rejected"]),
+        warnings=tuple(found["warnings"]),
+        reprojection_error=found["reprojection_error"],
+        facts=found["facts"],
+    )
 
 
 @contextlib.contextmanager

@@ -41,6 +41,15 @@ def test_processor_time_is_that_of_the_process_and_its_children(tmp_path: Path, 
     assert usage.cores >= 1
 
 
+def large_child(job: Job) -> None:
+    subprocess.run([sys.executable, "-c", f"x = bytes(range(256)) * {2**22}"], check=True)
+
+
+def test_the_memory_of_a_child_counts(tmp_path: Path) -> None:
+    usage = local.execute(Stage("toy", 1, NoSettings, (), large_child), Job(settings=NoSettings(), out=tmp_path / "out", work=tmp_path / "work"))
+    assert usage.peak_memory > 2**30
+
+
 def test_waiting_is_not_busy(tmp_path: Path) -> None:
     usage = local.execute(Stage("toy", 1, NoSettings, (), idle), Job(settings=NoSettings(), out=tmp_path / "out", work=tmp_path / "work"))
     assert usage.cpu_seconds < 0.2 < usage.seconds

@@ -19,7 +19,7 @@ from pipeline.errors import BadInput
 from stages.io import photo as reading
 from stages.io.capture import Capture
 from stages.sfm import matches
-from stages.sfm.reconstruction import find_cameras
+from stages.sfm.reconstruction import find_cameras, reconstruct
 
 ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE = ROOT / "examples" / "still_life"
@@ -182,6 +182,19 @@ def test_again_in_another_order_gives_the_same_bits(ten: tuple[list[str], Path, 
     names, _, capture = ten
     assert numbers(find(STILL_LIFE, names[::-1], tmp_path)) == numbers(capture)
     assert capfd.readouterr() == ("", "")  # COLMAP keeps silent
+
+
+def test_the_process_changes_no_bit(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+    names, work, capture = ten
+    shutil.copytree(work, tmp_path / "work")
+    quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
+    here = reconstruct(
+        STILL_LIFE, names, max_side=SIDE, features=4096, matching="auto", seed=0, masks={}, work=tmp_path / "work", **quiet
+    )  # fmt: skip
+    assert numbers(here) == numbers(capture)
+    assert (here.facts, here.warnings, here.rejected, here.reprojection_error) == (
+        capture.facts, capture.warnings, capture.rejected, capture.reprojection_error,
+    )  # fmt: skip
 
 
 KILLED = """

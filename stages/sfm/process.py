@@ -1,0 +1,209 @@
+"""Structure from motion in a process of its own: an abort inside of COLMAP, or the system's end of a process that takes too much memory, is then an
+error of the stage and not the end of the run.
+
+The child is a fresh interpreter (`stages.sfm.child`), never a fork: threads of torch would not survive one. It speaks lines of JSON over two pipes:
+
+    to the child    {"parent": pid, "arguments": ...}, then a line "go" or "stop" for each safe point
+    from the child  {"event": "progress" | "warning" | "safe point", ...}, in the end "result", "error" or "stopped"
+
+At each safe point the child waits for the answer, so that signals are the parent's alone: the child ignores Ctrl-C and SIGTERM, and ends with its parent.
+"""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NoReturn
+
+from pipeline import errors
+from pipeline.errors import StageFailed
+from pipeline.text import printable
+
+# An entry of sys.path that is empty stands for the working folder, which may hold anything: the parent's own entries take its place first.
+_BOOTSTRAP = "import sys; sys.path[:] = sys.argv[1:]; from stages.sfm.child import main; main()"
+_HANDLED = (signal.SIGINT, signal.SIGTERM)
+_TAIL_BYTES = 16384  # of the child's standard error that are kept
+_SHOWN_LINES, _SHOWN_CHARACTERS = 3, 240
+_FRAMES = (" ", "\t", "*** ", "PC: @", "Current thread", "Thread 0x", "Stack (most", "Extension modules")  # beginnings of lines of a stack trace
+
+
+class ChildAborted(StageFailed):
+    """The process ended without an answer; the text has its last words."""
+
+
+class _ChildTraceback(Exception):
+    """Where an error was raised in the child: its cause, for a traceback."""
+
+
+def run(arguments: Mapping[str, Any], *, progress: Callable[..., None], safe_point: Callable[[], None], warn: Callable[..., None]) -> Any:
+    """What `stages.sfm.child` returns for `arguments`, which JSON can hold.
+
+    The callables are called here, in the order in which the child calls them; what they raise stops the child at its next safe point and passes.
+    An error of the child is raised again, of the same class. Raises ChildAborted where it ended without an answer.
+    """
+    child = _Child(arguments)
+    try:
+        while (message := child.receive()) is not None:
+            match message["event"]:
+                case "progress":
+                    progress(*message["values"], **message["facts"])
+                case "warning":
+                    warn(message["text"], **message["facts"])
+                case "safe point":
+                    safe_point()
+                    child.answer("go")
+                case "error":
+                    child.wait()
+                    _raise(message)
+                case "result":
+                    child.wait()
+                    return message["value"]
+        code = child.wait()
+    except BaseException:
+        child.stop()
+        raise
+    finally:
+        child.close()
+    raise ChildAborted(_end_in_words(code, child.last_words()))
+
+
+class _Child:
+    """The child process and its pipes."""
+
+    def __init__(self, arguments: Mapping[str, Any]) -> None:
+        # Signals that arrive while the interpreter starts wait until the child ignores them; the mask is inherited.
+        former = signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
+        try:
+            self.process = subprocess.Popen(command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, former)
+        self._tail = bytearray()
+        self._listener = threading.Thread(target=self._listen, name="last words of structure from motion", daemon=True)
+        self._listener.start()
+        self._write(json.dumps({"parent": os.getpid(), "arguments": arguments}))
+
+    def receive(self) -> dict[str, Any] | None:
+        """The next message; None once the child has ended."""
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        try:
+            message = json.loads(line)
+        except ValueError:  # the end of the pipe, or half a line before it
+            return None
+        return message if isinstance(message, dict) else None
+
+    def answer(self, word: str) -> None:
+        self._write(json.dumps(word))
+
+    def _write(self, line: str) -> None:
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):  # a child that has ended is noticed where it is read from
+            self.process.stdin.write(line.encode() + b"\n")
+            self.process.stdin.flush()
+
+    def stop(self) -> None:
+        """Let the child go on to its next safe point and end there; at once where this is interrupted."""
+        assert self.process.stdout is not None
+        try:
+            self.answer("stop")
+            while self.process.stdout.read(65536):
+                pass
+            self.process.wait()
+        except BaseException:
+            self.process.kill()
+            raise
+
+    def wait(self) -> int:
+        """Its return code; negative, the number of the signal that ended it."""
+        return self.process.wait()
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self._listener.join(1.0)
+        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
+            assert pipe is not None
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+    def _listen(self) -> None:
+        assert self.process.stderr is not None
+        while some := os.read(self.process.stderr.fileno(), 4096):
+            self._tail += some
+            del self._tail[:-_TAIL_BYTES]
+
+    def last_words(self) -> list[str]:
+        """The last lines of its standard error, without stack traces."""
+        lines = [line for line in self._tail.decode(errors="replace").splitlines() if line.strip() and not line.startswith(_FRAMES)]
+        return [printable(line.strip(), _SHOWN_CHARACTERS) for line in lines[-_SHOWN_LINES:]]
+
+
+def command() -> list[str]:
+    """The command line of the child: this interpreter with its options, and where it finds modules."""
+    path = [entry or _working_folder() for entry in sys.path]
+    return [interpreter(), *_options(), "-c", _BOOTSTRAP, *(entry for entry in path if entry)]
+
+
+def interpreter() -> str:
+    """The path of the interpreter that runs; StageFailed where there is none, as in a program that embeds Python."""
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    for candidate in (sys.executable, os.path.join(sys.exec_prefix, "bin", version), getattr(sys, "_base_executable", ""), "/proc/self/exe"):
+        if candidate and os.path.basename(os.path.realpath(candidate)).startswith(("python", "pypy")) and os.access(candidate, os.X_OK):
+            return candidate
+    raise StageFailed(f"poses: no Python interpreter to run structure from motion in (sys.executable is {sys.executable!r}). Set it to one of {version}.")
+
+
+def _options() -> Iterator[str]:
+    flags = sys.flags
+    for option, given in (("-I", flags.isolated), ("-E", flags.ignore_environment), ("-s", flags.no_user_site), ("-B", flags.dont_write_bytecode)):
+        if given:
+            yield option
+    yield from ("-X", f"utf8={flags.utf8_mode}")  # the names of files mean the same in both
+
+
+def _working_folder() -> str:
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
+
+
+def _raise(message: Mapping[str, Any]) -> NoReturn:
+    """The child's error again: ours and Python's own by their class, any other as a RuntimeError that names it."""
+    name, text, number = str(message["type"]), str(message["text"]), message["errno"]
+    cause = _ChildTraceback(f"\n{message['traceback']}")
+    if number is not None:
+        raise OSError(number, message["strerror"], message["filename"]) from cause
+    found = getattr(errors, name, None) or getattr(builtins, name, None)
+    if isinstance(found, type) and issubclass(found, Exception) and not issubclass(found, OSError | UnicodeError):
+        raise found(text) from cause
+    raise RuntimeError(f"{name}: {text}" if text else name) from cause
+
+
+def _end_in_words(code: int, last_words: list[str]) -> str:
+    said = f" Its last words: {' / '.join(last_words)}." if last_words else ""
+    if code == -signal.SIGKILL:
+        return (
+            f"poses: structure from motion was ended by SIGKILL, as a system that runs out of memory does.{said} Close other programs, or lower"
+            " poses.feature_image_size or poses.max_features; what is done is kept."
+        )
+    how = f"by {_name_of(-code)}" if code < 0 else f"with code {code} and no result"
+    return (
+        f"poses: structure from motion ended {how}.{said} Run again. Should it end so again, lower poses.max_features, take out photographs, or install"
+        " another version of pycolmap."
+    )
+
+
+def _name_of(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
