@@ -178,7 +178,7 @@ def _format_of(capture: Capture) -> str:
 def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tuple[Capture, list[Any]]:
     """Write the working images. Returns the capture without the images that cannot be decoded, and what was written for the others."""
     from stages.io import working_images
-    from stages.io.photo import UnreadableImage
+    from stages.io.pictures import UnreadableImage
 
     relative = working_images.image_paths([photo.camera for photo in capture.photos])
     kept: list[int] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from stages.artifacts import PosesOutputs
+from stages.io.pictures import UnreadableImage, opened
 from stages.io.scene import SPLITS, Scene
 
 THUMBNAIL = 144  # px, longest side
@@ -57,12 +59,9 @@ def _thumbnail(path: Path | None) -> Any:
     from PIL import Image, ImageOps
 
     if path is not None:
-        try:
-            with Image.open(path) as image:
-                image.draft("RGB", (2 * THUMBNAIL, 2 * THUMBNAIL))
-                upright = ImageOps.exif_transpose(image)
-                upright.thumbnail((THUMBNAIL, THUMBNAIL))
-                return upright.convert("RGBA" if upright.mode in ("RGBA", "LA", "P", "PA") else "RGB")
-        except Exception:
-            pass  # probably rejected for being unreadable
+        with contextlib.suppress(UnreadableImage), opened(path) as image:
+            image.draft("RGB", (2 * THUMBNAIL, 2 * THUMBNAIL))
+            upright = ImageOps.exif_transpose(image)
+            upright.thumbnail((THUMBNAIL, THUMBNAIL))
+            return upright.convert("RGBA" if upright.mode in ("RGBA", "LA", "P", "PA") else "RGB")
     return Image.new("RGB", (THUMBNAIL, THUMBNAIL * 3 // 4), (200, 200, 200))

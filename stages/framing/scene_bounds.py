@@ -195,7 +195,8 @@ def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: floa
 def silhouette(photo: Photo) -> np.ndarray | None:
     """(h, w) bool, upright, longest side at most SILHOUETTE: whether any pixel below is not wholly transparent; None without an alpha channel
     or where nothing is transparent."""
-    from stages.io.photo import UnreadableImage, read_alpha
+    from stages.io.photo import read_alpha
+    from stages.io.pictures import UnreadableImage
 
     try:
         alpha = read_alpha(photo.image)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stages.io.pictures import UnreadableImage, exif_of, grey_of, opened, orientation_of, rgb_and_alpha
+
 FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm; the "35 mm equivalent" focal length refers to it
 
-_ORIENTATION, _MAKE, _MODEL, _EXIF = 274, 271, 272, 34665
+_MAKE, _MODEL, _EXIF = 271, 272, 34665
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 37386, 41989, 41486, 41488, 40962
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-
-
-class UnreadableImage(Exception):
-    """An image file that cannot be decoded, or a mask that does not fit; the text gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -57,53 +54,36 @@ def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
 
 def read_photo(path: Path, max_side: int) -> DecodedPhoto:
     """Decode a photograph; raises UnreadableImage."""
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
-            with Image.open(path) as image:
-                exif = image.getexif()
-                details = exif.get_ifd(_EXIF)
-                orientation = exif.get(_ORIENTATION, 1)
-                orientation = orientation if orientation in range(1, 9) else 1
-                full = image.size
-                _draft(image, max_side)
-                rgb, alpha = rgb_and_alpha(image)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise UnreadableImage(f"cannot be read ({reason.splitlines()[0] if reason else type(error).__name__})") from error
+    with opened(path) as image:
+        exif = exif_of(image)
+        details = dict(exif.get_ifd(_EXIF))
+        maker = " ".join(str(exif.get(tag, "")).strip(" \0") for tag in (_MAKE, _MODEL)).strip()
+        orientation = orientation_of(image)
+        full = image.size
+        # As the sensor has it, which the numbers of EXIF refer to: libheif has turned the pixels already.
+        taken = full[::-1] if image.info.get("original_orientation") in range(5, 9) else full
+        _draft(image, max_side)
+        rgb, alpha = rgb_and_alpha(image)
     width, height = full if orientation < 5 else full[::-1]
     rgb = _resized(apply_exif_orientation(rgb, orientation), working_size(width, height, max_side))
     opaque = None
     if alpha is not None and (alpha < 128).any():
         opaque = _resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
-    maker = " ".join(str(exif.get(tag, "")).strip(" \0") for tag in (_MAKE, _MODEL)).strip()
-    return DecodedPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *full), maker)
+    return DecodedPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *taken), maker)
 
 
 def read_alpha(path: Path) -> np.ndarray | None:
     """(H, W) uint8 of an image file at full size, after EXIF rotation; None if it has no alpha channel. Raises UnreadableImage."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
-                return None
-            return apply_exif_orientation(np.asarray(image.convert("RGBA"))[..., 3], image.getexif().get(_ORIENTATION, 1))
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise UnreadableImage(f"{path.name} cannot be read") from error
+    with opened(path) as image:
+        orientation = orientation_of(image)
+        alpha = rgb_and_alpha(image)[1]
+    return None if alpha is None else apply_exif_orientation(alpha, orientation)
 
 
 def read_mask_file(path: Path, photo: DecodedPhoto) -> np.ndarray:
     """(h, w) bool at the photograph's working size, True where the mask is not black; raises UnreadableImage."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            mask = np.asarray(image.convert("L"))
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise UnreadableImage(f"{path.name} cannot be read") from error
+    with opened(path) as image:
+        mask = grey_of(image)
     if photo.orientation >= 5 and same_aspect(mask.shape[::-1], (photo.height, photo.width)):
         mask = apply_exif_orientation(mask, photo.orientation)  # a mask of the pixels as stored
     if not same_aspect(mask.shape, (photo.height, photo.width)):
@@ -156,18 +136,6 @@ def _draft(image: Any, max_side: int) -> None:
             scale *= 2
         if scale > 1:
             image.draft(image.mode, (image.size[0] // scale, image.size[1] // scale))
-
-
-def rgb_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """(rgb, alpha or None) as uint8; 16 bits are scaled to 8, which Pillow would clip."""
-    if image.mode.startswith("I") or image.mode == "F":
-        values = np.asarray(image).astype(np.float64)
-        values = values / 257.0 if values.max(initial=0) > 255 else values
-        return np.repeat(np.clip(np.rint(values), 0, 255).astype(np.uint8)[..., None], 3, axis=2), None
-    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
-        rgba = np.asarray(image.convert("RGBA"))
-        return rgba[..., :3], rgba[..., 3]
-    return np.asarray(image.convert("RGB")), None
 
 
 def apply_exif_orientation(pixels: np.ndarray, orientation: int) -> np.ndarray:

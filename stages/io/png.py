@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.files import atomic
+from stages.io.pictures import opened
 
 FAST = 1  # compression of what is read once and thrown away
 USUAL = 6
@@ -21,8 +22,6 @@ def write_png(pixels: np.ndarray, path: Path, *, compress_level: int = USUAL, du
 
 
 def read_png(path: Path) -> np.ndarray:
-    """uint8, in the shape that `write_png` was given."""
-    from PIL import Image
-
-    with Image.open(path) as image:
+    """uint8, in the shape that `write_png` was given; raises UnreadableImage."""
+    with opened(path, ("PNG",)) as image:
         return np.asarray(image)

@@ -11,6 +11,7 @@ Training frame: right-handed, z up, origin at the centre of the box, the largest
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,16 +20,19 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.geometry.ndc import Ndc
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.files import write_json
+from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.framing.forward_facing import SPACES, ForwardFacing
 from stages.io.capture import SparsePoints
 from stages.io.json_file import JsonReader, read_json
+from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
 AGAIN = "Run the poses stage again."
+WORKING_FORMATS = ("PNG", "JPEG")  # of images/; masks/ hold PNG
 
 
 @dataclass(frozen=True)
@@ -194,40 +198,36 @@ def load(folder: Path) -> Scene:
 
 
 def read_image(folder: Path, view: View) -> np.ndarray:
-    """The working image, uint8 sRGB (H, W, 3), or (H, W, 4) with straight alpha."""
-    import cv2
-
+    """The working image, uint8 sRGB (H, W, 3), or (H, W, 4) with straight alpha. Raises CorruptArtifact."""
     path = folder / view.image
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION) if path.is_file() else None
-    if pixels is None or pixels.dtype != np.uint8 or pixels.shape[:2] != (view.camera.height, view.camera.width):
-        found = "missing or unreadable" if pixels is None else f"{pixels.dtype} {pixels.shape[1]}x{pixels.shape[0]}"
-        raise BadInput(f"{path}: {found}; expected an 8-bit image of {view.camera.width}x{view.camera.height}. Run the poses stage again.")
-    if pixels.ndim == 2:
-        return np.repeat(pixels[..., None], 3, -1)
-    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])
+    try:
+        with opened(path, WORKING_FORMATS) as image:
+            rgb, alpha = rgb_and_alpha(image)
+    except UnreadableImage as error:
+        raise CorruptArtifact(f"{printable(path)}: missing or {error}. {AGAIN}") from error
+    if rgb.shape[:2] != (view.camera.height, view.camera.width):
+        found = f"{rgb.dtype} {rgb.shape[1]}x{rgb.shape[0]}"
+        raise CorruptArtifact(f"{printable(path)}: {found}; expected an 8-bit image of {view.camera.width}x{view.camera.height}. {AGAIN}")
+    return np.ascontiguousarray(rgb if alpha is None else np.dstack([rgb, alpha]))
 
 
 def has_alpha(folder: Path, view: View) -> bool:
     """Whether the working image has an alpha channel; only its header is read."""
-    from PIL import Image
-
     try:
-        with Image.open(folder / view.image) as image:
-            return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-    except OSError:
+        return read_header(folder / view.image).alpha
+    except UnreadableImage:
         return False  # read_image says what is wrong
 
 
 def read_mask(folder: Path, view: View) -> np.ndarray | None:
-    """bool (H, W), True = use; None where every pixel counts."""
-    import cv2
-
+    """bool (H, W), True = use; None where every pixel counts. Raises CorruptArtifact."""
     if view.mask is None:
         return None
-    path = folder / view.mask
-    pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    path, pixels = folder / view.mask, None
+    with contextlib.suppress(UnreadableImage), opened(path, WORKING_FORMATS) as image:
+        pixels = grey_of(image)
     if pixels is None or pixels.shape != (view.camera.height, view.camera.width):
-        raise BadInput(f"{path}: missing, unreadable or not {view.camera.width}x{view.camera.height}. Run the poses stage again.")
+        raise CorruptArtifact(f"{printable(path)}: missing, unreadable or not {view.camera.width}x{view.camera.height}. {AGAIN}")
     return pixels >= 128
 
 

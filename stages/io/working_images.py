@@ -12,14 +12,14 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
+from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo
-from stages.io.importers.lenses import read_header
-from stages.io.photo import UnreadableImage, same_aspect, working_size
+from stages.io.photo import apply_exif_orientation, same_aspect, working_size
+from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, read_header, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
 OPAQUE = 128  # alpha from which a pixel counts where alpha is used as a mask
-_LOSSY = (".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,13 @@ class Decoded:
     pixels       (H, W, 3 or 4) uint8 sRGB, straight alpha
     verbatim     whether the file itself holds exactly these pixels in a form that later stages read
     orientation  EXIF's number, 1-8
+    lossy        whether the format keeps pixels only about as they were
     """
 
     pixels: np.ndarray
     verbatim: bool
     orientation: int
+    lossy: bool
 
 
 @dataclass(frozen=True)
@@ -49,24 +51,13 @@ class Written:
 
 def decode(path: Path) -> Decoded:
     """Every pixel of an image file; raises UnreadableImage, also where the file ends early."""
-    import warnings
-
-    from PIL import Image
-
-    from stages.io.photo import apply_exif_orientation, rgb_and_alpha
-
-    orientation = _orientation(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
-            with Image.open(path) as image:
-                verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image, path)
-                rgb, alpha = rgb_and_alpha(image)
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UnreadableImage(f"cannot be decoded ({reason[:100]})") from error
+    with opened(path) as image:
+        orientation = orientation_of(image)
+        verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image)
+        lossy = image.format in LOSSY
+        rgb, alpha = rgb_and_alpha(image)
     pixels = rgb if alpha is None else np.dstack([rgb, alpha])
-    return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation)
+    return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, lossy)
 
 
 def has_transparency(path: Path) -> bool:
@@ -156,23 +147,9 @@ def image_paths(cameras: list[Camera]) -> list[str]:
     return paths
 
 
-def _orientation(path: Path) -> int:
-    from stages.io.importers.lenses import UnreadableHeader
-
-    try:
-        return read_header(path).orientation
-    except UnreadableHeader as error:
-        raise UnreadableImage(f"cannot be decoded ({error})") from error
-
-
-def _is_plain(image: Any, path: Path) -> bool:
-    """Whether OpenCV reads the file's pixels as Pillow does: JPEG in colour, PNG with 8 bits a channel."""
-    if image.format == "JPEG":
-        return bool(image.mode == "RGB")
-    if image.format == "PNG" and image.mode in ("RGB", "RGBA"):
-        with path.open("rb") as file:
-            return file.read(25)[24:] == b"\x08"  # IHDR's bit depth: Pillow cuts 16 bits to 8
-    return False
+def _is_plain(image: Any) -> bool:
+    """Whether later stages read the file itself: JPEG in colour, PNG with 8 bits a channel."""
+    return image.mode == "RGB" if image.format == "JPEG" else image.format == "PNG" and image.mode in ("RGB", "RGBA") and holds_eight_bits(image)
 
 
 def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -192,13 +169,12 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.ndarray, list[str]]:
     """(h, w) bool at working size from the photo's mask file, and warnings."""
-    from stages.io.photo import apply_exif_orientation
-
     assert photo.mask is not None
     try:
-        mask = _grey(photo.mask)
+        decoded = decode(photo.mask)
     except UnreadableImage as error:
-        raise UnreadableImage(f"its mask {photo.mask.name} {error}") from error
+        raise UnreadableImage(f"its mask {printable(photo.mask.name)} is {error}") from error
+    mask = decoded.pixels[..., :3].max(-1)  # any colour counts as not black
     expected = photo.camera.width, photo.camera.height
     if orientation >= 5 and not same_aspect(mask.shape[::-1], expected):
         mask = apply_exif_orientation(mask, orientation)  # a mask of the pixels as stored
@@ -210,9 +186,5 @@ def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.n
     rows = ((np.arange(size[1]) + 0.5) * found[1] / size[1]).astype(int)
     columns = ((np.arange(size[0]) + 0.5) * found[0] / size[0]).astype(int)
     # Lossy files have no clean zero.
-    marked = mask[rows][:, columns] > (127 if photo.mask.suffix.lower() in _LOSSY else 0)
+    marked = mask[rows][:, columns] > (127 if decoded.lossy else 0)
     return marked if photo.mask_ignore == "black" else ~marked, warnings
-
-
-def _grey(path: Path) -> np.ndarray:
-    return decode(path).pixels[..., :3].max(-1)  # any colour counts as not black

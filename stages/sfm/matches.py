@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.files import rename, write_atomically, write_json
-from stages.io.photo import DecodedPhoto, UnreadableImage, read_mask_file, read_photo
+from stages.io.photo import DecodedPhoto, read_mask_file, read_photo
+from stages.io.pictures import UnreadableImage
 from stages.io.png import FAST, write_png
 
 LAYOUT = 1  # of the work folder; raise it when what is written there changes meaning

@@ -122,7 +122,7 @@ def test_a_truncated_image_is_named_and_left_out(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:1500])
     made, warnings = run(source, tmp_path / "a")
     assert [view.name for view in made.views] == [f"images/img_{i}.png" for i in (0, 1, 3, 4, 5)]
-    assert any("1 of 6 images cannot be used: images/img_2.png cannot be decoded" in warning for warning in warnings)
+    assert any("1 of 6 images cannot be used: images/img_2.png unreadable: " in warning for warning in warnings)
     assert scene.read_points(tmp_path / "a/poses").tracks[0] == (0, 1, 2, 3, 4)
     report = json.loads((tmp_path / "a/poses/report.json").read_text())
     assert report["rejected"][0]["name"] == "images/img_2.png"
@@ -216,7 +216,7 @@ def test_masks_of_another_size(tmp_path: Path) -> None:
     (source / "masks/img_0.png").write_bytes(b"nothing")
     made, warnings = run(source, tmp_path / "c")
     assert len(made.views) == 5
-    assert any("its mask img_0.png cannot be decoded" in warning for warning in warnings)
+    assert any("its mask img_0.png is unreadable" in warning for warning in warnings)
 
 
 def photos(splits: list[str | None]) -> list[Photo]:

@@ -18,6 +18,7 @@ from stages.io.importers import lenses
 from stages.io.importers.colmap_model import Model, Points, count_images, model_files, read_model
 from stages.io.importers.photographs import masks_of
 from stages.io.importers.source import MIN_IMAGES, ImportSettings, Source, abbreviated, missing_images_warning, moved_images_warnings
+from stages.io.pictures import UnreadableImage, read_header
 
 _MODEL_PLACES = (".", "sparse", "sparse/*", "colmap", "colmap/sparse", "colmap/sparse/*", "dense/sparse", "dense/*/sparse", "model", "models/*")
 _IMAGE_PLACES = ("images", "input", "rgb", "photos", ".", "../images", "../../images")
@@ -116,8 +117,8 @@ def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> 
         posed, name = model.images[number], source.name_of(path)
         lens = model.cameras[posed.camera]
         try:
-            header = lenses.read_header(path)
-        except lenses.UnreadableHeader as error:
+            header = read_header(path)
+        except UnreadableImage as error:
             rejected.append((name, str(error)))
             warnings.append(f"{name}: {error}; left out.")
             continue

@@ -11,9 +11,10 @@ import numpy as np
 
 from efficientnerf.settings import Auto
 from stages.io.capture import Capture
-from stages.io.importers import IMPORTERS, candidates, lenses
+from stages.io.importers import IMPORTERS, candidates
 from stages.io.importers.photographs import masks_of, photographs
 from stages.io.importers.source import Source
+from stages.io.pictures import UnreadableImage, read_header
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,8 @@ def _photographs(folder: Path) -> dict[str, Any]:
     sizes, rejected, turned = [], [], 0
     for image in images:
         try:
-            header = lenses.read_header(image)
-        except lenses.UnreadableHeader as error:
+            header = read_header(image)
+        except UnreadableImage as error:
             rejected.append({"name": source.name_of(image), "reason": str(error)})
             continue
         sizes.append(header.size)

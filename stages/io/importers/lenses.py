@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,60 +11,9 @@ from efficientnerf.geometry.cameras import Camera, resized, rotated_clockwise
 from pipeline.errors import BadInput
 from stages.io.importers.source import abbreviated
 from stages.io.photo import same_aspect
+from stages.io.pictures import Header
 
-_EXIF_ORIENTATION = 0x0112
 _QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}  # clockwise, from the stored pixels to the upright image; the others are mirrored
-
-
-class UnreadableHeader(Exception):
-    """A file that is not an image; the text says why."""
-
-
-@dataclass(frozen=True)
-class Header:
-    """The header of an image file.
-
-    stored_width, stored_height  of the pixels as stored
-    orientation                  EXIF's number, 1-8
-    alpha                        whether the format holds an alpha channel
-    """
-
-    stored_width: int
-    stored_height: int
-    orientation: int
-    alpha: bool
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) after EXIF rotation."""
-        width, height = self.stored_width, self.stored_height
-        return (height, width) if self.orientation >= 5 else (width, height)
-
-
-def read_header(path: Path) -> Header:
-    """Size, orientation and alpha of an image file; raises UnreadableHeader."""
-    import warnings
-
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
-            with Image.open(path) as image:
-                exif = Image.Exif()
-                if "exif" in image.info:  # getexif() would decode the whole of a PNG to look for a late block
-                    exif.load(image.info["exif"])
-                else:
-                    exif = image.getexif() if image.format != "PNG" else exif
-                orientation = exif.get(_EXIF_ORIENTATION, 1)
-                alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-                width, height = image.size
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else f"{type(error).__name__}: not an image that can be read"
-        raise UnreadableHeader(reason) from error
-    if not (0 < width <= 65535 and 0 < height <= 65535):
-        raise UnreadableHeader(f"size {width}x{height}")
-    return Header(width, height, orientation if orientation in range(1, 9) else 1, alpha)
 
 
 def rigid(matrix: Any, where: str) -> np.ndarray:

@@ -17,6 +17,7 @@ from stages.io.capture import Capture, Photo
 from stages.io.importers import lenses
 from stages.io.importers.photographs import masks_of
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in
+from stages.io.pictures import UnreadableImage, read_header
 
 POSES = "poses_bounds.npy"
 
@@ -54,8 +55,8 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     for index, (row, image) in enumerate(zip(rows, images, strict=True)):
         name, where = source.name_of(image), f"{POSES}: row {index} ({source.name_of(image)})"
         try:
-            header = lenses.read_header(image)
-        except lenses.UnreadableHeader as error:
+            header = read_header(image)
+        except UnreadableImage as error:
             rejected.append((name, str(error)))
             warnings.append(f"{name}: {error}; left out.")
             continue

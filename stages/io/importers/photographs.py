@@ -68,7 +68,7 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
 
 
 def _nothing(folder: Path, everything: Sequence[Path]) -> str:
-    known = "png, jpg, webp, tif or bmp"
+    known = "png, jpg, webp, tif, bmp or heic"
     if not everything:
         return f"{folder}: the folder is empty. Expected at least {MIN_IMAGES} photographs ({known}) or a posed data set."
     common = Counter(path.suffix.lower() or "(no extension)" for path in everything).most_common(3)

@@ -16,7 +16,7 @@ from typing import Protocol
 from efficientnerf.settings import Auto
 from pipeline.errors import BadInput
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".hif")
 MAX_FRAMES = 100_000
 MAX_FILES = 1_000_000  # entries of a source folder
 MIN_IMAGES = 3  # images that make a data set

@@ -25,6 +25,7 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, missing_images_warning, moved_images_warnings
 from stages.io.json_file import read_json
+from stages.io.pictures import UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 MAX_PLY = 1 << 30  # bytes
@@ -201,8 +202,8 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
     for frame in listing.frames:
         name = source.name_of(frame.image)
         try:
-            header = lenses.read_header(frame.image)
-        except lenses.UnreadableHeader as error:
+            header = read_header(frame.image)
+        except UnreadableImage as error:
             rejected.append((name, str(error)))
             warnings.append(f"{name}: {error}; left out.")
             continue

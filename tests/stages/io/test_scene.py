@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Similarity, rays, resized
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, CorruptArtifact
 from stages.io import importers, scene
 from stages.io.capture import SparsePoints
 from stages.io.exporters import cameras
@@ -135,10 +135,10 @@ def test_images_and_masks_are_read_as_written(tmp_path: Path) -> None:
 def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
     view = scene_of().views[0]
     for read in (scene.read_image, scene.read_mask):
-        with pytest.raises(BadInput, match="missing"):
+        with pytest.raises(CorruptArtifact, match="missing"):
             read(tmp_path, view)
     captures.write_picture(tmp_path / view.image, captures.picture(1, 12, 12))
-    with pytest.raises(BadInput, match="uint8 12x12; expected an 8-bit image of 16x12"):
+    with pytest.raises(CorruptArtifact, match="uint8 12x12; expected an 8-bit image of 16x12"):
         scene.read_image(tmp_path, view)
 
 

@@ -1,0 +1,191 @@
+"""The one place that opens picture files, whoever wrote them.
+
+A file is recognised by its content, among the formats below and no others: Pillow knows more, and runs Ghostscript for one of them. Whatever the decoder
+raises becomes UnreadableImage, so that one bad picture is left out and ends nothing. Pixels become 8 bits by the type of the file, never by their values:
+
+    8 bits a channel            as they are; grey, palette, CMYK and LAB are converted to sRGB by Pillow
+    1 bit                       0 and 255
+    16 bits, grey               value / 257, rounded
+    16 bits, colour             the high byte, as Pillow reads it
+    other widths, signed,       refused by name: what their white is the file does not say
+    floating point
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from pipeline.errors import PipelineError
+from pipeline.text import printable
+
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF")  # Pillow's names; a JPEG of several pictures (MPO) comes with JPEG
+LOSSY = ("JPEG", "MPO", "WEBP", "HEIF")  # without a clean zero
+MAX_SIDE = 65_535  # pixels
+MAX_PIXELS = 178_956_970  # of a picture, from its header, before anything is decoded; Pillow's own limit
+
+_ORIENTATION = 274
+_ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
+# The fault of the process or the machine, not of one file: to leave pictures out for these would change results in silence.
+_NOT_THE_FILES_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+
+
+class UnreadableImage(Exception):
+    """A picture that cannot be used; the text gives the reason, as "unreadable: ..."."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """The header of a picture.
+
+    stored_width, stored_height  of the pixels as stored
+    orientation                  EXIF's number, 1-8, of the pixels as they are decoded
+    alpha                        whether the format holds an alpha channel
+    """
+
+    stored_width: int
+    stored_height: int
+    orientation: int
+    alpha: bool
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) after EXIF rotation."""
+        width, height = self.stored_width, self.stored_height
+        return (height, width) if self.orientation >= 5 else (width, height)
+
+
+@contextmanager
+def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
+    """A Pillow image of one of `formats`, whose pixels are not decoded yet. Nothing but decoding belongs into the block: whatever is raised in it becomes
+    UnreadableImage, but for MemoryError, and OSError where the process has no more memory or open files.
+    """
+    from PIL import Image
+
+    try:
+        with _regular_file(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
+            with Image.open(file, formats=_possible(file, formats)) as image:
+                width, height = image.size
+                if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+                    raise UnreadableImage(f"unreadable: {width}x{height} pixels; at most {MAX_SIDE} a side and {MAX_PIXELS // 10**6} million in all are read")
+                yield image
+    except (UnreadableImage, MemoryError, PipelineError):
+        raise
+    except OSError as error:
+        if error.errno in _NOT_THE_FILES_FAULT:
+            raise
+        raise UnreadableImage(f"unreadable: {_reason(error)}") from error
+    except Exception as error:  # decoders raise whatever they stumble over: struct.error, TypeError, KeyError, RecursionError ...
+        raise UnreadableImage(f"unreadable: {_reason(error)}") from error
+
+
+def _regular_file(path: Path) -> BinaryIO:
+    """The file, open; a pipe or a device is not waited for."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise UnreadableImage("unreadable: not a regular file")
+    return open(descriptor, "rb")
+
+
+def _possible(file: BinaryIO, formats: Sequence[str]) -> tuple[str, ...]:
+    """The decoders that may try. HEIF's is asked only for files of its kind, so that others never load it."""
+    head = file.read(12)
+    file.seek(0)
+    if head[4:8] == b"ftyp" and "HEIF" in formats:
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
+        return ("HEIF",)
+    return tuple(name for name in formats if name != "HEIF")
+
+
+def _reason(error: Exception) -> str:
+    from PIL import Image, UnidentifiedImageError
+
+    if isinstance(error, UnidentifiedImageError):
+        return "no picture in a format that is read (PNG, JPEG, WebP, TIFF, BMP, HEIF), or damaged at its start"
+    if isinstance(error, Image.DecompressionBombError):
+        return f"more than {MAX_PIXELS // 10**6} million pixels"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    text = printable(next(iter(str(error).splitlines()), ""), 100)
+    return text if text and isinstance(error, OSError | SyntaxError | ValueError) else f"damaged ({type(error).__name__}{': ' if text else ''}{text})"
+
+
+def read_header(path: Path) -> Header:
+    """Size, orientation and alpha of a picture; its pixels are not decoded. Raises UnreadableImage."""
+    with opened(path) as image:
+        return Header(image.width, image.height, orientation_of(image), image.mode in _ALPHA_MODES or "transparency" in image.info)
+
+
+def orientation_of(image: Any) -> int:
+    """EXIF's number, 1-8, of an opened image whose pixels are not decoded yet."""
+    number = 1 if image.format == "HEIF" else exif_of(image).get(_ORIENTATION, 1)  # libheif turns the pixels itself
+    return int(number) if number in range(1, 9) else 1
+
+
+def exif_of(image: Any) -> Any:
+    """The EXIF data before the pixels: getexif() would decode the whole of a PNG to look for a late block."""
+    from PIL import Image
+
+    if image.format != "PNG":
+        return image.getexif()
+    exif = Image.Exif()
+    exif.load(image.info.get("exif"))
+    return exif
+
+
+def holds_eight_bits(image: Any) -> bool:
+    """Whether an opened PNG has at most 8 bits a channel: Pillow cuts 16 to 8 without a word."""
+    return os.pread(image.fp.fileno(), 1, 24) <= b"\x08"  # IHDR's bit depth
+
+
+def rgb_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """(rgb, alpha or None) as uint8, decoded by the rules above; raises UnreadableImage for a type of pixel that has none."""
+    _refuse_unknown_samples(image)
+    if image.mode.startswith("I"):
+        deep = np.asarray(image)
+        grey = np.rint(deep / 257.0).astype(np.uint8)
+        see_through = image.info.get("transparency")
+        alpha = None if see_through is None else np.where(deep == see_through, np.uint8(0), np.uint8(255))
+        return np.repeat(grey[..., None], 3, axis=2), alpha
+    if image.mode in _ALPHA_MODES or "transparency" in image.info:
+        rgba = np.asarray((image.convert("LA") if image.mode == "La" else image).convert("RGBA"))
+        return rgba[..., :3], rgba[..., 3]
+    return np.asarray(image.convert("RGB")), None
+
+
+def grey_of(image: Any) -> np.ndarray:
+    """(H, W) uint8 luminance of an opened image for masks: 0 is black; of 16 bits whatever is not 0 is 255."""
+    _refuse_unknown_samples(image)
+    if image.mode.startswith("I"):
+        return np.where(np.asarray(image) > 0, np.uint8(255), np.uint8(0))
+    return np.asarray(image.convert("L"))
+
+
+def _refuse_unknown_samples(image: Any) -> None:
+    """Raise UnreadableImage unless the samples are unsigned integers of up to 8, or of exactly 16 bits."""
+    if image.format == "PNG":
+        return  # 16 bits at most, unsigned, whatever Pillow's version calls them
+    tags = getattr(image, "tag_v2", {})
+    bits, kinds, white_is_zero = tags.get(258, (8,)), tags.get(339, (1,)), tags.get(262) == 0
+    what = None
+    if image.mode == "F" or 3 in kinds:
+        what = "floating point"
+    elif 2 in kinds:
+        what = f"signed {max(bits)}-bit integer"
+    elif image.mode.startswith("I") and (image.mode == "I" or set(bits) != {16} or white_is_zero):
+        what = f"{max(bits)}-bit integer{' with white as 0' if white_is_zero else ''}"
+    if what is not None:
+        raise UnreadableImage(f"unreadable: {what} {image.format}: unsupported pixel type; convert it to 8 or 16 bits")

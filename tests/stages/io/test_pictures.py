@@ -1,0 +1,348 @@
+"""Pictures from anybody: every type of pixel has one meaning or is refused by name, and no file ends more than itself."""
+
+from __future__ import annotations
+
+import ast
+import errno
+import io
+import os
+import random
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from stages.io import photo, pictures, working_images
+from stages.io.capture import Photo
+from stages.io.pictures import UnreadableImage
+from tests.stages import captures
+
+ROOT = Path(__file__).resolve().parents[3]
+RAMP = (np.arange(12, dtype=np.uint16).reshape(3, 4) * 5461).astype(np.uint16)  # 0 to 60071
+DIM = np.arange(12, dtype=np.uint16).reshape(3, 4) * 23  # below 256
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    with pictures.opened(path) as image:
+        return pictures.rgb_and_alpha(image)
+
+
+def grey(values: np.ndarray) -> np.ndarray:
+    return np.repeat(np.asarray(values, np.uint8)[..., None], 3, -1)
+
+
+# --- which files are opened, and where
+
+
+def test_pictures_are_opened_in_one_place() -> None:
+    """Only there are the formats limited; tests may open what they wrote."""
+    opening = {"open": "Image", "imread": "cv2", "imdecode": "cv2", "imreadmulti": "cv2"}
+    wrong = []
+    for package in ("pipeline", "efficientnerf", "stages", "workflows", "benchmarks", "docs", "examples"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                name = node.func if isinstance(node, ast.Call) else None
+                if isinstance(name, ast.Attribute) and opening.get(name.attr) == ast.unparse(name.value).split(".")[-1]:
+                    wrong.append(str(path.relative_to(ROOT)))
+                if isinstance(node, ast.Import | ast.ImportFrom) and "imageio" in ast.unparse(node):
+                    wrong.append(str(path.relative_to(ROOT)))
+    assert wrong == ["stages/io/pictures.py"]
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 24\n%%EndComments\n(x) run\n%%EOF\n"
+
+
+def test_postscript_named_as_a_photograph_is_not_interpreted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from PIL import EpsImagePlugin
+
+    def started(*arguments: Any, **more: Any) -> None:
+        raise AssertionError("Ghostscript was started")
+
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", started)
+    path = tmp_path / "a.png"
+    path.write_bytes(EPS)
+    for attempt in (pictures.read_header, working_images.decode, photo.read_alpha, lambda path: photo.read_photo(path, 100)):
+        with pytest.raises(UnreadableImage, match=r"^unreadable: no picture in a format that is read"):
+            attempt(path)
+
+
+@pytest.mark.parametrize("kind", ["GIF", "PPM", "TGA", "PCX", "SGI", "ICO", "PSD"])
+def test_other_formats_are_refused(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.png"
+    if kind == "PSD":
+        path.write_bytes(b"8BPS" + b"\0" * 100)
+    else:
+        Image.fromarray(captures.picture()).save(path, kind)
+    with pytest.raises(UnreadableImage, match="unreadable"):
+        pictures.read_header(path)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF"])
+def test_the_content_decides_and_not_the_suffix(tmp_path: Path, kind: str) -> None:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    path = tmp_path / "a.bmp"
+    Image.fromarray(np.full((24, 32, 3), 100, np.uint8)).save(path, kind)
+    assert pictures.read_header(path).size == (32, 24)
+    assert np.abs(read(path)[0].astype(int) - 100).max() <= 3
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.png")
+    for path in (tmp_path / "a.png", tmp_path):
+        with pytest.raises(UnreadableImage, match="not a regular file"):
+            pictures.read_header(path)
+
+
+# --- photographs of phones
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_heic_photographs_are_turned_once(tmp_path: Path, orientation: int) -> None:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    seen = np.zeros((64, 96, 3), np.uint8)
+    seen[:32, :48], seen[:32, 48:], seen[32:, :48] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
+    undo = {3: 3, 6: 2, 8: 4}
+    stored = Image.fromarray(seen)
+    stored = stored if orientation == 1 else stored.transpose(Image.Transpose(undo[orientation]))
+    exif = Image.Exif()
+    exif[274], exif[271], exif[272] = orientation, "Maker", "Phone"
+    exif.get_ifd(34665)[41989] = 26  # mm, full-frame equivalent
+    stored.save(tmp_path / "a.heic", "HEIF", exif=exif.tobytes(), quality=95)  # writes the rotation of HEIF too
+    found = photo.read_photo(tmp_path / "a.heic", 1000)
+    assert (found.width, found.height, found.orientation, found.maker) == (96, 64, 1, "Maker Phone")
+    assert found.focal == pytest.approx(26 / np.hypot(36, 24) * np.hypot(96, 64))
+    assert np.abs(found.rgb[8:24, 8:40].astype(int) - (250, 0, 0)).max() < 40
+    assert np.abs(found.rgb[40:56, 8:40].astype(int) - (0, 0, 250)).max() < 40
+    assert pictures.read_header(tmp_path / "a.heic").size == (96, 64)
+    decoded = working_images.decode(tmp_path / "a.heic")
+    assert not decoded.verbatim  # later stages read PNG and JPEG
+    np.testing.assert_array_equal(decoded.pixels, found.rgb)
+
+
+def test_the_density_of_a_turned_heic_counts_along_the_sensor(tmp_path: Path) -> None:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    exif = Image.Exif()
+    exif[274] = 6
+    details = exif.get_ifd(34665)
+    details[37386], details[41486], details[41488], details[40962] = 2.0, 50.0, 4, 96  # 2 mm at 50 pixels a mm; 96 pixels across the sensor
+    Image.fromarray(np.full((64, 96, 3), 99, np.uint8)).save(tmp_path / "a.heic", "HEIF", exif=exif.tobytes())
+    found = photo.read_photo(tmp_path / "a.heic", 1000)
+    assert (found.width, found.height) == (64, 96)
+    assert found.focal == pytest.approx(100)
+
+
+# --- pixels
+
+
+def tiff(path: Path, values: np.ndarray, **options: Any) -> None:
+    tifffile.imwrite(path, values, photometric=options.pop("photometric", "rgb" if values.ndim == 3 else "minisblack"), **options)
+
+
+def saved(image: Image.Image, kind: str = "PNG") -> Callable[[Path], None]:
+    return lambda path: image.save(path, kind)
+
+
+PALETTE = Image.fromarray(np.array([[0, 1], [2, 0]], np.uint8)).convert("P")
+PALETTE.putpalette([10, 20, 30, 40, 50, 60, 70, 80, 90])
+RGB16 = np.stack([RAMP, RAMP[::-1], RAMP[:, ::-1]], -1)
+CASES: dict[str, tuple[Callable[[Path], Any], np.ndarray]] = {
+    "16-bit grey PNG": (saved(Image.fromarray(RAMP)), grey(np.rint(RAMP / 257))),
+    "16-bit grey PNG, all dark": (saved(Image.fromarray(DIM)), grey(np.rint(DIM / 257))),
+    "16-bit grey TIFF": (lambda path: tiff(path, RAMP), grey(np.rint(RAMP / 257))),
+    "16-bit grey TIFF, big-endian": (lambda path: tiff(path, RAMP, byteorder=">"), grey(np.rint(RAMP / 257))),
+    "16-bit grey TIFF, all dark": (lambda path: tiff(path, DIM), grey(np.rint(DIM / 257))),
+    "16-bit colour TIFF": (lambda path: tiff(path, RGB16), RGB16 >> 8),
+    "16-bit colour PNG": (lambda path: path.write_bytes(cv2.imencode(".png", RGB16[..., ::-1])[1].tobytes()), RGB16 >> 8),
+    "1 bit": (saved(Image.fromarray(np.array([[True, False], [False, True]]))), grey(np.array([[255, 0], [0, 255]]))),
+    "grey": (saved(Image.fromarray(DIM.astype(np.uint8))), grey(DIM)),
+    "palette": (saved(PALETTE), np.array([[[10, 20, 30], [40, 50, 60]], [[70, 80, 90], [10, 20, 30]]])),
+    "CMYK TIFF": (saved(Image.new("CMYK", (2, 2), (255, 0, 51, 0)), "TIFF"), np.broadcast_to((0, 255, 204), (2, 2, 3))),
+    "white is zero, 8 bits": (lambda path: tiff(path, DIM.astype(np.uint8), photometric="miniswhite"), grey(255 - DIM)),
+}
+
+
+@pytest.mark.parametrize("what", CASES)
+def test_types_of_pixels(tmp_path: Path, what: str) -> None:
+    write, expected = CASES[what]
+    write(tmp_path / "a")
+    rgb, alpha = read(tmp_path / "a")
+    assert alpha is None
+    np.testing.assert_array_equal(rgb, expected)
+    np.testing.assert_array_equal(working_images.decode(tmp_path / "a").pixels, expected)
+    np.testing.assert_array_equal(photo.read_photo(tmp_path / "a", 100).rgb, expected)
+
+
+def test_lab_is_converted(tmp_path: Path) -> None:
+    for lightness, expected in [(0, 0), (255, 255)]:
+        Image.new("LAB", (2, 2), (lightness, 128, 128)).save(tmp_path / "a.tif")
+        assert np.abs(read(tmp_path / "a.tif")[0].astype(int) - expected).max() <= 1  # of the colour engine's rounding
+
+
+def test_alpha_of_every_kind(tmp_path: Path) -> None:
+    la = np.stack([DIM, 255 - DIM], -1).astype(np.uint8)
+    Image.fromarray(la, "LA").save(tmp_path / "la.png")
+    rgb, alpha = read(tmp_path / "la.png")
+    np.testing.assert_array_equal(rgb, grey(DIM))
+    np.testing.assert_array_equal(alpha, la[..., 1])
+    Image.fromarray(RAMP).save(tmp_path / "deep.png", transparency=int(RAMP[1, 1]))
+    rgb, alpha = read(tmp_path / "deep.png")
+    np.testing.assert_array_equal(alpha, np.where(int(RAMP[1, 1]) != RAMP, 255, 0))
+    assert pictures.read_header(tmp_path / "deep.png").alpha
+    PALETTE.save(tmp_path / "p.png", transparency=1)
+    np.testing.assert_array_equal(read(tmp_path / "p.png")[1], [[255, 0], [255, 255]])
+
+
+REFUSED: dict[str, tuple[np.ndarray, dict[str, Any], str]] = {
+    "float in 0 to 1": (np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4), {}, "floating point TIFF"),
+    "float with nan": (np.full((3, 4), np.nan, np.float32), {}, "floating point TIFF"),
+    "int32": (RAMP.astype(np.int32), {}, "signed 32-bit integer TIFF"),
+    "uint32": (RAMP.astype(np.uint32), {}, "32-bit integer TIFF"),
+    "int16": (DIM.astype(np.int16), {}, "signed 16-bit integer TIFF"),
+    "int8": (DIM.astype(np.int8), {}, "signed 8-bit integer TIFF"),
+    "16 bits, white is zero": (RAMP, {"photometric": "miniswhite"}, "16-bit integer with white as 0 TIFF"),
+    "float colour": (RGB16.astype(np.float32), {}, ""),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_pixels_without_a_known_white_are_refused_by_name(tmp_path: Path, what: str) -> None:
+    values, options, name = REFUSED[what]
+    tiff(tmp_path / "a.tif", values, **options)
+    for attempt in (read, working_images.decode, lambda path: photo.read_photo(path, 100)):
+        with pytest.raises(UnreadableImage, match=f"^unreadable: {name}.*" + ("unsupported pixel type; convert it to 8 or 16 bits" if name else "")):
+            attempt(tmp_path / "a.tif")
+
+
+def test_a_mask_of_16_bits_keeps_its_labels(tmp_path: Path) -> None:
+    captures.write_picture(tmp_path / "a.png", captures.picture(width=4, height=3))
+    Image.fromarray((DIM > 23).astype(np.uint16)).save(tmp_path / "m.png")
+    found = photo.read_mask_file(tmp_path / "m.png", photo.read_photo(tmp_path / "a.png", 100))
+    np.testing.assert_array_equal(found, DIM > 23)
+
+
+# --- damage
+
+
+def jpeg(exif: bytes = b"") -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(captures.picture()).save(buffer, "JPEG", exif=exif)
+    return buffer.getvalue()
+
+
+def assert_reason_or_none(attempt: Callable[[Path], Any], path: Path) -> None:
+    """That a file is read, or refused with one line."""
+    reason = "unreadable: "
+    try:
+        attempt(path)
+    except UnreadableImage as error:
+        reason = str(error)
+    assert re.fullmatch("unreadable: .*", reason)
+
+
+def png_of_size(width: int, height: int) -> bytes:
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+        + chunk(b"IDAT", zlib.compress(b"\0"))
+        + chunk(b"IEND", b"")
+    )
+
+
+@pytest.mark.parametrize("exif", [b"Exif\0\0II*\0", b"Exif\0\0", b"Exif\0\0MM", b"II*\0\xff\xff\xff\xff", b"\0"])
+def test_exif_that_is_cut_off_leaves_out_that_picture_at_most(tmp_path: Path, exif: bytes) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(jpeg(exif))
+    for attempt in (pictures.read_header, working_images.decode, photo.read_alpha, lambda path: photo.read_photo(path, 100)):
+        assert_reason_or_none(attempt, path)
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (13_378, 13_378), (65_536, 1), (2**31 - 1, 2**31 - 1)])
+def test_sizes_are_bounded_before_anything_is_decoded(tmp_path: Path, size: tuple[int, int]) -> None:
+    (tmp_path / "bomb.png").write_bytes(png_of_size(*size))
+    captures.write_picture(tmp_path / "a.png", captures.picture())
+    fine = photo.read_photo(tmp_path / "a.png", 100)
+    for attempt in (
+        pictures.read_header,
+        working_images.decode,
+        photo.read_alpha,
+        lambda path: photo.read_photo(path, 9),
+        lambda path: photo.read_mask_file(path, fine),
+    ):
+        with pytest.raises(UnreadableImage, match=r"^unreadable: .*million"):
+            attempt(tmp_path / "bomb.png")
+    masked = Photo(captures.cameras(1)[0], tmp_path / "a.png", tmp_path / "bomb.png")
+    with pytest.raises(UnreadableImage, match=r"its mask bomb\.png is unreadable: .*million"):
+        working_images.write(masked, tmp_path / "out", "a.png", max_side=64, keep_alpha=False)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF", "WEBP", "BMP", "HEIF"])
+def test_mutated_pictures_are_read_or_unreadable(tmp_path: Path, kind: str) -> None:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    buffer, rng = io.BytesIO(), random.Random(kind)
+    exif = Image.Exif()
+    exif[274], exif[271] = 6, "Maker"
+    Image.fromarray(captures.picture()).save(buffer, kind, **({} if kind == "BMP" else {"exif": exif}))
+    whole = buffer.getvalue()
+    path = tmp_path / "a.png"
+    for _ in range(150):
+        data = bytearray(whole[: rng.randrange(len(whole))] if rng.random() < 0.2 else whole)
+        for _ in range(rng.choice((1, 2, 8))):
+            at = rng.randrange(min(len(data), 400) if rng.random() < 0.7 else len(data)) if data else 0
+            data[at : at + 1] = bytes([rng.choice((0, 1, 127, 128, 255, rng.randrange(256)))])
+        path.write_bytes(data)
+        for attempt in (pictures.read_header, working_images.decode, lambda path: photo.read_photo(path, 20)):
+            assert_reason_or_none(attempt, path)
+
+
+class Failing(Exception):
+    pass
+
+
+@pytest.mark.parametrize("raised", [struct.error("x"), TypeError("x"), KeyError(7), RecursionError(), Failing(), SyntaxError("broken"), IndexError()])
+def test_whatever_a_decoder_raises_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raised: Exception) -> None:
+    captures.write_picture(tmp_path / "a.png", captures.picture())
+
+    def fail(*arguments: Any, **more: Any) -> None:
+        raise raised
+
+    monkeypatch.setattr(Image.Image, "convert", fail)
+    with pytest.raises(UnreadableImage, match=r"^unreadable: "):
+        read(tmp_path / "a.png")
+
+
+def test_the_true_reason_is_said_and_want_of_memory_stays_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UnreadableImage, match="unreadable: No such file"):
+        pictures.read_header(tmp_path / "none.png")
+    captures.write_picture(tmp_path / "a.png", captures.picture())
+    for raised, expected, text in [
+        (OSError(errno.EIO, os.strerror(errno.EIO)), UnreadableImage, "unreadable: Input/output error"),
+        (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), UnreadableImage, "unreadable: Permission denied"),
+        (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), OSError, "Too many open files"),
+        (MemoryError("none left"), MemoryError, "none left"),
+    ]:
+
+        def fail(*arguments: Any, raised: BaseException = raised, **more: Any) -> None:
+            raise raised
+
+        monkeypatch.setattr(Image, "open", fail)
+        with pytest.raises(expected, match=text):
+            pictures.read_header(tmp_path / "a.png")
