@@ -124,7 +124,7 @@ def run(job: Job) -> None:
     save(scene, job.out)
     _write_report(PosesOutputs(job.out).report, capture, scene, framed.facts, notes)
     job.safe_point()
-    write_contact_sheet(scene, job.out, capture.rejected, job.source)
+    write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
 
 STAGE = Stage(name="poses", version=2, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
@@ -133,7 +133,7 @@ STAGE = Stage(name="poses", version=2, settings=PosesSettings, needs=(), run=run
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
     assert job.source is not None
-    possible = importers.candidates(job.source) if settings.format == "auto" else [settings.format]
+    possible = importers.candidates(job.source, settings.allow_outside) if settings.format == "auto" else [settings.format]
     name = possible[0]
     if len(possible) > 1 and possible[1:] != ["photographs"]:
         warn(f"{job.source} is read as {name}; it could also be {', '.join(possible[1:])}. Choose with --as.")
@@ -155,20 +155,25 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
     assert job.source is not None
     source = Source(job.source, settings.allow_outside)
-    images = [source.check_inside(path) for path in photographs(source.root)]
-    return find_cameras(
+    paths = {source.name_of(path): source.real(path) for path in photographs(source)}
+    masks = {source.name_of(image): source.real(mask) for image, mask in masks_of(source, photographs(source)).items()}
+    for sentence in source.run_warnings():
+        warn(sentence)
+    found = find_cameras(
         source.root,
-        [source.name_of(path) for path in images],
+        [*paths],
         max_side=settings.feature_image_size,
         features=settings.max_features,
         matching=settings.matching,
         seed=settings.seed,
-        masks={source.name_of(image): mask for image, mask in masks_of(source, images).items()},
+        paths=paths,
+        masks=masks,
         work=job.work / "cameras",
         progress=job.progress,
         safe_point=job.safe_point,
         warn=warn,
     )
+    return replace(found, rejected_files={name: paths[name] for name, _ in found.rejected})
 
 
 def _format_of(capture: Capture) -> str:
@@ -211,11 +216,13 @@ def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, s
     if not failed:
         return capture
     place = {index: new for new, index in enumerate(kept)}
+    files = {photo.camera.name: photo.image for index, photo in enumerate(capture.photos) if index not in place}
     points = capture.points
     if points is not None:
         tracks = tuple(tuple(place[photo] for photo in track if photo in place) for track in points.tracks)
         points = SparsePoints(points.xyz, points.rgb, points.error, tracks)
-    return replace(capture, photos=tuple(capture.photos[index] for index in kept), points=points, rejected=(*capture.rejected, *failed))
+    photos = tuple(capture.photos[index] for index in kept)
+    return replace(capture, photos=photos, points=points, rejected=(*capture.rejected, *failed), rejected_files=capture.rejected_files | files)
 
 
 def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: None) -> list[str]:

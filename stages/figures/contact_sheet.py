@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.pictures import UnreadableImage, opened
 from stages.io.scene import SPLITS, Scene
@@ -20,19 +21,23 @@ MAX_THUMBNAILS = 240  # of larger captures every n-th image is shown
 COLOURS = {"train": (70, 130, 180), "val": (218, 165, 32), "test": (60, 160, 75), "rejected": (200, 40, 40)}
 
 
-def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str, str]], source: Path) -> None:
-    """Write the contact sheet of the folder of a scene: thumbnails framed in the colour of their split, names below; rejected ones crossed out, at the end."""
+def write_contact_sheet(scene: Scene, folder: Path, rejected: Sequence[tuple[str, str]], files: Mapping[str, Path]) -> None:
+    """Write the contact sheet of the folder of a scene: thumbnails framed in the colour of their split, names below; rejected ones crossed out, at the end.
+
+    rejected  (name, reason) of each
+    files     name -> file of those that have a picture; names themselves are never opened, they may be anybody's
+    """
     from stages.figures.plots import contact_sheet
 
     entries: list[tuple[Path | None, str, str]] = [(folder / view.image, view.name, view.split) for view in scene.views]
     every = -(-len(entries) // MAX_THUMBNAILS)
     counts = {split: sum(entry[2] == split for entry in entries) for split in SPLITS} | {"rejected": len(rejected)}
     title = f"{len(entries)} images: " + ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-    shown = entries[::every] + [(_readable(source / name), name, "rejected") for name, _ in rejected[: MAX_THUMBNAILS // 4]]
+    shown = entries[::every] + [(files.get(name), name, "rejected") for name, _ in rejected[: MAX_THUMBNAILS // 4]]
     rows = [shown[first : first + COLUMNS] for first in range(0, len(shown), COLUMNS)]
     contact_sheet(
         [[_framed(path, split) for path, _, split in row] for row in rows],
-        [[f"{name} {split}" for _, name, split in row] for row in rows],
+        [[printable(f"{name} {split}") for _, name, split in row] for row in rows],
         PosesOutputs(folder).contact_sheet,
         thumbnail=THUMBNAIL + 2 * FRAME,
         title=title + (f" (every {every}th shown)" if every > 1 else ""),
@@ -48,10 +53,6 @@ def _framed(path: Path | None, split: str) -> np.ndarray:
         draw.line((0, 0, right, bottom), fill=COLOURS[split], width=FRAME)
         draw.line((0, bottom, right, 0), fill=COLOURS[split], width=FRAME)
     return np.asarray(framed)
-
-
-def _readable(path: Path) -> Path | None:
-    return path if path.is_file() else None
 
 
 def _thumbnail(path: Path | None) -> Any:

@@ -16,8 +16,8 @@ class Photo:
 
     camera      in the capture's frame, for the image after EXIF rotation, at the source's full size; its name is the image's
                 path relative to the source folder
-    image       the file itself
-    mask        the file of its mask, or None
+    image       the file itself, without links
+    mask        the file of its mask, without links, or None
     mask_ignore "black" if zero pixels of the mask are left out, "white" if the non-zero ones are
     split       "train", "val" or "test" where the source states it, else None
     near, far   along the view axis in the capture's units where the source states it, else None
@@ -59,6 +59,7 @@ class Capture:
     points      or None
     bounds      (2, 3) box in the capture's frame where the source states one (instant-ngp's aabb), else None
     rejected    (name, reason) of each image that could not be used
+    rejected_files  name -> file, without links, of those of the rejected that are there
     warnings    sentences for the user
     reprojection_error  mean, pixels, where known
     metric      whether a unit of the capture's frame is known to be a metre
@@ -75,3 +76,4 @@ class Capture:
     reprojection_error: float | None = None
     metric: bool = False
     facts: dict[str, object] = field(default_factory=dict)
+    rejected_files: dict[str, Path] = field(default_factory=dict)

@@ -36,7 +36,7 @@ MAX_PIXELS = 178_956_970  # of a picture, from its header, before anything is de
 _ORIENTATION = 274
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 # The fault of the process or the machine, not of one file: to leave pictures out for these would change results in silence.
-_NOT_THE_FILES_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+NOT_THE_FILES_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 class UnreadableImage(Exception):
@@ -82,7 +82,7 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     except (UnreadableImage, MemoryError, PipelineError):
         raise
     except OSError as error:
-        if error.errno in _NOT_THE_FILES_FAULT:
+        if error.errno in NOT_THE_FILES_FAULT:
             raise
         raise UnreadableImage(f"unreadable: {_reason(error)}") from error
     except Exception as error:  # decoders raise whatever they stumble over: struct.error, TypeError, KeyError, RecursionError ...

@@ -19,6 +19,7 @@ from stages.io.photo import apply_exif_orientation, same_aspect, working_size
 from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, read_header, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
+MAX_PART = 200  # bytes of a part of the path of a working image
 OPAQUE = 128  # alpha from which a pixel counts where alpha is used as a mask
 
 
@@ -137,7 +138,7 @@ def image_paths(cameras: list[Camera]) -> list[str]:
     taken: set[str] = set()
     paths = []
     for camera in cameras:
-        parts = [part for part in PurePosixPath(camera.name).parts if part not in ("/", "..")]
+        parts = [_short(part) for part in PurePosixPath(camera.name).parts if part not in ("/", "..")]
         parts = parts[1:] if len(parts) > 1 and re.fullmatch(r"images(_\d+)?", parts[0]) else parts
         path, again = PurePosixPath(*parts), 2
         while path.with_suffix("").as_posix().lower() in taken:
@@ -145,6 +146,15 @@ def image_paths(cameras: list[Camera]) -> list[str]:
         taken.add(path.with_suffix("").as_posix().lower())
         paths.append(path.as_posix())
     return paths
+
+
+def _short(part: str) -> str:
+    """A part of a path that leaves room for what is added to it, within what file systems take: 255 bytes, and a name's escapes make it longer."""
+    if len(part.encode()) <= MAX_PART:
+        return part
+    suffix = PurePosixPath(part).suffix
+    suffix = suffix if len(suffix) <= 8 else ""
+    return part.encode()[: MAX_PART - 8].decode(errors="ignore") + suffix
 
 
 def _is_plain(image: Any) -> bool:

@@ -124,6 +124,7 @@ def prepare_images(
     features: int,
     seed: int,
     masks: Mapping[str, Path],
+    paths: Mapping[str, Path] | None = None,
     work: Path,
     progress: Progress,
     safe_point: SafePoint,
@@ -131,11 +132,13 @@ def prepare_images(
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
     """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
+    paths    of some or all names: the file that is read, where it is not the name below the folder
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 
     What an earlier, killed call with the same photographs and settings left in `work` is kept, anything else there is removed.
     """
-    request = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "photographs": _digests(folder, names, masks, safe_point)}
+    paths = {name: folder / name for name in names} | dict(paths or {})
+    request = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "photographs": _digests(paths, masks, safe_point)}
     text = json.dumps(request, indent=1, sort_keys=True)
     record = work / "request.json"
     if not record.is_file() or record.read_text() != text:
@@ -147,11 +150,11 @@ def prepare_images(
         write_atomically(record, text.encode(), durable=False)
     images: list[WorkImage] = []
     rejected: list[tuple[str, str]] = []
-    for index, name in enumerate(sorted(names)):
+    for index, name in enumerate(sorted(paths)):
         safe_point()
         note = work / "copies" / f"{index:05d}.json"
         if not note.is_file():
-            write_json(note, _copy(folder, name, index, max_side, masks.get(name), work), durable=False)
+            write_json(note, _copy(name, paths[name], index, max_side, masks.get(name), work), durable=False)
         copied = json.loads(note.read_text())
         if "reason" in copied:
             rejected.append((name, copied["reason"]))
@@ -160,25 +163,25 @@ def prepare_images(
             if copied["remark"]:
                 warn(f"{name}: {copied['remark']}")
             images.append(WorkImage(**copied["image"]))
-        progress(index + 1, len(names), "reading photographs")
+        progress(index + 1, len(paths), "reading photographs")
     return images, rejected
 
 
-def _digests(folder: Path, names: Sequence[str], masks: Mapping[str, Path], safe_point: SafePoint) -> list[list[str | None]]:
+def _digests(paths: Mapping[str, Path], masks: Mapping[str, Path], safe_point: SafePoint) -> list[list[str | None]]:
     rows: list[list[str | None]] = []
-    for name in sorted(names):
+    for name in sorted(paths):
         safe_point()
         try:
-            digest = _sha256(folder / name)
+            digest = _sha256(paths[name])
         except OSError as error:
             digest = str(error.strerror)
         rows.append([name, digest, _sha256(masks[name]) if name in masks else None])
     return rows
 
 
-def _copy(folder: Path, name: str, index: int, max_side: int, mask_path: Path | None, work: Path) -> dict[str, Any]:
+def _copy(name: str, path: Path, index: int, max_side: int, mask_path: Path | None, work: Path) -> dict[str, Any]:
     try:
-        photo: DecodedPhoto = read_photo(folder / name, max_side)
+        photo: DecodedPhoto = read_photo(path, max_side)
     except UnreadableImage as error:
         return {"reason": str(error)}
     file = f"{index:05d}.png"

@@ -38,6 +38,7 @@ def find_cameras(
     features: int = 4096,
     matching: str = "auto",
     seed: int = 0,
+    paths: Mapping[str, Path] | None = None,
     masks: Mapping[str, Path] | None = None,
     work: Path,
     progress: Callable[..., None],
@@ -50,6 +51,7 @@ def find_cameras(
     max_side        longest side of the photographs in which features are detected, pixels
     features        most features of a photograph
     matching        "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
+    paths           of some or all names: the file that is read, where it is not the name below the folder
     masks           of some or all names: no features where the mask is black
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
@@ -58,8 +60,9 @@ def find_cameras(
 
     Raises BadInput where fewer than 3 or less than half of the photographs are registered, StageFailed where the process aborts.
     """
-    masks = masks or {}
+    paths, masks = paths or {}, masks or {}
     arguments = {"folder": os.path.abspath(folder), "names": [*names], "max_side": max_side, "features": features, "matching": matching, "seed": seed}
+    arguments |= {"paths": {name: os.path.abspath(path) for name, path in paths.items()}}
     arguments |= {"masks": {name: os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
     resumed = matches.database_path(work).exists()
     try:
@@ -68,12 +71,13 @@ def find_cameras(
         if resumed:  # what was left by an earlier attempt may be what COLMAP cannot bear
             matches.remove_database(work)
         raise
-    return _capture_from(found, folder, masks)
+    return _capture_from(found, folder, paths, masks)
 
 
 def capture_for(arguments: Mapping[str, Any], **callables: Callable[..., None]) -> dict[str, Any]:
     """`reconstruct` for arguments that have come through JSON; the capture as JSON can hold it."""
-    paths = {"folder": Path(arguments["folder"]), "work": Path(arguments["work"]), "masks": {name: Path(path) for name, path in arguments["masks"].items()}}
+    paths: dict[str, Any] = {"folder": Path(arguments["folder"]), "work": Path(arguments["work"])}
+    paths |= {of: {name: Path(path) for name, path in arguments[of].items()} for of in ("paths", "masks")}
     with _alone(Path(arguments["work"]), callables["safe_point"]):
         return _plain(reconstruct(**{**arguments, **paths}, **callables))  # type: ignore[arg-type]
 
@@ -106,6 +110,7 @@ def reconstruct(
     features: int,
     matching: str,
     seed: int,
+    paths: Mapping[str, Path] | None = None,
     masks: Mapping[str, Path],
     work: Path,
     progress: Callable[..., None],
@@ -115,7 +120,17 @@ def reconstruct(
     """`find_cameras` in this process."""
     work.mkdir(parents=True, exist_ok=True)
     images, unreadable = matches.prepare_images(
-        folder, names, max_side=max_side, features=features, seed=seed, masks=masks, work=work, progress=progress, safe_point=safe_point, warn=warn
+        folder,
+        names,
+        max_side=max_side,
+        features=features,
+        seed=seed,
+        masks=masks,
+        paths=paths,
+        work=work,
+        progress=progress,
+        safe_point=safe_point,
+        warn=warn,
     )
     if len(images) < mapping.MIN_MODEL_SIZE:
         raise BadInput(
@@ -155,14 +170,14 @@ def _plain(capture: Capture) -> dict[str, Any]:
     }
 
 
-def _capture_from(found: Mapping[str, Any], folder: Path, masks: Mapping[str, Path]) -> Capture:
+def _capture_from(found: Mapping[str, Any], folder: Path, paths: Mapping[str, Path], masks: Mapping[str, Path]) -> Capture:
     """The inverse of `_plain`."""
     xyz, rgb, error, poses = (np.frombuffer(base64.b64decode(data), dtype).reshape(shape).copy() for dtype, shape, data in found["arrays"])
     lenses = zip(found["lenses"], poses, strict=True)
     cameras = [Camera(name, width, height, model, tuple(params), pose) for (name, width, height, model, params), pose in lenses]
     return Capture(
         kind="photographs",
-        photos=tuple(Photo(camera=camera, image=folder / camera.name, mask=masks.get(camera.name)) for camera in cameras),
+        photos=tuple(Photo(camera, paths.get(camera.name, folder / camera.name), masks.get(camera.name)) for camera in cameras),
         background=None,
         points=SparsePoints(xyz, rgb, error, tuple(tuple(track) for track in found["tracks"])),
         rejected=tuple((name, reason) for name, reason in found["rejected"]),

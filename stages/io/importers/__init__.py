@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput
+from pipeline.text import printable
 from stages.io.capture import Capture
-from stages.io.importers.source import ImportSettings
+from stages.io.importers.source import ImportSettings, Source
+from stages.io.pictures import NOT_THE_FILES_FAULT
 
 
 @dataclass(frozen=True)
@@ -27,22 +31,42 @@ class Importer:
     renders: bool = False
     dialect: str | None = None
 
-    def recognises(self, folder: Path) -> bool:
+    def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         """Whether a folder holds files of this format; BadInput where they cannot be read."""
-        return bool(self._call("recognises", folder))
+        with _shown(folder):
+            return bool(self._function("recognises")(folder, allow_outside, *self._dialect))
 
     def read(self, folder: Path, settings: ImportSettings) -> Capture:
-        """The capture; raises BadInput."""
-        capture: Capture = self._call("read", folder, settings)
-        return capture
+        """The capture, whose names and sentences may be shown; raises BadInput."""
+        with _shown(folder):
+            capture: Capture = self._function("read")(folder, settings, *self._dialect)
+        return replace(capture, warnings=tuple(map(printable, capture.warnings)))
 
     def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
         """What the capture depends on; raises BadInput."""
-        paths: list[Path] = import_module(f"{__name__}.{self.module}").files(folder, settings)
+        with _shown(folder):
+            paths: list[Path] = self._function("files")(folder, settings)
         return paths
 
-    def _call(self, function: str, *arguments: Any) -> Any:
-        return getattr(import_module(f"{__name__}.{self.module}"), function)(*arguments, *(() if self.dialect is None else (self.dialect,)))
+    def _function(self, name: str) -> Callable[..., Any]:
+        return getattr(import_module(f"{__name__}.{self.module}"), name)
+
+    @property
+    def _dialect(self) -> tuple[str, ...]:
+        return () if self.dialect is None else (self.dialect,)
+
+
+@contextmanager
+def _shown(folder: Path) -> Iterator[None]:
+    """BadInput whose text is one line that may be shown, whatever the names in it hold; also where a file or folder of the source cannot be read."""
+    try:
+        yield
+    except BadInput as error:
+        raise BadInput(printable(error)) from error
+    except OSError as error:
+        if error.errno in NOT_THE_FILES_FAULT:
+            raise
+        raise BadInput(printable(f"{error.filename or folder}: cannot be read ({error.strerror or error}). Check the source folder.")) from error
 
 
 # In order of preference: a folder may hold several formats.
@@ -57,27 +81,28 @@ IMPORTERS: dict[str, Importer] = {
 FORMATS = ("auto", *IMPORTERS)
 
 
-def detect(folder: Path) -> str:
+def detect(folder: Path, allow_outside: bool = False) -> str:
     """The name of the format of a source folder; BadInput where it is none."""
-    return candidates(folder)[0]
+    return candidates(folder, allow_outside)[0]
 
 
-def candidates(folder: Path) -> list[str]:
+def candidates(folder: Path, allow_outside: bool = False) -> list[str]:
     """Every format that the folder could be read as, the one to choose first; BadInput where there is none."""
     if not folder.exists():
         raise BadInput(f"{folder}: no such folder. Expected a folder of photographs or a posed data set.")
     if not folder.is_dir():
         raise BadInput(f"{folder}: a file; expected a folder of photographs or of a posed data set. Name the folder that holds it.")
-    found = [name for name, importer in IMPORTERS.items() if importer.recognises(folder)]
+    found = [name for name, importer in IMPORTERS.items() if importer.recognises(folder, allow_outside)]
     if not found:
         from stages.io.importers.photographs import photographs
 
-        photographs(folder)  # anywhere below; says what is there instead
+        with _shown(folder):
+            photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
         found.append("photographs")
     return found
 
 
 def files(folder: Path, settings: Any) -> list[Path]:
     """What the poses stage depends on: the files of the format in question that it reads."""
-    name = detect(folder) if settings.format == "auto" else settings.format
+    name = detect(folder, settings.allow_outside) if settings.format == "auto" else settings.format
     return sorted(set(IMPORTERS[name].files(folder, settings)))

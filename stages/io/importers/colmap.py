@@ -13,6 +13,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, pose_from_colmap
 from pipeline.errors import BadInput
+from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.colmap_model import Model, Points, count_images, model_files, read_model
@@ -25,22 +26,28 @@ _IMAGE_PLACES = ("images", "input", "rgb", "photos", ".", "../images", "../../im
 _REMEDY = "Put the images into a folder `images` beside the model."
 
 
-def model_folders(folder: Path) -> list[Path]:
-    """Every folder of the source that holds a model, the one with most images first (then in order of name)."""
+def model_folders(source: Source) -> list[Path]:
+    """Every folder of the source that holds a model, the one with most images first (then in order of name). Raises BadInput."""
+    folder = source.root
     places = dict.fromkeys(place for pattern in _MODEL_PLACES for place in (sorted(folder.glob(pattern)) if pattern != "." else [folder]))
     found = [place for place in places if place.is_dir() and model_files(place)]
-    return sorted(found, key=count_images, reverse=True) if len(found) > 1 else found
+    return sorted(found, key=lambda place: count_images(_files(source, place)), reverse=True) if len(found) > 1 else found
 
 
-def recognises(folder: Path) -> bool:
-    return bool(model_folders(folder))
+def recognises(folder: Path, allow_outside: bool = False) -> bool:
+    return bool(model_folders(Source(folder, allow_outside)))
+
+
+def _files(source: Source, place: Path) -> list[Path]:
+    """The files of a model, without links."""
+    return [source.real(path) for path in model_files(place) or []]
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The files of the model that is used, the images that it names and their masks."""
     source = Source(folder, settings.allow_outside)
     place = _best(source)
-    model = read_model(place, points=False)
+    model = read_model(place, _files(source, place), points=False)
     images = [path for path in _find_images(source, model)[0].values() if path is not None]
     return [*(model_files(place) or []), *images, *masks_of(source, images).values()]
 
@@ -49,14 +56,14 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     """The capture that the folder's best model describes. Raises BadInput."""
     source = Source(folder, settings.allow_outside)
     place = _best(source)
-    model = read_model(place)
+    model = read_model(place, _files(source, place))
     where = source.name_of(place) if place != source.root else source.root.name
     images, places, extensions = _find_images(source, model)
-    missing = sorted(model.images[number].name for number, path in images.items() if path is None)
+    missing = sorted(printable(model.images[number].name) for number, path in images.items() if path is None)
     here = {number: path for number, path in images.items() if path is not None}
     warnings = missing_images_warning(where, len(images), len(here), missing, settings.strict, _REMEDY)
     warnings += moved_images_warnings(where, places, extensions)
-    others = [f"{source.name_of(other)} ({count_images(other)} images)" for other in model_folders(source.root) if other != place]
+    others = [f"{source.name_of(other)} ({count_images(_files(source, other))} images)" for other in model_folders(source) if other != place]
     if others:
         warnings.append(f"{where} with {len(model.images)} images is used; there is also {abbreviated(others)}.")
     photos, ids, rejected, remarks = _photos(source, model, here, where)
@@ -70,18 +77,18 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
         photos=photos,
         background=None,
         points=points,
-        rejected=(*((name, "listed but missing on disk") for name in missing), *rejected),
+        rejected=(*((name, "listed but missing on disk") for name in missing), *((name, reason) for name, reason, _ in rejected)),
         warnings=tuple(warnings + remarks),
         reprojection_error=_mean_error(points),
         facts={"model": where, "registered": len(model.images), "cameras": len(model.cameras)},
+        rejected_files={name: file for name, _, file in rejected},
     )
 
 
 def _best(source: Source) -> Path:
-    found = model_folders(source.root)
+    found = model_folders(source)
     if not found:
         raise BadInput(f"{source.root}: no COLMAP model: expected cameras and images (.bin or .txt) here, in sparse/ or sparse/0. Choose a format with --as.")
-    source.check_inside(found[0])
     return found[0]
 
 
@@ -93,7 +100,7 @@ def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], 
     names = {number: image.name for number, image in sorted(model.images.items(), key=lambda item: item[1].name)}
     places_to_look = [Path(os.path.normpath(base / place)) for place in _IMAGE_PLACES for base in (source.root, model.folder, model.folder.parent)]
     candidates = [path for path in dict.fromkeys(places_to_look) if path.is_dir() and path.is_relative_to(source.root)]
-    counts = {folder: sum((folder / name).is_file() for name in names.values()) for folder in candidates}
+    counts = {folder: sum(os.path.isfile(folder / name) for name in names.values()) for folder in candidates}
     best = max(candidates, key=lambda folder: counts[folder])  # the first of equals
     found: dict[int, Path | None] = {}
     places: list[tuple[str, str]] = []
@@ -106,20 +113,22 @@ def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], 
     return found, places, extensions
 
 
-def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> tuple[tuple[Photo, ...], dict[int, int], list[tuple[str, str]], list[str]]:
-    """Photos sorted by name; COLMAP's image id -> index of its photo; the rejected; warnings."""
+def _photos(
+    source: Source, model: Model, here: dict[int, Path], where: str
+) -> tuple[tuple[Photo, ...], dict[int, int], list[tuple[str, str, Path]], list[str]]:
+    """Photos sorted by name; COLMAP's image id -> index of its photo; name, reason and file of the rejected; warnings."""
     masks = masks_of(source, list(here.values()))
     kept: list[tuple[int, Photo]] = []
-    rejected: list[tuple[str, str]] = []
+    rejected: list[tuple[str, str, Path]] = []
     warnings: list[str] = []
     remarks_by_kind: dict[str, list[str]] = {}
     for number, path in here.items():
         posed, name = model.images[number], source.name_of(path)
         lens = model.cameras[posed.camera]
         try:
-            header = read_header(path)
+            header = read_header(source.real(path))
         except UnreadableImage as error:
-            rejected.append((name, str(error)))
+            rejected.append((name, str(error), source.real(path)))
             warnings.append(f"{name}: {error}; left out.")
             continue
         pose = pose_from_colmap(np.array(posed.quaternion), np.array(posed.translation))
@@ -127,7 +136,8 @@ def _photos(source: Source, model: Model, here: dict[int, Path], where: str) -> 
         camera, remark = lenses.fit_to_image(stated, header, f"{where}: {posed.name}")
         if remark is not None:
             remarks_by_kind.setdefault(remark, []).append(name)
-        kept.append((number, Photo(camera, path, masks.get(path))))
+        mask = source.real(masks[path]) if path in masks else None
+        kept.append((number, Photo(camera, source.real(path), mask)))
     kept.sort(key=lambda item: item[1].camera.name)
     ids = {number: index for index, (number, _) in enumerate(kept)}
     return tuple(photo for _, photo in kept), ids, rejected, warnings + lenses.fit_warnings(where, remarks_by_kind)

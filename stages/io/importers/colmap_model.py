@@ -86,11 +86,8 @@ def model_files(folder: Path) -> list[Path] | None:
     return None
 
 
-def count_images(folder: Path) -> int:
-    """The number of images that a model states, from its header; 0 where it cannot be read."""
-    found = model_files(folder)
-    if not found:
-        return 0
+def count_images(found: list[Path]) -> int:
+    """The number of images that a model of these files states, from its header; 0 where it cannot be read."""
     path = found[1]
     if path.suffix == ".bin":
         with path.open("rb") as file:
@@ -99,9 +96,12 @@ def count_images(folder: Path) -> int:
     return sum(1 for _ in _image_lines(path))
 
 
-def read_model(folder: Path, *, points: bool = True) -> Model:
-    """The model in a folder, with or without its points. Raises BadInput."""
-    found = model_files(folder)
+def read_model(folder: Path, found: list[Path] | None = None, *, points: bool = True) -> Model:
+    """The model in a folder, with or without its points. Raises BadInput.
+
+    found  its files as they are opened, in the order of `model_files`, where they are known
+    """
+    found = model_files(folder) if found is None else found
     if found is None:
         raise BadInput(f"{folder}: no COLMAP model: expected cameras and images as .bin or .txt.")
     for path in found:

@@ -28,7 +28,7 @@ class Defaults:
 
 def describe_source(folder: Path, format: str = "auto") -> dict[str, Any]:
     """What `enerf inspect SOURCE` prints of a data set: count, resolutions, camera models, bounds, warnings. Raises BadInput."""
-    possible = candidates(folder)
+    possible = candidates(folder, Defaults.allow_outside)
     name = possible[0] if format == "auto" else format
     described = _posed(IMPORTERS[name].read(folder, Defaults())) if IMPORTERS[name].posed else _photographs(folder)
     others = [other for other in possible if other not in (name, "photographs")]
@@ -79,17 +79,18 @@ def _posed(capture: Capture) -> dict[str, Any]:
 
 def _photographs(folder: Path) -> dict[str, Any]:
     source = Source(folder)
-    images = [source.check_inside(path) for path in photographs(folder)]
+    images = photographs(source)
     sizes, rejected, turned = [], [], 0
     for image in images:
         try:
-            header = read_header(image)
+            header = read_header(source.real(image))
         except UnreadableImage as error:
             rejected.append({"name": source.name_of(image), "reason": str(error)})
             continue
         sizes.append(header.size)
         turned += header.orientation != 1
     warnings = [f"{entry['name']}: {entry['reason']}" for entry in rejected]
+    warnings += source.run_warnings()
     if turned:
         warnings.append(f"{turned} images are rotated by their EXIF orientation.")
     if len(set(sizes)) > 1:

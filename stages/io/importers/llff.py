@@ -13,6 +13,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, pose_from_llff
 from pipeline.errors import BadInput
+from pipeline.text import printable
 from stages.io.capture import Capture, Photo
 from stages.io.importers import lenses
 from stages.io.importers.photographs import masks_of
@@ -22,7 +23,7 @@ from stages.io.pictures import UnreadableImage, read_header
 POSES = "poses_bounds.npy"
 
 
-def recognises(folder: Path) -> bool:
+def recognises(folder: Path, allow_outside: bool = False) -> bool:
     return (folder / POSES).is_file()
 
 
@@ -39,25 +40,27 @@ def image_folders(folder: Path) -> dict[int, Path]:
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The matrix of poses, the images of the folder that is used, and their masks."""
     source = Source(folder, settings.allow_outside)
-    images = _images(source, settings, len(read_rows(folder / POSES)))[0]
+    images = _images(source, settings, len(_rows(source)))[0]
     return [folder / POSES, *images, *masks_of(source, images).values()]
 
 
 def read(folder: Path, settings: ImportSettings) -> Capture:
     """The capture that poses_bounds.npy describes. Raises BadInput."""
-    rows = read_rows(folder / POSES)
     source = Source(folder, settings.allow_outside)
+    rows = _rows(source)
     images, factor, warnings = _images(source, settings, len(rows))
     masks = masks_of(source, images)
     photos: list[Photo] = []
     rejected: list[tuple[str, str]] = []
+    rejected_files: dict[str, Path] = {}
     remarks: dict[str, list[str]] = {}
     for index, (row, image) in enumerate(zip(rows, images, strict=True)):
         name, where = source.name_of(image), f"{POSES}: row {index} ({source.name_of(image)})"
         try:
-            header = read_header(image)
+            header = read_header(source.real(image))
         except UnreadableImage as error:
             rejected.append((name, str(error)))
+            rejected_files[name] = source.real(image)
             warnings.append(f"{name}: {error}; left out.")
             continue
         camera, remark = lenses.fit_to_image(_camera(row, name, where), header, where)
@@ -66,7 +69,8 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
         near, far = float(row[15]), float(row[16])
         if not 0 < near < far:
             raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
-        photos.append(Photo(camera, image, masks.get(image), near=near, far=far))
+        mask = source.real(masks[image]) if image in masks else None
+        photos.append(Photo(camera, source.real(image), mask, near=near, far=far))
     if len(photos) < MIN_IMAGES:
         raise BadInput(f"{folder}: {len(photos)} usable images; at least {MIN_IMAGES} are needed.")
     return Capture(
@@ -75,8 +79,13 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
         background=None,
         rejected=tuple(rejected),
         warnings=tuple(warnings + lenses.fit_warnings(POSES, remarks)),
-        facts={"image_folder": images[0].parent.name, "factor": factor},
+        facts={"image_folder": printable(images[0].parent.name), "factor": factor},
+        rejected_files=rejected_files,
     )
+
+
+def _rows(source: Source) -> np.ndarray:
+    return read_rows(source.real(source.root / POSES))
 
 
 def _camera(row: np.ndarray, name: str, where: str) -> Camera:

@@ -11,28 +11,29 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.errors import BadInput
-from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, walk
+from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in
 
 MASKS = "masks"
 # What conversions leave beside the photographs: reductions, depth maps, masks.
 _NOT_PHOTOGRAPHS = {MASKS, "mask", "depth", "depths", "sparse", "dense", "stereo"}
 
 
-def recognises(folder: Path) -> bool:
+def recognises(folder: Path, allow_outside: bool = False) -> bool:
     return bool(images_in(folder) or images_in(folder / "images"))
 
 
-def photographs(folder: Path) -> list[Path]:
-    """The photographs of a folder: directly in it, else in its folder images/, else anywhere below it; sorted by path."""
+def photographs(source: Source) -> list[Path]:
+    """The photographs of a source: directly in it, else in its folder images/, else anywhere below it; sorted by path. Raises BadInput."""
+    folder = source.root
     found = images_in(folder) or images_in(folder / "images")
     if not found:
-        everything = walk(folder)
+        everything = source.walk()
         found = sorted(path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not _NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1]))
         if not found:
             raise BadInput(_nothing(folder, everything))
     if len(found) > MAX_FRAMES:
         raise BadInput(f"{folder}: {len(found)} images; at most {MAX_FRAMES} are read.")
-    return found
+    return [source.check_inside(path) for path in found]
 
 
 def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
@@ -63,7 +64,7 @@ def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The photographs and their masks."""
     source = Source(folder, settings.allow_outside)
-    images = [source.check_inside(path) for path in photographs(folder)]
+    images = photographs(source)
     return [*images, *masks_of(source, images).values()]
 
 

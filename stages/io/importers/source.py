@@ -2,7 +2,10 @@
 
 Data sets travel: lists hold absolute paths of another computer, extensions that have changed, files that were never copied. A listed
 name is therefore searched for, in this order: as listed; with another extension; by its last parts, from the longest, inside the
-source; absolute paths also by their file name alone. What lies outside the source folder is not read unless the user allows it.
+source; absolute paths also by their file name alone.
+
+What lies outside the source folder is not read unless the user allows it. `Source.real` is the one gate: it follows the links of a path once, and the path
+that it returns is the one that is opened, whatever becomes of the links later.
 """
 
 from __future__ import annotations
@@ -14,7 +17,9 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Protocol
 
 from efficientnerf.settings import Auto
+from pipeline import files, run
 from pipeline.errors import BadInput
+from pipeline.text import printable
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".hif")
 MAX_FRAMES = 100_000
@@ -57,28 +62,58 @@ class Source:
 
     root           the folder
     allow_outside  whether files outside it may be read
+    runs           run folders below it that a look-up came by: what they hold was made from the source, and is no part of it
     """
 
     root: Path
     allow_outside: bool = False
+    runs: set[Path] = field(default_factory=set)
+    _real: dict[Path, Path] = field(default_factory=dict)
+    _names: dict[Path, str] = field(default_factory=dict)
+    _taken: set[str] = field(default_factory=set)
     _folders: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
     _by_name: dict[str, list[Path]] | None = None
 
     def __post_init__(self) -> None:
         self.root = Path(os.path.abspath(self.root))
+        self._real[self.root] = Path(os.path.realpath(self.root))
 
     def name_of(self, path: Path) -> str:
-        """The path relative to the source folder, with /; for a file outside, its last two parts."""
-        try:
-            return path.relative_to(self.root).as_posix()
-        except ValueError:
-            return "/".join(path.parts[-2:]).strip("/")
+        """What a file is called from here on: its path relative to the source folder, with /; for a file outside, its last two parts. Line ends, terminal
+        escapes and bytes of no encoding are escaped, and no two files have one name.
+        """
+        if path not in self._names:
+            inside = path.is_relative_to(self.root)
+            plain = printable(path.relative_to(self.root).as_posix() if inside else "/".join(path.parts[-2:]).strip("/"))
+            name, again = plain, 2
+            while name in self._taken:
+                name, again = f"{plain} ({again})", again + 1
+            self._taken.add(name)
+            self._names[path] = name
+        return self._names[path]
+
+    def real(self, path: Path) -> Path:
+        """The file that a path leads to, without links, to be opened in its place; BadInput if that lies outside the source folder."""
+        if path not in self._real:
+            target = Path(os.path.realpath(path))
+            if not self.allow_outside and not target.is_relative_to(self._real[self.root]):
+                raise BadInput(f"{path}: leads out of the source folder {self.root} (to {target}). Copy it into the folder, or pass --allow-outside.")
+            self._real[path] = target
+        return self._real[path]
 
     def check_inside(self, path: Path) -> Path:
-        """The path itself; BadInput if it, or the file a link leads to, lies outside the source folder."""
-        if not self.allow_outside and not path.resolve().is_relative_to(self.root.resolve()):
-            raise BadInput(f"{path}: leads out of the source folder {self.root} (to {path.resolve()}). Copy it into the folder, or pass --allow-outside.")
+        """The path itself, which has passed the gate; BadInput otherwise."""
+        self.real(path)
         return path
+
+    def walk(self) -> list[Path]:
+        """Every file of the source, without those of run folders in it; see `walk`."""
+        return walk(self.root, self.runs)
+
+    def run_warnings(self) -> list[str]:
+        """A sentence about the run folders that look-ups came by, if any."""
+        names = [self.name_of(path) for path in sorted(self.runs)]
+        return [f"{abbreviated(names)}: {'runs' if len(names) > 1 else 'a run'} inside the source folder; what was made there is not read."] if names else []
 
     def find(self, name: str, beside: Path | None = None, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Found:
         """The file that a list names.
@@ -88,7 +123,7 @@ class Source:
         Raises BadInput where the name leads out of the source folder.
         """
         beside = beside or self.root
-        if "\0" in name or not name.strip():
+        if not name.strip() or not _is_encodable(name):
             return Found(None)
         foreign = PureWindowsPath(name) if "\\" in name or PureWindowsPath(name).drive else PurePosixPath(name)
         absolute = bool(foreign.root or foreign.drive)
@@ -109,16 +144,13 @@ class Source:
             alike = self._index().get(parts[-1].lower(), [])
             if len(alike) == 1:
                 return Found(self.check_inside(alike[0]), "elsewhere")
-            if here is not None and here.is_file() and not inside:
+            if here is not None and os.path.isfile(here) and not inside:
                 raise BadInput(f"{name}: lies outside the source folder {self.root}. Copy it into the folder, or pass --allow-outside.")
         return Found(None)
 
     def _with_any_suffix(self, path: Path, suffixes: Sequence[str]) -> Found:
-        try:
-            if path.is_file():
-                return Found(self.check_inside(path))
-        except OSError:  # a name longer than the system allows
-            return Found(None)
+        if os.path.isfile(path):
+            return Found(self.check_inside(path))
         stem = path.stem if path.suffix.lower() in suffixes else path.name
         alike = self._folder(path.parent).get(stem.lower(), [])
         usable = [other for other in alike if other.suffix.lower() in suffixes and (other.stem.lower() == stem.lower())]
@@ -131,7 +163,7 @@ class Source:
         """The files of a folder by stem in lower case."""
         if folder not in self._folders:
             stems: dict[str, list[Path]] = {}
-            if folder.is_dir() and (self.allow_outside or folder.resolve().is_relative_to(self.root.resolve())):
+            if os.path.isdir(folder) and (self.allow_outside or Path(os.path.realpath(folder)).is_relative_to(self._real[self.root])):
                 for entry in sorted(folder.iterdir()):
                     stems.setdefault(entry.stem.lower(), []).append(entry)
             self._folders[folder] = stems
@@ -141,25 +173,48 @@ class Source:
         """Every file of the source by name in lower case; links to folders are not followed."""
         if self._by_name is None:
             self._by_name = {}
-            for path in walk(self.root):
+            for path in self.walk():
                 self._by_name.setdefault(path.name.lower(), []).append(path)
         return self._by_name
 
 
-def walk(folder: Path) -> list[Path]:
-    """Every file below a folder in sorted order; hidden ones and links to folders are left out."""
+def walk(folder: Path, runs: set[Path] | None = None) -> list[Path]:
+    """Every file below a folder in sorted order; hidden ones and links to folders are left out, and so are run folders, which go into `runs`."""
     found: list[Path] = []
-    for parent, folders, files in os.walk(folder):
+    for parent, folders, names in os.walk(folder):
+        here = Path(parent)
+        if here != folder and run.NAME in names and is_run(here):
+            folders.clear()
+            if runs is not None:
+                runs.add(here)
+            continue
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        found += [Path(parent) / name for name in sorted(files) if not name.startswith(".")]
+        found += [here / name for name in sorted(names) if not name.startswith(".")]
         if len(found) > MAX_FILES:
             raise BadInput(f"{folder}: more than {MAX_FILES} files. Name the folder of the data set itself.")
     return found
 
 
+def is_run(folder: Path) -> bool:
+    """Whether a folder is one that a run writes into."""
+    try:
+        about = files.read_json(folder / run.NAME)
+    except (files.Unreadable, FileNotFoundError):
+        return False
+    return isinstance(about, dict) and about.get("format") == run.FORMAT
+
+
+def _is_encodable(name: str) -> bool:
+    """Whether a file may have this name at all: half a surrogate pair of a JSON text has no bytes."""
+    try:
+        return b"\0" not in os.fsencode(name)
+    except UnicodeEncodeError:
+        return False
+
+
 def images_in(folder: Path) -> list[Path]:
     """The image files directly in a folder, sorted by name."""
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file())
 

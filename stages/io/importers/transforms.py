@@ -21,6 +21,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import MODELS, Camera, pose_from_opengl
 from pipeline.errors import BadInput
+from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, missing_images_warning, moved_images_warnings
@@ -29,6 +30,7 @@ from stages.io.pictures import UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 MAX_PLY = 1 << 30  # bytes
+MAX_NAME = 200  # characters of a listed name that are shown
 _REMEDY = "Copy them into the source folder, or take their frames out of the JSON."
 _NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path")
 _NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
@@ -52,7 +54,7 @@ class _Frame:
 
     @property
     def where(self) -> str:
-        return f"{self.file.name}: frame {self.index} ({self.listed})"
+        return f"{self.file.name}: frame {self.index} ({printable(self.listed, MAX_NAME)})"
 
 
 @dataclass
@@ -72,9 +74,9 @@ def json_files(folder: Path) -> list[Path]:
     return splits or ([whole] if whole.is_file() else [])
 
 
-def dialect(folder: Path) -> str:
+def dialect(source: Source) -> str:
     """ "blender", "nerfstudio" or "instant-ngp", by the keys that only one of them has."""
-    document = read_document(json_files(folder)[0])
+    document = _documents(source)[0][1]
     frames = [frame for frame in document["frames"] if isinstance(frame, dict)]
     if any(key in document for key in _NERFSTUDIO_KEYS) or any("mask_path" in frame or "depth_file_path" in frame for frame in frames):
         return "nerfstudio"
@@ -83,17 +85,21 @@ def dialect(folder: Path) -> str:
     return "blender" if "camera_angle_x" in document and "fl_x" not in document else "nerfstudio"
 
 
-def recognises(folder: Path, kind: str) -> bool:
+def recognises(folder: Path, allow_outside: bool, kind: str) -> bool:
     """Whether a folder holds a transforms.json of this dialect. Raises BadInput where it cannot be read."""
-    return bool(json_files(folder)) and dialect(folder) == kind
+    return bool(json_files(folder)) and dialect(Source(folder, allow_outside)) == kind
+
+
+def _documents(source: Source) -> list[tuple[Path, dict[str, Any]]]:
+    """The files of the data set and what they hold."""
+    return [(file, read_document(source.real(file))) for file in json_files(source.root)]
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The JSON files, the images and masks that they name, and the points."""
     source = Source(folder, settings.allow_outside)
     paths: dict[Path, None] = dict.fromkeys(json_files(folder))
-    for file in json_files(folder):
-        document = read_document(file)
+    for _, document in _documents(source):
         ply = _ply(source, document)
         if ply is not None:
             paths[ply] = None
@@ -109,19 +115,19 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
     """The capture that a folder's transforms*.json describes; `kind` overrides the dialect. Raises BadInput."""
     if not json_files(folder):
         raise BadInput(f"{folder}: no transforms.json or transforms_train.json. Name the folder that holds it, or choose another format with --as.")
-    kind = kind or dialect(folder)
     source = Source(folder, settings.allow_outside)
+    kind = kind or dialect(source)
     where = ", ".join(file.name for file in json_files(folder))
     listing = _list_frames(source)
-    photos, rejected, remarks, lens_warnings = _photos(source, listing, kind)
-    rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *rejected]
+    photos, unreadable, remarks, lens_warnings = _photos(source, listing, kind)
+    rejected = [*((name, "listed but missing on disk") for name in listing.missing), *listing.repeated, *((name, why) for name, why, _ in unreadable)]
     warnings = missing_images_warning(where, listing.total, len(photos), listing.missing, settings.strict, _REMEDY)
     if len(photos) < MIN_IMAGES:
         raise BadInput(f"{folder / where}: {len(photos)} usable images of {listing.total} frames; at least {MIN_IMAGES} are needed.")
     warnings += moved_images_warnings(where, listing.places, listing.extensions) + lenses.fit_warnings(where, remarks) + lens_warnings
     if listing.repeated:
         warnings.append(f"{where}: {len(listing.repeated)} frames name an image that an earlier frame has, e.g. {listing.repeated[0][0]}; they were left out.")
-    document = read_document(json_files(folder)[0])
+    document = _documents(source)[0][1]
     if len({file.name for file in json_files(folder)} & set(SPLIT_FILES)) and (folder / "transforms.json").is_file():
         warnings.append(f"transforms.json is not read: {where} state the same with their splits.")
     points, point_warnings = _points(source, document)
@@ -137,6 +143,7 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
         warnings=tuple(warnings + point_warnings),
         metric=any("depth_file_path" in frame.entry for frame in listing.frames) and "applied_scale" not in document,
         facts={key: document[key] for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
+        rejected_files={name: file for name, _, file in unreadable},
     )
 
 
@@ -155,10 +162,9 @@ def read_document(file: Path, max_frames: int = MAX_FRAMES) -> dict[str, Any]:
 def _list_frames(source: Source) -> _Listing:
     listing = _Listing()
     seen: set[Path] = set()
-    split_files = json_files(source.root)
-    for file in split_files:
-        document = read_document(file)
-        split_of_file = SPLIT_FILES.get(file.name) if len(split_files) > 1 else None
+    documents = _documents(source)
+    for file, document in documents:
+        split_of_file = SPLIT_FILES.get(file.name) if len(documents) > 1 else None
         split_of_name = dict(_listed_splits(document, file))
         for index, entry in enumerate(document["frames"]):
             if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
@@ -167,14 +173,14 @@ def _list_frames(source: Source) -> _Listing:
             name = entry["file_path"]
             found = source.find(name, file.parent)
             if found.path is None:
-                listing.missing.append(name)
+                listing.missing.append(printable(name, MAX_NAME))
             elif found.path in seen:
-                listing.repeated.append((name, f"the same image as an earlier frame ({source.name_of(found.path)})"))
+                listing.repeated.append((printable(name, MAX_NAME), f"the same image as an earlier frame ({source.name_of(found.path)})"))
             else:
                 seen.add(found.path)
                 place = {"elsewhere": listing.places, "extension": listing.extensions}.get(found.how)
                 if place is not None:
-                    place.append((name, source.name_of(found.path)))
+                    place.append((printable(name, MAX_NAME), source.name_of(found.path)))
                 split = split_of_file or split_of_name.get(_plain(name))
                 listing.frames.append(_Frame(document, file, index, entry, split, name, found.path))
     return listing
@@ -192,19 +198,19 @@ def _plain(name: str) -> str:
     return name.removeprefix("./").replace("\\", "/")
 
 
-def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str]], dict[str, list[str]], list[str]]:
-    """Photos, the rejected as (name, reason), what `lenses.fit_to_image` found remarks, and warnings."""
+def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str, Path]], dict[str, list[str]], list[str]]:
+    """Photos, the unreadable as (name, reason, file), what `lenses.fit_to_image` found remarks, and warnings."""
     photos: list[Photo] = []
-    rejected: list[tuple[str, str]] = []
+    rejected: list[tuple[str, str, Path]] = []
     remarks: dict[str, list[str]] = {}
     warnings: list[str] = []
     rolling = lost_masks = 0
     for frame in listing.frames:
         name = source.name_of(frame.image)
         try:
-            header = read_header(frame.image)
+            header = read_header(source.real(frame.image))
         except UnreadableImage as error:
-            rejected.append((name, str(error)))
+            rejected.append((name, str(error), source.real(frame.image)))
             warnings.append(f"{name}: {error}; left out.")
             continue
         pose = _pose(frame)
@@ -214,7 +220,7 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
             remarks.setdefault(remark, []).append(name)
         mask, ignore = _mask(source, frame)
         lost_masks += mask is None and "mask_path" in frame.entry
-        photos.append(Photo(camera, frame.image, mask, ignore, frame.split))
+        photos.append(Photo(camera, source.real(frame.image), None if mask is None else source.real(mask), ignore, frame.split))
     if rolling:
         warnings.append(f"{rolling} frames state a rolling shutter (transform_matrix_start, _end); the pose in the middle is used.")
     if lost_masks:
@@ -342,7 +348,8 @@ def _points(source: Source, document: dict[str, Any]) -> tuple[SparsePoints | No
     import trimesh
 
     try:
-        cloud = trimesh.load(path, file_type="ply", process=False)
+        with source.real(path).open("rb") as file:
+            cloud = trimesh.load(file, file_type="ply", process=False)
         xyz = np.asarray(cloud.vertices, np.float64).reshape(-1, 3)
         colours = getattr(cloud, "colors", None)
         colours = cloud.visual.vertex_colors if colours is None else colours

@@ -161,7 +161,7 @@ def test_masks_beside_photographs(tmp_path: Path) -> None:
         root = tmp_path / layout.replace("/", "_") / "source"
         image = captures.write_picture(root / ("images" if layout.startswith("images") else ".") / "1.jpg", captures.picture())
         made = captures.write_picture(root / mask, black)
-        assert photographs(root) == [image]
+        assert photographs(Source(root)) == [image]
         assert masks_of(Source(root), [image]) == {image: made}
         assert importers.files(root, Settings()) == sorted([image, made])
 
