@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -148,7 +149,7 @@ def colmap_bin(folder: Path, made: list[Camera] | None = None, place: str = "spa
     images = struct.pack("<Q", len(made))
     for number, camera in enumerate(made, 11):
         wxyz, translation = colmap_pose(camera)
-        images += struct.pack("<I7dI", number, *wxyz, *translation, 7) + camera.name.encode() + b"\0"
+        images += struct.pack("<I7dI", number, *wxyz, *translation, 7) + os.fsencode(camera.name) + b"\0"
         images += struct.pack("<Q", len(points))
         images += b"".join(struct.pack("<ddQ", *xy, index) for index, xy in enumerate(project(camera, points)[0]))
     (model / "images.bin").write_bytes(images)
@@ -172,7 +173,7 @@ def colmap_txt(folder: Path, made: list[Camera] | None = None, place: str = "spa
         wxyz, translation = colmap_pose(camera)
         lines.append(" ".join([str(number), *(repr(float(value)) for value in (*wxyz, *translation)), "7", camera.name]))
         lines.append("" if number % 2 else "1.5 2.5 -1")
-    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    (model / "images.txt").write_bytes(os.fsencode("\n".join(lines) + "\n"))
     rows = [f"# Number of points: {len(points)}, mean track length: 6"]
     rows += [f"{i} {x!r} {y!r} {z!r} 200 100 50 0.5 " + " ".join(f"{c + 11} {i}" for c in range(len(made))) for i, (x, y, z) in enumerate(points.tolist())]
     (model / "points3D.txt").write_text("\n".join(rows) + "\n")

@@ -12,6 +12,7 @@ The capture's frame is that of the matrices; `applied_transform` is recorded onl
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -314,7 +315,7 @@ def _mask(source: Source, frame: _Frame) -> tuple[Path | None, str]:
         return source.find(listed, frame.file.parent).path, "black"
     for name in (f"dynamic_mask_{frame.image.stem}.png", f"dynamic_mask_{frame.image.name}.png"):
         beside = frame.image.with_name(name)
-        if beside.is_file():
+        if os.path.isfile(beside):
             return source.check_inside(beside), "white"
     return None, "black"
 
