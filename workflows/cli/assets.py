@@ -25,7 +25,7 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 
     Exit code 0 if they are equal, 6 if they differ, 4 if one is damaged.
     """
-    from workflows.cli.progress import write_json
+    from workflows.cli.output import listing, write_json
     from workflows.inspection.compare import compare, in_words
 
     found = compare(first, second, views, size)
@@ -33,7 +33,7 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
     if as_json:
         write_json({"event": "summary", "ok": True, "first": str(first), "second": str(second), **found, "exit_code": code})
     elif not quiet:
-        click.echo(in_words(found))
+        listing(*in_words(found))
     return code
 
 
@@ -54,7 +54,8 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     """
     from efficientnerf.asset.format import describe
     from pipeline.errors import UsageError
-    from workflows.cli.progress import size, write_json
+    from workflows.cli.output import closing, write_json
+    from workflows.cli.progress import size
     from workflows.inspection.convert import convert as convert_asset
 
     if out.suffix.lower() != ".nerftree":
@@ -67,4 +68,4 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     if as_json:
         write_json({"event": "summary", "ok": True, "written": [{"path": str(out.absolute()), **facts}], "exit_code": 0})
     elif not quiet:
-        click.echo(f"{out}: {about['layout']}, {about['voxels']} voxels, degree {about['sh_degree']}, {size(about['bytes'])}")
+        closing(f"{out}: {about['layout']}, {about['voxels']} voxels, degree {about['sh_degree']}, {size(about['bytes'])}")

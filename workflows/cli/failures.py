@@ -8,7 +8,15 @@ from typing import Any
 
 import click
 
+from pipeline.text import printable
+
 INTERNAL = 1  # a defect of this program; the documented codes are those of the errors in pipeline/errors.py
+LONGEST = 4000  # characters of an error; a path may have 4096
+# What is wrong with a path that was given; other errors of the system are no fault of the request.
+OF_THE_PATH = {
+    errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP,
+    errno.EINVAL, errno.EXDEV, errno.ENXIO, errno.ENODEV, errno.ESPIPE, errno.EBUSY, errno.ETXTBSY,
+}  # fmt: skip
 
 
 class Reported(Exception):
@@ -32,7 +40,11 @@ def exit_code(error: BaseException) -> int:
     if isinstance(error, click.ClickException):
         return 2
     if isinstance(error, OSError):
-        return 3 if error.errno in (errno.ENOSPC, errno.EDQUOT) else 2
+        return 2 if error.errno in OF_THE_PATH else 3
+    if isinstance(error, MemoryError):
+        return 3
+    if isinstance(error, UnicodeEncodeError):
+        return 2  # of a file's name
     return INTERNAL
 
 
@@ -54,6 +66,10 @@ def sentence(error: BaseException) -> str:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             return f"{error.filename or 'the disk'}: {what}. Free some space and run the same command again; nothing is lost."
         return f"{error.filename}: {what}." if error.filename else f"{what}."
+    if isinstance(error, MemoryError):
+        return "out of memory. Close other programs, or ask for less: smaller images, fewer voxels."
+    if isinstance(error, UnicodeEncodeError):
+        return f"{error.object[:200]}: a file of this name cannot be opened in the encoding {error.encoding}. Set LC_ALL=C.UTF-8."
     text = " ".join(str(error).split())
     return f"internal error: {type(error).__name__}: {text[:300]}. Run it again with --debug for the traceback."
 
@@ -70,16 +86,14 @@ def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
     code = exit_code(error)
     if code == 0:
         return 0
-    if isinstance(error, BrokenPipeError):
-        return 0  # the reader of our output has had enough
     if debug:
         import traceback
 
         traceback.print_exception(error, file=sys.stderr)
-    text = sentence(error)
+    text = printable(sentence(error), LONGEST)
     print(f"enerf: {text}", file=sys.stderr, flush=True)
     if as_json:
-        from workflows.cli.progress import write_json
+        from workflows.cli.output import write_json
 
         write_json({"event": "summary", "ok": False, "error": text, "kind": type(error).__name__, **facts, "exit_code": code})
     return code

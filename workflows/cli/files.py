@@ -32,7 +32,7 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, set
     """
     from pipeline.errors import UsageError
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
-    from workflows.cli.progress import write_json
+    from workflows.cli.output import closing, write_json
 
     files = [first, *more]
     known = [*(POINT_EXPORTERS if as_points else MESH_EXPORTERS), CAMERAS]
@@ -57,7 +57,7 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, set
     elif not quiet:
         for entry in written:
             facts = ", ".join(f"{value} {name}" for name, value in entry.items() if name != "path")
-            click.echo(f"{entry['path']}  ({facts})")
+            closing(f"{entry['path']}  ({facts})")
 
 
 def _export_cameras(what: Path, path: Path) -> int:
@@ -139,7 +139,7 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
     from stages.io.camera_path import read_camera_path
     from stages.io.exporters.frames import background_from_text
     from stages.turntable import TurntableSettings, cameras_of
-    from workflows.cli.progress import write_json
+    from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
 
     if video is not None and video.suffix.lower() != ".mp4":
@@ -168,7 +168,7 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
     if as_json:
         write_json({"event": "summary", "ok": True, "written": [str(each.absolute()) for each in written], "exit_code": 0})
     elif not quiet:
-        click.echo(f"{len(cameras)} frames in {out}" + (f", {video}" if video is not None else ""))
+        closing(f"{len(cameras)} frames in {out}" + (f", {video}" if video is not None else ""))
 
 
 @click.command(short_help="Describe an asset, a run, a data set, a mesh or points.")
@@ -177,14 +177,14 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
 @common_options
 def inspect(what: Path, as_json: bool) -> None:
     """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, warnings."""
-    from workflows.cli.progress import write_json
+    from workflows.cli.output import listing, write_json
     from workflows.inspection.describe import describe, in_words
 
     found = describe(what)
     if as_json:
         write_json(found, indent=1)
     else:
-        click.echo(in_words(found))
+        listing(*in_words(found))
 
 
 def _shown(as_json: bool, quiet: bool) -> Any:

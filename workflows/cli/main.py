@@ -14,6 +14,7 @@ import click
 
 from workflows.cli import assets, files, paper, presets, run, state
 from workflows.cli.failures import report_failure
+from workflows.cli.output import exit_code, watched
 
 if TYPE_CHECKING:
     from workflows.asset import Workflow
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    epilog="Exit codes: 0 done; 2 usage or bad input; 3 a stage failed; 4 corrupt artifact; 5 run locked; 6 assets differ; 130, 143 interrupted.",
+    epilog="Exit codes: 0 done; 2 usage or bad input; 3 a stage failed, or output could not be written; 4 corrupt artifact; 5 run locked; 6 assets differ; "
+    "130, 143 interrupted.",
 )
 @click.version_option(package_name="efficientnerf", prog_name="enerf")
 def enerf() -> None:
@@ -57,11 +59,13 @@ def main(arguments: Sequence[str] | None = None, workflow: Workflow | None = Non
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     as_json, debug = "--json" in given, "--debug" in given
-    try:
-        result = enerf.main(args=given, prog_name="enerf", standalone_mode=False, obj=workflow)
-    except BaseException as error:
-        return report_failure(error, as_json=as_json, debug=debug)
-    return result if isinstance(result, int) else 0
+    with watched() as out:
+        try:
+            result = enerf.main(args=given, prog_name="enerf", standalone_mode=False, obj=workflow)
+            code = result if isinstance(result, int) else 0
+        except BaseException as error:
+            code = report_failure(error, as_json=as_json, debug=debug)
+        return exit_code(out, code, as_json=as_json)
 
 
 if __name__ == "__main__":

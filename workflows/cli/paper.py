@@ -24,7 +24,8 @@ def paper(table: str, data: Path | None, out: Path, scale: float, device: str | 
     strategies, 7 NerfTree against other structures. Writes DIR/table_N.md, .json and, where something is trained, .png.
     """
     from workflows.cli.device import resolve_device
-    from workflows.cli.progress import display, write_json
+    from workflows.cli.output import closing, write_json
+    from workflows.cli.progress import display
     from workflows.paper.document import Request, make
 
     with display(as_json=as_json, quiet=quiet) as show:
@@ -33,4 +34,4 @@ def paper(table: str, data: Path | None, out: Path, scale: float, device: str | 
     if as_json:
         write_json({"event": "summary", "ok": True, "table": table, "files": {kind: str(path) for kind, path in written.items()}, "exit_code": 0})
     elif not quiet:
-        click.echo(written["markdown"].read_text(encoding="utf-8"))
+        closing(*written["markdown"].read_text(encoding="utf-8").split("\n"))

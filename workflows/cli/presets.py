@@ -21,7 +21,7 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
     """List the presets and the main settings with their defaults and meaning; with STAGE... all settings of these stages."""
     from pipeline.errors import UsageError
     from stages.settings import describe_settings
-    from workflows.cli.progress import write_json
+    from workflows.cli.output import listing, write_json
     from workflows.cli.resolve import Settings, nearest, preset_names, read_preset, table_of
 
     folder = workflow().presets
@@ -40,18 +40,18 @@ def presets(stages: tuple[str, ...], preset: str | None, as_json: bool) -> None:
         write_json({"presets": listed, "stages": {stage: _facts(infos, values[stage]) for stage, infos in described.items()}}, indent=1)
         return
     for each in known:
-        click.echo(f"{each.name:<10} {each.description}")
+        listing(f"{each.name:<10} {each.description}")
     for stage, infos in described.items():
         common, advanced = ([info for info in infos if info.advanced == rank] for rank in (False, True))
         if common or stages:
-            click.echo(f"\n[{stage}]")
+            listing("", f"[{stage}]")
         _list(common, values[stage])
         if stages and advanced:
-            click.echo(f"\n[{stage}] advanced")
+            listing("", f"[{stage}] advanced")
             _list(advanced, values[stage])
     if not stages:
         count = sum(info.advanced for infos in described.values() for info in infos)
-        click.echo(f"\n{count} advanced settings are listed by stage: enerf presets {' '.join(types)}")
+        listing("", f"{count} advanced settings are listed by stage: enerf presets {' '.join(types)}")
 
 
 def _facts(infos: list[SettingInfo], values: dict[str, Any]) -> list[dict[str, Any]]:
@@ -65,8 +65,9 @@ def _facts(infos: list[SettingInfo], values: dict[str, Any]) -> list[dict[str, A
 
 def _list(infos: list[SettingInfo], values: dict[str, Any]) -> None:
     """A line for each setting."""
+    from workflows.cli.output import listing
     from workflows.cli.resolve import meaning, shown
 
     for info in infos:
         choices = f" One of: {', '.join(shown(choice) for choice in info.choices)}." if info.choices and info.listed else ""
-        click.echo(f"{info.name + ' = ' + shown(values[info.name]):<36} {meaning(info)}{choices}")
+        listing(f"{info.name + ' = ' + shown(values[info.name]):<36} {meaning(info)}{choices}")

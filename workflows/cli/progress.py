@@ -5,12 +5,14 @@ Each display is a callable that takes the engine's events. Text goes to standard
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, TextIO
+
+from pipeline.text import printable
+from workflows.cli.output import write_json
 
 Event = Mapping[str, Any]
 
@@ -18,9 +20,15 @@ Event = Mapping[str, Any]
 SECONDS_BETWEEN_LINES = 10.0
 SECONDS_BETWEEN_TENTHS = 2.0
 
+# Numbers beyond these come of files that are damaged, or made to mislead.
+_LONGEST = 1e12  # seconds
+_LARGEST = 2**64  # bytes
+
 
 def duration(seconds: float) -> str:
-    """`8.1 s`, `2 min 05 s`, `1 h 02 min`."""
+    """`8.1 s`, `2 min 05 s`, `1 h 02 min`; `?` for what is no time."""
+    if not 0 <= seconds < _LONGEST:
+        return "?"
     if seconds < 59.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)
@@ -30,7 +38,9 @@ def duration(seconds: float) -> str:
 
 
 def size(count: float) -> str:
-    """Bytes in decimal units: `812 B`, `3.4 MB`."""
+    """Bytes in decimal units: `812 B`, `3.4 MB`; `?` for what is no size."""
+    if not 0 <= count < _LARGEST:
+        return "?"
     for unit in ("B", "kB", "MB", "GB"):
         if count < 999.5:
             return f"{count:.0f} {unit}" if unit == "B" or count >= 99.95 else f"{count:.1f} {unit}"
@@ -65,6 +75,11 @@ def sentence(event: Event) -> str:
             return ""
 
 
+def _line(stage: str, words: str) -> str:
+    """An event as one line; names of files in it may hold anything."""
+    return printable(f"{stage:<9} {words}" if stage else words)
+
+
 class Lines:
     """Plain lines, for logs and pipes."""
 
@@ -91,7 +106,7 @@ class Lines:
             self._line(stage, words)
 
     def _line(self, stage: str, words: str) -> None:
-        print(f"{stage:<9} {words}" if stage else words, file=self.stream, flush=True)
+        print(_line(stage, words), file=self.stream, flush=True)
 
     def _progress(self, stage: str, event: Event) -> None:
         now, total = time.monotonic(), event.get("total") or 0
@@ -145,7 +160,7 @@ class Bars:
             self._clear()
         if words := sentence(event):
             style = "yellow" if event["event"] == "warning" else None
-            self.console.print(f"{stage:<9} {words}" if stage else words, style=style, markup=False, soft_wrap=True)
+            self.console.print(_line(stage, words), style=style, markup=False, soft_wrap=True)
 
     def _clear(self) -> None:
         if self.task is not None:
@@ -160,7 +175,7 @@ class Bars:
             self.task, self.part = self.progress.add_task(text, total=total, stage=stage), (stage, total)
         if self.task is not None:
             words = "  ".join(word for word in (text, facts(event)) if word)
-            self.progress.update(self.task, completed=event.get("done", 0), description=words.replace("[", "\\["))
+            self.progress.update(self.task, completed=event.get("done", 0), description=printable(words).replace("[", "\\["))
 
 
 class JsonLines:
@@ -191,33 +206,7 @@ class Quiet:
 
     def __call__(self, event: Event) -> None:
         if event["event"] == "warning":
-            print(f"{event.get('stage') or '':<9} {sentence(event)}".strip(), file=sys.stderr, flush=True)
-
-
-def write_json(value: Any, *, indent: int | None = None) -> None:
-    """One JSON object on standard output; a closed pipe does not stop a run."""
-    try:
-        print(json.dumps(plain(value), indent=indent, ensure_ascii=False, allow_nan=False), flush=True)
-    except BrokenPipeError:
-        import os
-
-        # Python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def plain(value: Any) -> Any:
-    """`value` in types of JSON: paths and arrays become text and lists, numbers that are not finite become null."""
-    if isinstance(value, Mapping):
-        return {str(name): plain(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if value is None or isinstance(value, (str, bool, int)):
-        return value
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if value - value == 0 else None
-    return str(value)
+            print(_line(event.get("stage") or "", sentence(event)), file=sys.stderr, flush=True)
 
 
 def display(*, as_json: bool, quiet: bool) -> Lines | Bars | JsonLines | Quiet:

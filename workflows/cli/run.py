@@ -81,7 +81,8 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
 
     from pipeline.runner import run_stages
     from workflows.cli.device import resolve_device
-    from workflows.cli.progress import display, write_json
+    from workflows.cli.output import closing, write_json
+    from workflows.cli.progress import display
     from workflows.report.summary import in_words, summary
 
     device = resolve_device(plan.device)
@@ -103,15 +104,14 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
     if as_json:
         write_json({"event": "summary", "ok": True, **facts, "elapsed": time.monotonic() - started, "device": device, "exit_code": 0})
     elif not quiet and not dry_run:
-        click.echo(in_words(run.path, outcomes))
+        closing(*in_words(run.path, outcomes))
 
 
 def _describe(run: Run) -> None:
     """Write the page about the run."""
-    from pipeline.decide import survey
     from workflows.report.page import write_report
 
-    write_report(run, survey(workflow().stages, run))
+    write_report(run, workflow().stages)
 
 
 def _check_stages(selection: dict[str, Any]) -> None:

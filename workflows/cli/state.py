@@ -20,7 +20,8 @@ def status(run_folder: Path, as_json: bool) -> None:
     A file of unchanged size and modification time counts as unchanged; 'enerf verify' hashes it.
     """
     from pipeline.decide import survey
-    from workflows.cli.progress import duration, size, write_json
+    from workflows.cli.output import listing, write_json
+    from workflows.cli.progress import duration, size
     from workflows.cli.target import check_names, open_run
 
     run = open_run(run_folder)
@@ -46,16 +47,16 @@ def status(run_folder: Path, as_json: bool) -> None:
         facts: dict[str, Any] = {"run": str(run.path), "source": run.source, "preset": run.preset, "seed": run.seed, "device": run.device}
         write_json({**facts, "written_by": None if holder is None else holder.text(), "stages": stages}, indent=1)
         return
-    click.echo(f"{run.path}  from {run.source}  preset {run.preset}" if run.preset else f"{run.path}  from {run.source}")
+    listing(f"{run.path}  from {run.source}  preset {run.preset}" if run.preset else f"{run.path}  from {run.source}")
     for entry in stages:
         seconds = "" if entry["seconds"] is None else duration(entry["seconds"])
         count = "" if entry["bytes"] is None else size(entry["bytes"])
         line = f"{entry['name']:<10} {entry['state']:<8} {seconds:>13} {count:>8}  {entry['reason'] or entry['note'] or ''}"
-        click.echo(line.rstrip())
+        listing(line.rstrip())
         if entry["extra"]:
-            click.echo(f"{'':<10} not written by it: {', '.join(entry['extra'][:5])}{' ...' if len(entry['extra']) > 5 else ''}")
+            listing(f"{'':<10} not written by it: {', '.join(entry['extra'][:5])}{' ...' if len(entry['extra']) > 5 else ''}")
     if holder is not None:
-        click.echo(f"It is being written by {holder.text()}.")
+        listing(f"It is being written by {holder.text()}.")
 
 
 @click.command(short_help="Check every file against its recorded hash.")
@@ -76,7 +77,8 @@ def verify(what: Path, as_json: bool, quiet: bool) -> None:
 def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
     from pipeline.errors import CorruptArtifact
     from workflows.cli.failures import Reported
-    from workflows.cli.progress import size, write_json
+    from workflows.cli.output import closing, write_json
+    from workflows.cli.progress import size
     from workflows.cli.target import describe_asset, load_asset
 
     try:
@@ -88,14 +90,15 @@ def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
         facts = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
         write_json({"event": "summary", "ok": True, "asset": str(path), **facts, "damaged": [], "exit_code": 0})
     elif not quiet:
-        click.echo(f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(int(str(about['bytes'])))}, all as written")
+        closing(f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(int(str(about['bytes'])))}, all as written")
 
 
 def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
     from pipeline.errors import CorruptArtifact
     from pipeline.runner import verify as verify_run
     from workflows.cli.failures import Reported
-    from workflows.cli.progress import display, size, write_json
+    from workflows.cli.output import closing, write_json
+    from workflows.cli.progress import display, size
     from workflows.cli.target import open_run
 
     run = open_run(run_folder)
@@ -108,7 +111,7 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
         write_json({"event": "summary", "ok": True, "run": str(run.path), "stages": [each.stage for each in outcomes], "damaged": [], "exit_code": 0})
     elif not quiet:
         total = sum(each.size for each in outcomes)
-        click.echo(f"{run.path}: {len(outcomes)} stages, {size(total)}, all as written")
+        closing(f"{run.path}: {len(outcomes)} stages, {size(total)}, all as written")
 
 
 @click.command(short_help="Write a page about a run: renders, figures, settings.")
@@ -117,15 +120,14 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
 @common_options
 def report(run_folder: Path, as_json: bool) -> None:
     """Write RUN/report.html: files, renders, metrics and settings of RUN. 'enerf run' writes it when it is done."""
-    from pipeline.decide import survey
-    from workflows.cli.progress import write_json
+    from workflows.cli.output import closing, write_json
     from workflows.cli.target import check_names, open_run
     from workflows.report.page import write_report
 
     run = open_run(run_folder)
     check_names(run)
-    path = write_report(run, survey(workflow().stages, run))
+    path = write_report(run, workflow().stages)
     if as_json:
         write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), "exit_code": 0})
     else:
-        click.echo(str(path))
+        closing(str(path))

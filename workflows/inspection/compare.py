@@ -51,14 +51,15 @@ def _psnr_of_renders(a: NerfTree, b: NerfTree, views: int, size: int) -> list[fl
     return [min(PSNR_CAP, psnr(*(render(tree, camera, background=background).colour.clip(0, 1) for tree in (a, b)))) for camera in cameras]
 
 
-def in_words(found: dict[str, Any]) -> str:
+def in_words(found: dict[str, Any]) -> list[str]:
+    """The comparison as lines."""
     if found["equal"]:
-        return "equal"
+        return ["equal"]
     lines = [f"{key:<24} {_short(a)} -> {_short(b)}" for key, (a, b) in found["metadata"].items()]
     lines += [f"{name:<24} {said}" for name, said in found["tensors"].items() if said != "same"]
     if found["views"]:
         lines.append(f"{'renders':<24} {found['psnr']:.2f} dB apart (PSNR), mean of {len(found['views'])} views; least {min(found['views']):.2f}")
-    return "\n".join(lines)
+    return lines
 
 
 def _short(value: Any) -> str:

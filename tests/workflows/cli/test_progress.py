@@ -11,19 +11,35 @@ import numpy as np
 import pytest
 
 from workflows.cli import progress
-from workflows.cli.progress import Bars, JsonLines, Lines, Quiet, duration, plain, sentence, size
+from workflows.cli.output import plain
+from workflows.cli.progress import Bars, JsonLines, Lines, Quiet, duration, sentence, size
 
 
 def event(kind: str, **facts: object) -> dict[str, object]:
     return {"event": kind, "stage": "train", "time": 0.0, **facts}
 
 
-@pytest.mark.parametrize(("seconds", "words"), [(0.04, "0.0 s"), (59.9, "59.9 s"), (59.96, "1 min 00 s"), (125, "2 min 05 s"), (3725, "1 h 02 min")])
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(0.04, "0.0 s"), (59.9, "59.9 s"), (59.96, "1 min 00 s"), (125, "2 min 05 s"), (3725, "1 h 02 min"), (math.inf, "?"), (math.nan, "?"), (-1, "?")],
+)
 def test_durations(seconds: float, words: str) -> None:
     assert duration(seconds) == words
 
 
-@pytest.mark.parametrize(("count", "words"), [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (99_960, "100 kB"), (3_400_000, "3.4 MB"), (2e15, "2000.0 TB")])
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [
+        (0, "0 B"),
+        (999, "999 B"),
+        (1000, "1.0 kB"),
+        (99_960, "100 kB"),
+        (3_400_000, "3.4 MB"),
+        (2e15, "2000.0 TB"),
+        pytest.param(10**400, "?", id="huge"),
+        (-1, "?"),
+    ],
+)
 def test_sizes(count: float, words: str) -> None:
     assert size(count) == words
 
@@ -89,3 +105,49 @@ def test_every_event_has_its_sentence() -> None:
 def test_json_holds_only_what_json_can() -> None:
     value = {"path": Path("a"), 1: (np.float64(2), np.arange(2)), "bad": [math.nan, math.inf], "none": None, "flag": True}
     assert plain(value) == {"path": "a", "1": [2.0, [0, 1]], "bad": [None, None], "none": None, "flag": True}
+
+
+HOSTILE = "a\x1b]0;title\x07\n\u202eb\udcff\x9b"
+ESCAPED = "a\\x1b]0;title\\x07\\n\\u202eb\\udcff\\x9b"
+
+
+def test_hostile_text_reaches_no_display_raw(capsys: pytest.CaptureFixture[str]) -> None:
+    told = [event("warning", text=HOSTILE), event("stage_started", reason=HOSTILE), event("progress", done=1, total=2, text=HOSTILE, name=HOSTILE)]
+    for each in told:
+        Quiet()(each)
+        lines = Lines()
+        lines.last_time = -1e9
+        lines(each)
+        JsonLines()(each)
+    with Bars() as bars:
+        for each in told:
+            bars(each)
+        assert bars.task is not None
+        described = next(task.description for task in bars.progress.tasks)
+    out, err = capsys.readouterr()
+    assert ESCAPED in described.replace("\\[", "[")
+    assert err.count(ESCAPED) >= 7
+    assert [json.loads(line).get("text") for line in out.splitlines()] == [HOSTILE, None, HOSTILE]
+    for character in "\x1b\x07\u202e\udcff\x9b":
+        assert character not in out + err
+
+
+def test_json_keeps_to_what_its_readers_know() -> None:
+    deep: list[object] = []
+    for _ in range(5000):
+        deep = [deep]
+    assert plain([2**63, 2**64, 10**5000, -(10**400)]) == [2**63, hex(2**64), hex(10**5000), hex(-(10**400))]
+    assert "nested too deeply" in json.dumps(plain(deep))
+
+
+def test_lists_and_errors_are_shown_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+    from pipeline.errors import BadInput
+    from workflows.cli.failures import report_failure
+    from workflows.cli.output import closing, listing
+
+    listing("own line", HOSTILE)
+    closing(HOSTILE)
+    assert report_failure(BadInput(f"{HOSTILE}: no such thing."), as_json=False, debug=False) == 2
+    out, err = capsys.readouterr()
+    assert out == f"own line\n{ESCAPED}\n{ESCAPED}\n"
+    assert err == f"enerf: {ESCAPED}: no such thing.\n"
