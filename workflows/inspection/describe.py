@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import BadInput
-from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
 from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from workflows.asset import STAGES
-from workflows.cli.progress import plain, size
+from workflows.cli.output import plain
+from workflows.cli.progress import size
 from workflows.cli.target import ASSET, describe_asset, is_run, open_run
 
 MESHES = tuple(dict.fromkeys((*MESH_EXPORTERS, *POINT_EXPORTERS)))
@@ -53,10 +54,17 @@ def _describe_file(path: Path) -> dict[str, Any]:
 
 def _describe_run(path: Path) -> dict[str, Any]:
     from pipeline.decide import survey
-    from workflows.report.summary import artifacts, metrics
+    from workflows.report import documents
+    from workflows.report.summary import artifacts
 
     run = open_run(path)
-    quality = metrics(run.path) or {}
+    quality: dict[str, Any] = {}
+    damaged = []
+    try:
+        measured = documents.read(EvaluateOutputs.of_run(run.path).metrics, documents.Metrics)
+        quality = {} if measured is None else measured[1]
+    except documents.Damaged as error:
+        damaged.append(str(error))
     found: dict[str, Any] = {
         "what": "run",
         "path": str(run.path),
@@ -65,6 +73,7 @@ def _describe_run(path: Path) -> dict[str, Any]:
         "stages": {decision.stage: decision.state for decision in survey(STAGES, run)},
         "artifacts": artifacts(run.path),
         "quality": {name: quality[name] for name in ("network", "asset") if name in quality},
+        "damaged": damaged,
     }
     if PosesOutputs.of_run(path).scene.is_file():
         from stages.io import scene
@@ -79,7 +88,8 @@ def _describe_mesh(path: Path) -> dict[str, Any]:
     import trimesh
 
     try:
-        loaded = trimesh.load(path, process=False)
+        with open(path, "rb") as file:  # not by its path: trimesh would open what the file names, textures and all
+            loaded = trimesh.load(file, file_type=path.suffix[1:].lower(), process=False, skip_materials=True)
     except Exception as error:  # trimesh raises whatever the broken file made it stumble over
         raise BadInput(f"{path}: cannot be read as {path.suffix} ({' '.join(str(error).split())[:200] or type(error).__name__}).") from error
     if isinstance(loaded, trimesh.Scene):
@@ -95,9 +105,9 @@ def _describe_mesh(path: Path) -> dict[str, Any]:
     return found
 
 
-def in_words(found: dict[str, Any]) -> str:
+def in_words(found: dict[str, Any]) -> list[str]:
     """The facts as lines of `name  value`; lists of cameras are shown with --json only."""
-    return "\n".join(_lines(plain(found), ""))
+    return _lines(plain(found), "")
 
 
 def _lines(found: dict[str, Any], indent: str) -> list[str]:
@@ -105,15 +115,15 @@ def _lines(found: dict[str, Any], indent: str) -> list[str]:
     for name, value in found.items():
         label = f"{indent}{name.replace('_', ' ')}"
         if name == "cameras" and isinstance(value, list) and all(isinstance(camera, dict) for camera in value):
-            if value:
-                first = value[0]
+            first = value[0] if value else {}
+            if {"name", "model", "params"} <= first.keys():
                 lines.append(f"{label:<24} {len(value)}, listed with --json; the first: {first['name']}, {first['model']} {_shown(first['params'])}")
         elif name == "warnings" and isinstance(value, list):
             lines += [f"{label:<24} {sentence}" for sentence in value] or [f"{label:<24} nothing"]
         elif isinstance(value, dict):
             lines += [label, *_lines(value, indent + "  ")]
         elif value not in (None, [], ""):
-            lines.append(f"{label:<24} {size(value) if name == 'bytes' else _shown(value)}")
+            lines.append(f"{label:<24} {size(value) if name == 'bytes' and isinstance(value, int) else _shown(value)}")
     return lines
 
 

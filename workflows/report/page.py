@@ -6,21 +6,29 @@ nothing from the network. The template is report.html.j2.
 
 from __future__ import annotations
 
-import json
+import os
+import stat
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import jinja2
+from markupsafe import Markup
 
+from pipeline.text import printable
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, TrainOutputs, TurntableOutputs
+from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
-from workflows.report.summary import metrics, quality_in_words, split_of
+from workflows.report import documents
+from workflows.report.documents import Damaged, Metrics, PosesReport, Quality
+from workflows.report.summary import quality_in_words, split_of
 
 if TYPE_CHECKING:
     from pipeline.decide import Decision
     from pipeline.run import Run
+    from pipeline.stage import Stage
 
 NAME = "report.html"
 RUN = Path()  # names are relative to the page
@@ -36,30 +44,59 @@ DOWNLOADS = (
     (EVALUATE.metrics, "all figures"),
 )
 TEMPLATE = "report.html.j2"
+ATTEMPTS = 5  # to find no stage replaced while the page was made
+LONGEST = 1000  # characters of a text that is shown
 
 
-def write_report(run: Run, decisions: Sequence[Decision]) -> Path:
-    """Write RUN/report.html atomically; returns its path. Raises DiskFull, and BadInput where the folder cannot be written."""
+def write_report(run: Run, stages: Sequence[Stage]) -> Path:
+    """Write RUN/report.html atomically; returns its path. Raises DiskFull, and BadInput where the folder cannot be written.
+
+    No lock is taken: where a stage is replaced meanwhile, the page is made again, so that all of it is of the same artifacts.
+    """
+    from pipeline.decide import survey
     from pipeline.files import write_atomically
     from pipeline.run import cannot_write
 
     path = run.path / NAME
+    for _ in range(ATTEMPTS):
+        before = _published(run, stages)
+        text = page(run, survey(stages, run))
+        if _published(run, stages) == before:
+            break
     try:
-        write_atomically(path, page(run, decisions).encode("utf-8"))
+        write_atomically(path, text.encode("utf-8"))
     except OSError as error:
         raise cannot_write(path, error) from error
     return path
 
 
+def _published(run: Run, stages: Sequence[Stage]) -> list[tuple[int, int] | None]:
+    """What tells the artifact of each stage from one that replaces it: a stage is published by a rename of its folder."""
+    found: list[tuple[int, int] | None] = []
+    for stage in stages:
+        try:
+            status = os.stat(run.folder(stage.name), follow_symlinks=False)
+            found.append((status.st_ino, status.st_ctime_ns))
+        except OSError:
+            found.append(None)
+    return found
+
+
 def page(run: Run, decisions: Sequence[Decision]) -> str:
-    """The page as text."""
+    """The page as text; whatever names hold, it encodes in UTF-8."""
     folder = run.path
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_shown,
     )
-    environment.filters["link"] = lambda name: quote(name.as_posix())
-    environment.tests["there"] = lambda name: (folder / name).is_file()
-    found = metrics(folder)
+    environment.filters["link"] = lambda name: quote(os.fsencode(name.as_posix()))
+    environment.tests["there"] = lambda name: _size(folder / name) is not None
+    damaged: list[str] = []
+    found = _read(folder / EVALUATE.metrics, Metrics, damaged)
     made = [each.manifest for each in decisions if each.manifest is not None]
     return environment.get_template(TEMPLATE).render(
         name=folder.name,
@@ -72,12 +109,13 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         evaluate=EVALUATE,
         turntable=TURNTABLE,
         mesh=MESH,
-        files=[{"name": name, "what": what, "size": size((folder / name).stat().st_size)} for name, what in DOWNLOADS if (folder / name).is_file()],
+        files=[{"name": name, "what": what, "size": size(count)} for name, what in DOWNLOADS if (count := _size(folder / name)) is not None],
         views=_views(found),
-        asset_report=_facts(folder, BAKE.report),
-        mesh_report=_facts(folder, MESH.report),
-        previews=[TRAIN.previews / path.name for path in sorted((folder / TRAIN.previews).glob("*.png"))],
-        cameras=_cameras(folder),
+        asset_report=_facts(folder, BAKE.report, damaged),
+        mesh_report=_facts(folder, MESH.report, damaged),
+        previews=_previews(folder),
+        cameras=_cameras(folder, damaged),
+        damaged=damaged,
         stages=[_stage(each) for each in decisions],
         settings=run.settings,
         versions=made[-1].versions if made else {},
@@ -91,43 +129,61 @@ def _stage(decision: Decision) -> tuple[str, ...]:
     return (decision.stage, decision.state, *cost, decision.reason or decision.note or "")
 
 
-def _json(path: Path) -> Any:
-    """A JSON file's value, or None where it cannot be read: the page of a damaged run can be made too."""
+def _shown(value: Any) -> Any:
+    """A value as the page shows it: text without control characters, of bounded length."""
+    if isinstance(value, Markup) or value is None or isinstance(value, bool | float):
+        return value
+    return printable(value if isinstance(value, str) else plain(value), LONGEST)
+
+
+def _size(path: Path) -> int | None:
+    """Bytes of a file, None where there is none (any more)."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        status = os.stat(path)
+    except OSError:
         return None
+    return status.st_size if stat.S_ISREG(status.st_mode) else None
 
 
-def _cameras(folder: Path) -> dict[str, Any] | None:
+def _previews(folder: Path) -> list[Path]:
+    names: list[str] = []
+    with suppress(OSError):
+        names = sorted(name for name in os.listdir(folder / TRAIN.previews) if name.endswith(".png"))
+    return [TRAIN.previews / name for name in names]
+
+
+def _read(path: Path, kind: type[Any], damaged: list[str]) -> Any:
+    """A document of the run, or None where there is none, or where it joins the damaged ones: a damaged run gets its page, too."""
+    try:
+        found = documents.read(path, kind)
+    except Damaged as error:
+        damaged.append(str(error))
+        return None
+    return None if found is None else found[0]
+
+
+def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
     """Facts from the report of the poses stage: a sentence, the images that were not used, warnings."""
-    report = _json(folder / POSES.report)
-    if not isinstance(report, dict):
+    report: PosesReport | None = _read(folder / POSES.report, PosesReport, damaged)
+    if report is None:
         return None
-    text = f"{len(report.get('registered') or [])} views"
-    if isinstance(error := report.get("reprojection_error"), (int, float)):
-        text += f", mean reprojection error {error:.2f} px"
-    rejected = [(each.get("name", ""), each.get("reason", "")) for each in report.get("rejected") or [] if isinstance(each, dict)]
-    return {"text": text, "rejected": rejected, "warnings": report.get("warnings") or []}
+    text = f"{len(report.registered or [])} views"
+    if report.reprojection_error is not None:
+        text += f", mean reprojection error {report.reprojection_error:.2f} px"
+    return {"text": text, "rejected": [(each.name, each.reason) for each in report.rejected or []], "warnings": report.warnings or []}
 
 
-def _views(found: dict[str, Any] | None) -> list[tuple[str, ...]]:
+def _views(found: Metrics | None) -> list[tuple[str, ...]]:
     """A row of figures for each view that was measured."""
-    views = (found or {}).get("views")
 
-    def figure(view: dict[str, Any], who: str, what: str, digits: int) -> str:
-        value = (view.get(who) or {}).get(what)
-        return f"{value:.{digits}f}" if isinstance(value, (int, float)) else ""
+    def figures(quality: Quality | None) -> tuple[str, str]:
+        psnr, ssim = (None, None) if quality is None else (quality.psnr, quality.ssim)
+        return "" if psnr is None else f"{psnr:.2f}", "" if ssim is None else f"{ssim:.3f}"
 
-    return [
-        (view.get("name", ""), *(figure(view, who, what, digits) for who in ("network", "asset") for what, digits in (("psnr", 2), ("ssim", 3))))
-        for view in (views if isinstance(views, list) else [])
-        if isinstance(view, dict)
-    ]
+    return [(view.name, *figures(view.network), *figures(view.asset)) for view in (found.views if found is not None else [])]
 
 
-def _facts(folder: Path, name: Path) -> dict[str, Any]:
+def _facts(folder: Path, name: Path, damaged: list[str]) -> dict[str, Any]:
     """The plain entries of a stage's report, and its name."""
-    found = _json(folder / name)
-    plain = found.items() if isinstance(found, dict) else ()
-    return {"name": name.as_posix(), "rows": [(key.replace("_", " "), value) for key, value in plain if isinstance(value, (str, int, float, bool))]}
+    found = _read(folder / name, dict[str, Any], damaged) or {}
+    return {"name": name.as_posix(), "rows": [(key.replace("_", " "), value) for key, value in found.items() if isinstance(value, (str, int, float, bool))]}

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from pipeline.runner import Outcome
 from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.progress import duration, size
+from workflows.report import documents
+from workflows.report.documents import Metrics
 
 RUN = Path()
 # The files of a run that a user wants.
@@ -34,12 +37,12 @@ def artifacts(run: Path) -> dict[str, str]:
 
 
 def metrics(run: Path) -> dict[str, Any] | None:
-    """RUN/evaluate/metrics.json, or None where it is missing or unreadable."""
+    """RUN/evaluate/metrics.json, or None where it is missing or damaged."""
     try:
-        found = json.loads(EvaluateOutputs.of_run(run).metrics.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = documents.read(EvaluateOutputs.of_run(run).metrics, Metrics)
+    except documents.Damaged:
         return None
-    return found if isinstance(found, dict) else None
+    return None if found is None else found[1]
 
 
 def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
@@ -56,8 +59,8 @@ def summary(run: Path, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def in_words(run: Path, outcomes: Sequence[Outcome]) -> str:
-    """The summary as text."""
+def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
+    """The summary as lines."""
     ran = [outcome for outcome in outcomes if outcome.action == "ran"]
     spent = sum(outcome.seconds for outcome in ran)
     if ran:
@@ -68,27 +71,25 @@ def in_words(run: Path, outcomes: Sequence[Outcome]) -> str:
     for name, path in artifacts(run).items():
         if name in TITLES:
             shown = os.path.relpath(path) if not os.path.relpath(path).startswith("..") else path
-            lines.append(f"  {TITLES[name]:<10} {shown}  ({size(Path(path).stat().st_size)})")
-    if (quality := quality_in_words(metrics(run))) is not None:
+            lines.append(f"  {TITLES[name]:<10} {shown}  ({size(os.stat(path).st_size)})")
+    found = metrics(run)
+    if (quality := quality_in_words(None if found is None else msgspec.convert(found, Metrics))) is not None:
         lines.append(f"  {'quality':<10} {quality}")
-    return "\n".join(lines)
+    return lines
 
 
-def quality_in_words(found: dict[str, Any] | None) -> str | None:
+def quality_in_words(found: Metrics | None) -> str | None:
     """`network 24.13 dB PSNR, 0.812 SSIM; asset ...`, on how many views."""
     if found is None:
         return None
     parts = []
-    for name in ("network", "asset"):
-        part = found.get(name)
-        if isinstance(part, dict) and isinstance(part.get("psnr"), (int, float)) and isinstance(part.get("ssim"), (int, float)):
-            parts.append(f"{name} {part['psnr']:.2f} dB PSNR, {part['ssim']:.3f} SSIM")
-    views = found.get("views")
-    count = f" (on {len(views)} {split_of(found)} view{'s' if len(views) != 1 else ''})" if isinstance(views, list) and views else ""
-    return "; ".join(parts) + count if parts else None
+    for name, part in (("network", found.network), ("asset", found.asset)):
+        if part is not None and part.psnr is not None and part.ssim is not None:
+            parts.append(f"{name} {part.psnr:.2f} dB PSNR, {part.ssim:.3f} SSIM")
+    count = len(found.views)
+    return "; ".join(parts) + (f" (on {count} {split_of(found)} view{'s' if count != 1 else ''})" if count else "") if parts else None
 
 
-def split_of(found: dict[str, Any] | None) -> str:
+def split_of(found: Metrics | None) -> str:
     """The split that was measured on: test, unless the figures say otherwise."""
-    split = (found or {}).get("split", "test")
-    return {"val": "validation", "train": "training"}.get(split, "test") if isinstance(split, str) else "test"
+    return {"val": "validation", "train": "training"}.get(found.split, "test") if found is not None else "test"

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import pytest
+
 from pipeline.run import Run
 from tests.workflows.command import Enerf, Result
 from workflows.report.page import page
@@ -102,3 +104,79 @@ def test_a_damaged_run_gets_a_page_too(tmp_path: Path) -> None:
         (run.path / name).parent.mkdir(exist_ok=True)
         (run.path / name).write_text("{", encoding="utf-8")
     assert "not evaluated yet" in page(run, [])
+
+
+def write(run: Run, name: str, text: str) -> None:
+    (run.path / name).parent.mkdir(exist_ok=True)
+    (run.path / name).write_text(text, encoding="utf-8")
+
+
+ODD = {
+    "evaluate/metrics.json": [
+        '{"network": {"psnr": ' + "9" * 400 + ', "ssim": 1}}', '{"network": {"psnr": ' + "9" * 5000 + "}}",
+        '{"views": 7}', '{"views": [3]}', '{"views": [{"name": ["x"]}]}', '{"network": []}', '{"split": {}}', "[1]", "3", "[" * 100_000,
+        '{"network": {"psnr": NaN}}',
+    ],
+    "poses/report.json": ['{"registered": 5}', '{"rejected": {"a": 1}}', '{"rejected": [{"name": 3}]}', '{"warnings": 4}', '{"reprojection_error": "far"}'],
+    "bake/report.json": ["[]", '"text"', '{"voxels": ' + "9" * 5000 + "}", "\0"],
+    "mesh/report.json": ["[]"],
+}  # fmt: skip
+
+
+def test_odd_documents_are_left_out_with_a_word(enerf: Enerf, tmp_path: Path) -> None:
+    for name, texts in ODD.items():
+        for k, text in enumerate(texts):
+            run = a_run(tmp_path / f"{name.partition('/')[0]} {k}")
+            write(run, name, text)
+            shown = page(run, [])
+            links(shown)
+            assert f"{name}: damaged (" in shown, text[:80]
+    for command in (["report", run.path], ["status", run.path], ["inspect", tmp_path / "evaluate 0"], ["inspect", tmp_path / "evaluate 0", "--json"]):
+        result = enerf(*command)
+        assert result.code == 0, result.err
+    assert result.object["damaged"][0].startswith("evaluate/metrics.json: damaged (")
+
+
+def test_the_page_shows_any_text_escaped(tmp_path: Path) -> None:
+    odd = "a\x1b[31m\u202e\udcff\n<b>"
+    run = a_run(tmp_path / "run\udcff\x1b", {"views": [{"name": odd, "network": {"psnr": 1, "ssim": 2}}]})
+    run.settings = {odd: {odd: odd, "many": 10**400, "list": [odd]}}
+    write(run, "poses/report.json", json.dumps({"rejected": [{"name": odd, "reason": odd}], "warnings": [odd]}))
+    write(run, "bake/report.json", json.dumps({odd: odd, "large": 10**400}))
+    (run.path / "train").mkdir()
+    write(run, "train/previews/p\udcff\x1b.png", "x")
+    text = page(run, [])
+    text.encode("utf-8")
+    assert "a\\x1b[31m\\u202e\\udcff\\n&lt;b&gt;" in text
+    assert not any(character in text for character in "\x1b\u202e\udcff")
+    assert "train/previews/p%FF%1B.png" in text
+
+
+def test_a_stage_that_is_replaced_meanwhile_is_read_again(toys: Path, enerf: Enerf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tests.workflows.conftest import TOYS
+    from workflows.report import page as module
+
+    enerf("run", toys, "--out", tmp_path / "run")
+    run = Run.open(tmp_path / "run")
+    calls = []
+    known = module._facts
+
+    def replaced(*arguments: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 1:
+            (run.path / "points").rename(tmp_path / "old")
+        if len(calls) == 3:
+            (tmp_path / "old").rename(run.path / "points")
+        return known(*arguments)
+
+    monkeypatch.setattr(module, "_facts", replaced)
+    path = module.write_report(run, TOYS)
+    assert "<td>points</td><td>fresh</td>" in path.read_text(encoding="utf-8")
+    assert "points/points.ply" in path.read_text(encoding="utf-8")
+    assert len(calls) == 6
+
+
+def test_what_vanishes_while_the_page_is_made_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = a_run(tmp_path / "run")
+    monkeypatch.setattr(Path, "is_file", lambda path: True)  # it was there a moment ago
+    assert links(page(run, [])) == []

@@ -1,0 +1,71 @@
+"""The documents of a run that the page and the summary read: metrics.json and the stages' reports, each checked against its schema.
+
+A run may come from anybody, or be damaged: a document that is not as it is written here is left out, and named.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from pipeline import files
+
+T = TypeVar("T")
+
+
+class Damaged(Exception):
+    """A document that does not follow its schema; the text names it and says why."""
+
+
+class Quality(msgspec.Struct):
+    """Means over views, or the figures of one view: PSNR in decibels."""
+
+    psnr: float | None = None
+    ssim: float | None = None
+
+
+class ViewQuality(msgspec.Struct):
+    """The figures of one view, of the network and of the asset."""
+
+    name: str = ""
+    network: Quality | None = None
+    asset: Quality | None = None
+
+
+class Metrics(msgspec.Struct):
+    """metrics.json, as far as it is shown."""
+
+    split: str = "test"
+    network: Quality | None = None
+    asset: Quality | None = None
+    views: list[ViewQuality] = []
+
+
+class Rejected(msgspec.Struct):
+    """An image that was not used, and why."""
+
+    name: str = ""
+    reason: str = ""
+
+
+class PosesReport(msgspec.Struct):
+    """The report of the stage poses, as far as it is shown; `registered` are its views."""
+
+    registered: list[Any] | None = None
+    reprojection_error: float | None = None
+    rejected: list[Rejected] | None = None
+    warnings: list[str] | None = None
+
+
+def read(path: Path, kind: type[T]) -> tuple[T, dict[str, Any]] | None:
+    """A document by its schema, and all that it holds; None where there is none. Raises Damaged."""
+    name = f"{path.parent.name}/{path.name}"
+    try:
+        found = files.read_json(path)
+        return msgspec.convert(found, kind, strict=True), found
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (files.Unreadable, msgspec.ValidationError) as error:
+        raise Damaged(f"{name}: damaged ({error})") from None
