@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from tests.workflows.conftest import TOYS
+from tests.workflows.toys import TOYS
 from workflows.asset import Workflow
 from workflows.cli.main import main
 

@@ -279,7 +279,7 @@ def test_interrupted_runs_say_how_to_go_on(toys: Path, tmp_path: Path) -> None:
     for number, code in ((signal.SIGTERM, 143), (signal.SIGINT, 130)):
         run = tmp_path / f"run {code}"
         program = (
-            "import sys, time; from pathlib import Path; from workflows.asset import Workflow; from tests.workflows.conftest import TOYS\n"
+            "import sys, time; from pathlib import Path; from workflows.asset import Workflow; from tests.workflows.toys import TOYS\n"
             "import pipeline.stage; known = pipeline.stage.Job.safe_point\n"
             "pipeline.stage.Job.safe_point = lambda job: (time.sleep(0.05), known(job))\n"
             f"from workflows.cli.main import main; sys.exit(main(sys.argv[1:], Workflow(TOYS, Path({str(toys.parent / 'presets')!r}))))"

@@ -89,7 +89,7 @@ def test_listings_that_cannot_be_written_end_with_3(toys: Path, tmp_path: Path) 
 def test_what_is_opened_does_not_take_the_place_of_a_closed_stream(toys: Path, tmp_path: Path) -> None:
     """In a shell, from the start of the interpreter: `>&-` leaves descriptor 1 free for the next file."""
     program = (
-        "import sys; from pathlib import Path; from workflows.asset import Workflow; from tests.workflows.conftest import TOYS\n"
+        "import sys; from pathlib import Path; from workflows.asset import Workflow; from tests.workflows.toys import TOYS\n"
         "import os, pipeline.files; known = pipeline.files.rename\n"
         "pipeline.files.rename = lambda a, b: (os.write(1, b'stray'), os.write(2, b'stray'), known(a, b))\n"
         f"from workflows.cli.main import main; sys.exit(main(sys.argv[1:], Workflow(TOYS, Path({str(toys.parent / 'presets')!r}))))"

@@ -153,7 +153,7 @@ def test_the_page_shows_any_text_escaped(tmp_path: Path) -> None:
 
 
 def test_a_stage_that_is_replaced_meanwhile_is_read_again(toys: Path, enerf: Enerf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tests.workflows.conftest import TOYS
+    from tests.workflows.toys import TOYS
     from workflows.report import page as module
 
     enerf("run", toys, "--out", tmp_path / "run")
