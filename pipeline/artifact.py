@@ -15,23 +15,27 @@ Publishing, where each line is durable before the next begins:
 
 A start that finds old-<stage> without RUN/<stage> was cut short between 2 and 3: it does 3 if out/ is whole, else it undoes 2. One that finds
 both was cut short between 3 and 4. A work folder without out/ belongs to an artifact that was published.
+
+Only names that these lines give are completed, undone or deleted, only for stages of the workflow, and only folders whose manifest is of that stage:
+.work may come from anybody. links.py has seen to it that it holds no links.
 """
 
 from __future__ import annotations
 
 import fnmatch
 import stat
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline import files, manifest
 from pipeline.errors import CorruptArtifact, StageFailed
 from pipeline.hashes import Hashes
+from pipeline.links import WORK
 from pipeline.manifest import Manifest, Output, Request
 from pipeline.stage import Stage
+from pipeline.text import printable
 
-WORK = ".work"
 _SHOWN = 3  # names in a message before "and N more"
 
 
@@ -80,7 +84,7 @@ class Differences:
 
 def listed(names: Iterable[str]) -> str:
     """ "a, b, c and 4 more"."""
-    names = list(names)
+    names = [printable(name, 200) for name in names]
     more = len(names) - _SHOWN
     return ", ".join(names[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
@@ -91,11 +95,11 @@ def outputs_of(folder: Path, stage: Stage, hashes: Hashes | None = None) -> dict
     outputs = {}
     for name, status in files.walk(folder):
         if not stat.S_ISREG(status.st_mode):
-            raise StageFailed(f"{stage.name}: left {name}, which is no plain file: an artifact must stay whole when the run is moved")
+            raise StageFailed(f"{stage.name}: left {printable(name, 200)}, which is no plain file: an artifact must stay whole when the run is moved")
         if name == manifest.NAME:
             raise StageFailed(f"{stage.name}: left a file named {manifest.NAME}, which is the engine's own")
         is_volatile = any(fnmatch.fnmatchcase(name, pattern) for pattern in stage.volatile)
-        outputs[name] = Output(hashes.digest(f"{stage.name}/{name}", folder / name, anew=True), status.st_size, is_volatile)
+        outputs[name] = Output(hashes.digest(f"{stage.name}/{name}", folder / name, anew=True, follow=False), status.st_size, is_volatile)
     if not outputs:
         raise StageFailed(f"{stage.name}: left no file behind")
     return outputs
@@ -112,8 +116,10 @@ def differences(folder: Path, outputs: dict[str, Output], hashes: Hashes | None 
             altered.append(name)
             continue
         try:
-            same = hashes.digest(f"{folder.name}/{name}", folder / name) == expected.sha256
-        except OSError:
+            same = hashes.digest(f"{folder.name}/{name}", folder / name, follow=False) == expected.sha256
+        except OSError as error:
+            if files.is_denied(error):
+                raise
             same = False
         if not same:
             altered.append(name)
@@ -129,6 +135,7 @@ def prepare(place: Workplace, trash: Path) -> bool:
     files.discard(place.out, trash)
     place.scratch.mkdir(parents=True, exist_ok=True)
     place.out.mkdir()
+    _sync(place.folder, place.root, trash, trash.parent)  # a checkpoint is as durable as the folders above it
     return not files.is_empty(place.scratch)
 
 
@@ -164,39 +171,57 @@ def publish(run: Path, stage: str, place: Workplace) -> None:
         place.root.rmdir()
 
 
-def finished(place: Workplace) -> Manifest | None:
+def finished(place: Workplace, stage: str) -> Manifest | None:
     """The manifest of a sealed out/ whose publication was cut short, every file checked; None if there is none such."""
-    try:
-        made = manifest.read_manifest(place.out)
-    except CorruptArtifact:
+    made = _sealed(place.out, stage)
+    if made is None or made.request.digest != place.request or differences(place.out, made.outputs).damaged:
         return None
-    whole = made.request.digest == place.request and not differences(place.out, made.outputs).damaged
-    return made if whole else None
+    return made
 
 
-def recover(run: Path) -> list[str]:
-    """Complete or undo what a kill cut short; returns a sentence for each thing done. Only for who holds the run's lock."""
+def is_published(run: Path, stage: str, place: Workplace) -> bool:
+    """Whether out/ has become RUN/<stage>, whatever failed after that."""
+    made = _sealed(run / stage, stage)
+    return made is not None and made.request.digest == place.request and not files.exists(place.out)
+
+
+def clear_published(run: Path, stage: str, place: Workplace) -> None:
+    """Delete the work on what is published: an interrupted run that was forced left it, and nobody asks for it any more."""
+    files.discard(place.folder, run / WORK)
+    if files.is_folder(place.root) and files.is_empty(place.root):
+        place.root.rmdir()
+
+
+def recover(run: Path, stages: Collection[str]) -> list[str]:
+    """Complete or undo what a kill cut short; returns a sentence for each thing done. Only for who holds the run's lock.
+
+    stages  names of the workflow's; what .work holds of others stays as it is
+    """
     work = run / WORK
-    if not work.is_dir():
+    if not files.is_folder(work):
         return []
     done = []
-    for old in sorted(work.glob("old-*")):
-        stage = old.name.removeprefix("old-")
-        done.append(f"{stage}: {_recovered(run, stage, old)}")
-    for root in sorted(path for path in work.iterdir() if path.is_dir() and "-" not in path.name):
-        _clear_published(run / root.name, root, work)
-    for trash in work.glob("trash-*"):
-        files.remove(trash)
+    for stage in sorted(stages):
+        if files.exists(work / f"old-{stage}"):
+            done.append(f"{stage}: {_recovered(run, stage, work / f'old-{stage}')}")
+        if files.is_folder(work / stage):
+            _clear_published(run, stage, work / stage)
+    for path in list(work.iterdir()):
+        if files.is_trash(path.name):
+            files.remove(path)
     return done
 
 
 def _recovered(run: Path, stage: str, old: Path) -> str:
     work, target = run / WORK, run / stage
-    if files.exists(target) and _is_sealed(target):
+    if _sealed(target, stage) is not None:
         files.discard(old, work)
         return "the former artifact, already replaced, was deleted"
+    if _sealed(old, stage) is None:
+        files.discard(old, work)
+        return "what was set aside as the former artifact is none, and was deleted"
     files.discard(target, work)
-    whole = [path for path in (work / stage).glob("*/out") if _is_sealed(path)]
+    whole = [path for path in (work / stage).glob("*/out") if _is_of(_sealed(path, stage), path.parent.name)]
     if len(whole) == 1:
         files.rename(whole[0], target)
         _sync(whole[0].parent, run)
@@ -207,20 +232,28 @@ def _recovered(run: Path, stage: str, old: Path) -> str:
     return "a replacement that was cut short was undone"
 
 
-def _clear_published(target: Path, root: Path, work: Path) -> None:
+def _clear_published(run: Path, stage: str, root: Path) -> None:
+    published = _sealed(run / stage, stage)
     for folder in list(root.iterdir()):
-        if not files.exists(folder / "out") and _is_sealed(target) and manifest.read_manifest(target).request.digest == folder.name:
-            files.discard(folder, work)
+        if files.is_folder(folder) and not files.exists(folder / "out") and _is_of(published, folder.name):
+            files.discard(folder, run / WORK)
     if files.is_empty(root):
         root.rmdir()
 
 
-def _is_sealed(folder: Path) -> bool:
+def _is_of(made: Manifest | None, request: str) -> bool:
+    return made is not None and made.request.digest == request
+
+
+def _sealed(folder: Path, stage: str) -> Manifest | None:
+    """The manifest of an artifact of this stage; None if the folder is none such."""
+    if not files.is_folder(folder):
+        return None
     try:
-        manifest.read_manifest(folder)
+        made = manifest.read_manifest(folder)
     except CorruptArtifact:
-        return False
-    return True
+        return None
+    return made if made.request.stage == stage else None
 
 
 def _sync(*folders: Path) -> None:

@@ -21,6 +21,7 @@ from pipeline.hashes import Hashes
 from pipeline.manifest import ABSENT, Manifest, Request
 from pipeline.run import Run
 from pipeline.stage import Stage, settings_dict, settings_from
+from pipeline.text import printable
 
 _CHANGES_SHOWN = 4
 
@@ -107,6 +108,8 @@ def _recorded(folder: Path, stage: Stage) -> tuple[Manifest | None, str | None]:
     """The manifest of the published artifact, or what is wrong with it."""
     if not files.exists(folder):
         return None, None
+    if not files.is_folder(folder):
+        return None, "it is no folder"
     try:
         recorded = manifest.read_manifest(folder)
     except CorruptArtifact as error:
@@ -169,7 +172,7 @@ def _source(stage: Stage, run: Run, settings: Any, former: dict[str, str] | None
             name = Path(os.path.relpath(path, base)).as_posix()
             digests[name] = hashes.digest(f"{prefix}{name}", path) if path.is_file() else ABSENT
     except (OSError, ValueError) as error:
-        raise BadInput(f"{source}: cannot be read ({error})") from error
+        raise BadInput(f"{source}: cannot be read ({printable(error, 300)})") from error
     hashes.forget(prefix, {prefix + name for name in digests})
     return dict(sorted(digests.items())), None
 

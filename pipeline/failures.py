@@ -6,8 +6,8 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+from pipeline.disk import disk_full, is_disk_full
 from pipeline.errors import Interrupted, PipelineError, StageFailed
-from pipeline.run import disk_full, is_disk_full
 
 _FULL_TEXTS = ("no space left on device", "disk quota exceeded", "disk is full", "disk full")  # of libraries that drop the number of the error
 _NOTHING_FREE = 2**16  # bytes

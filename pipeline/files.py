@@ -1,15 +1,20 @@
 """The few operations on files that everything else is made of: atomic writes, bounded reads, canonical JSON, safe names.
 
 What must survive a kill or a power cut goes through these functions and no others, so that tests can cut the power at each of them. `atomic` is the
-one writer of files that appear whole or not at all.
+one writer of files that appear whole or not at all. Nothing is written or deleted through a link, and nothing but plain files is opened.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import math
 import os
+import re
+import secrets
 import shutil
+import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,10 +24,33 @@ from typing import Any
 SafePoint = Callable[[], None]
 
 MAX_JSON = 64 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
+MAX_DEPTH = 100  # of nested JSON; whoever walks through a value by recursion stays far from Python's limit
+
+_RANDOM = 8  # bytes; nobody guesses the name of a temporary file
+# Names that `atomic` and `discard` give now, and those with a process's number that they gave before release 0.2.
+_TEMPORARY = re.compile(r"\.(.+)\.(?:[0-9a-f]{16}|[0-9]{1,10})\.part", re.DOTALL)
+_TRASH = re.compile(r"trash-(?:[0-9a-f]{16}|[0-9]{1,10}-[0-9]{1,20})")
+_LONGEST = 200  # bytes of a file's name that its temporary's repeats: file systems allow 255
+_NOT_ITS_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES, errno.EPERM)
+_KINDS = {
+    stat.S_IFLNK: "a link",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+}
 
 
 class Unreadable(ValueError):
-    """A JSON file that is too large, cut off or not valid; the text says why."""
+    """A JSON file that is too large, cut off or not valid; the text says why.
+
+    denied  the error of the system where nothing is wrong with the file: no permission, too many open files, no memory
+    """
+
+    def __init__(self, text: str, denied: OSError | None = None) -> None:
+        super().__init__(text)
+        self.denied = denied
 
 
 def canonical_json(value: Any) -> bytes:
@@ -35,24 +63,80 @@ def pretty_json(value: Any, *, sort_keys: bool = True, default: Callable[[Any], 
     return json.dumps(value, indent=1, sort_keys=sort_keys, ensure_ascii=True, allow_nan=False, default=default).encode("ascii") + b"\n"
 
 
-def read_json(path: Path, limit: int = MAX_JSON) -> Any:
-    """The value in a file of at most `limit` bytes. Raises Unreadable; FileNotFoundError if there is none."""
+def is_denied(error: OSError) -> bool:
+    """Whether nothing is wrong with the file: no permission, too many open files, no memory."""
+    return error.errno in _NOT_ITS_FAULT
+
+
+def kind_of(mode: int) -> str:
+    """ "a link", "a pipe", "a device": what a file of this mode (st_mode) is."""
+    return _KINDS.get(stat.S_IFMT(mode), "a plain file")
+
+
+def open_plain(path: Path, *, follow: bool = True) -> int:
+    """A descriptor of a plain file, to read from. Raises OSError; for a pipe, a device, a socket or a folder too, which are never opened.
+
+    follow  whether `path` itself may be a link; not so for files of a run
+    """
+    _check_plain(path, os.stat(path, follow_symlinks=follow))  # before it is opened: opening a device may do something
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow else os.O_NOFOLLOW))
     try:
-        with open(path, "rb") as file:
-            data = file.read(limit + 1)
+        _check_plain(path, os.fstat(descriptor))
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _check_plain(path: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        number = errno.EISDIR if stat.S_ISDIR(status.st_mode) else errno.ELOOP if stat.S_ISLNK(status.st_mode) else errno.EINVAL
+        raise OSError(number, f"is {kind_of(status.st_mode)}, expected a plain file", str(path))
+
+
+def read_json(path: Path, limit: int = MAX_JSON, *, follow: bool = True) -> Any:
+    """The value in a plain file of at most `limit` bytes, finite and not deeply nested. Raises Unreadable; FileNotFoundError if there is none.
+
+    follow  see `open_plain`
+    """
+    try:
+        with open(open_plain(path, follow=follow), "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            data = b"" if size > limit else file.read(limit + 1)
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise Unreadable(error.strerror or str(error)) from None
-    if len(data) > limit:
+        raise Unreadable(error.strerror or str(error), error if is_denied(error) else None) from None
+    except ValueError as error:  # of a path with a NUL, or of characters that no file's name has
+        raise Unreadable(str(error)) from None
+    if max(size, len(data)) > limit:
         raise Unreadable(f"larger than {limit} bytes")
     if not data.strip():
         raise Unreadable("the file is empty")
     try:
-        return json.loads(data, parse_constant=_refused)
+        value = json.loads(data, parse_constant=_refused)
+        _check_values(value)
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
         text = str(error) if isinstance(error, ValueError) else "nested too deeply"
         raise Unreadable(f"not valid JSON ({text.splitlines()[0][:120]})") from None
+    return value
+
+
+def _check_values(value: Any) -> None:
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        below: list[Any] = []
+        for item in level:
+            if isinstance(item, dict):
+                below.extend(item.values())
+            elif isinstance(item, list):
+                below.extend(item)
+            elif isinstance(item, float) and not math.isfinite(item):
+                _refused("1e999")
+        if not below:
+            return
+        level = below
+    raise ValueError("nested too deeply")
 
 
 def _refused(name: str) -> Any:
@@ -74,17 +158,32 @@ def atomic(path: Path, *, durable: bool = True) -> Iterator[Path]:
     durable  sync the file before and the folder after the rename: the file has its old content or all of the new after a power cut, too.
              Without, only a kill is survived: for scratch that is checked when it is read, or made again
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = _created_beside(path)
     try:
         yield temporary
         if durable:
             sync_file(temporary)
         rename(temporary, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # the error in flight is the one to report
+            temporary.unlink(missing_ok=True)
         raise
     if durable:
         sync_folder(path.parent)
+
+
+def _created_beside(path: Path) -> Path:
+    """A new, empty file in the same folder: whoever writes to it next finds this file, not a link that somebody put there."""
+    temporary = path.with_name(f".{_repeated(path.name)}.{secrets.token_hex(_RANDOM)}.part")
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666))
+    return temporary
+
+
+def _repeated(name: str) -> str:
+    """As much of a file's name as its temporary's has room for."""
+    while len(os.fsencode(name)) > _LONGEST:
+        name = name[:-1]
+    return name
 
 
 def write_atomically(path: Path, data: bytes, *, durable: bool = True) -> None:
@@ -95,14 +194,28 @@ def write_atomically(path: Path, data: bytes, *, durable: bool = True) -> None:
 
 def is_temporary(name: str, path: str) -> bool:
     """Whether a file of this name is what a kill left of writing `path`."""
-    return name.startswith(f".{path}.") and name.endswith(".part")
+    found = _TEMPORARY.fullmatch(name)
+    return found is not None and found.group(1) == _repeated(path)
 
 
 def remove_temporaries(path: Path) -> None:
-    """What kills left of writing `path`; only while no other process writes it."""
-    for entry in list(path.parent.iterdir()):
-        if is_temporary(entry.name, path.name):
-            entry.unlink(missing_ok=True)
+    """The plain files that kills left of writing `path`; only while no other process writes it. Raises OSError."""
+    if not path.parent.is_dir():
+        return
+    with os.scandir(path.parent) as entries:
+        found = [entry for entry in entries if is_temporary(entry.name, path.name) and entry.is_file(follow_symlinks=False)]
+    for entry in found:
+        Path(entry.path).unlink(missing_ok=True)
+
+
+def remove_abandoned(folder: Path, seconds: float) -> None:
+    """The plain files directly in a folder that kills left of writing any file, last written longer ago than this. Raises OSError."""
+    with os.scandir(folder) as entries:
+        found = [entry for entry in entries if _TEMPORARY.fullmatch(entry.name) and entry.is_file(follow_symlinks=False)]
+    for entry in found:
+        with contextlib.suppress(FileNotFoundError):
+            if entry.stat(follow_symlinks=False).st_mtime < time.time() - seconds:
+                os.unlink(entry.path)
 
 
 def write_json(path: Path, value: Any, *, sort_keys: bool = False, default: Callable[[Any], Any] | None = None, durable: bool = True) -> None:
@@ -116,12 +229,16 @@ def rename(source: Path, target: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames within the folder survive a power cut."""
-    _sync(folder, os.O_DIRECTORY)
+    """Make renames within the folder, which may be given by a link, survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def sync_tree(folder: Path) -> None:
-    """Every file and folder below, then the folder itself."""
+    """Every file and folder below, then the folder itself. Raises OSError for a link, or for what is no plain file."""
     for parent, _, names in os.walk(folder, topdown=False):
         for name in names:
             sync_file(Path(parent, name))
@@ -129,11 +246,8 @@ def sync_tree(folder: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    _sync(path, os.O_NOFOLLOW)
-
-
-def _sync(path: Path, flags: int) -> None:
-    descriptor = os.open(path, os.O_RDONLY | flags)
+    """Raises OSError for a link."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
     finally:
@@ -142,19 +256,27 @@ def _sync(path: Path, flags: int) -> None:
 
 def remove(path: Path) -> None:
     """Whatever it is, with all that is in it; a link goes, not what it points to."""
-    if path.is_symlink() or not path.is_dir():
+    if not is_folder(path):
         path.unlink(missing_ok=True)
-    else:
+        return
+    try:
         shutil.rmtree(path)
+    except RecursionError:
+        raise OSError(errno.ENAMETOOLONG, "folders nested too deeply to be removed", str(path)) from None
 
 
 def discard(path: Path, trash: Path) -> None:
     """Remove so that a kill never leaves a half-removed folder under the old name: it goes to the folder `trash` first."""
     if not os.path.lexists(path):
         return
-    doomed = trash / f"trash-{os.getpid()}-{time.time_ns()}"
+    doomed = trash / f"trash-{secrets.token_hex(_RANDOM)}"
     rename(path, doomed)
     remove(doomed)
+
+
+def is_trash(name: str) -> bool:
+    """Whether a kill in `discard` may have left this name."""
+    return _TRASH.fullmatch(name) is not None
 
 
 def walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
@@ -162,14 +284,27 @@ def walk(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
     pending = [("", folder)]
     while pending:
         prefix, current = pending.pop()
-        with os.scandir(current) as entries:
-            found = sorted(entries, key=lambda entry: entry.name)
+        try:
+            with os.scandir(current) as entries:
+                found = sorted(entries, key=lambda entry: entry.name)
+        except FileNotFoundError:
+            if not prefix:
+                raise
+            continue  # as below
         for entry in found:
             if entry.is_dir(follow_symlinks=False):
                 pending.append((f"{prefix}{entry.name}/", Path(entry.path)))
                 continue
             with contextlib.suppress(FileNotFoundError):  # a reader takes no lock: a file may vanish under its eyes
                 yield prefix + entry.name, os.stat(entry.path, follow_symlinks=False)
+
+
+def is_folder(path: Path) -> bool:
+    """Whether it is a folder, and no link to one."""
+    try:
+        return stat.S_ISDIR(os.lstat(path).st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def exists(path: Path) -> bool:

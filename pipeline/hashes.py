@@ -1,28 +1,39 @@
-"""SHA-256 of files, remembered by size, modification time and inode so that an unchanged run is recognised without reading it."""
+"""SHA-256 of files, remembered by size, times and inode so that an unchanged run is recognised without reading it."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-import re
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+import msgspec
 
 from pipeline import files
 from pipeline.files import SafePoint
 
 CHUNK = 2**20  # bytes between two safe points
-FORMAT = "enerf-hashes-1"
-# A file changed again within one tick of the file system's clock keeps its modification time (4-10 ms on Linux). What was modified this
+FORMAT = "enerf-hashes-2"
+# A file changed again within one tick of the file system's clock keeps its times (4-10 ms on Linux's own, 2 s on FAT). What was changed this
 # recently when it was hashed is not remembered but hashed again the next time.
-SETTLED_NS = 20_000_000
+SETTLED_NS = 2_100_000_000
+
+Sha256 = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+Entry = tuple[int, int, int, int, Sha256]
 
 
-def sha256_of(path: Path, safe_point: SafePoint | None = None) -> str:
-    """Hex digest of a file's bytes."""
+class _Memory(msgspec.Struct):
+    """The file that remembers."""
+
+    format: Literal["enerf-hashes-2"]
+    files: dict[str, Entry]
+
+
+def sha256_of(path: Path, safe_point: SafePoint | None = None, *, follow: bool = True) -> str:
+    """Hex digest of a plain file's bytes. Raises OSError; see `pipeline.files.open_plain`."""
     digest = hashlib.sha256()
-    with open(path, "rb", buffering=0) as file:
+    with open(files.open_plain(path, follow=follow), "rb", buffering=0) as file:
         while chunk := file.read(CHUNK):
             digest.update(chunk)
             if safe_point is not None:
@@ -42,21 +53,22 @@ class Hashes:
         self.trust = trust
         self.safe_point = safe_point
         self._changed = False
-        self._entries: dict[str, tuple[int, int, int, str]] = {} if path is None else _read(path)
+        self._entries: dict[str, Entry] = {} if path is None else _read(path)
 
-    def digest(self, key: str, path: Path, *, anew: bool = False) -> str:
+    def digest(self, key: str, path: Path, *, anew: bool = False, follow: bool = True) -> str:
         """Of the file at `path`, which is or will be at the place `key`. Raises OSError if it cannot be read.
 
-        anew  read it whatever is remembered, and without a safe point: what a stage has just finished is not given up for a Ctrl-C
+        anew    read it whatever is remembered, and without a safe point: what a stage has just finished is not given up for a Ctrl-C
+        follow  whether `path` itself may be a link; not so for files of a run
         """
-        before = os.stat(path)
+        before = os.stat(path, follow_symlinks=follow)
         known = self._entries.get(key)
-        if self.trust and not anew and known is not None and known[:3] == _identity(before):
-            return known[3]
+        if self.trust and not anew and known is not None and known[:4] == _identity(before):
+            return known[4]
         started = time.time_ns()
-        digest = sha256_of(path, None if anew else self.safe_point)
-        after = os.stat(path)
-        if _identity(after) == _identity(before) and after.st_mtime_ns < started - SETTLED_NS:
+        digest = sha256_of(path, None if anew else self.safe_point, follow=follow)
+        after = os.stat(path, follow_symlinks=follow)
+        if _identity(after) == _identity(before) and max(after.st_mtime_ns, after.st_ctime_ns) < started - SETTLED_NS:
             self._entries[key] = (*_identity(after), digest)
             self._changed = True
         elif self._entries.pop(key, None) is not None:
@@ -75,31 +87,20 @@ class Hashes:
             return
         try:
             self.path.parent.mkdir(exist_ok=True)
+            files.remove_temporaries(self.path)
             files.write_atomically(self.path, files.canonical_json({"format": FORMAT, "files": self._entries}))
             self._changed = False
         except OSError:
             pass
 
 
-def _identity(stat: os.stat_result) -> tuple[int, int, int]:
-    return stat.st_size, stat.st_mtime_ns, stat.st_ino
+def _identity(stat: os.stat_result) -> tuple[int, int, int, int]:
+    """Also the time of the last change of the file's status: anybody may set its modification time back."""
+    return stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
 
 
-def _read(path: Path) -> dict[str, tuple[int, int, int, str]]:
+def _read(path: Path) -> dict[str, Entry]:
     try:
-        value = files.read_json(path, limit=4 * files.MAX_JSON)
-    except (files.Unreadable, FileNotFoundError, NotADirectoryError):
+        return msgspec.convert(files.read_json(path, limit=4 * files.MAX_JSON, follow=False), _Memory).files
+    except (OSError, ValueError):  # unreadable, or of another form; both of msgspec's errors are ValueErrors
         return {}
-    if not isinstance(value, dict) or value.get("format") != FORMAT or not isinstance(value.get("files"), dict):
-        return {}
-    return {key: (entry[0], entry[1], entry[2], entry[3]) for key, entry in value["files"].items() if _is_entry(entry)}
-
-
-def _is_entry(entry: Any) -> bool:
-    return (
-        isinstance(entry, list)
-        and len(entry) == 4
-        and all(type(number) is int for number in entry[:3])
-        and isinstance(entry[3], str)
-        and re.fullmatch(r"[0-9a-f]{64}", entry[3]) is not None
-    )

@@ -15,34 +15,36 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import msgspec
 
 from pipeline import files
-from pipeline.errors import BadInput, RunLocked
-
-LOCK = ".lock"
-HOLDER = ".lock.json"
+from pipeline.disk import cannot_write
+from pipeline.errors import BadInput, PipelineError, RunLocked
+from pipeline.links import HOLDER, LOCK, refuse_links
+from pipeline.text import printable
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who writes a run; `since` in seconds since 1970."""
+    """Who writes a run; `since` in seconds since 1970. Anybody may have written the note that this is read from."""
 
-    pid: int
-    host: str
-    since: float
-    command: str
+    pid: Annotated[int, msgspec.Meta(ge=1, le=2**31 - 1)]
+    host: Annotated[str, msgspec.Meta(max_length=255)]
+    since: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
+    command: Annotated[str, msgspec.Meta(max_length=1000)]
 
     def text(self) -> str:
         since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.since))
-        return f"process {self.pid} on {self.host} since {since} ({self.command})"
+        return f"process {self.pid} on {printable(self.host, 80)} since {since} ({printable(self.command, 500)})"
 
 
 def holder_of(run: Path) -> Holder | None:
     """The process that holds the lock by HOLDER, if it may still be alive. Takes no lock, writes nothing."""
     try:
-        value = files.read_json(run / HOLDER, limit=2**16)
-        holder = Holder(int(value["pid"]), str(value["host"]), float(value["since"]), str(value["command"]))
-    except (OSError, ValueError, TypeError, KeyError, OverflowError):
+        holder = msgspec.convert(files.read_json(run / HOLDER, limit=2**16, follow=False), Holder)
+    except (OSError, ValueError):  # of msgspec, too
         return None
     return holder if holder.host != socket.gethostname() or _is_alive(holder.pid) else None
 
@@ -64,6 +66,7 @@ def lock(run: Path) -> Iterator[None]:
     """Hold the run's lock. Raises RunLocked at once if another holds it, BadInput if the run cannot be written."""
     import filelock  # not needed by the commands that only read
 
+    refuse_links(run)  # before the lock's file is opened
     guard = filelock.FileLock(run / LOCK, timeout=0, thread_local=False)
     try:
         guard.acquire()
@@ -72,13 +75,21 @@ def lock(run: Path) -> Iterator[None]:
         who = holder.text() if holder is not None else "a process that did not say who it is"
         raise RunLocked(f"{run}: being written by {who}. Wait until it is done, or stop it.") from None
     except OSError as error:
-        raise BadInput(f"{run}: cannot be locked for writing ({error.strerror or error})") from None
+        raise _cannot_lock(run, error) from None
     try:
         _write_holder(run)
         yield
     finally:
-        (run / HOLDER).unlink(missing_ok=True)
-        guard.release()
+        # An error in flight is the one to report, and without one all is done: a note of a dead process does no harm, and the lock ends with its process.
+        with contextlib.suppress(OSError):
+            (run / HOLDER).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            guard.release()
+
+
+def _cannot_lock(run: Path, error: OSError) -> PipelineError:
+    found = cannot_write(run, error)
+    return BadInput(f"{run}: cannot be locked for writing ({error.strerror or error})") if isinstance(found, BadInput) else found
 
 
 def _write_holder(run: Path) -> None:

@@ -9,6 +9,7 @@ checksum  of all of the above, so that a damaged manifest is known as such
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib.metadata
 import platform
@@ -18,16 +19,24 @@ import time
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from pipeline import files
 from pipeline.errors import CorruptArtifact
+from pipeline.hashes import Sha256
+from pipeline.text import printable
 
 NAME = "manifest.json"
 FORMAT = "enerf-manifest"
 VERSION = 1
 ABSENT = "absent"  # in place of the digest of a source file that is listed but missing
 DISTRIBUTION = "efficientnerf"  # its requirements are the packages whose versions are written down
+
+_Sha256OrAbsent = Annotated[str, msgspec.Meta(pattern=rf"^(?:[0-9a-f]{{64}}|{ABSENT})\Z")]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+_Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e12)]
 
 
 @dataclass(frozen=True)
@@ -40,10 +49,10 @@ class Request:
     """
 
     stage: str
-    version: int
+    version: _Count
     settings: dict[str, Any]
-    inputs: dict[str, str]
-    source: dict[str, str] | None = None
+    inputs: dict[str, Sha256]
+    source: dict[str, _Sha256OrAbsent] | None = None
 
     def plain(self) -> dict[str, Any]:
         return {"stage": self.stage, "version": self.version, "settings": self.settings, "inputs": self.inputs, "source": self.source}
@@ -57,8 +66,8 @@ class Request:
 class Output:
     """One file of an artifact; size in bytes."""
 
-    sha256: str
-    size: int
+    sha256: Sha256
+    size: _Count
     volatile: bool = False
 
 
@@ -147,15 +156,18 @@ def artifact_digest(outputs: dict[str, Output]) -> str:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """The manifest in an artifact's folder. Every value is checked. Raises CorruptArtifact."""
-    path = folder / NAME
+    """The manifest in an artifact's folder. Every value is checked. Raises CorruptArtifact; OSError where it may not be read."""
     where = f"{folder.name}/{NAME}"
     try:
-        return _parsed(files.read_json(path))
+        return _parsed(files.read_json(folder / NAME, follow=False))
     except (FileNotFoundError, NotADirectoryError):
         raise CorruptArtifact(f"{where}: is not there", (where,)) from None
-    except (ValueError, OverflowError, RecursionError) as error:  # Unreadable and _Bad are ValueErrors; the others come of absurd numbers
+    except files.Unreadable as error:
+        if error.denied is not None:
+            raise error.denied from None
         raise CorruptArtifact(f"{where}: {error}", (where,)) from None
+    except (ValueError, OverflowError, RecursionError) as error:  # of msgspec, too
+        raise CorruptArtifact(f"{where}: {printable(error, 300)}", (where,)) from None
 
 
 class _Bad(ValueError):
@@ -167,8 +179,26 @@ def _plain_output(output: Output) -> dict[str, Any]:
     return {**plain, "volatile": True} if output.volatile else plain
 
 
+class _Document(msgspec.Struct):
+    """manifest.json, as anybody may have written it. Those of 2026 before release 0.1.0 have no cpu_seconds, cores and facts."""
+
+    request: Request
+    request_digest: Sha256
+    outputs: dict[str, Output]
+    digest: Sha256
+    seconds: _Seconds
+    peak_memory: _Count
+    resumed: bool
+    made: _Seconds
+    versions: dict[str, str]
+    cpu_seconds: _Seconds = 0.0
+    cores: _Count = 0
+    facts: dict[str, Any] = {}
+
+
 def _parsed(value: Any) -> Manifest:
-    value = _typed(value, dict, "the manifest")
+    if not isinstance(value, dict):
+        raise _Bad(f"found {type(value).__name__}, expected an object")
     if value.get("format") != FORMAT:
         raise _Bad(f"format {value.get('format')!r:.40}, expected {FORMAT!r}")
     if value.get("format_version") != VERSION:
@@ -176,58 +206,11 @@ def _parsed(value: Any) -> Manifest:
     rest = {key: item for key, item in value.items() if key != "checksum"}
     if value.get("checksum") != hashlib.sha256(files.canonical_json(rest)).hexdigest():
         raise _Bad("its checksum is not that of its content: it was altered or damaged")
-    outputs = {_name(name): _output(name, entry) for name, entry in _typed(value.get("outputs"), dict, "outputs").items()}
-    manifest = Manifest(
-        request=_request(value.get("request")),
-        outputs=outputs,
-        seconds=float(_typed(value.get("seconds"), (int, float), "seconds")),
-        peak_memory=_typed(value.get("peak_memory"), int, "peak_memory"),
-        resumed=_typed(value.get("resumed"), bool, "resumed"),
-        made=float(_typed(value.get("made"), (int, float), "made")),
-        versions={_typed(k, str, "versions"): _typed(v, str, "versions") for k, v in _typed(value.get("versions"), dict, "versions").items()},
-        cpu_seconds=float(_typed(value.get("cpu_seconds", 0.0), (int, float), "cpu_seconds")),  # manifests of 2026 before release 0.1.0 have none
-        cores=_typed(value.get("cores", 0), int, "cores"),
-        facts=_typed(value.get("facts", {}), dict, "facts"),
-    )
-    if value.get("digest") != manifest.digest or value.get("request_digest") != manifest.request.digest:
+    document = msgspec.convert(value, _Document)
+    for name in document.outputs:
+        if not files.is_safe_name(name) or name == NAME:
+            raise _Bad(f"output {name!r:.80} is no name of a file in its folder")
+    manifest = Manifest(**{each.name: getattr(document, each.name) for each in dataclasses.fields(Manifest)})
+    if document.digest != manifest.digest or document.request_digest != manifest.request.digest:
         raise _Bad("its digests are not those of what it lists")
     return manifest
-
-
-def _request(value: Any) -> Request:
-    value = _typed(value, dict, "request")
-    source = value.get("source")
-    inputs = _typed(value.get("inputs"), dict, "inputs")
-    return Request(
-        stage=_typed(value.get("stage"), str, "stage"),
-        version=_typed(value.get("version"), int, "version"),
-        settings=_typed(value.get("settings"), dict, "settings"),
-        inputs={name: _hex(digest) for name, digest in inputs.items()},
-        source=None if source is None else {name: d if d == ABSENT else _hex(d) for name, d in _typed(source, dict, "source").items()},
-    )
-
-
-def _output(name: str, value: Any) -> Output:
-    value = _typed(value, dict, name)
-    size = _typed(value.get("size"), int, f"size of {name}")
-    if size < 0:
-        raise _Bad(f"{name}: size {size}")
-    return Output(_hex(value.get("sha256")), size, _typed(value.get("volatile", False), bool, f"volatile of {name}"))
-
-
-def _name(name: str) -> str:
-    if not files.is_safe_name(name) or name == NAME:
-        raise _Bad(f"output {name!r:.80} is no name of a file in its folder")
-    return name
-
-
-def _hex(value: Any) -> str:
-    if not isinstance(value, str) or re.fullmatch(r"[0-9a-f]{64}", value) is None:
-        raise _Bad(f"{value!r:.80} is no SHA-256")
-    return value
-
-
-def _typed(value: Any, kind: Any, what: str) -> Any:
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise _Bad(f"{what}: found {type(value).__name__}, expected {getattr(kind, '__name__', 'number')}")
-    return value

@@ -11,41 +11,60 @@ Nothing in it but the source is an absolute path: a run may be moved or copied.
 
 from __future__ import annotations
 
-import errno
+import contextlib
 import os
-import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
+
+import msgspec
 
 from pipeline import files
-from pipeline.errors import BadInput, CorruptArtifact, DiskFull
-from pipeline.lock import HOLDER, LOCK, Holder, holder_of, lock
+from pipeline.disk import cannot_write
+from pipeline.errors import BadInput, CorruptArtifact
+from pipeline.links import CACHE, HOLDER, LOCK, RUN, refuse_links
+from pipeline.lock import Holder, holder_of, lock
 
-NAME = "run.json"
+NAME = RUN
 FORMAT = "enerf-run"
 VERSION = 1
 _CHANGEABLE = ("source", "settings", "preset", "seed", "device")
+_ABANDONED = 24 * 3600.0  # seconds after which nobody is writing to a temporary file any more, such as that of a report
+# The fields of a run.json that anybody may have written. Settings are checked by the stages that have them.
+_FIELDS: dict[str, Any] = {
+    "source": Annotated[str, msgspec.Meta(max_length=4096)] | None,
+    "settings": dict[str, dict[str, Any]],
+    "preset": Annotated[str, msgspec.Meta(max_length=200)] | None,
+    "seed": Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None,
+    "device": Annotated[str, msgspec.Meta(max_length=200)] | None,
+    "created": Annotated[float, msgspec.Meta(gt=-1e15, lt=1e15)],
+}
 
 
 class ResumeText(Protocol):
     """What messages say of how to go on with a run: a workflow gives the command, the engine knows none.
 
     until        the last stage to run; None: all
+    start        the first stage to run even if it is up to date; None: none
     only         the one stage to run
+    force        whether that one is to run even if it is up to date
     with_source  whether the source has to be named
     """
 
-    def __call__(self, run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str: ...
+    def __call__(
+        self, run: Path, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
+    ) -> str: ...
 
 
-def resume_in_words(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+def resume_in_words(
+    run: Path, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
+) -> str:
     """The ResumeText of a run that was given none."""
-    what = f"the stage {only}" if only is not None else "the stages" if until is None else f"the stages until {until}"
-    return f"run {what} of {run}" + (" with a source" if with_source else "")
+    what = f"the stage {only}" if only is not None else "the stages" + (f" from {start}" if start else "") + (f" until {until}" if until else "")
+    return f"run {what} of {run}" + (", forced" if force else "") + (" with a source" if with_source else "")
 
 
 @dataclass
@@ -78,7 +97,7 @@ class Run:
         run = cls(path, source, settings or {}, **more)
         run.check_free()
         try:
-            run.path.mkdir(parents=True, exist_ok=True)
+            _make_folder(run.path)
         except OSError as error:
             raise cannot_write(run.path, error) from None
         with run.locked():
@@ -100,34 +119,32 @@ class Run:
 
     @classmethod
     def open(cls, path: Path, resume_text: ResumeText = resume_in_words) -> Run:
-        """Read run.json. Raises BadInput if it is no run or one of a newer format, CorruptArtifact if it is damaged."""
+        """Read run.json. Raises BadInput if it is no run or one of a newer format, CorruptArtifact if it is damaged or the run holds links."""
         path = _absolute(path)
         if not path.is_dir():
             raise BadInput(f"{path}: {'is not a folder' if files.exists(path) else 'no such folder'}. Give the folder of a run.")
-        try:
-            value = files.read_json(path / NAME, limit=16 * 2**20)
-        except FileNotFoundError:
-            raise BadInput(f"{path}: is not a run (it has no {NAME}).") from None
-        except files.Unreadable as error:
-            raise CorruptArtifact(f"{path / NAME}: {error}. Restore it, or start a new run.", (NAME,)) from None
-        return cls(path, **_checked(path / NAME, value), resume_text=resume_text)
+        refuse_links(path)
+        return cls(path, **_recorded(path), resume_text=resume_text)
 
     def update(self, **changes: Any) -> None:
-        """Change source, settings (all of them), preset, seed or device, and write run.json if that makes a difference."""
+        """Change source, settings (all of them), preset, seed or device, and write run.json if that makes a difference.
+
+        What is not changed is as another process may have left it. What is read first, and changed for that, is read in `locked`.
+        """
         unknown = sorted(changes.keys() - set(_CHANGEABLE))
         if unknown:
             raise TypeError(f"a run has no {unknown[0]!r} to change")
-        former = {name: getattr(self, name) for name in changes}
-        before = self.plain()
-        self._set(changes)
-        if self.plain() == before:
-            return
-        try:
-            with self.locked():
+        with self.locked():
+            former = {name: getattr(self, name) for name in changes}
+            before = self.plain()
+            self._set(changes)
+            if self.plain() == before:
+                return
+            try:
                 self._save()
-        except BaseException:
-            self._set(former)
-            raise
+            except BaseException:
+                self._set(former)
+                raise
 
     def folder(self, stage: str) -> Path:
         return self.path / stage
@@ -135,11 +152,13 @@ class Run:
     @property
     def cache(self) -> Path:
         """The file that remembers digests."""
-        return self.path / ".cache" / "hashes.json"
+        return self.path / CACHE / "hashes.json"
 
-    def how_to_resume(self, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+    def how_to_resume(
+        self, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
+    ) -> str:
         """How to go on with this run; see ResumeText."""
-        return self.resume_text(self.path, until=until, only=only, with_source=with_source)
+        return self.resume_text(self.path, until=until, start=start, only=only, force=force, with_source=with_source)
 
     def holder(self) -> Holder | None:
         """Who is writing the run, for messages; takes no lock."""
@@ -147,7 +166,10 @@ class Run:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Hold the lock; may be nested. Raises RunLocked if another process holds it."""
+        """Hold the lock; may be nested. Source, settings and the rest are read anew: another process may have changed them since.
+
+        Raises RunLocked if another process holds it, CorruptArtifact if the run holds links.
+        """
         if self._holds:
             self._holds += 1
             try:
@@ -157,12 +179,20 @@ class Run:
             return
         with lock(self.path):
             self._holds = 1
-            for name in (NAME, HOLDER):  # what a kill left of writing these
-                files.remove_temporaries(self.path / name)
             try:
+                self._clear_temporaries()
+                if files.exists(self.path / NAME):
+                    self._set(_recorded(self.path))
                 yield
             finally:
                 self._holds = 0
+
+    def _clear_temporaries(self) -> None:
+        """What kills left of writing files outside of artifacts; if they cannot be removed, they do no harm."""
+        with contextlib.suppress(OSError):
+            for path in (self.path / NAME, self.path / HOLDER, self.cache):
+                files.remove_temporaries(path)
+            files.remove_abandoned(self.path, _ABANDONED)
 
     def plain(self) -> dict[str, Any]:
         """What run.json holds."""
@@ -189,22 +219,13 @@ class Run:
             raise cannot_write(self.path, error) from None
 
 
-def disk_full(folder: Path, what: str) -> DiskFull:
-    """The error that names the disk that is full and the space left on it."""
-    there = next((path for path in (folder, *folder.parents) if path.is_dir()), Path("/"))
-    free = shutil.disk_usage(there).free / 2**20
-    return DiskFull(f"{what}: no space (or quota) left in {there} ({free:.1f} MiB free). Make room and go on; what was published before is not lost.")
-
-
-def is_disk_full(error: BaseException) -> bool:
-    return isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-
-
-def cannot_write(path: Path, error: OSError) -> BadInput | DiskFull:
-    """What to raise where a file of a run could not be written."""
-    if is_disk_full(error):
-        return disk_full(path, str(path))
-    return BadInput(f"{path}: cannot be written ({error.strerror or error}).")
+def _make_folder(path: Path) -> None:
+    """With those above it, durable."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    for folder in made:
+        with contextlib.suppress(PermissionError):  # a folder that may be written but not read cannot be opened
+            files.sync_folder(folder.parent)
 
 
 def _is_ours(name: str) -> bool:
@@ -216,32 +237,39 @@ def _absolute(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
-def _checked(path: Path, value: Any) -> dict[str, Any]:
-    """The fields of a run.json that anybody may have written."""
+def _recorded(run: Path) -> dict[str, Any]:
+    """What run.json holds, checked."""
+    path = run / NAME
+    try:
+        value = files.read_json(path, limit=16 * 2**20, follow=False)
+    except FileNotFoundError:
+        raise BadInput(f"{run}: is not a run (it has no {NAME}).") from None
+    except files.Unreadable as error:
+        if error.denied is not None:
+            raise BadInput(f"{path}: cannot be read ({error}).") from None
+        raise CorruptArtifact(f"{path}: {error}. Restore it, or start a new run.", (NAME,)) from None
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise BadInput(f"{path}: not of a run (expected format {FORMAT!r}).")
     version = value.get("version")
     if type(version) is int and version > VERSION:
-        raise BadInput(f"{path}: made by a newer version: run format {version}; this build reads {VERSION}. Upgrade efficientnerf.")
-    settings = value.get("settings", {})
-    good = {
-        "version": version == VERSION and type(version) is int,
-        "source": isinstance(value.get("source"), str | None) and "\0" not in (value.get("source") or ""),
-        "settings": isinstance(settings, dict) and all(isinstance(of_stage, dict) for of_stage in settings.values()),
-        "preset": isinstance(value.get("preset"), str | None),
-        "seed": type(value.get("seed")) in (int, type(None)),
-        "device": isinstance(value.get("device"), str | None),
-        "created": type(value.get("created", 0.0)) in (int, float) and abs(value.get("created", 0.0)) < 1e15,
-    }
-    for name, is_good in good.items():
-        if not is_good:
-            raise CorruptArtifact(f"{path}: {name} is {value.get(name)!r:.60}. Restore the file, or start a new run.", (NAME,))
-    source = value.get("source")
-    return {
-        "source": None if source is None else Path(source),
-        "settings": settings,
-        "preset": value.get("preset"),
-        "seed": value.get("seed"),
-        "device": value.get("device"),
-        "created": float(value.get("created", 0.0)),
-    }
+        raise BadInput(f"{path}: made by a newer version: run format {version!r:.20}; this build reads {VERSION}. Upgrade efficientnerf.")
+    if version != VERSION or type(version) is not int:
+        raise _damaged(path, "version", version)
+    fields = {name: _field(path, name, value) for name in _FIELDS}
+    source = fields["source"]
+    return {**fields, "source": None if source is None else Path(source)}
+
+
+def _field(path: Path, name: str, value: dict[str, Any]) -> Any:
+    found = value.get(name, {"settings": {}, "created": 0.0}.get(name))
+    try:
+        checked = msgspec.convert(found, _FIELDS[name])
+        if name == "source" and checked is not None and ("\0" in checked or not os.fsencode(checked)):
+            raise ValueError
+    except (ValueError, OverflowError):  # a path that no file system can name is a ValueError, too
+        raise _damaged(path, name, found) from None
+    return checked
+
+
+def _damaged(path: Path, name: str, found: Any) -> CorruptArtifact:
+    return CorruptArtifact(f"{path}: {name} is {found!r:.60}. Restore the file, or start a new run.", (NAME,))

@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 from pipeline import artifact, files, manifest
 from pipeline.artifact import Workplace
 from pipeline.decide import Decision, decide, survey
+from pipeline.disk import failed
 from pipeline.errors import BadInput, CorruptArtifact, Interrupted, UsageError
 from pipeline.executors import local
 from pipeline.executors.local import Usage
@@ -20,7 +21,7 @@ from pipeline.failures import interruption_in, translated
 from pipeline.hashes import Hashes
 from pipeline.interrupt import Stop, stopping
 from pipeline.manifest import Manifest, Request
-from pipeline.run import Run, disk_full, is_disk_full
+from pipeline.run import Run
 from pipeline.stage import Job, Report, Stage, settings_from
 
 Executor = Callable[[Stage, Job], Usage]
@@ -76,15 +77,24 @@ def run_stages(
         if only is not None:
             _warn_of_stale_needs(run, stages, only, report, Hashes(run.cache))
         return _plan(run, chosen, forced, report)
+
+    def go_on(stage: str) -> str:
+        """How to go on after an interruption in this stage: what was to run although it was up to date is, still."""
+        if only is not None:
+            return run.how_to_resume(only=only, force=force)
+        first = stage if stage in forced else next((each.name for each in chosen if each.name in forced), None)
+        return run.how_to_resume(until=until, start=first)
+
     with run.locked(), stopping() as stop:
-        return _Runner(run, device, report, stop, execute).all(stages, chosen, forced, only)
+        return _Runner(run, stages, device, report, stop, execute).all(chosen, forced, only, go_on)
 
 
 class _Runner:
     """One call of run_stages."""
 
-    def __init__(self, run: Run, device: str, report: Report | None, stop: Stop, execute: Executor) -> None:
+    def __init__(self, run: Run, stages: Sequence[Stage], device: str, report: Report | None, stop: Stop, execute: Executor) -> None:
         self.run = run
+        self.stages = stages
         self.work = run.path / artifact.WORK
         self.device = device
         self.stop = stop
@@ -92,24 +102,22 @@ class _Runner:
         self._report = report
         self.hashes = Hashes(run.cache, safe_point=self.safe_point)
 
-    def all(self, stages: Sequence[Stage], chosen: Sequence[Stage], forced: frozenset[str], only: str | None) -> list[Outcome]:
+    def all(self, chosen: Sequence[Stage], forced: frozenset[str], only: str | None, go_on: Callable[[str], str]) -> list[Outcome]:
         outcomes: list[Outcome] = []
         current = ""
         try:
-            for text in artifact.recover(self.run.path):
+            for text in self._recover():
                 self.emit("message", text.partition(":")[0], text=text)
             if only is not None:
-                _warn_of_stale_needs(self.run, stages, only, self._report, self.hashes)
+                _warn_of_stale_needs(self.run, self.stages, only, self._report, self.hashes)
             for stage in chosen:
                 current = stage.name
                 self.safe_point()
                 outcomes.append(self.one(stage, forced=stage.name in forced))
         except (Interrupted, KeyboardInterrupt) as error:
-            raise self._interrupted(error, current, only) from error
+            raise self._interrupted(error, current, go_on(current)) from error
         except OSError as error:  # outside of a stage: while looking, or while putting right
-            if is_disk_full(error):
-                raise disk_full(self.run.path, str(self.run.path)) from error
-            raise
+            raise failed(self.run.path, error) from error
         finally:
             self.hashes.save()
         return outcomes
@@ -120,6 +128,7 @@ class _Runner:
         if decision.note:
             self.emit("warning" if not decision.fresh else "message", stage.name, text=decision.note)
         if decision.fresh and not forced and decision.manifest is not None:
+            self._clear(stage, decision.manifest)
             self.emit("stage_skipped", stage.name, reason="up to date", digest=decision.manifest.digest)
             return _outcome(stage, "skipped", None, decision.manifest)
         reason = decision.reason or "forced"
@@ -127,7 +136,7 @@ class _Runner:
         place = artifact.workplace(self.run.path, stage.name, request)
         started = time.monotonic()
         try:
-            made = artifact.finished(place)
+            made = artifact.finished(place, stage.name)
             if made is None:
                 made = self._make(stage, request, place, reason)
             else:
@@ -186,23 +195,33 @@ class _Runner:
         """Clean up after a stage that raised, and raise the error for the user."""
         failure = interruption_in(error, self.stop()) or translated(error, stage.name, self.run.path)
         with contextlib.suppress(OSError):  # else the next start cleans up; the first error is the one to report
-            if files.exists(place.out / manifest.NAME):
-                artifact.recover(self.run.path)  # it was being published
+            if files.exists(place.out / manifest.NAME) or artifact.is_published(self.run.path, stage.name, place):
+                self._recover()  # it was being published
             else:
                 artifact.abandon(place, self.work)
         if isinstance(failure, Interrupted):
             raise failure from error
-        self.emit("stage_failed", stage.name, text=str(failure), exit_code=failure.exit_code)
+        with contextlib.suppress(OSError):  # of who takes the events
+            self.emit("stage_failed", stage.name, text=str(failure), exit_code=failure.exit_code)
         if failure is error:
             raise error
         raise failure from error
 
-    def _interrupted(self, error: BaseException, stage: str, only: str | None) -> Interrupted:
+    def _recover(self) -> list[str]:
+        return artifact.recover(self.run.path, [stage.name for stage in self.stages])
+
+    def _clear(self, stage: Stage, made: Manifest) -> None:
+        place = artifact.workplace(self.run.path, stage.name, made.request)
+        with contextlib.suppress(OSError):  # else the next start does
+            if files.exists(place.folder):
+                artifact.clear_published(self.run.path, stage.name, place)
+
+    def _interrupted(self, error: BaseException, stage: str, go_on: str) -> Interrupted:
         number = error.number if isinstance(error, Interrupted) else signal.SIGINT
-        go_on = self.run.how_to_resume(only=only)
         during = f" in {stage}" if stage else ""
         interrupted = Interrupted(number, f"interrupted by {signal.Signals(number).name}{during}; what is done is kept. Go on with: {go_on}")
-        self.emit("interrupted", stage, text=str(interrupted), resume=go_on, exit_code=interrupted.exit_code)
+        with contextlib.suppress(OSError):
+            self.emit("interrupted", stage, text=str(interrupted), resume=go_on, exit_code=interrupted.exit_code)
         return interrupted
 
     def safe_point(self) -> None:

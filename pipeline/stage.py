@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import re
 import time
 import types
 import typing
@@ -17,6 +16,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from pipeline.errors import Interrupted, UnknownSetting, UsageError
+from pipeline.links import is_stage_name
+from pipeline.text import printable
 
 T = TypeVar("T")
 Report = Callable[[dict[str, Any]], None]
@@ -49,7 +50,7 @@ class Stage:
     volatile: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[a-z][a-z0-9_]*", self.name):
+        if not is_stage_name(self.name):
             raise ValueError(f"stage name {self.name!r}: lower-case letters, digits and _ only; it names a folder")
         if not dataclasses.is_dataclass(self.settings):
             raise TypeError(f"stage {self.name}: settings must be a dataclass, found {self.settings!r}")
@@ -149,12 +150,14 @@ def settings_from(cls: type[T], mapping: Mapping[str, Any], *, where: str = "") 
     values = {}
     for name, value in mapping.items():
         if name not in names:
-            raise UnknownSetting(_unknown(prefix, str(name), names))
+            raise UnknownSetting(_unknown(prefix, printable(name, 80), names))
         try:
             values[name] = msgspec.convert(value, hints[name], strict=True)
-        except msgspec.ValidationError:
+            if any(isinstance(number, int) and abs(number) >= 2**63 for number in _numbers(values[name])):
+                raise OverflowError
+        except (ValueError, OverflowError, RecursionError):  # msgspec's own is a ValueError; the others are of texts and numbers beyond all bounds
             raise UsageError(f"{prefix}{name}: found {_shown(value)}, expected {type_in_words(hints[name])}.{_near(hints[name], value)}") from None
-        if not all(math.isfinite(number) for number in _floats(values[name])):
+        if not all(math.isfinite(number) for number in _numbers(values[name])):
             raise UsageError(f"{prefix}{name}: found {_shown(value)}, expected a finite number.")
     return cls(**values)
 
@@ -174,10 +177,10 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
-def _floats(value: Any) -> list[float]:
+def _numbers(value: Any) -> list[float]:
     if isinstance(value, tuple):
-        return [number for item in value for number in _floats(item)]
-    return [value] if isinstance(value, float) else []
+        return [number for item in value for number in _numbers(item)]
+    return [value] if isinstance(value, int | float) else []
 
 
 def type_in_words(hint: Any) -> str:
@@ -224,5 +227,8 @@ def _near(hint: Any, value: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    text = f"{value!r} ({type(value).__name__})" if value is not None else "none"
+    try:
+        text = f"{value!r} ({type(value).__name__})" if value is not None else "none"
+    except (ValueError, RecursionError):  # of a number of thousands of digits; of a value nested too deeply
+        text = f"a value that is too long ({type(value).__name__})"
     return text if len(text) <= 80 else text[:77] + "..."

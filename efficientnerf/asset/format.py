@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +66,9 @@ def save(tree: NerfTree, path: str | Path, layout: str | None = None) -> None:
     """Write `tree` to `path`, whole or not at all; `layout` as in `serialize`."""
     path = Path(path)
     data = serialize(tree, layout)
-    aside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    aside = path.with_name(f".{path.name[:50]}.{secrets.token_hex(8)}.part")
     try:
-        with open(aside, "wb") as file:
+        with open(aside, "xb") as file:  # a new file: never what a link of that name leads to
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

@@ -171,28 +171,28 @@ def old_and_something_else_in_its_place(run: Path) -> None:
 def test_recovery_from_each_state(tmp_path: Path, state: Callable[[Path], None], number: int, said: str) -> None:
     run = tmp_path / "run"
     state(run)
-    (text,) = artifact.recover(run)
+    (text,) = artifact.recover(run, ["train"])
     assert text.startswith("train: ")
     assert said in text
     made = read_manifest(run / "train")
     assert made.request.settings["number"] == number
     assert not artifact.differences(run / "train", made.outputs).damaged
     assert not (run / artifact.WORK / "old-train").exists()
-    assert artifact.recover(run) == []
+    assert artifact.recover(run, ["train"]) == []
 
 
 def test_nothing_to_recover(tmp_path: Path) -> None:
-    assert artifact.recover(tmp_path) == []
+    assert artifact.recover(tmp_path, ["train"]) == []
     neither(tmp_path / "run")
-    assert artifact.recover(tmp_path / "run") == []
+    assert artifact.recover(tmp_path / "run", ["train"]) == []
     assert not (tmp_path / "run" / "train").exists()
-    assert artifact.finished(artifact.workplace(tmp_path / "run", "train", request(2))) is not None
+    assert artifact.finished(artifact.workplace(tmp_path / "run", "train", request(2)), "train") is not None
 
 
 def test_a_finished_output_that_was_damaged_is_not_finished(tmp_path: Path) -> None:
     place = sealed(tmp_path, 1)
     (place.out / "a.txt").write_text("number 9")
-    assert artifact.finished(place) is None
+    assert artifact.finished(place, "train") is None
 
 
 def test_publishing_killed_before_every_step(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_publishing_killed_before_every_step(tmp_path: Path) -> None:
         run = tmp_path / f"run{moment}"
         published(run, 1)
         killed = run_and_kill(lambda run=run: published(run, 2), moment)  # type: ignore[misc]
-        artifact.recover(run)
+        artifact.recover(run, ["train"])
         made = read_manifest(run / "train")
         assert artifact.differences(run / "train", made.outputs) == artifact.Differences()
         seen.add(made.request.settings["number"])
@@ -220,8 +220,8 @@ def test_recovery_killed_before_every_step(tmp_path: Path) -> None:
         for moment in itertools.count(1):
             run = tmp_path / f"{state.__name__}{moment}"
             state(run)
-            killed = run_and_kill(lambda run=run: artifact.recover(run), moment)  # type: ignore[misc]
-            artifact.recover(run)
+            killed = run_and_kill(lambda run=run: artifact.recover(run, ["train"]), moment)  # type: ignore[misc]
+            artifact.recover(run, ["train"])
             made = read_manifest(run / "train")
             assert made.request.settings["number"] == number
             assert not artifact.differences(run / "train", made.outputs).damaged

@@ -39,7 +39,7 @@ def test_json_from_anybody(tmp_path: Path, data: bytes, message: str) -> None:
 
 
 def test_a_folder_in_place_of_a_file_is_unreadable(tmp_path: Path) -> None:
-    with pytest.raises(files.Unreadable, match="directory"):
+    with pytest.raises(files.Unreadable, match="is a folder, expected a plain file"):
         files.read_json(tmp_path)
     with pytest.raises(FileNotFoundError):
         files.read_json(tmp_path / "none.json")

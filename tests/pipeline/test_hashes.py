@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -16,23 +17,50 @@ def old_file(path: Path, data: bytes) -> Path:
     return path
 
 
-def test_a_known_file_is_not_read_again(tmp_path: Path) -> None:
+@pytest.fixture
+def later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some seconds after all files of the test were written."""
+    monkeypatch.setattr("pipeline.hashes.SETTLED_NS", -10_000_000_000)
+
+
+def test_a_known_file_is_not_read_again(tmp_path: Path, later: None, monkeypatch: pytest.MonkeyPatch) -> None:
     path = old_file(tmp_path / "a", b"one")
     hashes = Hashes(tmp_path / "cache" / "h.json")
     first = hashes.digest("k", path)
     assert first == hashlib.sha256(b"one").hexdigest()
     hashes.save()
 
-    with open(path, "r+b") as file:  # the same inode, size and, below, time
+    monkeypatch.setattr("pipeline.hashes.sha256_of", lambda *arguments, **more: "read")
+    assert Hashes(tmp_path / "cache" / "h.json").digest("k", path) == first
+    assert Hashes(tmp_path / "cache" / "h.json").digest("k", path, anew=True) == "read"
+    assert Hashes(tmp_path / "cache" / "h.json", trust=False).digest("k", path) == "read"
+
+
+def test_a_file_whose_time_was_set_back_is_read_again(tmp_path: Path, later: None) -> None:
+    """The same inode, size and time of modification; that of the change of its status nobody can set."""
+    path = old_file(tmp_path / "a", b"one")
+    hashes = Hashes()
+    hashes.digest("k", path)
+    time.sleep(0.02)  # a tick
+    with open(path, "r+b") as file:
         file.write(b"two")
     os.utime(path, ns=(10**18, 10**18))
-    again = Hashes(tmp_path / "cache" / "h.json")
-    assert again.digest("k", path) == first
-    assert again.digest("k", path, anew=True) != first
-    assert Hashes(tmp_path / "cache" / "h.json", trust=False).digest("k", path) != first
+    assert hashes.digest("k", path) == hashlib.sha256(b"two").hexdigest()
 
 
-def test_another_size_time_or_inode_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("age", [1.9, 2.2])
+def test_only_what_is_older_than_two_seconds_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, age: float) -> None:
+    """A file system may have ticks of two seconds: what is written twice within one keeps its times."""
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    written = max(path.stat().st_mtime_ns, path.stat().st_ctime_ns)
+    monkeypatch.setattr("pipeline.hashes.time.time_ns", lambda: written + int(age * 1e9))
+    hashes = Hashes()
+    hashes.digest("k", path)
+    assert bool(hashes._entries) == (age > 2)
+
+
+def test_another_size_time_or_inode_is_read(tmp_path: Path, later: None) -> None:
     path = old_file(tmp_path / "a", b"one")
     hashes = Hashes()
     hashes.digest("k", path)
@@ -63,7 +91,7 @@ def test_a_damaged_memory_is_ignored(tmp_path: Path, text: str) -> None:
     assert Hashes(cache).digest("k", path) == hashlib.sha256(b"one").hexdigest()
 
 
-def test_forgetting(tmp_path: Path) -> None:
+def test_forgetting(tmp_path: Path, later: None) -> None:
     cache = tmp_path / "h.json"
     path = old_file(tmp_path / "a", b"one")
     hashes = Hashes(cache)

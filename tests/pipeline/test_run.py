@@ -34,7 +34,7 @@ def test_paths_become_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_messages_name_the_command_that_a_workflow_gives(tmp_path: Path) -> None:
-    def command(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+    def command(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False, **more: Any) -> str:
         return f"make {run.name} {until} {only} {with_source}"
 
     run = Run.create(tmp_path / "run", resume_text=command)

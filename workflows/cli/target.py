@@ -18,12 +18,15 @@ if TYPE_CHECKING:
 ASSET = BakeOutputs.asset  # the file's name
 
 
-def resume_command(run: Path, *, until: str | None = None, only: str | None = None, with_source: bool = False) -> str:
+def resume_command(
+    run: Path, *, until: str | None = None, start: str | None = None, only: str | None = None, force: bool = False, with_source: bool = False
+) -> str:
     """The command that resumes a run; see `pipeline.run.ResumeText`."""
     folder = shlex.quote(str(run))
     if only is not None:
-        return f"enerf stage {only} {folder}"
-    return f"enerf run{' SOURCE' if with_source else ''} --out {folder}" + ("" if until is None else f" --until {until}")
+        return f"enerf stage {only} {folder}" + (" --force" if force else "")
+    options = "".join(f" --{option} {stage}" for option, stage in (("from", start), ("until", until)) if stage is not None)
+    return f"enerf run{' SOURCE' if with_source else ''} --out {folder}{options}"
 
 
 def open_run(path: Path) -> Run:
