@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from workflows.cli.options import common_options, folder_type, json_option, quiet_option
+from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option
 
 DIFFERENT = 6  # exit code of `enerf diff`; 1 would be that of a defect
 LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asset.serialisation.WRITERS, which a test compares; that import is heavy
@@ -43,26 +43,29 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 @click.option("--layout", type=click.Choice(LAYOUTS), help="Layout of the voxels in OUT; by default that of ASSET.")
 @click.option("--sh-degree", "degree", type=click.IntRange(0, 4), help="Keep the spherical harmonics up to this degree.")
 @click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side; fewer than there are.")
+@force_option
 @json_option
 @quiet_option
 @common_options
-def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None, as_json: bool, quiet: bool) -> None:
+def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Write the asset of RUN, or ASSET, to the file OUT.
 
     compact: 4 bytes a voxel and one for each harmonic above the first; small: 6; sparse: 16-bit floats; full: all voxels of each brick, 16-bit
-    floats, or 32-bit ones as full32. An existing file is replaced atomically.
+    floats, or 32-bit ones as full32. OUT appears whole or not at all; an existing file is replaced with --force only, a file of a run never.
     """
     from efficientnerf.asset.format import describe
     from pipeline.errors import UsageError
+    from workflows.cli.destination import check_files, writing
     from workflows.cli.output import closing, write_json
     from workflows.cli.progress import size
+    from workflows.cli.target import asset_of
     from workflows.inspection.convert import convert as convert_asset
 
     if out.suffix.lower() != ".nerftree":
         raise UsageError(f"{out}: the extension {out.suffix!r} is not that of an asset; expected .nerftree. For meshes and points: enerf export")
-    if out.is_dir() or not out.absolute().parent.is_dir():
-        raise UsageError(f"{out}: is a folder. Give a file." if out.is_dir() else f"{out}: the folder {out.parent} does not exist. Make it first.")
-    convert_asset(what, out, layout, degree, resolution)
+    check_files([out], force=force, inputs=[asset_of(what)])
+    with writing(out, force=force):
+        convert_asset(what, out, layout, degree, resolution)
     about = describe(out)
     facts = {key: about[key] for key in ("layout", "resolution", "voxels", "sh_degree", "bytes", "bytes_per_voxel")}
     if as_json:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from workflows.cli.options import common_options, folder_type, json_option, quiet_option, set_option
+from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option, set_option
 
 if TYPE_CHECKING:
     from workflows.cli.resolve import Settings
@@ -21,17 +21,20 @@ CAMERAS = ".json"
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", required=True, metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
 @click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
+@force_option
 @set_option
 @json_option
 @quiet_option
 @common_options
-def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, sets: tuple[str, ...], as_json: bool, quiet: bool) -> None:
+def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, force: bool, sets: tuple[str, ...], as_json: bool, quiet: bool) -> None:
     """Write the surface of RUN or ASSET as .ply, .glb or .obj, with --points as .ply or .xyz; or the cameras of RUN as .json (nerfstudio).
 
-    Existing files are replaced atomically. Settings of the stages mesh and points apply: '--set mesh.max_faces=...'.
+    Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. Settings of the stages mesh and points
+    apply: '--set mesh.max_faces=...'.
     """
     from pipeline.errors import UsageError
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+    from workflows.cli.destination import check_files
     from workflows.cli.output import closing, write_json
 
     files = [first, *more]
@@ -40,18 +43,15 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, set
         if path.suffix.lower() not in known:
             kind = "points" if as_points else "a mesh"
             raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
-        if not path.parent.is_dir():
-            raise UsageError(f"{path}: the folder {path.parent} does not exist. Make it first.")
-        if path.is_dir():
-            raise UsageError(f"{path}: is a folder. Give a file.")
+    check_files(files, force=force, inputs=[what])
     cameras = [path for path in files if path.suffix.lower() == CAMERAS]
     surfaces = [path for path in files if path not in cameras]
     written: list[dict[str, Any]] = []
     with _shown(as_json, quiet) as show:
         for path in cameras:
-            written.append({"path": str(path.absolute()), "cameras": _export_cameras(what, path)})
+            written.append({"path": str(path.absolute()), "cameras": _export_cameras(what, path, force)})
         if surfaces:
-            written += _export_surface(what, surfaces, as_points, sets, show)
+            written += _export_surface(what, surfaces, as_points, force, sets, show)
     if as_json:
         write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
     elif not quiet:
@@ -60,25 +60,30 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, set
             closing(f"{entry['path']}  ({facts})")
 
 
-def _export_cameras(what: Path, path: Path) -> int:
+def _export_cameras(what: Path, path: Path, force: bool) -> int:
     from pipeline.errors import BadInput
     from stages.artifacts import PosesOutputs
     from stages.io import scene
     from stages.io.exporters import cameras
+    from workflows.cli.destination import writing
     from workflows.cli.target import is_run
 
     poses = PosesOutputs.of_run(what) if is_run(what) else PosesOutputs(what)
     if not poses.scene.is_file():
         raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
     found = scene.load(poses.folder)
-    cameras.write(found, path)
+    with writing(path, force=force):
+        cameras.write(found, path)
     return len(found.views)
 
 
-def _export_surface(what: Path, files: list[Path], as_points: bool, sets: tuple[str, ...], show: Callable[[dict[str, Any]], None]) -> list[dict[str, Any]]:
+def _export_surface(
+    what: Path, files: list[Path], as_points: bool, force: bool, sets: tuple[str, ...], show: Callable[[dict[str, Any]], None]
+) -> list[dict[str, Any]]:
     from stages import mesh, points
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
     from stages.io.exporters.writing import source_frame
+    from workflows.cli.destination import writing
     from workflows.cli.target import load_asset
 
     settings = _settings_for(what, sets, {"mesh": mesh.MeshSettings, "points": points.PointsSettings}).resolved()
@@ -88,12 +93,14 @@ def _export_surface(what: Path, files: list[Path], as_points: bool, sets: tuple[
     if as_points:
         cloud = points.points_of(tree, settings["points"], frame, progress)
         for path in files:
-            POINT_EXPORTERS[path.suffix.lower()](cloud, path, frame)
+            with writing(path, force=force):
+                POINT_EXPORTERS[path.suffix.lower()](cloud, path, frame)
         facts: dict[str, Any] = {"points": len(cloud.positions)}
     else:
         found = mesh.in_capture(mesh.mesh_of(tree, settings["mesh"], progress), frame)
         for path in files:
-            MESH_EXPORTERS[path.suffix.lower()](found, path, frame)
+            with writing(path, force=force):
+                MESH_EXPORTERS[path.suffix.lower()](found, path, frame)
         facts = {"vertices": len(found.vertices), "faces": len(found.faces)}
     return [{"path": str(path.absolute()), **facts} for path in files]
 
@@ -122,14 +129,18 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @click.option("--height", type=click.IntRange(16, 8192), help="Pixels.")
 @click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb.")
 @click.option("--video", metavar="FILE", type=folder_type, help="Also write the frames as an MP4 (H.264).")
+@force_option
 @set_option
 @json_option
 @quiet_option
 @common_options
-def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any) -> None:
+def render(
+    what: Path, out: Path, camera_path: Path | None, video: Path | None, force: bool, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any
+) -> None:
     """Render the asset of RUN, or ASSET, on a turntable or along a camera path, into DIR.
 
-    Settings of the stage turntable apply: '--set turntable.elevation=30'. Existing frames are replaced.
+    Settings of the stage turntable apply: '--set turntable.elevation=30'. Existing frames are replaced with --force only;
+    DIR cannot lie in a run.
     """
     from dataclasses import replace
 
@@ -139,31 +150,37 @@ def render(what: Path, out: Path, camera_path: Path | None, video: Path | None, 
     from stages.io.camera_path import read_camera_path
     from stages.io.exporters.frames import background_from_text
     from stages.turntable import TurntableSettings, cameras_of
+    from workflows.cli.destination import check_files, check_folder, check_free, writing
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
 
     if video is not None and video.suffix.lower() != ".mp4":
         raise UsageError(f"--video {video}: the extension {video.suffix!r} is not known; expected .mp4.")
-    if video is not None and not video.absolute().parent.is_dir():
-        raise UsageError(f"--video {video}: the folder {video.parent} does not exist. Make it first.")
+    check_folder(out)
+    read = [what, *([] if camera_path is None else [camera_path])]
+    check_files([] if video is None else [video], force=force, inputs=read)
     if camera_path is not None and given["frames"] is not None:
         raise UsageError("--frames: the path says how many there are; give either --path or --frames.")
     settings = _settings_for(what, sets, {"turntable": TurntableSettings}).resolved()["turntable"]
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     background_from_text(settings.background)
     tree = load_asset(what)
-    fps = settings.fps
     if camera_path is not None:
         path = read_camera_path(camera_path, similarity_of(tree), width=given["width"], height=given["height"])
-        cameras, fps = list(path.cameras), path.fps or fps
+        cameras, fps = list(path.cameras), path.fps or settings.fps
     else:
-        cameras = cameras_of(tree, settings)
+        cameras, fps = cameras_of(tree, settings), settings.fps
+    for k in range(len(cameras)):
+        for kind in ("png", "exr"):
+            check_free(out / f"frame_{k:04d}.{kind}", force=force, inputs=read)
     options = RenderOptions(background=settings.background, supersample=settings.supersample, exr=settings.exr, video=None, fps=fps, crf=settings.crf)
     with _shown(as_json, quiet) as show:
         progress = _progress("render", show)
-        written = render_frames(tree, cameras, out, options, lambda done, total: progress(done, total, "frames"))
+        with writing(out / "frame_0000.png", force=force):
+            written = render_frames(tree, cameras, out, options, lambda done, total: progress(done, total, "frames"))
         if video is not None:
-            encode_frames([each for each in written if each.suffix == ".png"], video, options)
+            with writing(video, force=force):
+                encode_frames([each for each in written if each.suffix == ".png"], video, options)
             written.append(video)
     if as_json:
         write_json({"event": "summary", "ok": True, "written": [str(each.absolute()) for each in written], "exit_code": 0})

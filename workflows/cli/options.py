@@ -15,6 +15,7 @@ C = TypeVar("C", bound=Callable[..., Any])
 
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON on standard output instead of text.")
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="Nothing but warnings and errors.")
+force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
 set_option = click.option("--set", "sets", multiple=True, metavar="STAGE.NAME=VALUE", help="A setting of a stage; may be repeated. 'enerf presets' lists them.")
 device_option = click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Device to compute on; auto: CUDA where there is one.")
 folder_type = click.Path(path_type=Path)

@@ -279,7 +279,7 @@ def test_recovered_cameras_go_on(enerf: Enerf, tmp_path: Path) -> None:
     """The cameras of a run, exported and read again, are the same."""
     blender(tmp_path / "source")
     enerf("run", tmp_path / "source", "--out", tmp_path / "run", "--until", "poses", "--quiet")
-    assert enerf("export", tmp_path / "run", "--to", tmp_path / "source/transforms.json").code == 0
+    assert enerf("export", tmp_path / "run", "--to", tmp_path / "source/transforms.json", "--force").code == 0
     found, again = enerf("inspect", tmp_path / "run/poses", "--json").object, enerf("inspect", tmp_path / "source", "--json").object
     for one, other in zip(*(sorted(each["cameras"], key=lambda camera: camera["name"]) for each in (found, again)), strict=True):
         assert one["name"] == other["name"]
