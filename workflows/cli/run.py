@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,8 +97,8 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
             if not dry_run:
                 run = plan.write()
             outcomes = run_stages(run, workflow().stages, device=device, report=show, dry_run=dry_run, **selection)
-            if any(outcome.action == "ran" for outcome in outcomes):
-                _describe(run)
+            if not dry_run:
+                _describe(run, anew=any(outcome.action == "ran" for outcome in outcomes))
     except (Exception, KeyboardInterrupt) as error:
         raise Reported(error, summary(run.path, ())) from error
     facts = summary(run.path, outcomes)
@@ -107,11 +108,22 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
         closing(*in_words(run.path, outcomes))
 
 
-def _describe(run: Run) -> None:
-    """Write the page about the run."""
-    from workflows.report.page import write_report
+def _describe(run: Run, *, anew: bool) -> None:
+    """Write the page about the run: anew, or where an earlier call was cut short before it did."""
+    if anew or not _is_described(run):
+        from workflows.report.page import write_report
 
-    write_report(run, workflow().stages)
+        write_report(run, workflow().stages)
+
+
+def _is_described(run: Run) -> bool:
+    """Whether the page is there and no artifact was published after it: that is a rename of its folder, which sets ctime."""
+    try:
+        written = os.stat(run.path / "report.html", follow_symlinks=False).st_mtime_ns
+    except OSError:
+        return False
+    folders = (run.folder(stage.name) for stage in workflow().stages)
+    return all(os.stat(folder, follow_symlinks=False).st_ctime_ns <= written for folder in folders if os.path.lexists(folder))
 
 
 def _check_stages(selection: dict[str, Any]) -> None:

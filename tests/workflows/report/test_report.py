@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -58,6 +59,20 @@ def test_a_run_leaves_a_page_about_itself(enerf: Enerf, toys: Path, tmp_path: Pa
     written = (run / "report.html").stat().st_mtime_ns
     assert enerf("run", "--out", run).code == 0
     assert (run / "report.html").stat().st_mtime_ns == written  # nothing was done: nothing is written
+
+
+def test_a_page_that_a_kill_prevented_is_written_by_the_next_run(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert enerf("run", toys, "--out", run).code == 0
+    page_file = run / "report.html"
+    page_file.unlink()
+    assert enerf("run", "--out", run).code == 0
+    assert page_file.is_file()
+    text = page_file.read_bytes()
+    page_file.write_bytes(b"of an older artifact")
+    os.utime(page_file, ns=(1, 1))
+    assert enerf("run", "--out", run).code == 0
+    assert page_file.read_bytes() == text
 
 
 def test_the_page_can_be_made_again(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
