@@ -1,7 +1,8 @@
 # make demo      install, then turn examples/still_life into a baked asset, turntable, mesh and point cloud under runs/demo
 # make test      install, then run the tests on all cores, but those marked slow
 # make test-slow install, then run the tests marked slow
-# make torture   kill -9 a run at 30 moments and compare its artifacts with those of an undisturbed run
+# make torture   kill runs at N moments (30; by night 1000: make torture N=1000 JOBS=2) and compare their artifacts with those of undisturbed runs
+# make faults    let each file operation of a run fail, by five errors: half an hour on two cores (make faults JOBS=2)
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
 # make gpu-packages   the packages that `make gpu` needs beside torch, Triton and numba, into build/gpu-packages: for a machine without a package index
 # make docs      rewrite the pages under docs/ that are made from the code
@@ -12,7 +13,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-slow torture gpu gpu-packages docs lint install clean
+.PHONY: demo test test-slow torture faults gpu gpu-packages docs lint install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
@@ -23,8 +24,13 @@ test: $(INSTALLED)
 test-slow: $(INSTALLED)
 	$(BIN)/python -m pytest -q -n auto --dist loadfile -m slow
 
+N ?= 30
+JOBS ?= 1
 torture: $(INSTALLED)
-	$(BIN)/python benchmarks/torture.py
+	$(BIN)/python -m benchmarks.torture --kills $(N) --jobs $(JOBS)
+
+faults: $(INSTALLED)
+	$(BIN)/python -m benchmarks.torture.faults --jobs $(JOBS)
 
 # A machine with a device often has a python whose torch sees it, and no way to a package index: then that one is used, and nothing is installed.
 # What it lacks beside them is read from build/gpu-packages, which `make gpu-packages` fills elsewhere, for python GPU_PYTHON.

@@ -1,0 +1,182 @@
+"""Let file operations of a run fail, each of them in turn, and see what the run says, what it leaves, and what the next run makes of that.
+
+    python -m benchmarks.torture.faults [--jobs 1] [--sources photographs,blender,llff] [--json FILE]
+
+A case is one operation of one stage, which fails with one of ENOSPC, EIO, EROFS, EACCES, EMFILE, once or with all that follow. The stage replaces an
+older artifact; those before and after it are there. Then
+
+    the exit code is 3, or 2 where it is the user's: the source cannot be read, or the run folder cannot be written before the first stage begins.
+    It is 0 where the run can do without the operation, with the right artifacts
+    the message has one or two lines, names the file, its folder or its stage, and is no traceback
+    every artifact that is there verifies
+    the next run, without faults, ends with the artifacts of an undisturbed run and an empty .work
+
+Every operation of every stage of the Blender set meets one error once and one lasting. Of the other sources, whose later stages do the same, it is the
+stage poses; where one file is written more than 40 times (COLMAP's database), the first 5, the last 5 and each 20th of these writes. The errors change from
+operation to operation, so that all five meet every kind of operation in every stage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.torture import processes, report
+from benchmarks.torture.cases import NEW, Case, Cases, base
+from benchmarks.torture.comparison import STAGES
+from benchmarks.torture.kills import Prepared
+from benchmarks.torture.preparation import in_prepared_process, prepare, python_alone, wait_for
+from benchmarks.torture.trap import Armed, Operation, Trap, operations
+
+RESULT = Path(__file__).resolve().parents[1] / "results" / "faults.json"
+ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EACCES, errno.EMFILE)
+OF_READING = (errno.EIO, errno.EACCES, errno.EMFILE)
+MANY, ENDS, EACH = 40, 5, 20
+DEADLY = (1, 2, 3, 5)  # the failing operation at which a run on a full disk is killed
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--jobs", type=int, default=1, help="how many runs at a time")
+    parser.add_argument("--sources", default="blender,photographs,llff")
+    parser.add_argument("--stages", default=",".join((NEW, *STAGES)), help="of the Blender set; of the others it is poses")
+    parser.add_argument("--share", type=int, default=1, help="one case in so many, for a look")
+    parser.add_argument("--json", type=Path, default=RESULT, help="where the result goes")
+    parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless a case is wrong")
+    given = parser.parse_args()
+    folder = given.folder or Path(tempfile.mkdtemp(prefix="faults-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    in_prepared_process(folder)
+    begun = time.monotonic()
+    prepared = prepare(folder, given.sources.split(","))
+    logs = folder / "logs"
+    wait_for([processes.forked(lambda: _log_all(prepared, given.stages.split(","), logs))])
+    cases, seen = planned(prepared, given.stages.split(","), logs)
+    cases = cases[:: given.share]
+    print(f"{len(cases)} cases", flush=True)
+    lines = _all(cases, prepared, folder, given.jobs)
+    result = summary(lines, seen) | report.circumstances(begun, python_alone=python_alone(), jobs=given.jobs, seed=0)
+    given.json.parent.mkdir(parents=True, exist_ok=True)
+    given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    found = f"{result['cases']} cases at {result['operations_covered']} operations, {result['elapsed_seconds']:.0f} s: {len(result['wrong'])} wrong"
+    print(f"{found}; {given.json}")
+    if not result["wrong"]:
+        shutil.rmtree(folder, ignore_errors=True)
+    return 1 if result["wrong"] else 0
+
+
+def _scenarios(prepared: Sequence[Prepared], stages: Sequence[str]) -> list[tuple[Prepared, str]]:
+    return [(each, stage) for each in prepared for stage in (stages if each.source.kind == "blender" else ["poses"])]
+
+
+def _log_all(prepared: Sequence[Prepared], stages: Sequence[str], logs: Path) -> None:
+    """Write what an undisturbed run does in each scenario."""
+    logs.mkdir()
+    for each, stage in _scenarios(prepared, stages):
+        run = logs / "run"
+        base(each, stage, run)
+        armed = Armed(Trap(), run, each.source.folder, logs / "state", logs / f"{each.source.kind}_{stage}")
+        child = processes.start(each.source.arguments(run), logs / "errors.txt", armed, watched_by_python=python_alone())
+        if child.end() != 0:
+            raise SystemExit(f"an undisturbed run ended with {child.code}: {child.errors}")
+        shutil.rmtree(run)
+
+
+def planned(prepared: Sequence[Prepared], stages: Sequence[str], logs: Path) -> tuple[list[Case], dict[str, dict[str, int]]]:
+    """(all cases, scenario -> "stage kind" -> number of operations that an undisturbed run makes)."""
+    cases: list[Case] = []
+    seen = {}
+    for each, stage in _scenarios(prepared, stages):
+        of_kind: dict[tuple[str, str], list[Operation]] = defaultdict(list)
+        for operation in operations(logs / f"{each.source.kind}_{stage}"):
+            of_kind[operation.stage, operation.kind].append(operation)
+        seen[f"{each.source.kind} {stage}"] = {" ".join(which): len(found) for which, found in sorted(of_kind.items())}
+        for (where, kind), found in sorted(of_kind.items()):
+            if where == stage or (where == "engine" and (kind != "read" or stage == NEW)) or (where == "source" and stage == "poses"):
+                cases += _of_kind(each, stage, kind, _thinned(found))
+        if stage != NEW:
+            cases += [Case(each.source.kind, stage, stage, "write", 1, errno.ENOSPC, True, deadly) for deadly in DEADLY]
+    return cases, seen
+
+
+def _of_kind(each: Prepared, stage: str, kind: str, found: Sequence[Operation]) -> list[Case]:
+    """Each operation once and lasting; errors in turn, and all of them where there are fewer operations than errors."""
+    errors = OF_READING if kind == "read" else ERRORS
+    cases = []
+    for index in range(max(len(found), len(errors))):
+        operation = found[index % len(found)]
+        for lasting, shift in ((False, 0), (True, 2)):
+            number = errors[(index + shift) % len(errors)]
+            cases.append(Case(each.source.kind, stage, operation.stage, kind, operation.number, number, lasting))
+    return cases
+
+
+def _thinned(found: Sequence[Operation]) -> list[Operation]:
+    """Without most of the many operations of one kind on one file."""
+    of_path: dict[str, list[Operation]] = defaultdict(list)
+    for operation in found:
+        of_path[operation.path].append(operation)
+    kept = [operation for many in of_path.values() for operation in (many if len(many) <= MANY else [*many[:ENDS], *many[ENDS:-ENDS:EACH], *many[-ENDS:]])]
+    return sorted(kept, key=lambda operation: operation.number)
+
+
+def _all(cases: Sequence[Case], prepared: Sequence[Prepared], folder: Path, jobs: int) -> list[dict[str, Any]]:
+    """Carry out all cases; the records."""
+    books = [folder / f"book_{job}.jsonl" for job in range(jobs)]
+
+    def work(job: int) -> None:
+        with books[job].open("w", encoding="utf-8") as book:
+            worker = Cases(folder / f"worker_{job}", prepared, book, python_alone=python_alone())
+            if job == 0:
+                worker.read_only(prepared[0])
+            for case in cases[job::jobs]:
+                worker.carry_out(case)
+
+    if wait_for([processes.forked(lambda job=job: work(job)) for job in range(jobs)]):  # type: ignore[misc]
+        raise SystemExit("a worker failed")
+    return [json.loads(line) for book in books for line in book.read_text(encoding="utf-8").splitlines()]
+
+
+def summary(lines: Iterable[dict[str, Any]], seen: dict[str, dict[str, int]]) -> dict[str, Any]:
+    """Counts of what was done, and all that was wrong."""
+    lines = list(lines)
+    read_only = [line for line in lines if line["event"] == "read-only"]
+    cases = [line for line in lines if line["event"] == "case"]
+    reached = [case for case in cases if case["reached"]]
+
+    def counted(*names: str) -> dict[str, int]:
+        return dict(sorted(Counter(" ".join(str(case[name]) for name in names) for case in reached).items()))
+
+    tolerated = Counter(f"{case['where']} {case['kind']} {(case['lasting'] and 'lasting') or 'once'}" for case in reached if case["code"] == 0)
+    met = {(case["where"], case["kind"], case["error"]) for case in reached}
+    wanted = {(where, kind, name) for where, kind, _ in met for name in map(errno.errorcode.get, OF_READING if kind == "read" else ERRORS)}
+    return {
+        "cases": len(reached),
+        "not_reached": len(cases) - len(reached),
+        "wrong": [line for line in lines if line["wrong"]],
+        "operations_covered": len({(case["source"], case["scenario"], case["where"], case["kind"], case["number"]) for case in reached}),
+        "operations_of_undisturbed_runs": seen,
+        "cases_per_scenario": counted("source", "scenario"),
+        "cases_per_kind_and_error": counted("kind", "error"),
+        "stages_kinds_and_errors_that_did_not_meet": sorted(" ".join(map(str, which)) for which in wanted - met),
+        "once_and_lasting": dict(Counter("lasting" if case["lasting"] else "once" for case in reached)),
+        "killed_while_the_disk_is_full": sum(bool(case["deadly"]) for case in reached),
+        "read_only_run_folder": read_only,
+        "exit_codes": counted("code"),
+        "exit_codes_by_place": counted("where", "code"),
+        "done_without_the_operation": dict(sorted(tolerated.items())),
+        "the_message_names": counted("names"),
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

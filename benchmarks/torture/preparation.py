@@ -1,0 +1,98 @@
+"""What comes before the first disturbance: sources, undisturbed runs, and a process that has everything imported."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.torture import processes, sources, trap
+from benchmarks.torture.comparison import Expected, differences, expected
+from benchmarks.torture.kills import Prepared
+from benchmarks.torture.sources import Source
+from benchmarks.torture.trap import Armed, Operation, Trap
+
+READY = "TORTURE_READY"
+
+
+def in_prepared_process(folder: Path) -> None:
+    """Begin this program anew with one thread and the library that counts operations, unless that is done."""
+    if os.environ.get(READY):
+        return
+    library = trap.build(folder)
+    environment = {**processes.single_threaded_environment(library), READY: str(library or "python")}
+    os.execve(sys.executable, [sys.executable, "-m", *_module(), *sys.argv[1:], "--folder", str(folder)], environment)
+
+
+def _module() -> list[str]:
+    spec = sys.modules["__main__"].__spec__
+    assert spec is not None, "run it as python -m"
+    return [spec.name.removesuffix(".__main__")]
+
+
+def python_alone() -> bool:
+    """Whether there is no compiler, and only the operations of Python are seen."""
+    return os.environ[READY] == "python"
+
+
+def undisturbed(source: Source, folder: Path) -> None:
+    """Write the reference of a source, how long its stages took and what they did; and a run with other artifacts. Raises SystemExit."""
+    place = folder / "undisturbed" / source.kind
+    place.mkdir(parents=True)
+    run, log = place / "run", place / "log"
+    armed = Armed(Trap(), run, source.folder, place / "state", log)
+    os.environ["TORTURE_MODULES"] = str(place / "modules")
+    _complete(source.arguments(run), place, armed)
+    del os.environ["TORTURE_MODULES"]
+    child = _complete(source.arguments(place / "again"), place)
+    real = _complete(source.arguments(place / "real"), place, fresh=True)
+    wanted = expected(run)
+    for name in ("again", "real"):
+        if wrong := differences(place / name, wanted):
+            raise SystemExit(f"{source.kind}: two undisturbed runs ({name}) differ: {'; '.join(wrong)}")
+    _complete(source.arguments(place / "older", "--set", sources.OTHER), place)
+    same = [stage for stage, digest in expected(place / "older").digests.items() if digest == wanted.digests[stage]]
+    if same:
+        raise SystemExit(f"{source.kind}: with {sources.OTHER} there is no other artifact of {', '.join(same)}")
+    facts = {"digests": wanted.digests, "names": sorted(wanted.names), "seconds": child.seconds, "real_seconds": real.seconds}
+    facts["operations"] = [asdict(operation) for operation in trap.operations(log)]
+    (place / "facts.json").write_text(json.dumps(facts), encoding="utf-8")
+
+
+def _complete(arguments: Sequence[str], place: Path, armed: Armed | None = None, *, fresh: bool = False) -> processes.Child:
+    child = processes.start(arguments, place / "errors.txt", armed, fresh=fresh, watched_by_python=python_alone())
+    if child.end() != 0:
+        raise SystemExit(f"an undisturbed run ended with {child.code}: {child.errors.strip()}")
+    return child
+
+
+def read(source: Source, folder: Path) -> Prepared:
+    """What `undisturbed` wrote."""
+    place = folder / "undisturbed" / source.kind
+    facts = json.loads((place / "facts.json").read_text(encoding="utf-8"))
+    found = [Operation(**operation) for operation in facts["operations"]]
+    return Prepared(source, Expected(facts["digests"], frozenset(facts["names"])), facts["seconds"], found, place / "older")
+
+
+def prepare(folder: Path, kinds: Sequence[str]) -> list[Prepared]:
+    """Make the sources, run each undisturbed, and import what those runs needed. Raises SystemExit."""
+    made = [sources.make(kind, folder / "sources") for kind in kinds]
+    processes.preload()
+
+    def all_undisturbed() -> None:
+        for source in made:
+            undisturbed(source, folder)
+
+    if wait_for([processes.forked(all_undisturbed)]):
+        raise SystemExit(1)
+    for source in made:
+        processes.preload_modules((folder / "undisturbed" / source.kind / "modules").read_text(encoding="utf-8").splitlines())
+    return [read(source, folder) for source in made]
+
+
+def wait_for(workers: Sequence[int]) -> int:
+    """How many workers did not end well."""
+    return sum(os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1]) != 0 for worker in workers)

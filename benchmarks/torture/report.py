@@ -1,0 +1,34 @@
+"""The circumstances of a result: machine, versions, date."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import time
+from importlib.metadata import version
+from typing import Any
+
+from benchmarks.machine import processor
+from benchmarks.torture.processes import ROOT
+
+LIBRARIES = ("torch", "numpy", "numba", "pycolmap", "av", "OpenEXR", "safetensors", "pillow", "filelock")
+
+
+def circumstances(begun: float, *, python_alone: bool, jobs: int, seed: int) -> dict[str, Any]:
+    """`begun`: of the monotonic clock."""
+    return {
+        "operations_seen": "those of Python alone, for want of a C compiler" if python_alone else "of all libraries (LD_PRELOAD)",
+        "elapsed_seconds": round(time.monotonic() - begun, 1),
+        "jobs": jobs,
+        "seed": seed,
+        "date": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
+        "commit": _commit(),
+        "machine": {"processor": processor(), "cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
+        "versions": {name: version(name) for name in LIBRARIES},
+    }
+
+
+def _commit() -> str | None:
+    done = subprocess.run(["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"], capture_output=True, text=True)
+    return done.stdout.strip() or None

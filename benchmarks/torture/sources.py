@@ -1,0 +1,78 @@
+"""The sources of the runs, as small as every stage can bear."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.scenes.__main__ import write_scene
+from benchmarks.scenes.catalogue import cameras, recipes
+from benchmarks.scenes.rendering import image
+from efficientnerf.geometry.cameras import opengl_from_pose
+
+PHOTOGRAPHS = Path(__file__).resolve().parents[2] / "examples" / "still_life"
+KINDS = ("photographs", "blender", "llff")
+
+# The preset tiny, smaller still; every stage keeps its checkpoints, previews and files.
+SETTINGS = (
+    "poses.max_image_size=64", "poses.max_features=512", "poses.feature_image_size=320",
+    "train.iterations=24", "train.checkpoint_every=8", "train.preview_every=12", "train.occupancy_warmup_steps=8", "train.max_rays_per_batch=128",
+    "bake.resolution=24", "bake.visibility_rays=2000", "bake.refine_steps=4", "bake.refine_rays_per_batch=256",
+    "turntable.frames=4", "mesh.max_faces=400", "points.num_points=500",
+)  # fmt: skip
+OTHER = "poses.max_image_size=40"  # with it every artifact is another
+
+
+@dataclass(frozen=True)
+class Source:
+    """A source, and how it is run."""
+
+    kind: str
+    folder: Path
+    options: tuple[str, ...]
+
+    def arguments(self, run: Path, *more: str) -> list[str]:
+        """Of `enerf`."""
+        return ["run", str(self.folder), "--out", str(run), "--json", *self.options, *more]
+
+
+def options(settings: Sequence[str] = SETTINGS) -> tuple[str, ...]:
+    return ("--preset", "tiny", "--device", "cpu", *(word for setting in settings for word in ("--set", setting)))
+
+
+def make(kind: str, folder: Path, photographs: int = 6) -> Source:
+    """Write the source of a kind below a folder."""
+    place = folder / kind
+    if kind == "photographs":
+        place.mkdir(parents=True)
+        for path in sorted(PHOTOGRAPHS.glob("*.jpg"))[:photographs]:
+            shutil.copyfile(path, place / path.name)
+        return Source(kind, place, options())
+    if kind == "llff":
+        write_scene(recipes()["window"], place, {"train": 6, "val": 0, "test": 2}, 48, 1)
+        (place / "transforms.json").unlink()
+        return Source(kind, place, ("--as", "llff", *options()))
+    if kind == "blender":
+        _write_blender(place)
+        return Source(kind, place, ("--as", "blender", *options()))
+    raise ValueError(f"kind {kind!r}: expected one of {', '.join(KINDS)}")
+
+
+def _write_blender(folder: Path) -> None:
+    from PIL import Image
+
+    recipe = recipes()["object"]
+    for split, count in (("train", 6), ("test", 2)):
+        views = cameras(recipe, split, count, 48)
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for number, camera in enumerate(views):
+            Image.fromarray(image(recipe.shapes, camera, supersample=1, alpha=True)).save(folder / split / f"r_{number}.png")
+            frames.append({"file_path": f"./{split}/r_{number}", "transform_matrix": opengl_from_pose(camera.world_from_camera).tolist()})
+        angle = 2 * float(np.arctan(0.5 * views[0].width / views[0].intrinsics["fx"]))
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}), encoding="utf-8")
