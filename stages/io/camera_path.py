@@ -11,11 +11,12 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, Similarity, pose_from_opengl
 from pipeline.errors import BadInput
-from stages.io.json_file import read_json
+from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
 
 MAX_FILE = 64 << 20
 MAX_SIZE = 16384
 MAX_CAMERAS = 100_000
+MIN_ANGLE = 1e-3  # degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
         raise BadInput(f"{path}: no list `camera_path`; expected a camera path as nerfstudio's viewer exports it.{hint}")
     kind = document.get("camera_type", "perspective")
     if kind != "perspective":
-        raise BadInput(f"{path}: camera_type {str(kind)[:40]!r}; only perspective paths can be drawn.")
+        raise BadInput(f"{path}: camera_type {shown(kind)}; only perspective paths can be drawn.")
     entries = document["camera_path"]
     if not 1 <= len(entries) <= MAX_CAMERAS:
         raise BadInput(f"{path}: camera_path holds {len(entries)} cameras; expected 1 to {MAX_CAMERAS}.")
@@ -50,9 +51,9 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
     for k, entry in enumerate(entries):
         where = f"{path}: camera_path[{k}]"
         if not isinstance(entry, dict):
-            raise BadInput(f"{where}: expected an object, found {_shown(entry)}.")
+            raise BadInput(f"{where}: expected an object, found {shown(entry)}.")
         pose = world_from_capture.pose(_pose(entry.get("camera_to_world"), where))
-        vertical = _number(entry.get("fov", document.get("default_fov")), f"{where}.fov", "degrees between 0 and 180", 0.0, 180.0)
+        vertical = _number(entry.get("fov", document.get("default_fov")), f"{where}.fov", "degrees between 0 and 180", MIN_ANGLE, 180.0 - MIN_ANGLE)
         focal = 0.5 * size[1] / math.tan(math.radians(vertical / 2))
         cameras.append(Camera(f"frame_{k:04d}", size[0], size[1], "SIMPLE_PINHOLE", (focal, size[0] / 2, size[1] / 2), pose))
     fps = document.get("fps")
@@ -79,10 +80,11 @@ def _pose(value: Any, where: str) -> np.ndarray:
     """camera_to_world with the project's axes, its rotation made exactly orthonormal."""
     where = f"{where}.camera_to_world"
     if not isinstance(value, list) or len(value) != 16 or any(isinstance(x, bool) or not isinstance(x, int | float) for x in value):
-        raise BadInput(f"{where}: expected 16 numbers, found {_shown(value)}.")
-    if any(abs(x) > 1e100 for x in value):  # also infinity, and integers that no float holds
-        raise BadInput(f"{where}: holds a number that is not finite.")
-    matrix = np.array(value, np.float64).reshape(4, 4)
+        raise BadInput(f"{where}: expected 16 numbers, found {shown(value)}.")
+    numbers = [finite(x) for x in value]
+    if None in numbers:
+        raise BadInput(f"{where}: holds a number that is not finite, or beyond {LARGEST_NUMBER:g}.")
+    matrix = np.array(numbers, np.float64).reshape(4, 4)
     if not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
         hint = " It looks transposed; write it row by row." if np.allclose(matrix[:, 3], (0, 0, 0, 1), atol=1e-6) else ""
         raise BadInput(f"{where}: its last row is {matrix[3].tolist()}, expected 0 0 0 1.{hint}")
@@ -96,12 +98,7 @@ def _pose(value: Any, where: str) -> np.ndarray:
 
 def _number(value: Any, where: str, expected: str, low: float, high: float) -> float:
     """A finite number strictly between low and high."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low < value < high:
-        raise BadInput(f"{where}: found {_shown(value)}, expected {expected}.")
-    return float(value)
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    return "nothing" if value is None else repr(value)[:40]
+    number = finite(value)
+    if number is None or not low < number < high:
+        raise BadInput(f"{where}: found {shown(value)}, expected {expected}.")
+    return number

@@ -17,17 +17,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec import to_builtins
 
 from efficientnerf.geometry.cameras import Camera, Similarity
 from efficientnerf.geometry.ndc import Ndc
 from pipeline.errors import BadInput, CorruptArtifact
-from pipeline.files import write_json
+from pipeline.files import is_safe_name, write_json
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.framing.forward_facing import SPACES, ForwardFacing
 from stages.io.capture import SparsePoints
-from stages.io.json_file import JsonReader, read_json
+from stages.io.json_file import read_json
 from stages.io.pictures import UnreadableImage, grey_of, opened, read_header, rgb_and_alpha
+from stages.io.scene_schema import CameraDocument, SceneDocument, ViewDocument, decoded
 
 FORMAT = 2
 SPLITS = ("train", "val", "test")
@@ -164,37 +166,46 @@ def save(scene: Scene, folder: Path) -> None:
 
 
 def load(folder: Path) -> Scene:
-    """Read and check scene.json. Raises BadInput."""
+    """Read and check scene.json. Raises CorruptArtifact; BadInput where there is none."""
     path = PosesOutputs(folder).scene
-    document = JsonReader(read_json(path, AGAIN, missing="Run the poses stage first."), str(path), AGAIN)
-    version = document.integer("format")  # also refuses what is not an object
-    if not 1 <= version <= FORMAT:
-        raise BadInput(f"{path}: format version {version}; this build reads 1 to {FORMAT}. Upgrade efficientnerf, or run the poses stage again.")
-    background = document.value.get("background")
-    transform, orbit = document.reader("world_from_capture"), document.reader("orbit")
-    views = tuple(_view_from_json(JsonReader(view, f"{path}: views[{i}]", AGAIN), folder) for i, view in enumerate(document.items("views")))
-    scene = Scene(
-        kind=document.text("kind"),
-        views=views,
-        bounds=document.numbers("bounds", (2, 3)),
-        background=None if background is None else _triple(document.numbers("background", (3,))),
-        world_from_capture=Similarity(transform.number("scale"), transform.numbers("rotation", (3, 3)), transform.numbers("translation", (3,))),
-        orbit=Orbit(
-            centre=_triple(orbit.numbers("centre", (3,))),
-            radius=orbit.number("radius"),
-            elevation=orbit.number("elevation"),
-            forward_facing=orbit.flag("forward_facing"),
-            heading=orbit.number("heading"),
-        ),
-        points=document.flag("points"),
-        metric=document.flag("metric"),
-        **({} if version == 1 else _space_from_json(document, path)),
+    if not path.is_file():
+        raise BadInput(f"{printable(path)}: no such file. Run the poses stage first.")
+    try:
+        found = read_json(path, AGAIN)
+    except BadInput as error:
+        raise CorruptArtifact(str(error)) from error
+    version = found.get("format") if isinstance(found, dict) else None
+    if type(version) is int and version > FORMAT:
+        newer = str(version) if version < 10**6 else "of many digits"
+        raise CorruptArtifact(f"{printable(path)}: format version {newer}; this build reads 1 to {FORMAT}. Upgrade efficientnerf. {AGAIN}")
+    try:
+        return _scene_from(decoded(found, SceneDocument, path, AGAIN))
+    except ValueError as error:
+        raise CorruptArtifact(f"{printable(path)}: {printable(error)}. {AGAIN}") from error
+
+
+def _scene_from(document: SceneDocument) -> Scene:
+    """The scene; ValueError for what no scene can be."""
+    if document.format < 1 or (document.format > 1 and document.space is None):
+        raise ValueError(f"format version {document.format} without all that belongs to it")
+    transform, orbit, bounds = document.world_from_capture, document.orbit, np.array(document.bounds, np.float64)
+    if not (bounds[0] < bounds[1]).all():
+        raise ValueError(f"bounds are empty ({bounds.tolist()})")
+    rotation = np.array(transform.rotation, np.float64)
+    if not _is_rotation(rotation):
+        raise ValueError("world_from_capture is not a similarity")
+    return Scene(
+        kind=printable(document.kind),
+        views=tuple(_view_from(view, f"views[{index}]") for index, view in enumerate(document.views)),
+        bounds=bounds,
+        background=document.background,
+        world_from_capture=Similarity(transform.scale, rotation, np.array(transform.translation, np.float64)),
+        orbit=Orbit(orbit.centre, orbit.radius, orbit.elevation, orbit.forward_facing, orbit.heading),
+        points=document.points,
+        metric=document.metric,
+        space="auto" if document.format == 1 else str(document.space),
+        forward=None if document.format == 1 else _forward_from(document),
     )
-    if not (scene.bounds[0] < scene.bounds[1]).all():
-        raise BadInput(f"{path}: bounds are empty ({scene.bounds.tolist()}). Run the poses stage again.")
-    if scene.world_from_capture.scale <= 0 or not _is_rotation(scene.world_from_capture.rotation):
-        raise BadInput(f"{path}: world_from_capture is not a similarity. Run the poses stage again.")
-    return scene
 
 
 def read_image(folder: Path, view: View) -> np.ndarray:
@@ -247,18 +258,25 @@ def save_points(points: SparsePoints, folder: Path) -> None:
 
 
 def read_points(folder: Path) -> SparsePoints:
-    """The sparse points in the training frame; tracks are indices into the scene's views."""
+    """The sparse points in the training frame; tracks are indices into the scene's views. Raises CorruptArtifact."""
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
     path = PosesOutputs(folder).points
     try:
-        tensors = load_file(str(path))
-        ends = np.cumsum(tensors["observer_counts"])
-        tracks = tuple(tuple(track.tolist()) for track in np.split(tensors["observers"], ends[:-1])) if len(ends) else ()
-        return SparsePoints(tensors["xyz"], tensors["rgb"], tensors["error"], tracks)
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise BadInput(f"{path}: not readable as sparse points ({error}). Run the poses stage again.") from error
+        tensors = load_file(path)
+        xyz, rgb, error, counts, observers = (tensors[name] for name in ("xyz", "rgb", "error", "observer_counts", "observers"))
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError) as reason:
+        raise CorruptArtifact(f"{printable(path)}: not readable as sparse points ({printable(reason, 80)}). {AGAIN}") from reason
+    count = len(counts) if counts.ndim == 1 else 0
+    shapes = [array.shape for array in (xyz, rgb, error, counts)] == [(count, 3), (count, 3), (count,), (count,)]
+    types = [array.dtype for array in (xyz, rgb, error, counts, observers)] == [np.float64, np.uint8, np.float64, np.int64, np.int64]
+    if not shapes or not types or (counts < 0).any() or (counts > observers.size).any() or observers.shape != (counts.sum(),) or (observers < 0).any():
+        raise CorruptArtifact(f"{printable(path)}: sparse points whose shapes, types or counts do not agree. {AGAIN}")
+    if not np.isfinite(xyz).all():
+        raise CorruptArtifact(f"{printable(path)}: sparse points that are not finite. {AGAIN}")
+    ends = np.cumsum(counts)
+    return SparsePoints(xyz, rgb, error, tuple(tuple(track.tolist()) for track in np.split(observers, ends[:-1])) if count else ())
 
 
 def describe(folder: Path) -> dict[str, Any]:
@@ -307,7 +325,7 @@ def _report_warnings(folder: Path) -> list[str]:
     path = PosesOutputs(folder).report
     report = read_json(path, AGAIN) if path.is_file() else {}
     found = report.get("warnings", []) if isinstance(report, dict) else []
-    return [str(sentence) for sentence in found]
+    return [printable(sentence, 1000) for sentence in found if isinstance(sentence, str)] if isinstance(found, list) else []
 
 
 def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:
@@ -321,23 +339,16 @@ def _forward_to_json(forward: ForwardFacing) -> dict[str, Any]:
     }
 
 
-def _space_from_json(document: JsonReader, path: Path) -> dict[str, Any]:
-    space = document.text("space")
-    if space not in SPACES or (space == "ndc") != (document.value.get("forward") is not None):
-        raise BadInput(f"{path}: space {space[:40]!r}; expected one of {', '.join(SPACES)}, and ndc with a forward-facing scene. Run the poses stage again.")
-    if space != "ndc":
-        return {"space": space}
-    reader = document.reader("forward")
-    try:
-        ndc = Ndc.from_json(reader.value)
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"{path}: forward: {error}. Run the poses stage again.") from error
-    bounds, tangents = reader.numbers("bounds", (2, 3)), reader.numbers("tangents", (2,))
-    radii = _triple(reader.numbers("radii", (3,)))
-    forward = ForwardFacing(ndc, bounds, reader.number("far"), radii, reader.number("focus"), (float(tangents[0]), float(tangents[1])))
-    if min([forward.far - ndc.near, forward.focus, *tangents, *(bounds[1] - bounds[0])]) <= 0:
-        raise BadInput(f"{path}: forward: no box before the reference camera. Run the poses stage again.")
-    return {"space": space, "forward": forward}
+def _forward_from(document: SceneDocument) -> ForwardFacing | None:
+    found = document.forward
+    if document.space not in SPACES or (document.space == "ndc") != (found is not None):
+        raise ValueError(f"space {document.space!r:.40}; expected one of {', '.join(SPACES)}, and ndc with a forward-facing scene")
+    if found is None:
+        return None
+    forward = ForwardFacing(Ndc.from_json(to_builtins(found)), np.array(found.bounds, np.float64), found.far, found.radii, found.focus, found.tangents)
+    if min([forward.far - forward.ndc.near, forward.focus, *forward.tangents, *(forward.bounds[1] - forward.bounds[0])]) <= 0:
+        raise ValueError("forward: no box before the reference camera")
+    return forward
 
 
 def _camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -351,35 +362,26 @@ def _camera_to_json(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _camera_from_json(data: JsonReader) -> Camera:
-    pose = data.numbers("world_from_camera", (4, 4))
+def _camera_from(data: CameraDocument, where: str) -> Camera:
+    pose = np.array(data.world_from_camera, np.float64)
     if not _is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any():
-        raise BadInput(f"{data.where}.world_from_camera is not a rigid motion. Run the poses stage again.")
-    width, height = data.integer("width"), data.integer("height")
-    if not (0 < width <= 65536 and 0 < height <= 65536):
-        raise BadInput(f"{data.where}: size {width}x{height}. Run the poses stage again.")
-    try:
-        return Camera(data.text("name"), width, height, data.text("model"), tuple(data.numbers("params", (-1,)).tolist()), pose)
-    except ValueError as error:
-        raise BadInput(f"{data.where}: {error}. Run the poses stage again.") from error
+        raise ValueError(f"{where}.world_from_camera is not a rigid motion")
+    camera = Camera(printable(data.name), data.width, data.height, data.model, tuple(data.params), pose)
+    if min(camera.intrinsics["fx"], camera.intrinsics["fy"]) <= 0:
+        raise ValueError(f"{where}: focal length that is not positive")
+    return camera
 
 
-def _view_from_json(data: JsonReader, folder: Path) -> View:
-    split = data.text("split")
-    near, far = data.number("near"), data.number("far")
-    if split not in SPLITS or not 0 <= near < far:
+def _view_from(data: ViewDocument, where: str) -> View:
+    if data.split not in SPLITS or not 0 <= data.near < data.far:
         expected = f"one of {', '.join(SPLITS)} and 0 <= near < far"
-        raise BadInput(f"{data.where}: split {split!r}, near {near}, far {far}; expected {expected}. Run the poses stage again.")
-    mask = data.text("mask") if data.value.get("mask") is not None else None
-    for relative in (data.text("image"), mask):
-        if relative is not None and (Path(relative).is_absolute() or ".." in Path(relative).parts):
-            raise BadInput(f"{data.where}: {relative} lies outside {folder}. Run the poses stage again.")
-    return View(data.text("image"), mask, split, _camera_from_json(data.reader("camera")), _camera_from_json(data.reader("source_camera")), near, far)
+        raise ValueError(f"{where}: split {data.split!r:.40}, near {data.near}, far {data.far}; expected {expected}")
+    for relative in (data.image, data.mask):
+        if relative is not None and not is_safe_name(relative):
+            raise ValueError(f"{where}: {printable(relative, 100)} lies outside of the scene's folder")
+    camera, source_camera = _camera_from(data.camera, f"{where}.camera"), _camera_from(data.source_camera, f"{where}.source_camera")
+    return View(data.image, data.mask, data.split, camera, source_camera, data.near, data.far)
 
 
 def _is_rotation(matrix: np.ndarray) -> bool:
     return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5) and np.linalg.det(matrix) > 0)
-
-
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])

@@ -62,12 +62,14 @@ def _shown(folder: Path) -> Iterator[None]:
     try:
         yield
     except BadInput as error:
-        raise BadInput(printable(error)) from error
+        raise BadInput(printable(error, LONGEST)) from error
     except OSError as error:
         if error.errno in NOT_THE_FILES_FAULT:
             raise
         raise BadInput(printable(f"{error.filename or folder}: cannot be read ({error.strerror or error}). Check the source folder.")) from error
 
+
+LONGEST = 2000  # characters of a message: a path of the longest kind may be in it, more than once it may not
 
 # In order of preference: a folder may hold several formats.
 IMPORTERS: dict[str, Importer] = {

@@ -16,7 +16,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
-from stages.io.importers.colmap_model import Model, Points, count_images, model_files, read_model
+from stages.io.importers.colmap_model import MAX_NAME, Model, Points, count_images, model_files, read_model
 from stages.io.importers.photographs import masks_of
 from stages.io.importers.source import MIN_IMAGES, ImportSettings, Source, abbreviated, missing_images_warning, moved_images_warnings
 from stages.io.pictures import UnreadableImage, read_header
@@ -59,7 +59,7 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     model = read_model(place, _files(source, place))
     where = source.name_of(place) if place != source.root else source.root.name
     images, places, extensions = _find_images(source, model)
-    missing = sorted(printable(model.images[number].name) for number, path in images.items() if path is None)
+    missing = sorted(printable(model.images[number].name, MAX_NAME) for number, path in images.items() if path is None)
     here = {number: path for number, path in images.items() if path is not None}
     warnings = missing_images_warning(where, len(images), len(here), missing, settings.strict, _REMEDY)
     warnings += moved_images_warnings(where, places, extensions)
@@ -109,7 +109,7 @@ def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], 
         result = source.find(name, best)
         found[number] = result.path
         if result.path is not None and result.how != "listed":
-            (places if result.how == "elsewhere" else extensions).append((name, source.name_of(result.path)))
+            (places if result.how == "elsewhere" else extensions).append((printable(name, MAX_NAME), source.name_of(result.path)))
     return found, places, extensions
 
 
@@ -121,10 +121,15 @@ def _photos(
     kept: list[tuple[int, Photo]] = []
     rejected: list[tuple[str, str, Path]] = []
     warnings: list[str] = []
+    seen: set[Path] = set()
     remarks_by_kind: dict[str, list[str]] = {}
     for number, path in here.items():
         posed, name = model.images[number], source.name_of(path)
         lens = model.cameras[posed.camera]
+        if path in seen:
+            rejected.append((printable(posed.name, MAX_NAME), f"the same image as an earlier one ({name})", source.real(path)))
+            continue
+        seen.add(path)
         try:
             header = read_header(source.real(path))
         except UnreadableImage as error:
@@ -133,7 +138,7 @@ def _photos(
             continue
         pose = pose_from_colmap(np.array(posed.quaternion), np.array(posed.translation))
         stated = lenses.validated(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {posed.camera}")
-        camera, remark = lenses.fit_to_image(stated, header, f"{where}: {posed.name}")
+        camera, remark = lenses.fit_to_image(stated, header, f"{where}: {printable(posed.name, MAX_NAME)}")
         if remark is not None:
             remarks_by_kind.setdefault(remark, []).append(name)
         mask = source.real(masks[path]) if path in masks else None

@@ -8,6 +8,7 @@ Formats: the COLMAP documentation, "Output format".
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import MODELS
 from pipeline.errors import BadInput
+from pipeline.text import printable
 
 # Number of each camera model in binary files: (name, how many parameters).
 MODEL_NUMBERS = {
@@ -35,6 +37,8 @@ MODEL_NUMBERS = {
 }
 MAX_FILE = 8 << 30  # bytes
 MAX_IMAGES = 100_000
+MAX_NAME = 200  # characters of a name that a message shows
+MAX_COORDINATE = 1e60  # of points: those of nearly parallel rays lie far away, and squares of squares are numbers yet
 _AGAIN = "Copy the model again, or export it anew."
 
 
@@ -112,7 +116,9 @@ def read_model(folder: Path, found: list[Path] | None = None, *, points: bool = 
     images = (_images_bin if binary else _images_txt)(found[1])
     for image in images.values():
         if image.camera not in cameras:
-            raise BadInput(f"{found[1]}: image {image.name} refers to camera {image.camera}, which {found[0].name} does not hold. {_AGAIN}")
+            raise BadInput(
+                f"{found[1]}: image {printable(image.name, MAX_NAME)} refers to camera {image.camera}, which {found[0].name} does not hold. {_AGAIN}"
+            )
     cloud = (_points_bin if binary else _points_txt)(found[2]) if points and len(found) == 3 else None
     return Model(folder, cameras, images, cloud)
 
@@ -159,7 +165,9 @@ class _Bytes:
 
 def _lens(path: Path, number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
     if model not in MODELS:
-        raise BadInput(f"{path}: camera {number} is a {model}; supported are {', '.join(MODELS)}. Undistort with `colmap image_undistorter` first.")
+        raise BadInput(
+            f"{path}: camera {number} is a {printable(model, 40)}; supported are {', '.join(MODELS)}. Undistort with `colmap image_undistorter` first."
+        )
     if len(params) != len(MODELS[model]):
         raise BadInput(f"{path}: camera {number}: {model} has {len(MODELS[model])} parameters, found {len(params)}. {_AGAIN}")
     if not (0 < width <= 65535 and 0 < height <= 65535):
@@ -168,10 +176,10 @@ def _lens(path: Path, number: int, model: str, width: int, height: int, params: 
 
 
 def _posed(path: Path, name: str, camera: int, numbers: tuple[float, ...]) -> PosedImage:
-    quaternion, translation = numbers[:4], numbers[4:]
+    quaternion, translation, shown = numbers[:4], numbers[4:], printable(name, MAX_NAME)
     if not all(map(math.isfinite, numbers)) or abs(math.hypot(*quaternion) - 1) > 1e-2:
         found = f"quaternion {list(quaternion)}, translation {list(translation)}"
-        raise BadInput(f"{path}: image {name}: {found}; expected a unit quaternion and finite numbers. {_AGAIN}")
+        raise BadInput(f"{path}: image {shown}: {found}; expected a unit quaternion and finite numbers. {_AGAIN}")
     if not name:
         raise BadInput(f"{path}: an image without a name. {_AGAIN}")
     return PosedImage(name, camera, quaternion, translation)  # type: ignore[arg-type]
@@ -216,8 +224,9 @@ def _points_bin(path: Path) -> Points:
 
 
 def _finite(path: Path, points: Points) -> Points:
-    if not np.isfinite(points.xyz).all():
-        raise BadInput(f"{path}: {int((~np.isfinite(points.xyz).all(1)).sum())} points are not finite. {_AGAIN}")
+    unusable = ~(np.abs(points.xyz) <= MAX_COORDINATE).all(1)  # nan, too
+    if unusable.any():
+        raise BadInput(f"{path}: {int(unusable.sum())} points are not finite. {_AGAIN}")
     return points
 
 
@@ -234,7 +243,7 @@ def _stated(path: Path, what: str) -> int | None:
             break
         if line.startswith(f"# Number of {what}:"):
             digits = line.split(":")[1].split(",")[0].strip()
-            return int(digits) if digits.isdigit() else None
+            return int(digits) if re.fullmatch("[0-9]{1,19}", digits) else None
     return None
 
 
@@ -248,11 +257,11 @@ def _numbers(path: Path, line: int, words: list[str]) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as error:
-        raise BadInput(f"{path}: line {line}: {error}. {_AGAIN}") from error
+        raise BadInput(f"{path}: line {line}: {printable(error, 100)}. {_AGAIN}") from error
 
 
 def _integer(path: Path, line: int, word: str) -> int:
-    if not word.lstrip("-").isdigit() or len(word) > 20:
+    if not re.fullmatch("-?[0-9]{1,19}", word):
         raise BadInput(f"{path}: line {line}: {word[:40]!r} is not a whole number. {_AGAIN}")
     return int(word)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,11 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, resized, rotated_clockwise
 from pipeline.errors import BadInput
 from stages.io.importers.source import abbreviated
+from stages.io.json_file import LARGEST_NUMBER
 from stages.io.photo import same_aspect
 from stages.io.pictures import Header
 
+SHORTEST_FOCAL = 1e-6  # pixels; its square is a number yet
 _QUARTER_TURNS = {1: 0, 6: 1, 3: 2, 8: 3}  # clockwise, from the stored pixels to the upright image; the others are mirrored
 
 
@@ -28,8 +29,10 @@ def rigid(matrix: Any, where: str) -> np.ndarray:
     if pose.shape != (4, 4):
         shape = "x".join(map(str, pose.shape)) if pose.size else "no matrix"
         raise BadInput(f"{where}: expected a 4x4 matrix, camera to world; found {shape}. Write the data set again.")
-    if not np.isfinite(pose).all():
-        raise BadInput(f"{where}: the matrix holds numbers that are not finite. Leave that frame out, or write the data set again.")
+    if not (np.abs(pose) <= LARGEST_NUMBER).all():  # nor nan
+        raise BadInput(
+            f"{where}: the matrix holds numbers that are not finite, or beyond {LARGEST_NUMBER:g}. Leave that frame out, or write the data set again."
+        )
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise BadInput(f"{where}: the last row of the matrix is {pose[3].tolist()}, expected 0 0 0 1 (is it transposed?).")
     pose[:3, :3] = rotation(pose[:3, :3], where)
@@ -57,12 +60,14 @@ def rotation(columns: np.ndarray, where: str) -> np.ndarray:
 
 
 def validated(camera: Camera, where: str) -> Camera:
-    """The camera itself; BadInput for a lens that cannot be: a focal length that is not positive, numbers that are not finite."""
+    """The camera itself; BadInput for a lens or a place that cannot be: a focal length that is not positive, numbers that are not finite."""
     named = camera.intrinsics
-    if not all(math.isfinite(value) for value in camera.params):
-        raise BadInput(f"{where}: camera parameters {list(camera.params)} are not all finite. Write the data set again.")
-    if named["fx"] <= 0 or named["fy"] <= 0:
+    if not all(abs(value) <= LARGEST_NUMBER for value in camera.params):
+        raise BadInput(f"{where}: camera parameters {list(camera.params)} are not all finite, or beyond {LARGEST_NUMBER:g}. Write the data set again.")
+    if min(named["fx"], named["fy"]) < SHORTEST_FOCAL:
         raise BadInput(f"{where}: focal length {min(named['fx'], named['fy']):g}; expected more than zero pixels. Write the data set again.")
+    if not (np.abs(camera.world_from_camera) <= LARGEST_NUMBER).all():
+        raise BadInput(f"{where}: the camera's place is not finite, or beyond {LARGEST_NUMBER:g}. Write the data set again.")
     if camera.width <= 0 or camera.height <= 0:
         raise BadInput(f"{where}: image size {camera.width}x{camera.height}; expected more than zero pixels. Write the data set again.")
     return camera

@@ -6,6 +6,7 @@ h, w, f are those of the full images; the images at hand may be smaller, and f i
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from stages.io.capture import Capture, Photo
 from stages.io.importers import lenses
 from stages.io.importers.photographs import masks_of
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in
+from stages.io.json_file import LARGEST_NUMBER
 from stages.io.pictures import UnreadableImage, read_header
 
 POSES = "poses_bounds.npy"
@@ -102,21 +104,37 @@ def _camera(row: np.ndarray, name: str, where: str) -> Camera:
 def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
     """(N, 17) float64, finite, N at most `max_frames`; nothing but plain numbers is read from the file. Raises BadInput."""
     try:
-        size = path.stat().st_size
-        if size > 17 * 8 * max_frames + 4096:
-            raise BadInput(f"{path}: {size} bytes; more than {max_frames} poses are not read.")
-        array = np.load(path, allow_pickle=False, mmap_mode=None)
+        with path.open("rb") as file:
+            data = file.read(17 * 8 * max_frames + 4097)
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error
-    except (ValueError, EOFError, MemoryError) as error:
-        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({str(error).splitlines()[0] if str(error) else type(error).__name__}).") from error
-    if not isinstance(array, np.ndarray) or array.ndim != 2 or array.shape[1] != 17 or array.dtype.kind not in "fiu":
-        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
-        raise BadInput(f"{path}: {found}; expected numbers of shape (N, 17): 3x5 poses, near and far. Write it again with LLFF's imgs2poses.")
-    rows = array.astype(np.float64)
-    if not np.isfinite(rows).all():
-        raise BadInput(f"{path}: row {int(np.flatnonzero(~np.isfinite(rows).all(1))[0])} holds numbers that are not finite. Write it again.")
+    if len(data) > 17 * 8 * max_frames + 4096:
+        raise BadInput(f"{path}: {path.stat().st_size} bytes; more than {max_frames} poses are not read.")
+    shape, fortran, kind, start = _npy_header(path, data)
+    if len(shape) != 2 or shape[1] != 17 or kind.kind not in "fiu":
+        found = f"{kind} {shape}"
+        raise BadInput(f"{path}: {found:.80}; expected numbers of shape (N, 17): 3x5 poses, near and far. Write it again with LLFF's imgs2poses.")
+    size = shape[0] * 17 * kind.itemsize
+    if not 0 <= size <= len(data) - start:
+        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({len(data)} bytes for {shape[0]} poses).")
+    rows = np.frombuffer(data, kind, shape[0] * 17, start).reshape(shape, order="F" if fortran else "C").astype(np.float64)
+    unusable = ~(np.abs(rows) <= LARGEST_NUMBER).all(1)  # nan, too
+    if unusable.any():
+        raise BadInput(f"{path}: row {int(np.flatnonzero(unusable)[0])} holds numbers that are not finite, or beyond {LARGEST_NUMBER:g}. Write it again.")
     return rows
+
+
+def _npy_header(path: Path, data: bytes) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+    """Shape, whether columns come first, type, and where the numbers begin, of a .npy file; nothing is allocated on its word."""
+    file = io.BytesIO(data)
+    try:
+        major, _ = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        shape, fortran, kind = read(file)
+    except Exception as error:  # a damaged header is parsed as a Python literal, which raises anything
+        reason = printable(next(iter(str(error).splitlines()), type(error).__name__), 80)
+        raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({reason}).") from error
+    return shape, fortran, kind, file.tell()
 
 
 def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[Path], int, list[str]]:

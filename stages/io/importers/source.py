@@ -24,6 +24,8 @@ from pipeline.text import printable
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".hif")
 MAX_FRAMES = 100_000
 MAX_FILES = 1_000_000  # entries of a source folder
+MAX_PATH = 4096  # characters of a listed name
+MAX_DEPTH = 32  # last parts of a listed name that are searched for below the source
 MIN_IMAGES = 3  # images that make a data set
 MAX_NAMES = 5  # names that a message lists
 
@@ -123,7 +125,7 @@ class Source:
         Raises BadInput where the name leads out of the source folder.
         """
         beside = beside or self.root
-        if not name.strip() or not _is_encodable(name):
+        if not name.strip() or len(name) > MAX_PATH or not _is_encodable(name):
             return Found(None)
         foreign = PureWindowsPath(name) if "\\" in name or PureWindowsPath(name).drive else PurePosixPath(name)
         absolute = bool(foreign.root or foreign.drive)
@@ -132,11 +134,11 @@ class Source:
         inside = here is not None and here.is_relative_to(self.root)
         if here is not None and (inside or self.allow_outside or not absolute):
             if not inside and not self.allow_outside:
-                raise BadInput(f"{name}: leads out of the source folder {self.root}. Copy it into the folder, or pass --allow-outside.")
+                raise BadInput(f"{printable(name, 200)}: leads out of the source folder {self.root}. Copy it into the folder, or pass --allow-outside.")
             found = self._with_any_suffix(here, suffixes)
             if found.path is not None:
                 return found
-        for drop in range(1 if not absolute else 0, len(parts)):
+        for drop in range(max(0 if absolute else 1, len(parts) - MAX_DEPTH), len(parts)):
             found = self._with_any_suffix(self.root.joinpath(*parts[drop:]), suffixes) if ".." not in parts[drop:] else Found(None)
             if found.path is not None:
                 return Found(found.path, "elsewhere")
@@ -145,7 +147,7 @@ class Source:
             if len(alike) == 1:
                 return Found(self.check_inside(alike[0]), "elsewhere")
             if here is not None and os.path.isfile(here) and not inside:
-                raise BadInput(f"{name}: lies outside the source folder {self.root}. Copy it into the folder, or pass --allow-outside.")
+                raise BadInput(f"{printable(name, 200)}: lies outside the source folder {self.root}. Copy it into the folder, or pass --allow-outside.")
         return Found(None)
 
     def _with_any_suffix(self, path: Path, suffixes: Sequence[str]) -> Found:

@@ -26,7 +26,7 @@ from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, missing_images_warning, moved_images_warnings
-from stages.io.json_file import read_json
+from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
 from stages.io.pictures import UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
@@ -143,9 +143,18 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
         rejected=tuple(rejected),
         warnings=tuple(warnings + point_warnings),
         metric=any("depth_file_path" in frame.entry for frame in listing.frames) and "applied_scale" not in document,
-        facts={key: document[key] for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
+        facts={key: _fact(document[key]) for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
         rejected_files={name: file for name, _, file in unreadable},
     )
+
+
+def _fact(value: Any, depth: int = 2) -> Any:
+    """A value of the file as reports can hold it; what is large, nested or no JSON is only described."""
+    if isinstance(value, str):
+        return printable(value, MAX_NAME)
+    if isinstance(value, list) and len(value) <= 16 and depth:
+        return [_fact(entry, depth - 1) for entry in value]
+    return value if value is None or isinstance(value, bool) or finite(value, 2.0**53) is not None else shown(value)
 
 
 def read_document(file: Path, max_frames: int = MAX_FRAMES) -> dict[str, Any]:
@@ -250,10 +259,10 @@ def _lens(frame: _Frame, name: str, actual: tuple[int, int], pose: np.ndarray) -
     given = {key: value for key, value in (frame.document | frame.entry).items() if key != "frames"}
 
     def number(key: str, default: float = 0.0) -> float:
-        value = given.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise BadInput(f"{frame.where}: {key} is {value!r}, expected a finite number. Write the data set again.")
-        return float(value)
+        value = finite(given.get(key, default))
+        if value is None:
+            raise BadInput(f"{frame.where}: {key} is {shown(given[key])}, expected a finite number. Write the data set again.")
+        return value
 
     for key in _UNSUPPORTED:
         if given.get(key):
@@ -298,8 +307,8 @@ def _model(frame: _Frame, given: dict[str, Any], named: dict[str, float]) -> str
         if stated == "OPENCV" or any(named[key] for key in ("k1", "k2", "p1", "p2")):
             return "OPENCV"
         return "SIMPLE_PINHOLE" if named["fx"] == named["fy"] else "PINHOLE"
-    if stated not in MODELS:
-        raise BadInput(f"{frame.where}: camera_model {stated!r}; supported are {', '.join(MODELS)}. Undistort the images first.")
+    if not isinstance(stated, str) or stated not in MODELS:
+        raise BadInput(f"{frame.where}: camera_model {shown(stated)}; supported are {', '.join(MODELS)}. Undistort the images first.")
     unused = [key for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2") if named[key] and key not in MODELS[stated]]
     if unused:
         raise BadInput(f"{frame.where}: camera_model {stated} with {', '.join(unused)}, which that model does not have. State the model that fits.")
@@ -328,11 +337,11 @@ def _bounds(document: dict[str, Any], file: Path) -> np.ndarray | None:
     if "aabb_scale" not in document and "scale" not in document:
         return None
     scale, offset = document.get("scale", _NGP_SCALE), document.get("offset", [0.5, 0.5, 0.5])
-    numbers = [scale, *(offset if isinstance(offset, list) else [None])]
-    if len(numbers) != 4 or any(isinstance(n, bool) or not isinstance(n, (int, float)) or not math.isfinite(n) for n in numbers) or scale <= 0:
-        raise BadInput(f"{file}: scale {scale!r} and offset {offset!r}; expected a positive number and three numbers.")
-    centre = (0.5 - np.array(offset, np.float64)) / scale
-    return np.stack([centre - 0.5 / scale, centre + 0.5 / scale])
+    factor, shift = finite(scale), [finite(n) for n in offset] if isinstance(offset, list) and len(offset) == 3 else [None]
+    if factor is None or factor < 1 / LARGEST_NUMBER or None in shift:
+        raise BadInput(f"{file}: scale {shown(scale)} and offset {shown(offset)}; expected a positive number and three numbers.")
+    centre = (0.5 - np.array(shift, np.float64)) / factor
+    return np.stack([centre - 0.5 / factor, centre + 0.5 / factor])
 
 
 def _ply(source: Source, document: dict[str, Any]) -> Path | None:
@@ -341,11 +350,12 @@ def _ply(source: Source, document: dict[str, Any]) -> Path | None:
 
 
 def _points(source: Source, document: dict[str, Any]) -> tuple[SparsePoints | None, list[str]]:
-    if "ply_file_path" not in document:
+    if not isinstance(document.get("ply_file_path"), str):
         return None, []
     path = _ply(source, document)
-    if path is None or path.stat().st_size > MAX_PLY:
-        return None, [f"ply_file_path {document['ply_file_path']}: {'missing' if path is None else 'larger than 1 GiB'}; the points are not used."]
+    if path is None or source.real(path).stat().st_size > MAX_PLY:
+        why = "missing" if path is None else "larger than 1 GiB"
+        return None, [f"ply_file_path {printable(document['ply_file_path'], MAX_NAME)}: {why}; the points are not used."]
     import trimesh
 
     try:
@@ -357,8 +367,8 @@ def _points(source: Source, document: dict[str, Any]) -> tuple[SparsePoints | No
         rgb = np.asarray(colours, np.uint8)[:, :3] if len(np.asarray(colours)) == len(xyz) else np.full((len(xyz), 3), 128, np.uint8)
     except Exception as error:  # trimesh raises whatever its parser stumbles over
         return None, [f"{path.name}: not readable as a PLY of points ({type(error).__name__}: {str(error)[:80]}); the points are not used."]
-    finite = np.isfinite(xyz).all(-1)
-    if not finite.any():
+    usable = (np.abs(xyz) <= LARGEST_NUMBER).all(-1)  # not nan either
+    if not usable.any():
         return None, [f"{path.name}: holds no points; not used."]
-    xyz, rgb = xyz[finite], rgb[finite]
+    xyz, rgb = xyz[usable], rgb[usable]
     return SparsePoints(xyz, rgb, np.full(len(xyz), np.nan), ((),) * len(xyz)), []

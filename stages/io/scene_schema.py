@@ -1,0 +1,94 @@
+"""What scene.json may hold, by msgspec: types, shapes and bounds of every number. `stages.io.scene` gives it its meaning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from pipeline.errors import CorruptArtifact
+from pipeline.text import printable
+
+LARGEST = 1e15  # of any number: beyond it squares lose all that they are compared with
+
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
+Side = Annotated[int, Meta(ge=1, le=65536)]
+Row = tuple[Number, Number, Number, Number]
+Vector = tuple[Number, Number, Number]
+Matrix = tuple[Row, Row, Row, Row]
+Rotation = tuple[Vector, Vector, Vector]
+Box = tuple[Vector, Vector]
+
+
+class CameraDocument(Struct):
+    name: str
+    width: Side
+    height: Side
+    model: str
+    params: Annotated[list[Number], Meta(max_length=16)]
+    world_from_camera: Matrix
+
+
+class ViewDocument(Struct):
+    image: str
+    split: str
+    near: Number
+    far: Number
+    camera: CameraDocument
+    source_camera: CameraDocument
+    mask: str | None = None
+
+
+class SimilarityDocument(Struct):
+    scale: Positive
+    rotation: Rotation
+    translation: Vector
+
+
+class OrbitDocument(Struct):
+    centre: Vector
+    radius: Number
+    elevation: Number
+    forward_facing: bool
+    heading: Number
+
+
+class ForwardDocument(Struct):
+    world_from_camera: Matrix
+    focal: Positive
+    width: Annotated[float, Meta(gt=0, le=65536)]
+    height: Annotated[float, Meta(gt=0, le=65536)]
+    near: Positive
+    bounds: Box
+    far: Number
+    radii: Vector
+    focus: Number
+    tangents: tuple[Number, Number]
+
+
+class SceneDocument(Struct):
+    format: int
+    kind: str
+    bounds: Box
+    world_from_capture: SimilarityDocument
+    orbit: OrbitDocument
+    points: bool
+    metric: bool
+    views: list[ViewDocument]
+    background: tuple[Number, Number, Number] | None = None
+    space: str | None = None  # format 1 has none
+    forward: ForwardDocument | None = None
+
+
+T = TypeVar("T")
+
+
+def decoded(document: Any, kind: type[T], path: Path, remedy: str) -> T:
+    """`document`, out of a JSON file, as `kind`; CorruptArtifact names the place that does not fit."""
+    try:
+        return msgspec.convert(document, kind)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise CorruptArtifact(f"{printable(path)}: {printable(error)}. {remedy}") from error
