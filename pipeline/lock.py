@@ -20,8 +20,8 @@ from typing import Annotated
 import msgspec
 
 from pipeline import files
-from pipeline.disk import cannot_write
 from pipeline.errors import BadInput, PipelineError, RunLocked
+from pipeline.failures import cannot_write
 from pipeline.links import HOLDER, LOCK, refuse_links
 from pipeline.text import printable
 

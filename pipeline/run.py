@@ -23,8 +23,8 @@ from typing import Annotated, Any, Protocol
 import msgspec
 
 from pipeline import files
-from pipeline.disk import cannot_write
 from pipeline.errors import BadInput, CorruptArtifact
+from pipeline.failures import cannot_write
 from pipeline.links import CACHE, HOLDER, LOCK, RUN, refuse_links
 from pipeline.lock import Holder, holder_of, lock
 

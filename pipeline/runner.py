@@ -13,11 +13,10 @@ from typing import Any, NoReturn
 from pipeline import artifact, files, manifest
 from pipeline.artifact import Workplace
 from pipeline.decide import Decision, decide, survey
-from pipeline.disk import failed
 from pipeline.errors import BadInput, CorruptArtifact, Interrupted, UsageError
 from pipeline.executors import local
 from pipeline.executors.local import Usage
-from pipeline.failures import interruption_in, translated
+from pipeline.failures import failed, interruption_in, translated
 from pipeline.hashes import Hashes
 from pipeline.interrupt import Stop, stopping
 from pipeline.manifest import Manifest, Request

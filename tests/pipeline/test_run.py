@@ -125,6 +125,17 @@ def test_update_is_written_only_if_it_changes_something(tmp_path: Path, monkeypa
         run.update(colour="red")
 
 
+def test_what_another_changed_is_read_under_the_lock(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "run", tmp_path, {"train": {"iterations": 5}})
+    other = Run.open(run.path)
+    other.update(settings={"train": {"iterations": 7}})
+    run.update(preset="high")
+    assert Run.open(run.path).settings == {"train": {"iterations": 7}}
+    other.update(settings={"train": {"iterations": 9}})
+    with run.locked():
+        assert run.settings == {"train": {"iterations": 9}}
+
+
 def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = Run.create(tmp_path / "run", tmp_path)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import BadInput, UsageError
@@ -38,21 +40,29 @@ class Plan:
     new       whether its folder has yet to be made
     device    "auto", "cpu" or "cuda" as requested
     warnings  for the user
+    again     makes the plan anew, of what run.json holds then
     """
 
     run: Run
     new: bool
     device: str
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str]
+    again: Callable[[], Plan]
 
-    def write(self) -> Run:
-        """Create the run, or update the existing one."""
+    @contextmanager
+    def written(self) -> Iterator[Run]:
+        """Create the run, or update the existing one, and hold its lock: nobody changes its settings while its stages run.
+
+        The settings that the options change are those that run.json holds under the lock, whatever it held before.
+        """
         if self.new:
             facts = {"preset": self.run.preset, "seed": self.run.seed, "device": self.run.device, "resume_text": resume_command}
-            return Run.create(self.run.path, self.run.source, self.run.settings, **facts)
+            Run.create(self.run.path, self.run.source, self.run.settings, **facts)
         run = open_run(self.run.path)
-        run.update(source=self.run.source, settings=self.run.settings, preset=self.run.preset, seed=self.run.seed, device=self.run.device)
-        return run
+        with run.locked():
+            now = self.again().run
+            run.update(source=now.source, settings=now.settings, preset=now.preset, seed=now.seed, device=now.device)
+            yield run
 
 
 def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
@@ -105,11 +115,11 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         device=device or (standing.device if standing else None) or "auto",
         resume_text=resume_command,
     )
-    return Plan(run, standing is None, run.device or "auto", warnings)
+    return Plan(run, standing is None, run.device or "auto", warnings, lambda: plan_run(path, workflow, options))
 
 
 def _standing(path: Path) -> Run | None:
-    return open_run(path) if (path / NAME).exists() else None
+    return open_run(path) if os.path.lexists(path / NAME) else None
 
 
 def _source(given: Path | None, standing: Run | None) -> Path | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,11 +95,10 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
         with display(as_json=as_json, quiet=quiet) as show:
             for text in plan.warnings:
                 show({"event": "warning", "stage": "", "text": text, "time": time.time()})
-            if not dry_run:
-                run = plan.write()
-            outcomes = run_stages(run, workflow().stages, device=device, report=show, dry_run=dry_run, **selection)
-            if not dry_run:
-                _describe(run, anew=any(outcome.action == "ran" for outcome in outcomes))
+            with nullcontext(run) if dry_run else plan.written() as run:
+                outcomes = run_stages(run, workflow().stages, device=device, report=show, dry_run=dry_run, **selection)
+                if not dry_run:
+                    _describe(run, anew=any(outcome.action == "ran" for outcome in outcomes))
     except (Exception, KeyboardInterrupt) as error:
         raise Reported(error, summary(run.path, ())) from error
     facts = summary(run.path, outcomes)

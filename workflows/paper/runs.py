@@ -141,14 +141,12 @@ def measured(request: Request, scene: Path, row: Row) -> Figures:
 
     folder = request.out / "runs" / scene.name / row.name
     settings = settings_of(row, request.scale)
-    if (folder / NAME).exists():
-        run = Run.open(folder)
-        run.update(source=scene.resolve(), settings=settings, preset=PRESET)
-    else:
-        run = Run.create(folder, scene.resolve(), settings, preset=PRESET, device=request.device)
-    request.say(f"{scene.name}, {row.name}: training {settings['train']['iterations']} steps")
+    run = Run.open(folder) if (folder / NAME).exists() else Run.create(folder, scene.resolve(), settings, preset=PRESET, device=request.device)
     stages = [stage for stage in asset.STAGES if stage.name in (("poses", "train", "bake") if row.bakes else ("poses", "train"))]
-    outcomes = run_stages(run, stages, device=request.device, report=request.report)
+    with run.locked():
+        run.update(source=scene.resolve(), settings=settings, preset=PRESET)
+        request.say(f"{scene.name}, {row.name}: training {settings['train']['iterations']} steps")
+        outcomes = run_stages(run, stages, device=request.device, report=request.report)
     request.say(f"{scene.name}, {row.name}: measuring")
     quality = _quality(run, str(outcomes[1].digest), settings, request.device)
     lines = [json.loads(line) for line in TrainOutputs.of_run(run.path).log.read_text(encoding="utf-8").splitlines()]
