@@ -14,7 +14,9 @@ from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.files import write_atomically
 from pipeline.stage import settings_from
+from pipeline.text import printable
 from stages.artifacts import TrainOutputs
+from stages.io.json_file import shown
 from stages.renamed_settings import updated
 
 if TYPE_CHECKING:
@@ -56,10 +58,11 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt", device="cpu") as file:
             about = json.loads((file.metadata() or {}).get("field", "null"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, ValueError, OSError) as error:
-        raise CorruptArtifact(f"{path}: not a readable field file ({str(error)[:80]}). Train again.") from None
+    except (SafetensorError, ValueError, OSError, RecursionError, TypeError, AttributeError) as error:  # the last two: types that NumPy or torch lack
+        raise CorruptArtifact(f"{printable(path)}: not a readable field file ({printable(error, 80)}). Train again.") from None
     if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise CorruptArtifact(f"{path}: field file of format {about.get('format') if isinstance(about, dict) else None}; this build reads {FORMAT}.")
+        found = shown(about.get("format")) if isinstance(about, dict) else None
+        raise CorruptArtifact(f"{printable(path)}: field file of format {found}; this build reads {FORMAT}.")
     if digest_of(tensors) != about.get("sha256"):
         raise CorruptArtifact(f"{path}: damaged field file: its tensors are not those that its SHA-256 was made of. Train again.")
     return tensors, about
@@ -107,6 +110,8 @@ def load_gains(folder: Path) -> dict[str, np.ndarray]:
     path = TrainOutputs(folder).field
     tensors, about = read_tensors(path)
     names = about.get("exposed", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise CorruptArtifact(f"{printable(path)}: 'exposed' is {shown(names)}; expected a list of names. Train again.")
     if not names and GAINS not in tensors:
         return {}
     if GAINS not in tensors or tuple(tensors[GAINS].shape) != (len(names), 3):
@@ -126,6 +131,8 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     tensors, about = read_tensors(path)
     try:
         background = about["background"]
+        if not isinstance(about["settings"], dict):
+            raise TypeError(f"'settings' is {shown(about['settings'])}")
         ndc = None if about.get("ndc") is None else Ndc.from_json(about["ndc"])
         space = space_from(np.asarray(about["bounds"], np.float64).reshape(2, 3), contracted=bool(about["contracted"]), ndc=ndc)
         span = (float(about["near"]), float(about["far"]))
@@ -138,5 +145,5 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
         )
         restore(m, tensors)
         return FieldRenderer(m, *span)
-    except (UsageError, KeyError, TypeError, ValueError) as error:
-        raise CorruptArtifact(f"{path}: {error}. Train again.") from None
+    except (UsageError, KeyError, TypeError, ValueError, OverflowError, RecursionError, RuntimeError) as error:  # the last: torch's, of shapes
+        raise CorruptArtifact(f"{printable(path)}: {printable(error, 300)}. Train again.") from None

@@ -14,6 +14,7 @@ raises becomes UnreadableImage, so that one bad picture is left out and ends not
 from __future__ import annotations
 
 import errno
+import io
 import os
 import stat
 import warnings
@@ -21,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,8 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF")  # Pillow's names; a JP
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF")  # without a clean zero
 MAX_SIDE = 65_535  # pixels
 MAX_PIXELS = 178_956_970  # of a picture, from its header, before anything is decoded; Pillow's own limit
+FEW_PIXELS = 32_000_000  # whatever the size of the file: memory stays within a few hundred MB
+PIXELS_A_BYTE = 10_000  # of a larger picture at most: deflate makes 1,032 bytes of one, which are 8,256 pixels of 1 bit
 
 _ORIENTATION = 274
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
@@ -75,9 +78,7 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
         with _regular_file(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
             with Image.open(file, formats=_possible(file, formats)) as image:
-                width, height = image.size
-                if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
-                    raise UnreadableImage(f"unreadable: {width}x{height} pixels; at most {MAX_SIDE} a side and {MAX_PIXELS // 10**6} million in all are read")
+                _check_size(*image.size, file.size)
                 yield image
     except (UnreadableImage, MemoryError, PipelineError):
         raise
@@ -89,16 +90,37 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
         raise UnreadableImage(f"unreadable: {_reason(error)}") from error
 
 
-def _regular_file(path: Path) -> BinaryIO:
+class _Bounded(io.BufferedReader):
+    """A file that never makes room for more than it holds: decoders ask for as many bytes as a length in the file says."""
+
+    def __init__(self, descriptor: int, size: int) -> None:
+        super().__init__(io.FileIO(descriptor))
+        self.size = size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(0, self.size - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
+def _regular_file(path: Path) -> _Bounded:
     """The file, open; a pipe or a device is not waited for."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+    about = os.fstat(descriptor)
+    if not stat.S_ISREG(about.st_mode):
         os.close(descriptor)
         raise UnreadableImage("unreadable: not a regular file")
-    return open(descriptor, "rb")
+    return _Bounded(descriptor, about.st_size)
 
 
-def _possible(file: BinaryIO, formats: Sequence[str]) -> tuple[str, ...]:
+def _check_size(width: int, height: int, size: int) -> None:
+    """Raise UnreadableImage for more pixels than are read, or than a file of `size` bytes can mean in earnest."""
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise UnreadableImage(f"unreadable: {width}x{height} pixels; at most {MAX_SIDE} a side and {MAX_PIXELS // 10**6} million in all are read")
+    if width * height > max(FEW_PIXELS, PIXELS_A_BYTE * size):
+        raise UnreadableImage(f"unreadable: {width}x{height} pixels, more than {FEW_PIXELS // 10**6} million, in {size} bytes")
+
+
+def _possible(file: _Bounded, formats: Sequence[str]) -> tuple[str, ...]:
     """The decoders that may try. HEIF's is asked only for files of its kind, so that others never load it."""
     head = file.read(12)
     file.seek(0)
@@ -154,6 +176,7 @@ def holds_eight_bits(image: Any) -> bool:
 def rgb_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
     """(rgb, alpha or None) as uint8, decoded by the rules above; raises UnreadableImage for a type of pixel that has none."""
     _refuse_unknown_samples(image)
+    image.load()  # here, and not within NumPy, which takes some errors for another kind of object
     if image.mode.startswith("I"):
         deep = np.asarray(image)
         grey = np.rint(deep / 257.0).astype(np.uint8)
@@ -163,12 +186,13 @@ def rgb_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
     if image.mode in _ALPHA_MODES or "transparency" in image.info:
         rgba = np.asarray((image.convert("LA") if image.mode == "La" else image).convert("RGBA"))
         return rgba[..., :3], rgba[..., 3]
-    return np.asarray(image.convert("RGB")), None
+    return np.asarray(image if image.mode == "RGB" else image.convert("RGB")), None
 
 
 def grey_of(image: Any) -> np.ndarray:
     """(H, W) uint8 luminance of an opened image for masks: 0 is black; of 16 bits whatever is not 0 is 255."""
     _refuse_unknown_samples(image)
+    image.load()  # here, and not within NumPy, which takes some errors for another kind of object
     if image.mode.startswith("I"):
         return np.where(np.asarray(image) > 0, np.uint8(255), np.uint8(0))
     return np.asarray(image.convert("L"))

@@ -24,4 +24,5 @@ def write_png(pixels: np.ndarray, path: Path, *, compress_level: int = USUAL, du
 def read_png(path: Path) -> np.ndarray:
     """uint8, in the shape that `write_png` was given; raises UnreadableImage."""
     with opened(path, ("PNG",)) as image:
+        image.load()  # here, and not within NumPy, which takes some errors for another kind of object
         return np.asarray(image)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,3 +115,39 @@ def test_a_field_of_before_release_0_1_is_read(tmp_path: Path) -> None:
     assert {"hidden", "log2_table", "warm_up"} <= settings.keys()
     write_tensors(tensors, {**{k: v for k, v in about.items() if k != "sha256"}, "settings": settings}, tmp_path / TrainOutputs.field)
     assert load_renderer(tmp_path).model.settings == m.settings
+
+
+def with_metadata(path: Path, text: str) -> None:
+    """A field file whose metadata is another text."""
+    from safetensors.torch import save
+
+    tensors, _ = read_tensors(path)
+    path.write_bytes(save(tensors, metadata={"field": text}))
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"format": 1' + "0" * 400 + "}", '{"format": []}', "[]", "1", '"\\ud800"'])
+def test_hostile_metadata_is_refused_in_a_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / TrainOutputs.field
+    save_model(untrained(field="hash", contracted=False), 0.5, 20.0, path)
+    with_metadata(path, text)
+    with pytest.raises(CorruptArtifact) as caught:
+        read_tensors(path)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("settings", []), ("settings", {"field": 10**400}), ("near", 10**400), ("bounds", "x"), ("bounds", [[10**400] * 3] * 2), ("background", 7), ("ndc", [])],
+)
+def test_hostile_values_of_a_field_are_refused_in_a_line(tmp_path: Path, name: str, value: Any) -> None:
+    path = tmp_path / TrainOutputs.field
+    save_model(untrained(field="hash", contracted=False), 0.5, 20.0, path)
+    tensors, about = read_tensors(path)
+    about.pop("sha256")
+    about.pop("format")
+    write_tensors(tensors, about | {name: value}, path)
+    with pytest.raises(CorruptArtifact) as caught:
+        load_renderer(tmp_path)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 600

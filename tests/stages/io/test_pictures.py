@@ -9,6 +9,7 @@ import os
 import random
 import re
 import struct
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -313,13 +314,37 @@ def test_mutated_pictures_are_read_or_unreadable(tmp_path: Path, kind: str) -> N
             assert_reason_or_none(attempt, path)
 
 
+def test_lengths_in_a_file_take_no_memory(tmp_path: Path) -> None:
+    """A decoder asks for as many bytes as the file says; the file gives as many as it has."""
+    data = png_of_size(32, 24)
+    at = data.index(b"IDAT") - 4
+    (tmp_path / "a.png").write_bytes(data[:at] + struct.pack(">I", 2**31 - 1) + b"IDAT\x9c\xff")
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnreadableImage):
+            working_images.decode(tmp_path / "a.png")
+        assert tracemalloc.get_traced_memory()[1] < 32 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("kind", ["PNG", "WEBP"])
+def test_a_small_file_does_not_mean_a_large_picture(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.png"
+    Image.new("L", (7000, 4000), 255).save(path, kind, **({"lossless": True} if kind == "WEBP" else {}))
+    assert pictures.read_header(path).size == (7000, 4000)  # a mask that leaves nothing out
+    path.write_bytes(png_of_size(13_000, 13_000))
+    with pytest.raises(UnreadableImage, match=r"13000x13000 pixels, more than 32 million, in \d+ bytes"):
+        pictures.read_header(path)
+
+
 class Failing(Exception):
     pass
 
 
 @pytest.mark.parametrize("raised", [struct.error("x"), TypeError("x"), KeyError(7), RecursionError(), Failing(), SyntaxError("broken"), IndexError()])
 def test_whatever_a_decoder_raises_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raised: Exception) -> None:
-    captures.write_picture(tmp_path / "a.png", captures.picture())
+    captures.write_picture(tmp_path / "a.png", captures.picture()[..., 0])
 
     def fail(*arguments: Any, **more: Any) -> None:
         raise raised
