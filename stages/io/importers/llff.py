@@ -134,7 +134,7 @@ def _npy_header(path: Path, data: bytes) -> tuple[tuple[int, ...], bool, np.dtyp
     except Exception as error:  # a damaged header is parsed as a Python literal, which raises anything
         reason = printable(next(iter(str(error).splitlines()), type(error).__name__), 80)
         raise BadInput(f"{path}: not a NumPy array of numbers, or truncated ({reason}).") from error
-    return shape, fortran, kind, file.tell()
+    return tuple(map(int, shape)), fortran, kind, file.tell()  # True is an integer to the parser
 
 
 def _images(source: Source, settings: ImportSettings, count: int) -> tuple[list[Path], int, list[str]]:

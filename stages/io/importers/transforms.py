@@ -31,6 +31,7 @@ from stages.io.pictures import UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 MAX_PLY = 1 << 30  # bytes
+MIN_ANGLE = 1e-9  # radians; its tangent is a number yet
 MAX_NAME = 200  # characters of a listed name that are shown
 _REMEDY = "Copy them into the source folder, or take their frames out of the JSON."
 _NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path")
@@ -285,7 +286,7 @@ def _focal(frame: _Frame, given: dict[str, Any], number: Any, width: float, heig
             focal[axis] = number(f"fl_{axis}")
         elif f"camera_angle_{axis}" in given:
             angle = number(f"camera_angle_{axis}")
-            if not 0 < angle < math.pi:
+            if not MIN_ANGLE < angle < math.pi:
                 raise BadInput(f"{frame.where}: camera_angle_{axis} is {angle:g}; expected an angle between 0 and pi, in radians.")
             focal[axis] = 0.5 * side / math.tan(0.5 * angle)
     if not focal:
