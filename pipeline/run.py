@@ -1,6 +1,6 @@
 """The run folder: its source and settings, and its layout.
 
-    RUN/run.json     {"format": "enerf-run", "version": 1, "source", "settings", "preset", "seed", "device", "created"}
+    RUN/run.json     {"format": "enerf-run", "version": 1, "source", "settings", "preset", "seed", "device", "memory", "created"}
     RUN/<stage>/     an artifact (artifact.py)
     RUN/.work/       what is being written
     RUN/.cache/      digests of files that have not changed since they were hashed; may be deleted at any time
@@ -24,6 +24,7 @@ import msgspec
 
 from pipeline import files
 from pipeline.errors import BadInput, CorruptArtifact
+from pipeline.executors.memory import MOST
 from pipeline.failures import cannot_write
 from pipeline.links import CACHE, HOLDER, LOCK, RUN, refuse_links
 from pipeline.lock import Holder, holder_of, lock
@@ -31,7 +32,7 @@ from pipeline.lock import Holder, holder_of, lock
 NAME = RUN
 FORMAT = "enerf-run"
 VERSION = 1
-_CHANGEABLE = ("source", "settings", "preset", "seed", "device")
+_CHANGEABLE = ("source", "settings", "preset", "seed", "device", "memory")
 _ABANDONED = 24 * 3600.0  # seconds after which nobody is writing to a temporary file any more, such as that of a report
 # The fields of a run.json that anybody may have written. Settings are checked by the stages that have them.
 _FIELDS: dict[str, Any] = {
@@ -40,6 +41,7 @@ _FIELDS: dict[str, Any] = {
     "preset": Annotated[str, msgspec.Meta(max_length=200)] | None,
     "seed": Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None,
     "device": Annotated[str, msgspec.Meta(max_length=200)] | None,
+    "memory": Annotated[int, msgspec.Meta(ge=1, le=MOST)] | None,
     "created": Annotated[float, msgspec.Meta(gt=-1e15, lt=1e15)],
 }
 
@@ -74,6 +76,7 @@ class Run:
     path         absolute
     source       absolute, or None
     settings     stage -> the resolved values of its settings, plain JSON
+    memory       bytes that stages may take; None: what the machine has
     resume_text  how to go on with the run, for messages
     """
 
@@ -83,6 +86,7 @@ class Run:
     preset: str | None = None
     seed: int | None = None
     device: str | None = None
+    memory: int | None = None
     created: float = field(default_factory=time.time)
     resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)
     _holds: int = field(default=0, init=False, repr=False, compare=False)
@@ -127,7 +131,7 @@ class Run:
         return cls(path, **_recorded(path), resume_text=resume_text)
 
     def update(self, **changes: Any) -> None:
-        """Change source, settings (all of them), preset, seed or device, and write run.json if that makes a difference.
+        """Change source, settings (all of them), preset, seed, device or memory, and write run.json if that makes a difference.
 
         What is not changed is as another process may have left it. What is read first, and changed for that, is read in `locked`.
         """
@@ -204,6 +208,7 @@ class Run:
             "preset": self.preset,
             "seed": self.seed,
             "device": self.device,
+            "memory": self.memory,
             "created": self.created,
         }
 

@@ -16,6 +16,7 @@ from pipeline.decide import Decision, decide, survey
 from pipeline.errors import BadInput, CorruptArtifact, Interrupted, UsageError
 from pipeline.executors import local
 from pipeline.executors.local import Usage
+from pipeline.executors.memory import Limit
 from pipeline.failures import failed, interruption_in, translated
 from pipeline.hashes import Hashes
 from pipeline.interrupt import Stop, stopping
@@ -54,6 +55,7 @@ def run_stages(
     only: str | None = None,
     force: bool = False,
     device: str = "cpu",
+    memory: Limit | None = None,
     report: Report | None = None,
     dry_run: bool = False,
     execute: Executor = local.execute,
@@ -66,6 +68,7 @@ def run_stages(
     only     consider this stage alone, with the artifacts of those before it; warns if they are not fresh
     force    run the stages considered even if they are fresh
     device   handed to the stages
+    memory   handed to the stages; None: no limit
     report   takes events: stage_started, progress, message, warning, stage_done, stage_skipped, stage_failed, interrupted
     dry_run  report what would be done, and do nothing
 
@@ -85,17 +88,18 @@ def run_stages(
         return run.how_to_resume(until=until, start=first)
 
     with run.locked(), stopping() as stop:
-        return _Runner(run, stages, device, report, stop, execute).all(chosen, forced, only, go_on)
+        return _Runner(run, stages, device, memory, report, stop, execute).all(chosen, forced, only, go_on)
 
 
 class _Runner:
     """One call of run_stages."""
 
-    def __init__(self, run: Run, stages: Sequence[Stage], device: str, report: Report | None, stop: Stop, execute: Executor) -> None:
+    def __init__(self, run: Run, stages: Sequence[Stage], device: str, memory: Limit | None, report: Report | None, stop: Stop, execute: Executor) -> None:
         self.run = run
         self.stages = stages
         self.work = run.path / artifact.WORK
         self.device = device
+        self.memory = memory
         self.stop = stop
         self.execute = execute
         self._report = report
@@ -160,6 +164,7 @@ class _Runner:
             out=place.out,
             work=place.scratch,
             device=self.device,
+            memory=self.memory,
             stage=stage.name,
             report=self._report,
             stop=self.stop,

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from pipeline.errors import Interrupted, UnknownSetting, UsageError
+from pipeline.executors.memory import Limit
 from pipeline.links import is_stage_name
 from pipeline.text import printable
 
@@ -65,6 +66,7 @@ class Job:
     out       an empty folder; what is in it when the stage returns is the artifact
     work      scratch of this very request that survives a kill: checkpoints. Removed once the artifact is published
     device    "cpu" or "cuda"; not part of the request
+    memory    what the stage may take; not part of the request: no bytes of an artifact may depend on it. None: no limit is known
     report    takes each event, a dict; None: nobody listens
     stop      returns the number of the signal that arrived, or None
     """
@@ -78,6 +80,7 @@ class Job:
         inputs: Mapping[str, Path] | None = None,
         source: Path | None = None,
         device: str = "cpu",
+        memory: Limit | None = None,
         stage: str = "",
         report: Report | None = None,
         stop: Callable[[], int | None] | None = None,
@@ -88,6 +91,7 @@ class Job:
         self.out = Path(out)
         self.work = Path(work)
         self.device = device
+        self.memory = memory
         self.stage = stage
         self._report = report
         self._stop = stop

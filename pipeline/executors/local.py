@@ -12,6 +12,7 @@ import sys
 import time
 from dataclasses import dataclass
 
+from pipeline.executors.memory import give_back_freed
 from pipeline.stage import Job, Stage
 
 
@@ -33,6 +34,7 @@ class Usage:
 
 def execute(stage: Stage, job: Job) -> Usage:
     """Run the stage to its end."""
+    give_back_freed()
     _reset_peak()
     started, busy, child = time.monotonic(), cpu_seconds(), peak_memory_of_children()
     stage.run(job)

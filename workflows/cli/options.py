@@ -18,6 +18,9 @@ quiet_option = click.option("--quiet", "-q", is_flag=True, help="Nothing but war
 force_option = click.option("--force", is_flag=True, help="Replace files that exist.")
 set_option = click.option("--set", "sets", multiple=True, metavar="STAGE.NAME=VALUE", help="A setting of a stage; may be repeated. 'enerf presets' lists them.")
 device_option = click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Device to compute on; auto: CUDA where there is one.")
+memory_option = click.option(
+    "--memory", metavar="SIZE", help="Memory that may be taken, as 512m, 8g or 1.5GiB; auto: what the machine or its control group has. Changes no result."
+)
 folder_type = click.Path(path_type=Path)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import BadInput, UsageError
+from pipeline.executors.memory import Limit, limit_for, parse_size, size_text
 from pipeline.run import NAME, Run
 from workflows.asset import Workflow
 from workflows.cli.device import has_cuda
@@ -28,6 +29,7 @@ class Options:
     seed: int | None = None
     budget: str | None = None
     device: str | None = None
+    memory: str | None = None
     strict: bool = False
     allow_outside: bool = False
 
@@ -39,6 +41,7 @@ class Plan:
     run       a Run with the new settings
     new       whether its folder has yet to be made
     device    "auto", "cpu" or "cuda" as requested
+    memory    what stages may take
     warnings  for the user
     again     makes the plan anew, of what run.json holds then
     """
@@ -46,6 +49,7 @@ class Plan:
     run: Run
     new: bool
     device: str
+    memory: Limit | None
     warnings: list[str]
     again: Callable[[], Plan]
 
@@ -56,12 +60,12 @@ class Plan:
         The settings that the options change are those that run.json holds under the lock, whatever it held before.
         """
         if self.new:
-            facts = {"preset": self.run.preset, "seed": self.run.seed, "device": self.run.device, "resume_text": resume_command}
+            facts = {"preset": self.run.preset, "seed": self.run.seed, "device": self.run.device, "memory": self.run.memory, "resume_text": resume_command}
             Run.create(self.run.path, self.run.source, self.run.settings, **facts)
         run = open_run(self.run.path)
         with run.locked():
             now = self.again().run
-            run.update(source=now.source, settings=now.settings, preset=now.preset, seed=now.seed, device=now.device)
+            run.update(source=now.source, settings=now.settings, preset=now.preset, seed=now.seed, device=now.device, memory=now.memory)
             yield run
 
 
@@ -106,6 +110,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
             settings.put("poses", name, [value], origin)
     if options.budget is not None:
         settings.put("train", "time_budget", [seconds_of(options.budget)], f"--budget {options.budget}")
+    memory, limit = _memory(options.memory, standing, warnings)
     run = Run(
         path,
         _source(options.source, standing),
@@ -113,9 +118,20 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         preset=preset or (standing.preset if standing else None),
         seed=seed if seed is not None else (standing.seed if standing else None),
         device=device or (standing.device if standing else None) or "auto",
+        memory=memory,
         resume_text=resume_command,
     )
-    return Plan(run, standing is None, run.device or "auto", warnings, lambda: plan_run(path, workflow, options))
+    return Plan(run, standing is None, run.device or "auto", limit, warnings, lambda: plan_run(path, workflow, options))
+
+
+def _memory(given: str | None, standing: Run | None, warnings: list[str]) -> tuple[int | None, Limit | None]:
+    """The bytes to record, None where the machine decides, and the limit that holds now. Raises UsageError."""
+    recorded = standing.memory if standing is not None and given is None else None
+    asked = None if given in (None, "auto") else parse_size(given)
+    here, limit = limit_for(None, None), limit_for(asked, recorded)
+    if asked is not None and here is not None and asked > here.bytes:
+        warnings.append(f"--memory {given}: {here.whose} leaves {size_text(here.bytes)}; what takes more may be ended by the system")
+    return asked or recorded, limit
 
 
 def _standing(path: Path) -> Run | None:

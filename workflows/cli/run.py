@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from workflows.cli.failures import Reported
-from workflows.cli.options import common_options, device_option, folder_type, json_option, quiet_option, set_option, workflow
+from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_option, quiet_option, set_option, workflow
 
 if TYPE_CHECKING:
     from pipeline.run import Run
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 @click.option("--until", metavar="STAGE", help="Stop after this stage.")
 @click.option("--from", "start", metavar="STAGE", help="Run this stage and those after it again, even if they are up to date.")
 @device_option
+@memory_option
 @click.option("--seed", type=int, help="Seed of every stage with random choices.")
 @click.option("--budget", metavar="TIME", help="Time to train for, as 90s, 10m or 1h; see train.time_budget.")
 @click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
@@ -55,6 +56,7 @@ def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, a
 @set_option
 @click.option("--force", is_flag=True, help="Run it even if it is up to date.")
 @device_option
+@memory_option
 @click.option("--dry-run", is_flag=True, help="Show whether it would run and why; do nothing.")
 @json_option
 @quiet_option
@@ -96,7 +98,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
             for text in plan.warnings:
                 show({"event": "warning", "stage": "", "text": text, "time": time.time()})
             with nullcontext(run) if dry_run else plan.written() as run:
-                outcomes = run_stages(run, workflow().stages, device=device, report=show, dry_run=dry_run, **selection)
+                outcomes = run_stages(run, workflow().stages, device=device, memory=plan.memory, report=show, dry_run=dry_run, **selection)
                 if not dry_run:
                     _describe(run, anew=any(outcome.action == "ran" for outcome in outcomes))
     except (Exception, KeyboardInterrupt) as error:

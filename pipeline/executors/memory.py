@@ -1,0 +1,190 @@
+"""How much memory a run may take: what `--memory` says, or what the machine and the limits on this process leave.
+
+Nothing here depends on what other programs take at the moment, `available_now` apart: the same limits give the same plan.
+
+    machine   all of its memory
+    cgroup    the smallest limit of the process's control group and of those above it, version 1 or 2
+    rlimit    RLIMIT_AS and RLIMIT_DATA, less the addresses that libraries and threads reserve and never use
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from pipeline.errors import UsageError
+from pipeline.text import printable
+
+UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+MOST = 2**60  # bytes; no limit that anybody means is larger, and version 1 of control groups says "none" by a number above it
+KEPT_BACK = 0.1  # of the machine, or of the control group: for the system, page tables and buffers of files
+# Addresses that a process with torch and OpenCV reserves beyond what it uses, and for each thread its stack and the C library's arena.
+RESERVED, RESERVED_BY_THREAD = 1200 * 2**20, 72 * 2**20  # under RLIMIT_AS
+PRIVATE, PRIVATE_BY_THREAD = 300 * 2**20, 8 * 2**20  # under RLIMIT_DATA, which counts what is writable and private alone
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Bytes that this process may take, and whose limit that is: "the machine", "the control group /a/b", "RLIMIT_AS"."""
+
+    bytes: int
+    whose: str
+
+
+def parse_size(text: str) -> int:
+    """Bytes in `512m`, `8g`, `1.5GiB`, `2 TB` or `8000000000`; units are powers of 1024. Raises UsageError."""
+    found = re.fullmatch(r"(\d{1,20}(?:\.\d{1,9})?)\s*(?:([kmgt])(?:i?b)?|b)?", text.strip().lower(), re.ASCII)
+    size = int(float(found[1]) * UNITS[found[2] or ""]) if found else 0
+    if not 0 < size <= MOST:
+        raise UsageError(f"--memory {printable(text[:40])}: expected a size, as in 512m, 8g or 1.5GiB.")
+    return size
+
+
+def limit_for(asked: int | None, recorded: int | None, root: Path = Path("/")) -> Limit | None:
+    """What a run may take: what was asked for now, else the smaller of what its run.json says and what this machine has, else that.
+
+    A run.json may come from anybody: it can lower the limit, and not lift it.
+    """
+    here = usable_memory(root)
+    if asked is not None:
+        return Limit(asked, "--memory")
+    if recorded is not None and (here is None or recorded < here.bytes):
+        return Limit(recorded, "--memory as run.json has it")
+    return here
+
+
+def size_text(count: float) -> str:
+    """Bytes in words: "1.5 GiB", "300 MiB"."""
+    return f"{count / 2**30:.1f} GiB" if count >= 2**30 else f"{max(1, round(count / 2**20))} MiB"
+
+
+def usable_memory(root: Path = Path("/"), cores: int | None = None) -> Limit | None:
+    """The smallest limit on this process, less what is kept back; None where the system states none.
+
+    root   where /proc and /sys lie, for tests
+    cores  threads that may run at a time; None: those of this process
+    """
+    cores = cores or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    limits = [Limit(int((1 - KEPT_BACK) * limit.bytes), limit.whose) for limit in (*_machine(root), *_cgroups(root))]
+    limits += _rlimits(cores)
+    return min(limits, key=lambda limit: limit.bytes, default=None)
+
+
+def available_now(root: Path = Path("/")) -> int | None:
+    """Bytes that this process could have right now: its own, and what no other program uses; None where the system does not say.
+
+    It changes from moment to moment. Only where data lie may depend on it, and warnings; never what is made, nor what is refused.
+    """
+    own, free = _field(root / "proc/self/status", "VmRSS"), _field(root / "proc/meminfo", "MemAvailable")
+    if own is None or free is None:
+        return None
+    found = own + free
+    for folder, _ in _cgroup_folders(root):
+        limit, used = _first_number(folder, _LIMITS), _first_number(folder, ("memory.current", "memory.usage_in_bytes"))
+        if limit is not None and used is not None and limit < MOST:
+            cached = sum(_statistic(folder / "memory.stat", name) for name in ("inactive_file", "active_file"))
+            found = min(found, own + max(0, limit - used + cached))
+    return found
+
+
+def give_back_freed() -> None:
+    """Give back to the system what this process has freed: the C library keeps it, and each stage would begin with what those before it took."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # glibc alone has it
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+_LIMITS = ("memory.max", "memory.limit_in_bytes")  # of version 2, of version 1
+
+
+def _machine(root: Path) -> Iterator[Limit]:
+    total = _field(root / "proc/meminfo", "MemTotal")
+    if total is None and root == Path("/"):  # no Linux
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if total:
+        yield Limit(total, "the machine")
+
+
+def _cgroups(root: Path) -> Iterator[Limit]:
+    """The limits of the control groups that the process is in, and of those around them, which hold for it too."""
+    for folder, name in _cgroup_folders(root):
+        limit = _first_number(folder, _LIMITS)
+        if limit is not None and limit < MOST:
+            yield Limit(limit, f"the control group {printable(name)}")
+
+
+def _cgroup_folders(root: Path) -> Iterator[tuple[Path, str]]:
+    """(folder, name) of each control group of this process that memory is limited by, the innermost first.
+
+    A line of /proc/self/cgroup is `number:controllers:/path`. In version 2 (number 0, no controllers) all are mounted at one place, /sys/fs/cgroup, or
+    `unified` in it beside version 1; in version 1 those of memory at `memory`. Within a container the path may be that of the host, and the
+    container's own group the root of the mount; so the root is always among them.
+    """
+    try:
+        lines = (root / "proc/self/cgroup").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = ["0::/"]
+    for line in lines:
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if "memory" in controllers.split(","):
+            mounts = ["sys/fs/cgroup/memory"]
+        elif number == "0" and not controllers:
+            mounts = ["sys/fs/cgroup", "sys/fs/cgroup/unified"]
+        else:
+            continue
+        inner = PurePosixPath("/", path)
+        if ".." in inner.parts:  # the group of another namespace
+            inner = PurePosixPath("/")
+        for name in (inner, *inner.parents):
+            for mount in mounts:
+                yield root / mount / name.relative_to("/"), str(name)
+
+
+def _rlimits(cores: int) -> list[Limit]:
+    """Soft limits on this process's addresses, less what is reserved of them and not used; at least a sixteenth stays."""
+    try:
+        import resource  # not on Windows
+    except ImportError:
+        return []
+    found = []
+    for name, reserved, by_thread in (("RLIMIT_AS", RESERVED, RESERVED_BY_THREAD), ("RLIMIT_DATA", PRIVATE, PRIVATE_BY_THREAD)):
+        soft, _ = resource.getrlimit(getattr(resource, name))
+        if soft != resource.RLIM_INFINITY and 0 <= soft < MOST:
+            found.append(Limit(max(soft - reserved - cores * by_thread, soft // 16, 1), name))
+    return found
+
+
+def _field(path: Path, name: str) -> int | None:
+    """Bytes of a line `name: 123 kB`."""
+    with contextlib.suppress(OSError, ValueError), path.open(encoding="ascii", errors="replace") as file:
+        for line in file:
+            key, _, value = line.partition(":")
+            if key == name:
+                return int(value.split()[0]) * 1024
+    return None
+
+
+def _first_number(folder: Path, names: tuple[str, ...]) -> int | None:
+    """The number in the first file that holds one; "max" is none."""
+    for name in names:
+        with contextlib.suppress(OSError, ValueError):
+            return int((folder / name).read_text(encoding="ascii", errors="replace")[:32])
+    return None
+
+
+def _statistic(path: Path, name: str) -> int:
+    """The number of a line `name 123`; 0 where there is none."""
+    with contextlib.suppress(OSError, ValueError), path.open(encoding="ascii", errors="replace") as file:
+        for line in file:
+            key, _, value = line.partition(" ")
+            if key == name:
+                return int(value)
+    return 0
