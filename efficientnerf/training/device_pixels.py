@@ -11,6 +11,7 @@ from efficientnerf.backends.transfer import to_device
 from efficientnerf.training.pixels import Pixels
 
 MEMORY_FRACTION = 0.5  # of the device's free memory: photographs that would take more stay on the host
+ROWS_AT_A_TIME = 2**24  # of images that are not in the host's memory
 
 
 class DevicePixels:
@@ -23,10 +24,20 @@ class DevicePixels:
             self._to_device(a) for a in (pixels.rotation, pixels.centre, pixels.near, pixels.far, pixels.lookup)
         )
         room = torch.cuda.mem_get_info(self.device)[0] if self.device.type == "cuda" else np.inf
-        self.images = self._to_device(pixels.images) if pixels.images.nbytes <= MEMORY_FRACTION * room else None
+        self.images = self._images_to_device() if pixels.images.nbytes <= MEMORY_FRACTION * room else None
 
     def _to_device(self, values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
+
+    def _images_to_device(self) -> Tensor:
+        """All images, a part at a time where they are not in memory."""
+        rows = self.pixels.images
+        if isinstance(rows, np.ndarray):
+            return self._to_device(rows)
+        there = torch.empty(rows.shape, dtype=torch.uint8, device=self.device)
+        for at in range(0, len(rows), ROWS_AT_A_TIME):
+            there[at : at + ROWS_AT_A_TIME] = self._to_device(rows[at : at + ROWS_AT_A_TIME])
+        return there
 
     def __len__(self) -> int:
         return len(self.pixels)

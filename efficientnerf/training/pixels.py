@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -18,10 +19,22 @@ EXACT = 2**23  # pixels of all lenses together up to which each has a direction 
 STRIDE = 8  # beyond it: pixels between knots
 
 
+class PixelRows(Protocol):
+    """Rows (P, 3 or 4) uint8 that are indexed like an array, by slices and by arrays of row numbers; they may lie elsewhere than in memory."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+    @property
+    def nbytes(self) -> int: ...
+    def __len__(self) -> int: ...
+    def __getitem__(self, index: Any) -> Any: ...
+    def __setitem__(self, index: slice, rows: Any) -> None: ...
+
+
 class Pixels:
     """All training pixels, and the rays that they see.
 
-    images    (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha
+    images    (P, 3 or 4) uint8 of all views end to end, sRGB, straight alpha; an array, or the rows that were given for it
     usable    (P / 8,) uint8 or None: a bit for each pixel, set where masks allow it
     lookup    (K, 3) float32: unit directions in the camera at knots, `stride` pixels apart; one table for all views that share a lens
 
@@ -29,12 +42,14 @@ class Pixels:
     """
 
     def __init__(
-        self, cameras: list[Camera], images: Iterable[np.ndarray], masks: Iterable[np.ndarray | None], near: np.ndarray, far: np.ndarray, channels: int = 0
-    ) -> None:
+        self, cameras: list[Camera], images: Iterable[np.ndarray], masks: Iterable[np.ndarray | None], near: np.ndarray, far: np.ndarray, channels: int = 0,
+        rows: PixelRows | None = None,
+    ) -> None:  # fmt: skip
         """
         images, masks  of each view, (H, W, 3 or 4) uint8, and (H, W) bool or None; taken one after the other, so that they may come from disk
         near, far      (C,) along the view axis
         channels       3, or 4 if any image has alpha; 0: found from the images, all of which are then held at once
+        rows           where the pixels are put; None: an array is made
         """
         self.near, self.far = near.astype(np.float32), far.astype(np.float32)
         if not channels:
@@ -43,11 +58,12 @@ class Pixels:
         self.width = np.array([camera.width for camera in cameras], np.int64)
         self.height = np.array([camera.height for camera in cameras], np.int64)
         self.offsets = np.concatenate([[0], np.cumsum(self.width * self.height)]).astype(np.int64)
-        self.images = np.empty((int(self.offsets[-1]), channels), np.uint8)
-        for at, image in zip(self.offsets[:-1], images, strict=True):
-            part = self.images[at : at + image.shape[0] * image.shape[1]]
-            part[:, : image.shape[-1]] = image.reshape(-1, image.shape[-1])
-            part[:, image.shape[-1] :] = 255
+        self.images: PixelRows = np.empty((int(self.offsets[-1]), channels), np.uint8) if rows is None else rows
+        for at, image in zip(self.offsets[:-1].tolist(), images, strict=True):
+            part = image.reshape(-1, image.shape[-1])
+            if part.shape[1] < channels:
+                part = np.concatenate([part, np.full((len(part), channels - part.shape[1]), 255, np.uint8)], axis=1)
+            self.images[at : at + len(part)] = part
         self.usable = self._usable(masks)
         self.rotation = np.stack([camera.world_from_camera[:3, :3] for camera in cameras]).astype(np.float32)
         self.centre = np.stack([camera.centre for camera in cameras]).astype(np.float32)

@@ -12,7 +12,7 @@ from efficientnerf.training.settings import TrainSettings
 
 if TYPE_CHECKING:
     from efficientnerf.model import Model
-    from efficientnerf.training.pixels import Pixels
+    from efficientnerf.training.pixels import PixelRows, Pixels
     from efficientnerf.training.sparse_depth import SparseDepthRays
     from pipeline.stage import Job
     from stages.io.scene import Scene, View
@@ -21,16 +21,30 @@ MIN_TRACK = 3  # images that a sparse point must be observed in
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
 
 
-def pixels_of(folder: Path, views: tuple[View, ...]) -> Pixels:
-    """All pixels of some views of a scene, as bytes; one image at a time is held beside them."""
+def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None) -> Pixels:
+    """All pixels of some views of a scene, as bytes; one image at a time is held beside them.
+
+    rows  where they are put, as many as `count_pixels` says, with as many channels as `channels_of`; None: in memory
+    """
     from efficientnerf.training.pixels import Pixels
     from stages.io import scene
 
     images = (scene.read_image(folder, view) for view in views)
     masks = (scene.read_mask(folder, view) for view in views)
     near, far = np.array([view.near for view in views]), np.array([view.far for view in views])
-    channels = 4 if any(scene.has_alpha(folder, view) for view in views) else 3
-    return Pixels([view.camera for view in views], images, masks, near, far, channels)
+    return Pixels([view.camera for view in views], images, masks, near, far, channels_of(folder, views), rows)
+
+
+def count_pixels(views: tuple[View, ...]) -> int:
+    """Pixels of all views."""
+    return sum(view.camera.width * view.camera.height for view in views)
+
+
+def channels_of(folder: Path, views: tuple[View, ...]) -> int:
+    """3, or 4 where any view has alpha."""
+    from stages.io import scene
+
+    return 4 if any(scene.has_alpha(folder, view) for view in views) else 3
 
 
 def depth_range(s: Scene, pixels: Pixels, settings: TrainSettings) -> tuple[float, float]:
