@@ -9,6 +9,7 @@ The scratch folder keeps what takes long: the visibility of the voxels, each blo
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -92,6 +93,8 @@ class BakeSettings:
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset import format
+    from efficientnerf.asset.bake import grid_of
+    from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.resolution import budget_of
     from stages.baking.voxels import choose_voxels, voxel_space, with_min_views
@@ -105,11 +108,13 @@ def run(job: Job) -> None:
     if m.settings.field == "nerf":
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = scene.load(job.inputs["poses"])
-    space, mib = voxel_space(job, m), budget_of(s, given(settings.max_mib))
-    pixels = pixels_of(job.inputs["poses"], scene.views_of(s, "train"))
+    space, mib, views = voxel_space(job, m), budget_of(s, given(settings.max_mib)), scene.views_of(s, "train")
+    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, space, mib))
     choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib)
     indices = with_min_views(m, s, indices, choice.resolution)
-    _check(job, m, choice, indices, mib)
+    _check(job, m, choice, indices)
+    shape, _ = grid_of(space.bounds, choice.resolution, settings.brick_size)
+    refuse_more_than_fits(job, m, views, pixels, choice, math.prod(shape), len(visibility.cells), len(indices), mib)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
     tree, report = refined(
@@ -124,17 +129,14 @@ def run(job: Job) -> None:
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _check(job: Job, m: Any, choice: Choice, indices: np.ndarray, mib: int) -> None:
-    """Say what is baked; StageFailed where nothing is, UsageError where it does not fit into memory."""
-    from stages.baking.memory import refuse_more_than_fits
-
+def _check(job: Job, m: Any, choice: Choice, indices: np.ndarray) -> None:
+    """Say what is baked; StageFailed where nothing is."""
     if job.settings.lookup == "nearest" and m.settings.discretise not in ("off", choice.resolution):
         trained = f"the field was trained on train.discretise={m.settings.discretise}"
         job.warn(f"bake.resolution={choice.resolution}, but {trained}: on other voxels than are baked")
     if not len(indices):
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.crop_box).")
-    refuse_more_than_fits(len(indices), (m.fine.degree + 1) ** 2, choice.resolution, mib)
     job.say(f"{choice.resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
 
 

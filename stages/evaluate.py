@@ -32,6 +32,7 @@ from stages.io.scene import Scene, View
 from stages.lpips_weights import load_lpips
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
     from efficientnerf.evaluation.lpips import Lpips
 
 FORMAT = 1
@@ -90,7 +91,24 @@ def run(job: Job) -> None:
 
         return load_renderer(inputs.train.folder, job.device)
 
-    evaluate(partial(render, format.load(inputs.bake.asset).to(job.device)), load_field, job)
+    tree = format.load(inputs.bake.asset).to(job.device)
+    _refuse_large_views(tree, inputs, job)
+    evaluate(partial(render, tree), load_field, job)
+
+
+def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> None:
+    """UsageError where views of this size do not fit into memory."""
+    from stages.io.scene import load
+    from stages.memory.need import refuse_what_does_not_fit
+    from stages.memory.rendering import views_needed
+
+    cameras = [view.camera for view in evaluation_views(load(inputs.poses.folder))[0]]
+    scale = given(job.settings.field_image_scale)
+    most = max(camera.width * camera.height for camera in cameras)
+    rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
+    refuse_what_does_not_fit(
+        job, views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, job.device), "Lower poses.max_image_size or bake.max_mib."
+    )
 
 
 def evaluate(render_tree: RenderTree, load_field: Callable[[], Any], job: Job) -> None:

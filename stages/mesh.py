@@ -101,10 +101,13 @@ def run(job: Job) -> None:
     from stages.io.exporters import MESH_EXPORTERS
     from stages.io.exporters.writing import source_frame
     from stages.io.png import write_png
+    from stages.memory.need import refuse_what_does_not_fit
+    from stages.memory.surface import surface_needed
 
     outputs = MeshOutputs(job.out)
     tree = load(inputs_of(MeshInputs, job.inputs).bake.asset)
     frame = source_frame(tree.metadata)
+    refuse_what_does_not_fit(job, surface_needed(tree), "Lower bake.max_mib or bake.resolution.")
     found = mesh_of(tree, job.settings, job.reached)
     job.safe_point()
     orbit = tree.metadata.get("orbit", {})

@@ -61,9 +61,13 @@ def run(job: Job) -> None:
     from efficientnerf.asset.format import load
     from stages.io.exporters import POINT_EXPORTERS
     from stages.io.exporters.writing import source_frame
+    from stages.memory.need import refuse_what_does_not_fit
+    from stages.memory.surface import surface_needed
 
     tree = load(inputs_of(PointsInputs, job.inputs).bake.asset)
     frame = source_frame(tree.metadata)
+    remedy = f"Lower points.num_points ({job.settings.num_points}), bake.max_mib or bake.resolution."
+    refuse_what_does_not_fit(job, surface_needed(tree, job.settings.num_points), remedy)
     cloud = points_of(tree, job.settings, frame, job.reached)
     job.safe_point()
     path = PointsOutputs(job.out).ply

@@ -7,6 +7,7 @@ Images are not undistorted: later stages trace the distorted rays.
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -78,6 +79,7 @@ def run(job: Job) -> None:
     from stages.figures.contact_sheet import write_contact_sheet
     from stages.framing import training_frame
     from stages.io import working_images
+    from stages.memory.poses import refuse_large_photographs
 
     settings: PosesSettings = job.settings
     if job.source is None:
@@ -90,6 +92,7 @@ def run(job: Job) -> None:
 
     capture = read(job, settings, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
+    refuse_large_photographs(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos])
     keep_alpha = working_images.alpha_is_coverage(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].renders)
     capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
     framed = training_frame.find_training_frame(capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space)
@@ -151,6 +154,9 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
 def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     from stages.io.importers.photographs import masks_of, photographs
+    from stages.io.pictures import UnreadableImage, read_header
+    from stages.memory.poses import feature_threads
+    from stages.sfm.matches import num_threads
     from stages.sfm.reconstruction import find_cameras
 
     assert job.source is not None
@@ -159,14 +165,19 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     masks = {source.name_of(image): source.real(mask) for image, mask in masks_of(source, photographs(source)).items()}
     for sentence in source.run_warnings():
         warn(sentence)
+    sizes = []
+    for path in paths.values():
+        job.safe_point()
+        with contextlib.suppress(UnreadableImage):  # said where it is read
+            sizes.append(read_header(path).size)
     found = find_cameras(
         source.root,
-        [*paths],
+        paths,
         max_side=settings.feature_image_size,
         features=settings.max_features,
         matching=settings.matching,
         seed=settings.seed,
-        paths=paths,
+        threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, num_threads()),
         masks=masks,
         work=job.work / "cameras",
         progress=job.progress,

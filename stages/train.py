@@ -25,7 +25,7 @@ from stages.compiling import compiling_kernels
 from stages.cores import use_all_cores
 from stages.training.budget import Budget
 from stages.training.checkpoints import Checkpoints
-from stages.training.data import depth_range, mask_uncovered_cells, pixels_of, sparse_depth_of
+from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, sparse_depth_of
 from stages.training.log import TrainLog
 from stages.training.previews import Previews
 
@@ -43,17 +43,19 @@ def run(job: Job) -> None:
     from efficientnerf.training import loop
     from efficientnerf.training.readback import AsyncOccupancy
     from stages.io import field_file, scene
+    from stages.memory.training import rows_for_training
     from stages.training.hash_resolution import with_auto_sizes
 
     use_all_cores()
     folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
     s = scene.load(folder)
     views = scene.views_of(s, "train")
-    job.progress(0, job.settings.iterations, "reading images")
-    pixels = pixels_of(folder, views)
-    settings = with_auto_sizes(job.settings, s, len(pixels))
+    settings, space = with_auto_sizes(job.settings, s, count_pixels(views)), field_file.space_of(s)
+    rows = rows_for_training(job, folder, views, settings, space)
+    job.progress(0, settings.iterations, "reading images")
+    pixels = pixels_of(folder, views, rows)
     near, far = depth_range(s, pixels, settings)
-    m = model(field_file.space_of(s), settings, s.background, job.device, (near, far))
+    m = model(space, settings, s.background, job.device, (near, far))
     mask_uncovered_cells(m, views, job)
 
     t = loop.trainer(m, len(views))

@@ -49,9 +49,14 @@ class TurntableSettings:
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset import format
+    from stages.memory.need import refuse_what_does_not_fit
+    from stages.memory.rendering import frames_needed
 
-    inputs = inputs_of(TurntableInputs, job.inputs)
-    render_turntable(format.load(inputs.bake.asset).to(job.device), job)
+    s: TurntableSettings = job.settings
+    tree = format.load(inputs_of(TurntableInputs, job.inputs).bake.asset).to(job.device)
+    remedy = f"Lower turntable.width ({s.width}), turntable.height ({s.height}) or turntable.supersample ({s.supersample})."
+    refuse_what_does_not_fit(job, frames_needed(tree, s.width * s.height, s.supersample, job.device), remedy)
+    render_turntable(tree, job)
 
 
 def cameras_of(tree: Any, s: TurntableSettings) -> list[Camera]:

@@ -26,6 +26,13 @@ COARSEST = 16  # resolution of the coarsest level
 FEATURES = 2
 
 
+def level_sizes(levels: int, log2_table: int, coarsest: int, finest: int) -> tuple[list[int], list[int]]:
+    """Of each level, the points a side of its lattice, and the entries of its table."""
+    growth = math.exp((math.log(finest) - math.log(coarsest)) / max(levels - 1, 1))
+    sides = [round(coarsest * growth**level) for level in range(levels)]
+    return sides, [min(side**3, 2**log2_table) for side in sides]
+
+
 class HashField(BakeableField):
     """hidden x layers ReLU network over 2L features; see `efficientnerf.fields`."""
 
@@ -37,15 +44,11 @@ class HashField(BakeableField):
     ) -> None:  # fmt: skip
         super().__init__()
         self.degree = degree
-        growth = math.exp((math.log(finest) - math.log(coarsest)) / max(levels - 1, 1))
-        sides = [round(coarsest * growth**level) for level in range(levels)]
-        size = 2**log2_table
-        dense = [side**3 <= size for side in sides]
-        counts = [side**3 if flat else size for side, flat in zip(sides, dense, strict=True)]
+        sides, counts = level_sizes(levels, log2_table, coarsest, finest)
         self.sides = np.array(sides, np.int64)
-        self.dense = np.array(dense)
+        self.dense = np.array([side**3 <= 2**log2_table for side in sides])
         self.starts = np.array([0, *np.cumsum(counts)[:-1]], np.int64)
-        self.mask = np.uint32(size - 1)
+        self.mask = np.uint32(2**log2_table - 1)
         self.table = nn.Parameter((torch.rand(sum(counts), FEATURES, generator=generator) * 2 - 1) * 1e-4)
         self.table_gradient = GradientBuffer()
         widths = [levels * FEATURES, *[hidden] * layers, 1 + 3 * harmonics_count(degree)]
@@ -83,13 +86,21 @@ class HashField(BakeableField):
         return dispatch.hash_network(points, self.table, self.hash_levels, weights, self.log_initial_density, precision, self.table_gradient)
 
 
+def grids(s: TrainSettings) -> tuple[dict[str, int], dict[str, int]]:
+    """The arguments of `level_sizes` for the coarse field and the fine one."""
+    log2_table, finest = given(s.log2_hashmap_size) or LOG2_TABLE, given(s.finest_resolution) or FINEST
+    return {
+        "levels": max(1, s.num_levels // 2), "log2_table": max(8, log2_table - 2), "coarsest": COARSEST, "finest": max(COARSEST, finest // 4),
+    }, {"levels": s.num_levels, "log2_table": log2_table, "coarsest": COARSEST, "finest": finest}  # fmt: skip
+
+
 def coarse_and_fine(s: TrainSettings, generator: torch.Generator) -> tuple[HashField, HashField]:
     """The coarse field is a proposal field: lighter, and of densities alone. docs/experiments/proposal-field.md"""
-    log2_table, finest = given(s.log2_hashmap_size) or LOG2_TABLE, given(s.finest_resolution) or FINEST
+    coarse, fine = grids(s)
     return HashField(
-        levels=max(1, s.num_levels // 2), log2_table=max(8, log2_table - 2), coarsest=COARSEST, finest=max(COARSEST, finest // 4),
+        **coarse,
         hidden=s.coarse_hidden_dim, layers=s.coarse_num_layers, degree=0, initial_density=s.initial_density, generator=generator, precision=s.precision,
     ), HashField(
-        levels=s.num_levels, log2_table=log2_table, coarsest=COARSEST, finest=finest,
+        **fine,
         hidden=s.hidden_dim, layers=s.num_layers, degree=s.sh_degree, initial_density=s.initial_density, generator=generator, precision=s.precision,
     )  # fmt: skip

@@ -29,6 +29,7 @@ from efficientnerf.surface.volume import NdcVolume, Volume
 Progress = Callable[[int, int, str], None]
 ViewDirections = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 BLOCK = 64  # voxels a side that are in memory at a time
+MOST_SLAB_VOXELS = 2**25  # that are in memory while enclosed space is found; more where a layer of its cells has more
 CHUNK = 1 << 16  # points whose colours are looked up at a time
 
 
@@ -44,7 +45,7 @@ def _grid(volume: Volume) -> np.ndarray:
     return np.asarray(volume.shape, np.int64) * int(volume.brick)  # (3,) voxels per axis
 
 
-def _pool(volume: Volume) -> int:
+def pool_of(volume: Volume) -> int:
     """Voxels along a side of the cells in which enclosed space is found: two; more where that were over 256 cells a side, for the memory."""
     return 2 * max(1, -(-int(_grid(volume).max()) // 512))
 
@@ -95,7 +96,7 @@ def _densities_on_entry(sigma: np.ndarray, voxel: float) -> np.ndarray:
 
 
 def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> np.ndarray:
-    """Empty space that nobody outside can see, because everything around it is dense: bool, one value per cell of `_pool`^3 voxels.
+    """Empty space that nobody outside can see, because everything around it is dense: bool, one value per cell of `pool_of`^3 voxels.
 
     viewpoints  (N, 3) places that are outside by definition, besides the boundary of the volume: a camera may stand in a closed room
 
@@ -103,10 +104,10 @@ def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> 
     """
     from scipy.ndimage import label
 
-    grid, pool = _grid(volume), _pool(volume)
+    grid, pool = _grid(volume), pool_of(volume)
     cells = -(-grid // pool)
     dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
-    step = pool * 16
+    step = pool * int(np.clip(MOST_SLAB_VOXELS // (pool**3 * int(cells[1]) * int(cells[2])), 1, 16))
     for start in range(0, int(grid[0]), step):
         sigma = np.asarray(volume.density_block((start, 0, 0), (start + step, *(cells[1:] * pool).tolist())))
         pooled = np.any((sigma >= threshold).reshape(step // pool, pool, cells[1], pool, cells[2], pool), axis=(1, 3, 5))
@@ -132,8 +133,8 @@ def _filled_block(volume: Volume, low: np.ndarray, high: np.ndarray, threshold: 
 
     if enclosed is None:
         return np.asarray(volume.density_block(low, high))
-    margin = _pool(volume) + 1
-    axes = [np.arange(a - margin, b + margin) // _pool(volume) for a, b in zip(low, high)]
+    margin = pool_of(volume) + 1
+    axes = [np.arange(a - margin, b + margin) // pool_of(volume) for a, b in zip(low, high)]
     known = [(axis >= 0) & (axis < count) for axis, count in zip(axes, enclosed.shape)]
     seed = enclosed[np.ix_(*(np.clip(axis, 0, count - 1) for axis, count in zip(axes, enclosed.shape)))]
     seed &= known[0][:, None, None] & known[1][:, None] & known[2]

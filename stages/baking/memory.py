@@ -1,15 +1,36 @@
-"""Whether a bake fits into memory, checked before it begins."""
+"""What baking takes: at most, before it begins; and once its voxels are known. docs/experiments/memory.md"""
 
 from __future__ import annotations
 
-import os
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from pipeline.executors.memory import size_text
+from pipeline.stage import Job
+from stages.cores import count_cores
+from stages.memory.need import Need, has_room, libraries, refuse_what_does_not_fit
+from stages.memory.training import DENSITY_VOXEL, PIXELS, parameters, pixels_needed, place_pixels
+from stages.training.data import channels_of, count_pixels
+from stages.training.pixel_file import PixelFile
+
+if TYPE_CHECKING:
+    from efficientnerf.geometry.spaces import Space
+    from efficientnerf.training.pixels import PixelRows
+    from stages.bake import BakeSettings
+    from stages.io.scene import Scene, View
 
 COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement
+# Bytes. Of a voxel besides its values: coordinates and keys while it is sorted into the tree; of a coarse cell: its brick, its row while voxels are chosen,
+# its distance to the next one; of a brick's voxel: greatest weight, three times while they grow, and its number; of a training pixel that visibility is
+# measured on: its number, what it shows before and behind the box; of a ray of a refinement step: the records of its samples.
+VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 5000
+MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.gradients
 
 
-def needed(voxels: int, harmonics: int) -> int:
+def voxels_needed(voxels: int, harmonics: int) -> int:
     """Bytes that density and K harmonics of so many voxels take while they are baked and refined, in float32."""
-    return COPIES * 4 * (1 + 3 * harmonics) * voxels
+    return (COPIES * 4 * (1 + 3 * harmonics) + VOXEL + 4 * min(MAX_SHARES, count_cores())) * voxels
 
 
 def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int) -> int:
@@ -25,27 +46,69 @@ def free_on_device(device: str) -> int:
     return torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
-def installed() -> int | None:
-    """Bytes of memory that the machine has, or that its control group allows; None where that is unknown."""
-    try:
-        found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):
-        return None
-    try:
-        with open("/sys/fs/cgroup/memory.max", encoding="ascii") as file:
-            found = min(found, int(file.read()))
-    except (OSError, ValueError):  # no control group, or no limit ("max")
-        pass
-    return found
+def needed(
+    settings: BakeSettings, trained: Any, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool, device: str
+) -> Need:
+    """What baking takes.
+
+    trained   settings of the field
+    channels  of the pixels
+    cells     coarse cells of the finest grid in question
+    bricks    that are reached by samples, at most
+    voxels    that are baked
+    stored    whether the pixels are in a file
+    """
+    from efficientnerf.settings import given
+
+    pixels = pixels_needed(views, channels, stored=stored)
+    rays = min(settings.visibility_rays, count_pixels(tuple(views)))
+    return Need({
+        PIXELS: pixels[PIXELS],
+        "voxels": max(voxels_needed(voxels, (degree + 1) ** 2), pixels["reading images"] + pixels["directions of pixels"]),
+        "the grid": CELL * cells + BRICK_VOXEL * settings.brick_size**3 * bricks,
+        "rays": VISIBILITY_RAY * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
+        "the field": 3 * 4 * parameters(trained) + DENSITY_VOXEL * (given(trained.occupancy_resolution) or 192) ** 3 // 4,
+        "libraries": libraries(device),
+    })  # fmt: skip
 
 
-def refuse_more_than_fits(voxels: int, harmonics: int, resolution: int, max_mib: int) -> None:
-    """UsageError where the voxels would take more memory than there is."""
-    from pipeline.errors import UsageError
+def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], space: Space, mib: int) -> PixelRows | None:
+    """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
-    there, bytes_ = installed(), needed(voxels, harmonics)
-    if there is not None and bytes_ > there:
-        raise UsageError(
-            f"bake: {voxels:,} voxels with {harmonics} harmonics need about {bytes_ / 2**30:.0f} GiB of memory; there are {there / 2**30:.0f}."
-            f" Lower bake.max_mib ({max_mib}) or bake.resolution ({resolution})."
-        )
+    How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
+    """
+    from efficientnerf.asset.bake import grid_of
+    from efficientnerf.asset.serialisation import most_voxels
+    from stages.baking.voxels import MAX_OVERSHOOT, finest_choice
+
+    settings, degree = job.settings, m.fine.degree
+    channels = channels_of(job.inputs["poses"], views)
+    finest = finest_choice(settings, m, s)
+    shape, _ = grid_of(space.bounds, finest.resolution, settings.brick_size)
+    cells = math.prod(shape)
+    room = MAX_OVERSHOOT * most_voxels(mib * 2**20, settings.layout, degree, (1, 1, 1), settings.brick_size)
+    voxels = min(room, cells * settings.brick_size**3)
+
+    def at_most(count: int, *, stored: bool) -> Need:
+        about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": degree, "device": job.device}
+        return needed(settings, m.settings, views, channels, **about, stored=stored)
+
+    stored = not has_room(job, at_most(voxels, stored=False))
+    remedy = f"Lower bake.max_resolution ({finest.resolution} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
+    rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
+    if job.memory is not None and (most := at_most(voxels, stored=stored).total) > job.memory.bytes:
+        job.warn(f"an asset of {mib} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. Should it not fit, that is said"
+                 " once its voxels are counted, before they are baked; with a lower bake.max_mib it surely fits.")  # fmt: skip
+    return rows
+
+
+def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, choice: Any, cells: int, bricks: int, voxels: int, mib: int) -> None:
+    """UsageError where the voxels would take more memory than the job may.
+
+    pixels  as they were placed
+    choice  the resolution
+    """
+    about: dict[str, Any] = {"cells": cells, "bricks": bricks, "voxels": voxels, "degree": m.fine.degree, "device": job.device}
+    need = needed(job.settings, m.settings, views, pixels.images.shape[1], **about, stored=isinstance(pixels.images, PixelFile))
+    remedy = f"Lower bake.max_mib ({mib}) or bake.resolution ({choice.resolution}): {voxels:,} voxels with {(m.fine.degree + 1) ** 2} harmonics are too many."
+    refuse_what_does_not_fit(job, need, remedy)

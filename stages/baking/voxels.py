@@ -44,7 +44,7 @@ def voxel_space(job: Job, m: Any) -> Space:
 def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) -> tuple[Choice, Visibility, np.ndarray]:
     """The resolution, the visibility of voxels at it, and the coordinates (N, 3) of the voxels to bake."""
     from efficientnerf.asset import bake, serialisation
-    from stages.baking.resolution import Choice, affordable_resolution, finest_resolution
+    from stages.baking.resolution import affordable_resolution
 
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick_size
@@ -53,15 +53,12 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
         shape, _ = bake.grid_of(bounds, resolution, brick)
         return serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, brick)
 
-    stated: int | None = given(settings.resolution)
-    discretise: int | None = given(m.settings.discretise)
-    if (fixed := stated or discretise) is not None:
-        choice = Choice(fixed, "bake.resolution" if stated else "train.discretise")
+    finest = choice = finest_choice(settings, m, s)
+    if (given(settings.resolution) or given(m.settings.discretise)) is not None:
         shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
 
-    finest = finest_resolution(s, given(settings.max_resolution))
     top_shape, top_voxel = bake.grid_of(bounds, finest.resolution, brick)
     visibility = _visibility(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64), space)
     last: tuple[int, Visibility, np.ndarray] | None = None
@@ -84,6 +81,17 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     if len(indices) > most:
         indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, choice.resolution, brick)[0], most)
     return choice, coarse, indices
+
+
+def finest_choice(settings: BakeSettings, m: Any, s: Scene) -> Choice:
+    """The resolution that is stated, or else the finest in question."""
+    from stages.baking.resolution import Choice, finest_resolution
+
+    stated: int | None = given(settings.resolution)
+    discretise: int | None = given(m.settings.discretise)
+    if (fixed := stated or discretise) is not None:
+        return Choice(fixed, "bake.resolution" if stated else "train.discretise")
+    return finest_resolution(s, given(settings.max_resolution))
 
 
 def _visibility(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], voxel: float, low: np.ndarray, space: Space) -> Visibility:

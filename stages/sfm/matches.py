@@ -273,8 +273,12 @@ def _is_intact(path: Path, images: Sequence[WorkImage]) -> bool:
         return False
 
 
-def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, progress: Progress, safe_point: SafePoint) -> None:
-    """SIFT features of the images that have none yet, a few images at a time."""
+def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, threads: int | None = None, progress: Progress, safe_point: SafePoint) -> None:
+    """SIFT features of the images that have none yet, a few images at a time.
+
+    threads  None: as many as the process may use. An image's features do not depend on them
+    """
+    threads = threads or num_threads()
     with quiet_pycolmap() as pycolmap:
         with pycolmap.Database.open(database_path(work)) as database:
             known = {image.name for image in database.read_all_images() if database.exists_descriptors(image.image_id)}
@@ -287,16 +291,16 @@ def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, 
             reader.mask_path = work / "masks"
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
-        options.num_threads = num_threads()
+        options.num_threads = threads
         options.sift.max_num_features = features
         done = len(known)
         progress(done, len(images), "detecting features")
         for octave in (-1, 0):
             options.sift.first_octave = octave
             todo = [i for i in images if i.file not in known and (max(i.work_width, i.work_height) < UPSAMPLE_BELOW) == (octave < 0)]
-            for start in range(0, len(todo), 2 * num_threads()):
+            for start in range(0, len(todo), 2 * threads):
                 safe_point()
-                some = [image.file for image in todo[start : start + 2 * num_threads()]]
+                some = [image.file for image in todo[start : start + 2 * threads]]
                 pycolmap.extract_features(
                     database_path(work), work / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
                 )

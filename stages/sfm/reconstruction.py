@@ -32,13 +32,13 @@ MAX_NAMES = 8  # photographs that an error lists by name
 
 def find_cameras(
     folder: Path,
-    names: Sequence[str],
+    names: Sequence[str] | Mapping[str, Path],
     *,
     max_side: int = 1600,
     features: int = 4096,
     matching: str = "auto",
     seed: int = 0,
-    paths: Mapping[str, Path] | None = None,
+    threads: int | None = None,
     masks: Mapping[str, Path] | None = None,
     work: Path,
     progress: Callable[..., None],
@@ -47,11 +47,11 @@ def find_cameras(
 ) -> Capture:
     """Find the pose and the intrinsics of each photograph's camera.
 
-    folder, names   the photographs, paths relative to the folder; any order
+    folder, names   the photographs, paths relative to the folder, any order; or for each the file that is read
     max_side        longest side of the photographs in which features are detected, pixels
     features        most features of a photograph
+    threads         on which features are detected; None: as many as the process may use. Changes no bit
     matching        "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
-    paths           of some or all names: the file that is read, where it is not the name below the folder
     masks           of some or all names: no features where the mask is black
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
@@ -60,9 +60,9 @@ def find_cameras(
 
     Raises BadInput where fewer than 3 or less than half of the photographs are registered, StageFailed where the process aborts.
     """
-    paths, masks = paths or {}, masks or {}
-    arguments = {"folder": os.path.abspath(folder), "names": [*names], "max_side": max_side, "features": features, "matching": matching, "seed": seed}
-    arguments |= {"paths": {name: os.path.abspath(path) for name, path in paths.items()}}
+    masks, paths = masks or {}, _paths(folder, names)
+    arguments: dict[str, Any] = {"folder": os.path.abspath(folder), "names": {name: os.path.abspath(path) for name, path in paths.items()}}
+    arguments |= {"max_side": max_side, "features": features, "matching": matching, "seed": seed, "threads": threads}
     arguments |= {"masks": {name: os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
     resumed = matches.database_path(work).exists()
     try:
@@ -74,10 +74,14 @@ def find_cameras(
     return _capture_from(found, folder, paths, masks)
 
 
+def _paths(folder: Path, names: Sequence[str] | Mapping[str, Path]) -> dict[str, Path]:
+    return dict(names) if isinstance(names, Mapping) else {name: folder / name for name in names}
+
+
 def capture_for(arguments: Mapping[str, Any], **callables: Callable[..., None]) -> dict[str, Any]:
     """`reconstruct` for arguments that have come through JSON; the capture as JSON can hold it."""
     paths: dict[str, Any] = {"folder": Path(arguments["folder"]), "work": Path(arguments["work"])}
-    paths |= {of: {name: Path(path) for name, path in arguments[of].items()} for of in ("paths", "masks")}
+    paths |= {of: {name: Path(path) for name, path in arguments[of].items()} for of in ("names", "masks")}
     with _alone(Path(arguments["work"]), callables["safe_point"]):
         return _plain(reconstruct(**{**arguments, **paths}, **callables))  # type: ignore[arg-type]
 
@@ -104,13 +108,13 @@ def _alone(work: Path, safe_point: Callable[[], None]) -> Iterator[None]:
 
 def reconstruct(
     folder: Path,
-    names: Sequence[str],
+    names: Sequence[str] | Mapping[str, Path],
     *,
     max_side: int,
     features: int,
     matching: str,
     seed: int,
-    paths: Mapping[str, Path] | None = None,
+    threads: int | None = None,
     masks: Mapping[str, Path],
     work: Path,
     progress: Callable[..., None],
@@ -121,12 +125,12 @@ def reconstruct(
     work.mkdir(parents=True, exist_ok=True)
     images, unreadable = matches.prepare_images(
         folder,
-        names,
+        [*names],
         max_side=max_side,
         features=features,
         seed=seed,
         masks=masks,
-        paths=paths,
+        paths=_paths(folder, names),
         work=work,
         progress=progress,
         safe_point=safe_point,
@@ -141,7 +145,7 @@ def reconstruct(
         matching = "exhaustive" if len(images) <= MAX_EXHAUSTIVE else "sequential"
     with _full_disk_named(work):
         matches.open_database(work, images)
-        matches.extract_features(work, images, features=features, progress=progress, safe_point=safe_point)
+        matches.extract_features(work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
         matches.match_pairs(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
         models = mapping.best_models(work, images, seed, progress, safe_point)
     rejected = [*unreadable, *_unregistered(work, images, models)]

@@ -1,0 +1,73 @@
+"""What a stage takes at its peak, and what becomes of a stage that does not fit.
+
+Memory decides where data lie and in how large pieces they are worked on, and never what is made: a stage that does not fit even so is refused, with the
+setting that would make it smaller. So an artifact has the same bytes whatever memory it was made in, and memory is no part of its request.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipeline.errors import UsageError
+from pipeline.executors.memory import available_now, size_text
+from pipeline.stage import Job
+
+MIB = 2**20
+TERMS_SHOWN = 3
+# The process with the libraries that a stage imports, its compiled kernels, and what the C library keeps of what was freed.
+IMAGING = 130 * MIB  # numpy, OpenCV and Pillow
+RENDERING = 600 * MIB  # torch and numba beside these
+SURFACES = 200 * MIB  # SciPy, scikit-image and what decimates, beside these
+CUDA = 2048 * MIB  # what torch adds on the host for a CUDA device
+
+
+def libraries(device: str = "cpu") -> int:
+    """Bytes of a process that renders or trains, before it has read anything."""
+    return RENDERING + (0 if device == "cpu" else CUDA)
+
+
+@dataclass(frozen=True)
+class Need:
+    """Bytes by what takes them, as read after "of": {"training pixels": 3600000000, "libraries": 450000000}."""
+
+    terms: Mapping[str, int]
+
+    @property
+    def total(self) -> int:
+        return sum(self.terms.values())
+
+    def text(self) -> str:
+        """The total, and the largest terms."""
+        largest = sorted(self.terms.items(), key=lambda term: -term[1])[:TERMS_SHOWN]
+        return f"about {size_text(self.total)} of memory ({', '.join(f'{what} {size_text(count)}' for what, count in largest)})"
+
+
+def has_room(job: Job, need: Need) -> bool:
+    """Whether it fits into what the job may take, and now into what other programs leave. For what changes no bytes."""
+    if job.memory is None:
+        return True
+    now = available_now()
+    return need.total <= (job.memory.bytes if now is None else min(job.memory.bytes, now))
+
+
+def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:
+    """Record the need in the manifest; UsageError where it is more than the job may take. To be called before the work.
+
+    remedy  what to do about it, a sentence: which settings, with their values
+    """
+    record(job, need)
+    if job.memory is not None and need.total > job.memory.bytes:
+        limit = f"{size_text(job.memory.bytes)} may be taken ({job.memory.whose})"
+        raise UsageError(f"{job.stage}: needs {need.text()}; {limit}. {remedy} Or give more by --memory.")
+    now = available_now() if job.memory is not None else None
+    if now is not None and need.total > now:
+        job.warn(f"{job.stage} needs {need.text()}; other programs leave {size_text(now)} at the moment. Close some, should it fail.")
+
+
+def record(job: Job, need: Need) -> None:
+    """Put a need into the manifest, beside what was measured (`peak_memory`); of several the largest."""
+    if need.total < job.facts.get("memory", {}).get("needed", 0):
+        return
+    limit = None if job.memory is None else job.memory.bytes
+    job.record("memory", {"needed": need.total, "terms": dict(need.terms), "limit": limit})

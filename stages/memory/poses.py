@@ -1,0 +1,60 @@
+"""What reading photographs takes, and finding their cameras. docs/experiments/memory.md"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pipeline.executors.memory import available_now
+from pipeline.stage import Job
+from stages.io.photo import working_size
+from stages.memory.need import IMAGING, MIB, Need, refuse_what_does_not_fit
+
+# Bytes. Of a pixel of the photograph that is decoded, turned, reduced and written; of a pixel of a photograph in which features are detected, on a thread
+# of its own (SIFT's first octave), four times as many where that is twice as large; of an image's descriptors while they are matched.
+DECODED, SIFT, DESCRIPTOR = 26, 80, 640
+COLMAP = 200 * MIB  # the process in which structure from motion runs
+REMEDY = "Lower poses.feature_image_size, or reduce the largest photographs."
+
+
+def decoding_needed(sizes: Sequence[tuple[int, int]]) -> Need:
+    """What it takes to read photographs of these sizes, one at a time."""
+    return Need({"a photograph": DECODED * max((width * height for width, height in sizes), default=0), "libraries": IMAGING})
+
+
+def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int) -> Need:
+    """What it takes to find the cameras of photographs of these sizes.
+
+    max_side  of the photographs in which features are detected, pixels
+    features  of a photograph, at most
+    """
+    from stages.sfm.matches import UPSAMPLE_BELOW
+
+    reduced = {working_size(*size, max_side) for size in sizes}
+    most = max((width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced), default=0)
+    decoded = decoding_needed(sizes).terms
+    return Need({
+        "a photograph, or features on each thread": max(decoded["a photograph"], SIFT * most * threads),
+        "descriptors": DESCRIPTOR * features * len(sizes),
+        "libraries": decoded["libraries"] + COLMAP,
+    })  # fmt: skip
+
+
+def refuse_large_photographs(job: Job, sizes: Sequence[tuple[int, int]]) -> None:
+    """UsageError where the largest photograph does not fit into memory while it is decoded."""
+    refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
+
+
+def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int) -> int:
+    """On how many of the threads features are detected: as many as fit. Each image's features depend on that image alone. UsageError where one does not fit."""
+    now = available_now()
+    fewer = threads
+    if job.memory is not None:
+        room = job.memory.bytes if now is None else min(job.memory.bytes, now)
+        while fewer > 1 and features_needed(sizes, max_side, features, fewer).total > room:
+            fewer -= 1
+    refuse_what_does_not_fit(job, features_needed(sizes, max_side, features, fewer), REMEDY)
+    if fewer < threads:
+        job.warn(
+            f"features are detected on {fewer} of {threads} threads: more do not fit into memory. Give more by --memory, or lower poses.feature_image_size."
+        )
+    return fewer

@@ -1,0 +1,53 @@
+"""What rendering an asset takes, and comparing its renders. docs/experiments/memory.md"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from stages.memory.need import Need, libraries
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Camera
+
+# Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of the
+# samples of a supersampled pixel where each ray is rendered on its own; of a test view with its photograph, renders, errors and windows of SSIM.
+TREE, FRAME, SAMPLE, COMPARED = 3, 100, 80, 230
+FIELD = 150  # bytes of a ray through the field, with what lies before and behind the box
+
+
+def tree_bytes(tree: NerfTree) -> int:
+    """Bytes of a tree and of what renderers make of it."""
+    from efficientnerf.asset.palettes import PaletteHarmonics
+
+    harmonics = tree.harmonics
+    colours = 16 * len(tree.density_values)  # as seen from a camera
+    stored = harmonics.base.nbytes + harmonics.codes.nbytes if isinstance(harmonics, PaletteHarmonics) else harmonics.nbytes
+    return TREE * (tree.brick_index.nbytes + tree.voxel_index.nbytes + tree.density_values.nbytes + stored) + colours
+
+
+def frames_needed(tree: NerfTree, pixels: int, supersample: int, device: str = "cpu") -> Need:
+    """What it takes to render and write frames of so many pixels, one at a time."""
+    by_rays = supersample > 1 and (tree.ndc is not None or tree.lookup == "nearest")
+    return Need({
+        "a frame": pixels * (FRAME + (SAMPLE * supersample**2 if by_rays else 0)),
+        "the asset": tree_bytes(tree),
+        "libraries": libraries(device),
+    })  # fmt: skip
+
+
+def views_needed(tree: NerfTree, cameras: Sequence[Camera], rays: int, field: int, device: str = "cpu") -> Need:
+    """What it takes to compare renders with photographs, one at a time.
+
+    rays   through the field, of one view at most
+    field  bytes of the field's file
+    """
+    most = max((camera.width * camera.height for camera in cameras), default=0)
+    return Need({
+        "a view": most * COMPARED,
+        "its rays": rays * FIELD,
+        "the asset": tree_bytes(tree),
+        "the field": 3 * field,
+        "libraries": libraries(device),
+    })  # fmt: skip
