@@ -3,6 +3,7 @@
 # make test-slow install, then run the tests marked slow
 # make torture   kill runs at N moments (30; by night 1000: make torture N=1000 JOBS=2) and compare their artifacts with those of undisturbed runs
 # make faults    let each file operation of a run fail, by five errors: half an hour on two cores (make faults JOBS=2)
+# make fuzz      100,000 damaged inputs to each reader; FUZZ_OPTIONS go to benchmarks/fuzz; `pip install -e '.[fuzz]'` guides it by coverage
 # make gpu       the tests and benchmarks that need CUDA; says so and stops where there is none
 # make gpu-packages   the packages that `make gpu` needs beside torch, Triton and numba, into build/gpu-packages: for a machine without a package index
 # make docs      rewrite the pages under docs/ that are made from the code
@@ -31,6 +32,9 @@ torture: $(INSTALLED)
 
 faults: $(INSTALLED)
 	$(BIN)/python -m benchmarks.torture.faults --jobs $(JOBS)
+
+fuzz: $(INSTALLED)
+	$(BIN)/python -m benchmarks.fuzz $(FUZZ_OPTIONS)
 
 # A machine with a device often has a python whose torch sees it, and no way to a package index: then that one is used, and nothing is installed.
 # What it lacks beside them is read from build/gpu-packages, which `make gpu-packages` fills elsewhere, for python GPU_PYTHON.

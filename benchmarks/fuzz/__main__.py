@@ -1,0 +1,131 @@
+"""The command line of the fuzzer; see the package."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import importlib.util
+import json
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks.fuzz import campaign, worker
+from benchmarks.fuzz.reader import ROOT
+
+RESULT = ROOT / "benchmarks" / "results" / "fuzz.json"
+FORMAT_RESULT = ROOT / "benchmarks" / "results" / "fuzz_format.json"
+LIBRARIES = ("atheris", "msgspec", "numpy", "pillow", "pillow-heif", "safetensors", "torch")
+
+
+def main() -> int:
+    given = _arguments()
+    coverage = not given.plain and importlib.util.find_spec("atheris") is not None
+    if given.worker:
+        first, count, folder = given.worker
+        worker.work(given.readers[0], given.seed, int(first), int(count), Path(folder), coverage=coverage, shrink=given.shrink)
+    from benchmarks.fuzz.table import READERS
+
+    unknown = [name for name in given.readers if name not in READERS]
+    if unknown:
+        print(f"{unknown[0]}: no such reader; there are {', '.join(READERS)}", file=sys.stderr)
+        return 2
+    if given.file is not None:
+        return _again(given.readers[0], given.file)
+    found: dict[str, dict[str, Any]] = {}
+    for name in given.readers or READERS:
+        found[name] = campaign.fuzz(
+            name, round(given.inputs * READERS[name].share), given.seed, coverage=coverage, shrink=given.shrink, say=lambda text: print(text, flush=True)
+        )
+        _tell(name, found[name], given.findings)
+        if given.json is not None:
+            write(given.json, found, given.seed, coverage)
+    return 1 if any(each["findings"] for each in found.values()) else 0
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description="Fuzz every reader, or some.")
+    parser.add_argument("readers", nargs="*", metavar="READER")
+    parser.add_argument("--inputs", type=int, default=100_000, help="for each reader")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--plain", action="store_true", help="without coverage, also where atheris is installed")
+    parser.add_argument("--shrink", type=float, default=5.0, metavar="SECONDS", help="to make the input of a finding smaller")
+    parser.add_argument("--findings", type=Path, default=ROOT / "build" / "fuzz", metavar="DIR", help="where the inputs of findings go")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="result to write")
+    parser.add_argument("--file", type=Path, metavar="FILE", help="try this one input on READER")
+    parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
+    return parser.parse_args()
+
+
+def _again(name: str, path: Path) -> int:
+    """One input, by every way that the reader has."""
+    from benchmarks.fuzz.reader import commanded
+
+    data = path.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        tally = worker.opened_reader(name, Path(folder), 0)
+        outcomes = [("read", tally.outcome(data))]
+        for arguments in tally.opened.commands:
+            tally.outcome(data)
+            tally.opened.prepare(data)
+            outcomes.append((" ".join(arguments), commanded(arguments)))
+    for what, outcome in outcomes:
+        print(f"{what}\n    {outcome.kind} {outcome.by}\n    {outcome.text}\n{outcome.trace}")
+    return 1 if any(outcome.kind == "finding" for _, outcome in outcomes) else 0
+
+
+def _tell(name: str, found: dict[str, Any], folder: Path) -> None:
+    """Print a line, and write each finding: its input, and a page about it."""
+    print(f"{name}: {found['inputs']} inputs, {found['accepted']} accepted, {sum(found['refused'].values())} refused, "
+          f"{found['command_lines']} command lines, {len(found['findings'])} findings; "
+          f"{found['inputs_per_cpu_s']} inputs a processor second, slowest {found['slowest_s']} s, peak {found['peak_rss_mib']} MiB", flush=True)  # fmt: skip
+    for number, each in enumerate(found["findings"]):
+        folder.mkdir(parents=True, exist_ok=True)
+        data = bytes.fromhex(each["data"])
+        path = folder / f"F_{name}_{number}.bin"
+        path.write_bytes(data)
+        command = "" if each["command"] is None else f"Command: enerf {' '.join(each['command'])}\n\n"
+        path.with_suffix(".md").write_text(
+            f"# {name}: {each['by']}\n\nAt {each['place'] or 'an unknown place'}; {each['count']} times; input {len(data)} bytes.\n\n{command}"
+            f"Again: `python -m benchmarks.fuzz {name} --file {path}`\n\n    {each['text'][:1000]}\n\n"
+            f"Input:\n\n    {data[:600]!r}\n\n```\n{each['trace'][-3000:]}\n```\n",
+            encoding="utf-8", errors="backslashreplace",
+        )  # fmt: skip
+        print(f"    {each['by']} at {each['place']} ({each['count']}): {path}", flush=True)
+
+
+def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: bool) -> None:
+    """The result, with the fuzzing of the asset's format beside it."""
+    from benchmarks.machine import processor
+
+    versions = {}
+    for name in LIBRARIES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    asset = json.loads(FORMAT_RESULT.read_text(encoding="utf-8")) if FORMAT_RESULT.exists() else {}
+    result = {
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "machine": processor(),
+        "python": platform.python_version(),
+        "versions": versions,
+        "seed": seed,
+        "guided_by": "coverage (atheris)" if coverage else "outcomes",
+        "inputs": sum(each["inputs"] for each in found.values()),
+        "findings": sum(len(each["findings"]) for each in found.values()),
+        "limit_s": 5.0,
+        "room_mib": worker.EXTRA_MEMORY // 2**20,
+        "readers": {
+            name: {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]]} for name, each in found.items()
+        },
+        "asset": {key: asset[key] for key in ("inputs", "read", "refused", "seed", "slowest_s", "peak_rss_mib") if key in asset} | {"file": FORMAT_RESULT.name},
+    }
+    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

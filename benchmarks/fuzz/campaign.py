@@ -1,0 +1,107 @@
+"""Many inputs on many readers: workers are started one after another, and again where one dies; what they report is added up."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks.fuzz.reader import ROOT
+from benchmarks.fuzz.worker import NOTE
+
+BATCH = 25_000  # inputs of one process
+MEMORY = "/dev/shm"  # files there are written ten times as fast as on a disk
+STUCK = 60.0  # seconds without a new input after which a process is ended: it does not answer to signals
+
+
+def fuzz(name: str, inputs: int, seed: int, *, coverage: bool, shrink: float, say: Callable[[str], None]) -> dict[str, Any]:
+    """All inputs of one reader; the sum of what its processes reported."""
+    began = resource.getrusage(resource.RUSAGE_CHILDREN)
+    parts: list[dict[str, Any]] = []
+    deaths: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory(prefix=f"fuzz-{name}-", dir=MEMORY if os.path.isdir(MEMORY) else None) as folder:
+        first = 0
+        while first < inputs and len(deaths) < 20:
+            found = _batch(name, seed + first, first, min(BATCH, inputs - first), Path(folder), coverage=coverage, shrink=shrink)
+            if "died" in found:
+                deaths.append(found)
+                first = found["index"] + 1
+                parts.append({"inputs": first - found["first"], "accepted": 0, "refused": {"unknown": first - found["first"] - 1}, "findings": [found]})
+            else:
+                parts.append(found)
+                first += found["inputs"]
+            say(f"{name}: {first} inputs, {sum(len(part['findings']) for part in parts)} findings")
+    return summed(name, parts, _cpu_seconds(resource.getrusage(resource.RUSAGE_CHILDREN)) - _cpu_seconds(began))
+
+
+def _cpu_seconds(usage: resource.struct_rusage) -> float:
+    return usage.ru_utime + usage.ru_stime
+
+
+def _batch(name: str, seed: int, first: int, count: int, folder: Path, *, coverage: bool, shrink: float) -> dict[str, Any]:
+    command = [sys.executable, "-m", "benchmarks.fuzz", name, "--seed", str(seed), "--worker", str(first), str(count), str(folder), "--shrink", str(shrink)]
+    note = folder / NOTE
+    note.unlink(missing_ok=True)
+    with open(folder / "stderr", "wb") as err, open(folder / "stdout", "wb") as out:
+        process = subprocess.Popen(command + ([] if coverage else ["--plain"]), cwd=ROOT, stdout=out, stderr=err)
+        code = _wait(process, note)
+    text = (folder / "stdout").read_text(errors="replace").strip().splitlines()
+    if code == 0 and text:
+        found: dict[str, Any] = json.loads(text[-1])
+        return found
+    number, _, data = note.read_bytes().partition(b"\n") if note.exists() else (b"", b"", b"")
+    index = int(number or first)
+    last = (folder / "stderr").read_text(errors="replace")[-2000:]
+    what = "stuck" if code is None else f"the process ended with {code}"
+    return {"died": True, "first": first, "index": index, "by": what, "place": "", "text": last, "trace": last, "count": 1, "command": None, "data": data.hex()}
+
+
+def _wait(process: subprocess.Popen[bytes], note: Path) -> int | None:
+    """The exit code; None where the process had to be killed because it came to no new input."""
+    last, since = b"", time.monotonic()
+    while True:
+        try:
+            return process.wait(timeout=1)
+        except subprocess.TimeoutExpired:
+            now = note.read_bytes()[:20] if note.exists() else b""
+            if now != last:
+                last, since = now, time.monotonic()
+            if time.monotonic() - since > (STUCK if now else 5 * STUCK):  # importing takes longer
+                process.kill()
+                process.wait()
+                return None
+
+
+def summed(name: str, parts: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
+    refused, codes = Counter[str](), Counter[str]()
+    findings: dict[tuple[str, str], dict[str, Any]] = {}
+    for part in parts:
+        refused.update(part["refused"])
+        codes.update(part.get("codes", {}))
+        for each in part["findings"]:
+            known = findings.setdefault((each["by"], each["place"]), {**each, "reader": name, "count": 0})
+            known["count"] += each["count"]
+            if len(each["data"]) < len(known["data"]):
+                known["data"] = each["data"]
+    inputs = sum(part["inputs"] for part in parts)
+    return {
+        "inputs": inputs,
+        "accepted": sum(part["accepted"] for part in parts),
+        "refused": dict(sorted(refused.items())),
+        "command_lines": sum(part.get("commands", 0) for part in parts),
+        "exit_codes": dict(sorted(codes.items())),
+        "findings": list(findings.values()),
+        "slowest_s": round(max((part.get("slowest_s", 0.0) for part in parts), default=0.0), 3),
+        "peak_rss_mib": max((part.get("peak_rss_mib", 0) for part in parts), default=0),
+        "rss_before_mib": max((part.get("rss_before_mib", 0) for part in parts), default=0),
+        "inputs_per_cpu_s": round(inputs / max(seconds, 1e-9)),
+        "cpu_seconds": round(seconds),
+    }

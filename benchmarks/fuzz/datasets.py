@@ -1,0 +1,165 @@
+"""Readers of posed data sets: a small folder in each format, of which one file is the input."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import numpy as np
+
+from benchmarks.fuzz import binary, json_text, lines
+from benchmarks.fuzz.reader import Opened, Reader
+from tests.stages import captures
+
+COUNT = 3  # images of a data set
+NGP = {"is_fisheye": False, "k1": 0.01}
+
+
+def read_source(folder: Path) -> None:
+    """As the poses stage reads a source: the formats that it may be, the files that it depends on, the cameras."""
+    from stages.io import importers
+
+    settings = captures.Settings()
+    name = importers.detect(folder)
+    importer = importers.IMPORTERS[name]
+    importer.files(folder, settings)  # type: ignore[arg-type]
+    if importer.posed:
+        capture = importer.read(folder, settings)  # type: ignore[arg-type]
+        for photo in capture.photos:
+            assert np.isfinite(photo.camera.world_from_camera).all(), "a camera that is not finite"
+            assert np.isfinite(photo.camera.params).all(), "a lens that is not finite"
+            assert photo.image.resolve().is_relative_to(folder.resolve()), "an image outside the source"
+        assert capture.bounds is None or np.isfinite(capture.bounds).all(), "bounds that are not finite"
+
+
+def _commands(folder: Path) -> tuple[tuple[tuple[str, ...], ...], Callable[[bytes], None]]:
+    """Describing the source, and the poses stage on it, in a new run each time."""
+    run = folder.parent / "run"
+    return (
+        ("inspect", str(folder)),
+        ("inspect", str(folder), "--json"),
+        ("run", str(folder), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet"),
+    ), lambda data: shutil.rmtree(run, ignore_errors=True)
+
+
+def _opened(write: Callable[..., Path], name: str) -> Callable[[Path], Opened]:
+    def opened(folder: Path) -> Opened:
+        source = folder / "source"
+        write(source, captures.cameras(COUNT))
+        path = source / name
+        commands, prepare = _commands(source)
+
+        def read(data: bytes) -> None:
+            path.write_bytes(data)
+            read_source(source)
+
+        return Opened(read, commands, prepare)
+
+    return opened
+
+
+def _bytes_of(write: Callable[..., Path], name: str, **more: object) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return (write(Path(folder) / "source", captures.cameras(COUNT), **more) / name).read_bytes()
+
+
+def _shorter(data: bytes) -> bytes:
+    """The first points of a text; the whole of anything else."""
+    head, _, rest = data.partition(b"\n")
+    if not head.startswith(b"# Number of points"):
+        return data
+    return b"# Number of points: 8, mean track length: 6\n" + b"\n".join(rest.split(b"\n")[:8]) + b"\n"
+
+
+def transforms_seeds() -> list[bytes]:
+    """The dialects in one file each; images lie where nerfstudio's are."""
+    import json
+
+    nerfstudio = json.loads(_bytes_of(captures.nerfstudio, "transforms.json"))
+    ngp = json.loads(_bytes_of(captures.instant_ngp, "transforms.json")) | NGP
+    blender = {"camera_angle_x": 0.76, "frames": captures.frames(captures.cameras(COUNT), "./images", "")}
+    masked = {**nerfstudio, "frames": [{**frame, "mask_path": frame["file_path"], "k3": 0.01, "depth_file_path": "x"} for frame in nerfstudio["frames"]]}
+    named = {
+        **nerfstudio,
+        "train_filenames": [frame["file_path"] for frame in nerfstudio["frames"]],
+        "ply_file_path": "p.ply",
+        "applied_transform": [[1, 0, 0, 0]],
+    }
+    rolling = {
+        **ngp,
+        "frames": [
+            {"file_path": f["file_path"], "transform_matrix_start": f["transform_matrix"], "transform_matrix_end": f["transform_matrix"]} for f in ngp["frames"]
+        ],
+    }
+    lens = {**nerfstudio, "camera_model": "OPENCV_FISHEYE", "k3": 0.001, "k4": 0.001}
+    return [json.dumps(each).encode() for each in (nerfstudio, ngp, blender, masked, named, rolling, lens)]
+
+
+def npy_seeds() -> list[bytes]:
+    rows = captures.llff_rows(captures.cameras(COUNT))
+    made = []
+    for array, options in (
+        (rows, {}),
+        (rows.astype(">f8"), {}),
+        (rows.astype(np.float32), {}),
+        (np.asfortranarray(rows), {}),
+        (rows.round().astype(np.int64), {}),
+    ):
+        out = io.BytesIO()
+        np.save(out, array, **options)
+        made.append(out.getvalue())
+    for version in ((2, 0), (3, 0)):
+        out = io.BytesIO()
+        np.lib.format.write_array(out, rows, version=version)
+        made.append(out.getvalue())
+    out = io.BytesIO()
+    np.savez(out, rows)
+    return [*made, out.getvalue()]
+
+
+_NPY_WORDS = [b"'<f8'", b"'<f4'", b"'|O'", b"'<U9999999'", b"'<c16'", b"'<M8[s]'", b"'|V17'", b"[('a', '<f8')]", b"True", b"False",
+              b"(3, 17)", b"(17,)", b"(0, 17)", b"(4611686018427387904, 17)", b"(-1, 17)", b"()", b"(1000000000, 17)",
+              b"None", b"1e9", b"'\\x00'", b"(" * 500, b"__import__('os')", b"(3, 17, 1)", b"(True, 17)"]  # fmt: skip
+
+
+def npy_changed(rng: Random, data: bytes) -> bytes:
+    """The header's values, numbers of the array, or bytes."""
+    import re
+
+    head = 10 + int.from_bytes(data[8:10], "little") if data[:6] == b"\x93NUMPY" and len(data) > 10 else 0
+    kind = rng.random()
+    if kind < 0.35 and head:
+        text = data[10:head]
+        found = [*re.finditer(rb"'[^']*'(?=[,}])|True|False|\([^)]*\)", text)]
+        if found:
+            chosen = rng.choice(found)
+            text = text[: chosen.start()] + rng.choice(_NPY_WORDS) + text[chosen.end() :]
+        length = len(text) if rng.random() < 0.8 else rng.choice((0, 65535, len(text) + 1))
+        return data[:8] + min(length, 65535).to_bytes(2, "little") + text + data[head:]
+    if kind < 0.7 and head:
+        return binary.changed_bytes(rng, data, begin=head)
+    return binary.changed_bytes(rng, data, end=None if rng.random() < 0.5 else max(head, 16))
+
+
+_READERS = [
+    Reader("transforms", "transforms.json, three dialects", transforms_seeds, json_text.changed, _opened(captures.nerfstudio, "transforms.json")),
+    Reader("poses_bounds", "poses_bounds.npy of LLFF", npy_seeds, npy_changed, _opened(captures.llff, "poses_bounds.npy")),
+]
+for _suffix, _write, _changed in ((".bin", captures.colmap_bin, binary.changed_bytes), (".txt", captures.colmap_txt, lines.changed)):
+    for _part in ("cameras", "images", "points3D"):
+        _name = f"sparse/0/{_part}{_suffix}"
+        _READERS.append(
+            Reader(
+                f"colmap_{_part}_{_suffix[1:]}",
+                f"COLMAP's {_part}{_suffix}",
+                lambda write=_write, name=_name: [_shorter(_bytes_of(write, name))],  # type: ignore[misc]
+                _changed,
+                _opened(_write, _name),
+                share=1 / 3,
+            )
+        )
+READERS = {reader.name: reader for reader in _READERS}
