@@ -126,7 +126,30 @@ def hostile_page() -> str:
                 lines.append(f"| {cell(name)} | {cell(str(error))} |")
             else:
                 raise SystemExit(f"hostile file '{name}' was read")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines + hostile_inputs()) + "\n"
+
+
+def hostile_inputs() -> list[str]:
+    """The inputs of the other readers."""
+    from benchmarks.fuzz.table import READERS
+    from tests.stages.hostile import FILES, MADE, READ
+
+    lines = [
+        "",
+        "# Hostile inputs of the other readers",
+        "",
+        "Found by `make fuzz`, which changes valid files of each kind at random, and made smaller (`tests/data/hostile`), or by `tests/stages/hostile.py`.",
+        "A data set, a configuration or a camera path that is refused ends `enerf` with exit code 2, a damaged run with 4. What only saves time or is shown to",
+        "people is passed over; a photograph that cannot be read is left out, with a warning.",
+        "",
+        "| what is read | input | words of the message |",
+        "|---|---|---|",
+    ]
+    answers = [(reader, name, says) for reader, names in FILES.items() for name, says in names.items()] + [(*key, says) for key, (_, says) in MADE.items()]
+    for reader, name, says in sorted(answers):
+        words = "(passed over)" if says == READ else says.replace("|", " or ").replace(".*", " ... ").replace("\\\\", "\\")
+        lines.append(f"| {cell(READERS[reader].what)} | {cell(name)} | {cell(words)} |")
+    return lines
 
 
 PAGES = {"settings.md": settings_page, "commands.md": commands_page, "hostile.md": hostile_page}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from random import Random
@@ -72,7 +73,7 @@ def open_posed(folder: Path) -> Opened:
         from benchmarks.fuzz.datasets import read_source
 
         path.write_bytes(data)
-        read_source(source)
+        read_source(source, data)
 
     command = ("run", str(source), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet")
     return Opened(read, (command,), lambda data: shutil.rmtree(run, ignore_errors=True))
@@ -84,8 +85,11 @@ def open_mask(folder: Path) -> Opened:
     from stages.io.capture import Photo
     from stages.io.pictures import UnreadableImage
 
-    source = folder / "source"
-    captures.nerfstudio(source, captures.cameras(COUNT), mask_path="mask.png")
+    source, run = folder / "source", folder / "run"
+    captures.nerfstudio(source, captures.cameras(COUNT))
+    document = json.loads((source / "transforms.json").read_text())
+    document["frames"][0]["mask_path"] = "mask.png"
+    captures.write_json(source / "transforms.json", document)
     image, path, out = source / "images" / "img_0.png", source / "mask.png", folder / "out"
     out.mkdir()
     taken = photo.read_photo(image, 16)
@@ -101,7 +105,8 @@ def open_mask(folder: Path) -> Opened:
         if refused is not None:
             raise refused
 
-    return Opened(read)
+    command = ("run", str(source), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet")
+    return Opened(read, (command,), lambda data: shutil.rmtree(run, ignore_errors=True))
 
 
 COUNT = 4
@@ -152,6 +157,6 @@ READERS = {
             every=200,
         ),
         Reader("posed_images", "an image of a posed data set", seeds, changed, open_posed, every=400, share=0.2),
-        Reader("masks", "masks of photographs", mask_seeds, changed, open_mask, ("UnreadableImage", "PipelineError")),
+        Reader("masks", "masks of photographs", mask_seeds, changed, open_mask, ("UnreadableImage", "PipelineError"), every=200),
     )
 }

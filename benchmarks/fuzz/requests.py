@@ -134,7 +134,7 @@ READERS = {
     reader.name: reader
     for reader in (
         Reader("config", "TOML configurations", lambda: [CONFIG], toml_text.changed, open_config),
-        Reader("options", "--set and --budget", lambda: OPTIONS, lines.changed, open_options),
+        Reader("options", "--set and --budget", lambda: OPTIONS, lines.changed, open_options, share=0.25),
         Reader("camera_path", "camera paths", path_seeds, json_text.changed, open_path, every=100),
     )
 }

@@ -244,7 +244,7 @@ READERS = {
         Reader("scene", "scene.json, the cameras of a run", scene_seeds, json_text.changed,
                opened("poses/scene.json", _scene, ("inspect", "RUN"), ("inspect", "RUN", "--json"), ("export", "RUN", "--to", "OUT.json"), *_STATUS)),
         Reader("points", "points.safetensors of a run", seed_of("poses/points.safetensors"), safetensors_bytes.changed,
-               opened("poses/points.safetensors", _points, ("inspect", "RUN"))),
+               opened("poses/points.safetensors", _points, ("inspect", "RUN")), share=0.25),
         *(_reports(name) for name in REPORTS),
     )
 }  # fmt: skip

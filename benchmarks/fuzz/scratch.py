@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -15,7 +14,7 @@ import numpy as np
 from benchmarks.fuzz import datasets, json_text, lines, safetensors_bytes
 from benchmarks.fuzz.reader import Opened, Reader
 
-QUICK = {"iterations": 13, "sample_batch_size": 256}
+QUICK = {"iterations": 13, "sample_batch_size": 256, "log2_hashmap_size": 6, "occupancy_resolution": 4}
 
 
 @cache
@@ -192,17 +191,13 @@ def open_blocks(folder: Path) -> Opened:
     return Opened(read)
 
 
-def _reader(name: str, what: str, seeds: Callable[[], list[bytes]], changed: Callable[[Random, bytes], bytes], opened: Callable[[Path], Opened]) -> Reader:
-    return Reader(name, what, seeds, changed, opened)
-
-
 READERS = {
     reader.name: reader
     for reader in (
-        _reader("checkpoint", "checkpoints of a training run", checkpoint_seeds, field_changed, open_checkpoint),
-        _reader("field", "field.safetensors, the trained field", field_seeds, field_changed, open_field),
-        _reader("log", "log.jsonl of a training run", log_seeds, log_changed, open_log),
-        _reader("schedule", "schedule.json of a time budget", schedule_seeds, json_text.changed, open_schedule),
-        _reader("blocks", "arrays that a bake goes on from", datasets.npy_seeds, datasets.npy_changed, open_blocks),
+        Reader("checkpoint", "checkpoints of a training run", checkpoint_seeds, field_changed, open_checkpoint),
+        Reader("field", "field.safetensors, the trained field", field_seeds, field_changed, open_field, share=0.25),
+        Reader("log", "log.jsonl of a training run", log_seeds, log_changed, open_log, share=0.25),
+        Reader("schedule", "schedule.json of a time budget", schedule_seeds, json_text.changed, open_schedule, share=0.25),
+        Reader("blocks", "arrays that a bake goes on from", datasets.npy_seeds, datasets.npy_changed, open_blocks, share=0.25),
     )
 }

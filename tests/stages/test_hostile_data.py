@@ -1,7 +1,4 @@
-"""Hostile inputs of every reader but the asset's (tests/efficientnerf/hostile.py): what each is answered with.
-
-tests/data/hostile/READER/FILE was found by `make fuzz` and made smaller; large ones are made here.
-"""
+"""Every hostile input of tests/stages/hostile.py is answered as stated there."""
 
 from __future__ import annotations
 
@@ -15,66 +12,7 @@ import pytest
 
 from benchmarks.fuzz.reader import Opened, Outcome, judged
 from benchmarks.fuzz.table import READERS
-
-FOLDER = Path(__file__).resolve().parents[1] / "data" / "hostile"
-READ = "read"  # what a file that is not a reason to stop is answered with: it only saves time, or tells people something
-NUMPY = "not a NumPy array of numbers, or truncated"
-NO_PICTURE = "no picture in a format that is read"
-FINITE = "expected a finite number"
-WHOLE = "is not a whole number"
-
-# reader: {file: words of the message, or READ}
-FILES = {
-    "camera_path": {"fov-of-nothing.json": "expected degrees between 0 and 180"},
-    "colmap_cameras_txt": {"superscript-digit.txt": WHOLE, "two-minus-signs.txt": WHOLE},
-    "colmap_images_bin": {
-        "control-characters-in-name.bin": r"image \\x11S4@.*expected a unit quaternion",
-        "name-not-utf8.bin": r"image g\\udcad.*expected a unit quaternion",
-    },
-    "colmap_images_txt": {"two-minus-signs.txt": WHOLE},
-    "colmap_points3D_txt": {"superscript-digit.txt": WHOLE},
-    "images": {"dds.png": NO_PICTURE, "exif-without-directory.jpg": "unreadable", "idat-length-beyond-memory.png": "unreadable"},
-    "lock": dict.fromkeys(("host-nul.json", "since-1e30.json", "since-1e38.json", "since-beyond-time_t.json"), READ),
-    "masks": {"bomb.png": "more than 178 million pixels", "exif-without-directory.png": "unreadable: damaged", "idat-length-beyond-memory.png": "unreadable"},
-    "options": {"byte-of-no-encoding.txt": "expected a time", "byte-of-no-encoding-in-list.txt": "expected a time"},
-    "posed_images": {"dds.png": READ, "exif-without-directory.jpg": READ},  # left out with a warning
-    "poses_bounds": dict.fromkeys(
-        (
-            "dtype-empty-tuple.npy", "header-cut-off.npy", "header-nested.npy", "header-no-literal.npy", "header-null-bytes.npy", "zip-cut-off.npy",
-            "zip-damaged.npy",
-        ),
-        NUMPY,
-    ),
-    "report_bake": {"lone-surrogate-in-name.json": READ},
-    "report_evaluate": dict.fromkeys(("psnr-of-400-digits.json", "ssim-of-400-digits.json", "view-of-a-number.json"), READ),
-    "report_mesh": {"lone-surrogate.json": READ},
-    "report_poses": dict.fromkeys(("error-of-400-digits.json", "lone-surrogate-warning.json", "registered-number.json", "warnings-infinity.json"), READ),
-    "transforms": {
-        "angle-of-400-digits.json": FINITE,
-        "camera-model-list.json": "camera_model a list of 0; supported are",
-        "camera-model-object.json": "camera_model an object; supported are",
-        "cx-of-400-digits.json": FINITE,
-        "cy-of-objects.json": "cy is a list of 94, expected a finite number",
-        "offset-of-400-digits.json": "expected a positive number and three numbers",
-        "scale-of-nothing.json": "expected a positive number and three numbers",
-        "width-of-long-list.json": "w is a list of 1, expected a finite number",
-    },
-}  # fmt: skip
-NESTED = {"arrays": b"[" * 100_000, "objects": b'{"a":' * 100_000, "closed": b"[" * 5000 + b"]" * 5000}
-JSON = {
-    "transforms": "nested too deeply|not valid JSON",
-    "camera_path": "nested too deeply|not valid JSON",
-    "run": "not valid JSON",
-    "manifest": "not valid JSON",
-    "scene": "not valid JSON",
-}
-IGNORED = ("lock", "hashes", "report_bake", "report_evaluate", "report_mesh", "report_poses")
-MADE: dict[tuple[str, str], tuple[Callable[[], bytes], str]] = {
-    **{(reader, f"nested {name}"): (lambda data=data: data, says) for name, data in NESTED.items() for reader, says in JSON.items()},  # type: ignore[misc]
-    **{(reader, f"nested {name}"): (lambda data=data: data, READ) for name, data in NESTED.items() for reader in IGNORED},  # type: ignore[misc]
-    **{(reader, "integer of 5000 digits"): (lambda: b"1" * 5000, says.replace("nested too deeply|", "")) for reader, says in JSON.items()},
-    **{(reader, "nothing"): (lambda: b"", "the file is empty") for reader in JSON},
-}  # fmt: skip
+from tests.stages.hostile import FILES, FOLDER, MADE, READ
 
 
 @cache
