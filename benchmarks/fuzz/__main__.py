@@ -10,6 +10,7 @@ import platform
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +37,17 @@ def main() -> int:
     if given.file is not None:
         return _again(given.readers[0], given.file)
     found: dict[str, dict[str, Any]] = {}
-    for name in given.readers or READERS:
-        found[name] = campaign.fuzz(
-            name, round(given.inputs * READERS[name].share), given.seed, coverage=coverage, shrink=given.shrink, say=lambda text: print(text, flush=True)
-        )
-        _tell(name, found[name], given.findings)
-        if given.json is not None:
-            write(given.json, found, given.seed, coverage)
+
+    def fuzz(name: str) -> tuple[str, dict[str, Any]]:
+        count = round(given.inputs * READERS[name].share)
+        return name, campaign.fuzz(name, count, given.seed, coverage=coverage, shrink=given.shrink, say=lambda text: print(text, flush=True))
+
+    with ThreadPoolExecutor(given.jobs) as threads:
+        for name, result in threads.map(fuzz, given.readers or READERS):
+            found[name] = result
+            _tell(name, result, given.findings)
+            if given.json is not None:
+                write(given.json, found, given.seed, coverage)
     return 1 if any(each["findings"] for each in found.values()) else 0
 
 
@@ -52,6 +57,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--inputs", type=int, default=100_000, help="for each reader")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--plain", action="store_true", help="without coverage, also where atheris is installed")
+    parser.add_argument("--jobs", type=int, default=1, help="readers at a time")
     parser.add_argument("--shrink", type=float, default=5.0, metavar="SECONDS", help="to make the input of a finding smaller")
     parser.add_argument("--findings", type=Path, default=ROOT / "build" / "fuzz", metavar="DIR", help="where the inputs of findings go")
     parser.add_argument("--json", type=Path, metavar="FILE", help="result to write")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,6 @@ STUCK = 60.0  # seconds without a new input after which a process is ended: it d
 
 def fuzz(name: str, inputs: int, seed: int, *, coverage: bool, shrink: float, say: Callable[[str], None]) -> dict[str, Any]:
     """All inputs of one reader; the sum of what its processes reported."""
-    began = resource.getrusage(resource.RUSAGE_CHILDREN)
     parts: list[dict[str, Any]] = []
     deaths: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix=f"fuzz-{name}-", dir=MEMORY if os.path.isdir(MEMORY) else None) as folder:
@@ -39,11 +37,7 @@ def fuzz(name: str, inputs: int, seed: int, *, coverage: bool, shrink: float, sa
                 parts.append(found)
                 first += found["inputs"]
             say(f"{name}: {first} inputs, {sum(len(part['findings']) for part in parts)} findings")
-    return summed(name, parts, _cpu_seconds(resource.getrusage(resource.RUSAGE_CHILDREN)) - _cpu_seconds(began))
-
-
-def _cpu_seconds(usage: resource.struct_rusage) -> float:
-    return usage.ru_utime + usage.ru_stime
+    return summed(name, parts)
 
 
 def _batch(name: str, seed: int, first: int, count: int, folder: Path, *, coverage: bool, shrink: float) -> dict[str, Any]:
@@ -80,7 +74,7 @@ def _wait(process: subprocess.Popen[bytes], note: Path) -> int | None:
                 return None
 
 
-def summed(name: str, parts: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
+def summed(name: str, parts: list[dict[str, Any]]) -> dict[str, Any]:
     refused, codes = Counter[str](), Counter[str]()
     findings: dict[tuple[str, str], dict[str, Any]] = {}
     for part in parts:
@@ -91,7 +85,7 @@ def summed(name: str, parts: list[dict[str, Any]], seconds: float) -> dict[str, 
             known["count"] += each["count"]
             if len(each["data"]) < len(known["data"]):
                 known["data"] = each["data"]
-    inputs = sum(part["inputs"] for part in parts)
+    inputs, seconds = sum(part["inputs"] for part in parts), sum(part.get("cpu_s", 0.0) for part in parts)
     return {
         "inputs": inputs,
         "accepted": sum(part["accepted"] for part in parts),

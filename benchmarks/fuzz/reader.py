@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 import signal
@@ -134,6 +135,8 @@ def commanded(arguments: tuple[str, ...]) -> Outcome:
         return _finding(f"{arguments[0]}: {type(error).__name__}", error)
     last = err.getvalue().strip().splitlines()[-1:] or [""]
     wrong = f"exit code {code}" if code not in CODES else wrong_output(out.getvalue(), err.getvalue(), code)
+    if not wrong and "--json" in arguments and not is_json(out.getvalue()):
+        wrong = "no JSON on stdout"
     if wrong:
         trace = _with_traceback(arguments) if code == 1 and "--debug" not in arguments else out.getvalue()[-500:]
         places = re.findall(r'File "(.*)", line \d+, in (\w+)', trace)
@@ -149,6 +152,18 @@ def _with_traceback(arguments: tuple[str, ...]) -> str:
     with contextlib.suppress(Exception, SystemExit), time_limit(), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
         main([*arguments, "--debug"])
     return err.getvalue()[-4000:]
+
+
+def is_json(text: str) -> bool:
+    """Whether a text is one JSON value, or one on each line."""
+    for values in ([text], text.splitlines()):
+        with contextlib.suppress(ValueError):
+            return bool([json.loads(value, parse_constant=_no_json) for value in values])
+    return False
+
+
+def _no_json(name: str) -> None:
+    raise ValueError(f"{name} is no JSON")
 
 
 def wrong_output(out: str, err: str, code: int) -> str:

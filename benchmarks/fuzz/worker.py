@@ -42,7 +42,7 @@ class Tally:
         self.refused: Counter[str] = Counter()
         self.codes: Counter[str] = Counter()
         self.findings: dict[tuple[str, str], dict[str, Any]] = {}
-        self.slowest, self.slowest_index = 0.0, first
+        self.slowest = 0.0
         self.note = open(folder / NOTE, "wb")  # noqa: SIM115 (as long as this process)
         self.before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
@@ -58,8 +58,7 @@ class Tally:
         spent = time.perf_counter() - begin
         if found.kind == "finding" and found.by == "Hang":
             found = self.outcome(data)  # the machine may have been busy
-        if spent > self.slowest:
-            self.slowest, self.slowest_index = spent, self.index
+        self.slowest = max(self.slowest, spent)
         self.inputs += 1
         self.accepted += found.kind == "accepted"
         if found.kind == "refused":
@@ -112,7 +111,7 @@ class Tally:
     def report(self) -> dict[str, Any]:
         return {
             "inputs": self.inputs, "accepted": self.accepted, "refused": dict(self.refused), "commands": self.commands, "codes": dict(self.codes),
-            "findings": list(self.findings.values()), "slowest_s": self.slowest, "slowest_index": self.slowest_index,
+            "findings": list(self.findings.values()), "slowest_s": self.slowest, "cpu_s": time.process_time(),
             "rss_before_mib": self.before // 1024, "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
         }  # fmt: skip
 
