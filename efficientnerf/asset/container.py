@@ -8,6 +8,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
+import secrets
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,8 @@ import numpy as np
 
 METADATA_KEY = "nerftree"
 HEADER_LIMIT = 16 * 2**20
+MARKS_LIMIT = 2**20  # commas, brackets and braces of a header: each may become an object of a hundred bytes
+PIECE = 2**26
 DTYPES: dict[str, np.dtype[Any]] = {
     "U8": np.dtype("<u1"), "U16": np.dtype("<u2"), "U64": np.dtype("<u8"), "F16": np.dtype("<f2"), "F32": np.dtype("<f4"),
 }  # fmt: skip
@@ -50,14 +55,53 @@ def _json(name: str, text: bytes | str) -> dict[str, Any]:
     return value
 
 
+def _regular(path: str, flags: int) -> int:
+    """A descriptor of a file, as `open` wants it; FormatError for a pipe or a device, which might never end. They are not waited for."""
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise FormatError(f"{Path(path).name}: can't be read (not a regular file)")
+    return descriptor
+
+
+def _digest(values: np.ndarray) -> str:
+    """SHA-256 of an array's bytes, in pieces, so that signals are answered between."""
+    digest, content = hashlib.sha256(), values.reshape(-1).view(np.uint8)
+    for begin in range(0, len(content), PIECE):
+        digest.update(content[begin : begin + PIECE])  # type: ignore[arg-type]
+    return digest.hexdigest()
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all, on the disk when this returns. What lies at `path` is replaced, links at it or beside it are not followed."""
+    aside = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.part")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    descriptor = os.open(aside, flags, 0o666)  # less the umask
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(aside, path)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+    if hasattr(os, "O_DIRECTORY"):
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
 class Header:
     """The safetensors header, checked against the file's size: name -> (dtype, shape, first byte, last byte)."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, path.name
         try:
-            self.size = path.stat().st_size
-            with open(path, "rb") as file:
+            with open(path, "rb", opener=_regular) as file:
+                self.size = os.fstat(file.fileno()).st_size
                 first = file.read(8)
                 if len(first) < 8:
                     raise FormatError(f"{self.name}: {self.size} bytes; a NerfTree begins with an 8-byte header length. The file is cut short or is none.")
@@ -67,6 +111,8 @@ class Header:
                 raw = file.read(length)
         except (OSError, IsADirectoryError) as error:
             raise FormatError(f"{self.name}: can't be read ({error.strerror})") from error
+        if sum(raw.count(mark) for mark in (b",", b"[", b"{")) > MARKS_LIMIT:
+            raise FormatError(f"{self.name}: header of more than {MARKS_LIMIT} commas, brackets and braces; no NerfTree needs so many.")
         header = _json(self.name, raw)
         strings = header.pop("__metadata__", None)
         if not isinstance(strings, dict) or not isinstance(strings.get(METADATA_KEY), str):
@@ -102,7 +148,8 @@ class Header:
 
     def read(self, name: str) -> np.ndarray:
         dtype, shape, begin, _ = self.tensors[name]
-        values = np.fromfile(self.path, DTYPES[dtype], count=math.prod(shape), offset=self.start + begin)
+        with open(self.path, "rb", opener=_regular) as file:
+            values = np.fromfile(file, DTYPES[dtype], count=math.prod(shape), offset=self.start + begin)
         if len(values) != math.prod(shape):
             raise FormatError(f"{self.name}: tensor '{name}' could not be read whole; the file changed while it was read")
         return values.reshape(shape)
@@ -111,7 +158,7 @@ class Header:
         """The tensor, if its bytes have the digest in the metadata."""
         values, digests = self.read(name), self.meta.get("sha256")
         want = digests.get(name) if isinstance(digests, dict) else None
-        found = hashlib.sha256(values.tobytes()).hexdigest()
+        found = _digest(values)
         if found != want:
             problem = f"has SHA-256 {found[:12]}…, the file says {str(want)[:12]}…"
             raise FormatError(f"{self.name}: tensor '{name}' {problem}; the file is damaged. Bake it again or copy it anew.")

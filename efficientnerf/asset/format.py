@@ -9,15 +9,14 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-import secrets
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.container import METADATA_KEY, FormatError, Header
+from efficientnerf.asset.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
 from efficientnerf.asset.layouts import LAYOUTS
+from efficientnerf.asset.memory import check_memory, needed
 from efficientnerf.asset.metadata import MAJOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of
 from efficientnerf.asset.serialisation import WRITERS, written_as
 from efficientnerf.asset.tree import NerfTree
@@ -59,22 +58,15 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
         text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise FormatError(f"metadata can't be written as JSON: {error}") from error
-    return save_tensors(tensors, metadata={METADATA_KEY: text})
+    data: bytes = save_tensors(tensors, metadata={METADATA_KEY: text})
+    shapes, types = {name: value.shape for name, value in tensors.items()}, {name: value.dtype for name, value in tensors.items()}
+    check_memory("the tree can't be saved", len(data), needed(written.layout, meta, shapes, types))
+    return data
 
 
 def save(tree: NerfTree, path: str | Path, layout: str | None = None) -> None:
     """Write `tree` to `path`, whole or not at all; `layout` as in `serialize`."""
-    path = Path(path)
-    data = serialize(tree, layout)
-    aside = path.with_name(f".{path.name[:50]}.{secrets.token_hex(8)}.part")
-    try:
-        with open(aside, "xb") as file:  # a new file: never what a link of that name leads to
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_whole(Path(path), serialize(tree, layout))
 
 
 def _open(path: str | Path) -> Header:
@@ -97,6 +89,7 @@ def _open(path: str | Path) -> Header:
     for tensor, want in expected.items():
         if shapes[tensor] != want:
             raise FormatError(f"{name}: tensor '{tensor}' has shape {shapes[tensor]}; expected {want}")
+    check_memory(name, header.size, needed(layout_of(meta), meta, shapes, {tensor: DTYPES[header.tensors[tensor][0]] for tensor in types}))
     return header
 
 
@@ -118,8 +111,9 @@ def load(path: str | Path) -> NerfTree:
     if len(occupied) != bricks:
         raise FormatError(f"{name}: {len(occupied)} occupied cells but {bricks} brick{' masks' if 'brick.mask' in raw else 's'}")
     bits = layout.stored(name, meta, raw)
-    count = int(bits.sum())
+    count = int(np.count_nonzero(bits))
     density, harmonics = layout.values(name, meta, raw, count)
+    del raw
     brick_index = np.full(cells, -1, np.int32)
     brick_index[occupied] = np.arange(len(occupied), dtype=np.int32)
     voxel_index = np.full(bits.shape, -1, np.int32)

@@ -60,7 +60,7 @@ def _masked(name: str, meta: dict[str, Any], raw: Tensors) -> np.ndarray:
     masks, voxels = raw["brick.mask"], _voxels_of(meta)
     if not len(masks):
         return np.zeros((0, voxels), bool)
-    bits = np.unpackbits(masks.view(np.uint8), axis=1, bitorder="little").astype(bool)
+    bits = np.unpackbits(masks.view(np.uint8), axis=1, bitorder="little").view(bool)
     if bits[:, voxels:].any():
         raise FormatError(f"{name}: 'brick.mask' has bits set beyond the {voxels} voxels of a brick")
     return bits[:, :voxels]

@@ -13,6 +13,8 @@ from efficientnerf.rendering.harmonics import MAX_DEGREE
 
 MAJOR = 1
 MAX_CELLS = 2**30
+FARTHEST = 2.0**40  # in units of the grid: 64-bit floats tell places to a thousandth of one there
+STEEPEST = 1e6  # of the reference camera's field of view, and of a spiral's
 NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not render it
 NDC_MINOR = 2  # the version that brought them
 NEAREST_PREFIX = "nearest-"  # of layouts whose voxels are not interpolated; before the other prefix where both hold
@@ -37,8 +39,8 @@ def _numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, 
     return value
 
 
-def _check_frame(name: str, meta: dict[str, Any]) -> None:
-    """The capture's frame and the cameras' orbit, where they are given."""
+def _check_frame(name: str, meta: dict[str, Any], unit: float) -> None:
+    """The capture's frame and the cameras' orbit, where they are given; `unit` a length of the world."""
     for key in ("world_from_capture", "orbit"):
         if not isinstance(meta.get(key, {}), dict):
             raise FormatError(f"{name}: metadata '{key}' is {str(meta[key])[:60]}; expected an object")
@@ -55,9 +57,9 @@ def _check_frame(name: str, meta: dict[str, Any]) -> None:
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
             raise FormatError(f"{name}: metadata 'rotation' is not a rotation")
     if "orbit" in meta:
-        orbit = meta["orbit"]
-        _numbers(name, orbit, "centre", 3, -1e30, 1e30)
-        _number(name, orbit, "radius", 1e-30, 1e30, whole=False)
+        orbit, far = meta["orbit"], FARTHEST * unit
+        _numbers(name, orbit, "centre", 3, -far, far)
+        _number(name, orbit, "radius", 1e-30, far, whole=False)
         _number(name, orbit, "elevation", -90, 90, whole=False)
         _number(name, orbit, "heading", -360, 360, whole=False)
         if type(orbit.get("forward_facing")) is not bool:
@@ -99,9 +101,28 @@ def ndc_of(name: str, meta: dict[str, Any]) -> Ndc | None:
     for row in rows:
         _numbers(name, {"world_from_camera": row}, "world_from_camera", 4, -1e30, 1e30)
     try:
-        return Ndc.from_json(found)
+        ndc = Ndc.from_json(found)
     except ValueError as error:
         raise FormatError(f"{name}: metadata 'ndc': {error}") from None
+    if not all(1 / STEEPEST <= slope <= STEEPEST for slope in ndc.slopes):
+        raise FormatError(f"{name}: metadata 'ndc': 2 f / w and 2 f / h are {ndc.slopes[0]:g} and {ndc.slopes[1]:g}; expected {1 / STEEPEST:g} to {STEEPEST:g}")
+    if np.abs(ndc.world_from_camera[:3, 3]).max() > FARTHEST * ndc.near:
+        raise FormatError(f"{name}: metadata 'ndc': the reference camera is more than {FARTHEST:g} times `near` from the world's origin")
+    return ndc
+
+
+def _check_spiral(name: str, spiral: Any, unit: float) -> None:
+    """The camera path before a forward-facing scene; `unit` a length of the world."""
+    if not isinstance(spiral, dict):
+        raise FormatError(f"{name}: metadata 'spiral' is {str(spiral)[:60]}; expected an object")
+    far = FARTHEST * unit
+    if "radii" in spiral:
+        _numbers(name, spiral, "radii", 3, 0, far)
+    for key in ("focus", "far"):
+        if key in spiral:
+            _number(name, spiral, key, unit / FARTHEST, far, whole=False)
+    if "tangents" in spiral:
+        _numbers(name, spiral, "tangents", 2, 1 / STEEPEST, STEEPEST)
 
 
 def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) -> None:
@@ -126,12 +147,15 @@ def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) ->
         raise FormatError(f"{name}: shape {shape}; expected whole numbers with a product of at most {MAX_CELLS}")
     _number(name, meta, "brick", 1, 16, whole=True)
     _number(name, meta, "sh_degree", 0, MAX_DEGREE, whole=True)
-    _number(name, meta, "voxel", 1e-30, 1e30, whole=False)
-    _numbers(name, meta, "bounds_min", 3, -1e30, 1e30)
+    far = FARTHEST * _number(name, meta, "voxel", 1e-30, 1e30, whole=False)
+    _numbers(name, meta, "bounds_min", 3, -far, far)
     if "background" not in meta:
         raise FormatError(f"{name}: metadata 'background' is missing; expected three numbers or null")
     if meta["background"] is not None:
         _numbers(name, meta, "background", 3, 0, 1)
-    _check_frame(name, meta)
     lookup_of(name, meta)
-    ndc_of(name, meta)
+    ndc = ndc_of(name, meta)
+    unit = float(meta["voxel"]) if ndc is None else ndc.near
+    _check_frame(name, meta, unit)
+    if ndc is not None and "spiral" in meta:
+        _check_spiral(name, meta["spiral"], unit)

@@ -155,7 +155,9 @@ def _seeded(sample: np.ndarray, entries: int, rng: np.random.Generator) -> np.nd
 def _nearest(vectors: np.ndarray, centroids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Index of the nearest centroid of each vector, and the squared distance to it."""
     from efficientnerf.backends.numba import kmeans
+    from efficientnerf.backends.pieces import pieces
 
     found, distance = np.zeros(len(vectors), np.int32), np.zeros(len(vectors), np.float32)
-    kmeans.nearest_centroids(np.ascontiguousarray(vectors.T), centroids, found, distance)
+    for part in pieces(len(vectors), first=4096):
+        kmeans.nearest_centroids(np.ascontiguousarray(vectors[part].T), centroids, found[part], distance[part])
     return found, distance

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 RAYS_PER_BAND = 2**20  # of supersampled images at once
+MOST_PIXELS = 2**27  # 4 GiB of colours, opacities, depths and normals
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,12 @@ def render(
     background     sRGB colour to composite over; None leaves the colour premultiplied
     supersample    rays along each side of a pixel
     rays_per_band  of supersampled images at once; changes memory alone
+
+    Raises ValueError for a camera without an image: of no size or of more than MOST_PIXELS, without a focal length, or with numbers that are not finite.
     """
     from efficientnerf.backends.numba.tree.rendering import render_image
 
-    if supersample < 1:
-        raise ValueError(f"supersample {supersample}: expected at least 1")
+    _check_camera(camera, supersample)
     behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
     if behind.shape != (3,):
         raise ValueError(f"background {background}: expected three numbers, red, green and blue")
@@ -65,6 +67,19 @@ def render(
     if tree.ndc is not None or tree.lookup == "nearest":
         return _render_by_rays(tree, camera, behind, supersample, rays_per_band)
     return Rendering(*render_image(tree, camera, supersample, behind, normals=True, rays_per_band=rays_per_band))
+
+
+def _check_camera(camera: Camera, supersample: int) -> None:
+    """Raises ValueError, see `render`."""
+    if supersample < 1:
+        raise ValueError(f"supersample {supersample}: expected at least 1")
+    if camera.width < 1 or camera.height < 1 or camera.width * camera.height > MOST_PIXELS:
+        raise ValueError(f"{camera.name}: {camera.width} x {camera.height} pixels; expected 1 to {MOST_PIXELS}")
+    if not (np.isfinite(camera.world_from_camera).all() and np.isfinite(camera.params).all()):
+        raise ValueError(f"{camera.name}: its pose or its lens holds a number that is not finite")
+    focal = camera.intrinsics["fx"], camera.intrinsics["fy"]
+    if min(focal) <= 0:
+        raise ValueError(f"{camera.name}: focal length {min(focal):g}; expected a positive one")
 
 
 def render_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, *, eye: np.ndarray | None = None, columns: int | None = None) -> Rendering:
@@ -180,7 +195,8 @@ def render_reference(tree: NerfTree, origins: Tensor, directions: Tensor, densit
     enter = torch.minimum(to_low, to_high).nan_to_num(-1e30).amax(dim=-1).clamp(min=0)  # (R,)
     leave = torch.maximum(to_low, to_high).nan_to_num(1e30).amin(dim=-1)
     step = 0.5
-    count = max(0, int(torch.ceil((leave - enter).clamp(min=0).max() / step).item()) + 1) if len(enter) else 0
+    most = 2 * sum(tree.resolution) + 4  # samples of a ray through the grid; distances far beyond it are rounded to more
+    count = max(0, int(torch.ceil((leave - enter).clamp(min=0).max() / step).clamp(max=most).item()) + 1) if len(enter) else 0
     transmittance = torch.ones_like(enter)
     colour = torch.zeros(len(enter), 3, device=device, dtype=dtype)
     harmonics = basis(view_directions, tree.degree)

@@ -131,11 +131,9 @@ class NerfTree:
 
 def leaps(occupied: np.ndarray) -> np.ndarray:
     """`NerfTree.leap` of coarse cells (X, Y, Z) bool."""
-    from scipy.ndimage import distance_transform_cdt
+    from efficientnerf.backends.numba.tree.leaps import leaps as distances
 
-    if not occupied.any():
-        return np.full(occupied.shape, 255, np.uint8)
-    return np.ascontiguousarray(np.minimum(distance_transform_cdt(~occupied, metric="chessboard"), 255).astype(np.uint8))
+    return distances(occupied)
 
 
 def tree_from_voxels(

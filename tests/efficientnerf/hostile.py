@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Callable
 from functools import cache
@@ -127,6 +128,31 @@ def reference(**changes: Any) -> bytes:
     return meta_with(layout="ndc-sparse", ndc={"world_from_camera": eye, "focal": 400, "width": 504, "height": 378, "near": 1, **changes})
 
 
+def spiral(value: Any) -> bytes:
+    header, meta, data = parts(reference())
+    return joined(header, {**meta, "spiral": value}, data)
+
+
+def filled(cells: tuple[int, int, int], occupied: int, brick: int = 1) -> bytes:
+    """A sound file of `cells`, of which the first ones are `occupied` and store one voxel each."""
+    occupancy = np.zeros(-(-math.prod(cells) // 8), np.uint8)
+    occupancy[: occupied // 8] = 255
+    occupancy[occupied // 8 :][:1] |= (1 << occupied % 8) - 1
+    mask = np.zeros((occupied, -(-(brick**3) // 64)), "<u8")
+    mask[:, 0] = 1
+    density, sh = np.ones(occupied, "<f2"), np.zeros((occupied, 1, 3), "<f2")
+    _, meta, _ = parts(blob())
+    header: dict[str, Any] = {}
+    data = b""
+    for name, values in zip(TENSORS, (occupancy, mask, density, sh), strict=True):
+        raw = values.tobytes()
+        dtype = next(key for key, value in DTYPES.items() if value == values.dtype)
+        header[name] = {"dtype": dtype, "shape": list(values.shape), "data_offsets": [len(data), len(data) + len(raw)]}
+        meta["sha256"][name] = hashlib.sha256(raw).hexdigest()
+        data += raw
+    return joined(header, {**meta, "shape": list(cells), "brick": brick}, data)
+
+
 def orbiting(**changes: Any) -> bytes:
     return meta_with(orbit={**ORBIT, **changes})
 
@@ -159,6 +185,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "overlapping tensors": (lambda: overlapping(), "tensors must lie end to end"),
     "a gap": (lambda: without_entry("voxel.density"), "tensors must lie end to end|appended to"),
     "bytes appended": (lambda: serialize(tiny()) + b"\0", "1 bytes after the last tensor; the file was appended to"),
+    "a million empty lists": (lambda: meta_with(note=[[]] * 2**19), "header of more than 1048576 commas, brackets and braces"),
     # metadata
     "another format": (lambda: meta_with(format="octree"), "metadata 'format' is octree; expected nerftree"),
     "version 2": (lambda: meta_with(format_version="2.0"), r"format version 2\.0; this build reads 1\.x\. Upgrade"),
@@ -182,6 +209,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a voxel of text": (lambda: meta_with(voxel="1"), "'voxel' is 1; expected a number"),
     "no corner": (lambda: meta_with(bounds_min=[0, 0]), "'bounds_min'"),
     "a corner far away": (lambda: meta_with(bounds_min=[0, 0, 10**400]), "'bounds_min'"),
+    "a corner beyond what floats resolve": (lambda: meta_with(bounds_min=[0, 0, 1e20]), "'bounds_min'"),
     "no background": (lambda: meta_with(background="absent"), "'background' is missing"),
     "a bright background": (lambda: meta_with(background=[1, 1, 2]), "expected 3 numbers from 0 to 1"),
     "a similarity of text": (lambda: meta_with(world_from_capture="identity"), "'world_from_capture' is identity; expected an object"),
@@ -194,6 +222,8 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a translation of text": (lambda: rotated(translation="0 0 0"), "'translation'"),
     "an orbit of text": (lambda: meta_with(orbit="round"), "'orbit' is round; expected an object"),
     "an orbit without centre": (lambda: meta_with(orbit={"radius": 1}), "'centre' is None"),
+    "an orbit around somewhere else": (lambda: orbiting(centre=[0, 1e25, 0]), "'centre'"),
+    "an orbit beyond what floats resolve": (lambda: orbiting(radius=1e25), "'radius'"),
     "an orbit of no radius": (lambda: orbiting(radius=0), "'radius' is 0"),
     "an orbit below the ground": (lambda: orbiting(elevation=-91), "'elevation' is -91"),
     "an orbit that winds": (lambda: orbiting(heading=1e9), "'heading'"),
@@ -257,6 +287,25 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a lookup of numbers": (lambda: meta_with(layout="nearest-sparse", lookup=[1]), r"'lookup' is \[1\]; expected nearest"),
     "prefixes the wrong way round": (lambda: meta_with(layout="ndc-nearest-sparse", lookup="nearest"), "layout ndc-nearest-sparse; this build reads"),
     "nearest, but no reference camera": (lambda: meta_with(layout="nearest-ndc-sparse", lookup="nearest"), "'ndc' is None; expected an object"),
+    "a reference camera as wide as the sky": (lambda: reference(width=1e30), "2 f / w and 2 f / h are 8e-28 and .*; expected 1e-06 to 1e\\+06"),
+    "a reference camera of endless focal length": (lambda: reference(focal=1e30), "2 f / w and 2 f / h"),
+    "a reference camera that is far away": (
+        lambda: reference(world_from_camera=[[1, 0, 0, 1e20], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        "times `near` from the world's origin",
+    ),
+    "a reference camera with its near plane on its centre": (
+        lambda: reference(near=1e-30, world_from_camera=[[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        "times `near` from the world's origin",
+    ),
+    "a spiral of text": (lambda: spiral("round"), "'spiral' is round; expected an object"),
+    "a spiral of two radii": (lambda: spiral({"radii": [1, 1]}), "'radii'"),
+    "a spiral that goes on for ever": (lambda: spiral({"radii": [1e30, 1, 1]}), "'radii'"),
+    "a spiral without focus": (lambda: spiral({"focus": 0}), "'focus' is 0"),
+    "a spiral of no width": (lambda: spiral({"tangents": [0, 1]}), "'tangents'"),
+    "a spiral that ends behind its camera": (lambda: spiral({"far": -1}), "'far' is -1"),
+    # memory
+    "one voxel in 2^27 cells": (lambda: filled((512, 512, 512), 1), r"16\.8 MB that take 805 MB of memory; expected at most 8 times the size and 200 MB"),
+    "large bricks of one voxel each": (lambda: filled((30, 30, 30), 27000, brick=16), r"14\.\d MB that take 55\d MB of memory"),
     # full
     **{f"full, no {name}": (lambda name=name: without(name, "full"), f"tensor '{re.escape(name)}' is missing") for name in LAYOUTS["full"].tensors},  # type: ignore[misc]
     "masks beside full bricks": (lambda: added("brick.mask", of="full"), r"unknown tensor 'brick\.mask'"),

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import io
 import os
-import pickle
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +69,7 @@ def _warn_once(text: str) -> None:
 
 
 class KernelFiles(caching.IndexDataCacheFile):
-    """The files of a function's compiled forms, those of this package behind their SHA-256.
+    """The files of a function's compiled forms, those of this package with their SHA-256 at the end.
 
     A file that a power cut left empty, cut short or full of zeros would else end the program: numba unpickles what it finds, and runs the machine code.
     """
@@ -94,39 +95,33 @@ class KernelFiles(caching.IndexDataCacheFile):
             return None
 
     def _load_index(self) -> dict[Any, str]:
-        return (self._verified(self._index_path) or {}) if self._own else super()._load_index()
-
-    def _save_index(self, overloads: dict[Any, str]) -> None:
-        if self._own:
-            self._write(self._index_path, overloads)
-        else:
-            super()._save_index(overloads)
+        return super()._load_index() if self._is_whole(self._index_path) else {}
 
     def _load_data(self, name: str) -> Any:
-        return self._verified(self._data_path(name)) if self._own else super()._load_data(name)
+        return super()._load_data(name) if self._is_whole(self._data_path(name)) else None
 
-    def _save_data(self, name: str, data: Any) -> None:
-        if self._own:
-            self._write(self._data_path(name), data)
-        else:
-            super()._save_data(name, data)
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
+        content = io.BytesIO()
+        yield content
+        with super()._open_for_write(filepath) as file:
+            file.write(content.getvalue())
+            if self._own:
+                file.write(hashlib.sha256(content.getvalue()).digest())  # numba stops reading before it
 
-    def _write(self, path: str, value: Any) -> None:
-        content = self._dump(value)
-        with self._open_for_write(path) as file:
-            file.write(hashlib.sha256(content).digest() + content)
-
-    def _verified(self, path: str) -> Any:
-        """What a file holds; None where there is none, or a damaged one, which is removed."""
+    def _is_whole(self, path: str) -> bool:
+        """Whether a file is there and what was written; removes it else."""
+        if not self._own:
+            return True
         try:
             content = Path(path).read_bytes()
         except FileNotFoundError:
-            return None
-        if hashlib.sha256(content[32:]).digest() != content[:32]:
-            Path(path).unlink(missing_ok=True)
-            warnings.warn(f"{path}: damaged, as by a power cut; removed, and compiled again.", RuntimeWarning, stacklevel=2)
-            return None
-        return pickle.loads(content[32:])  # noqa: S301 -- of a private folder, see kernel_cache
+            return False
+        if hashlib.sha256(content[:-32]).digest() == content[-32:]:
+            return True
+        Path(path).unlink(missing_ok=True)
+        warnings.warn(f"{path}: damaged, as by a power cut; removed, and compiled again.", RuntimeWarning, stacklevel=2)
+        return False
 
 
 class _Compilations(event.Listener):

@@ -134,9 +134,10 @@ def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  #
 
 
 @triton.jit
-def _in_grid(ray, k):  # type: ignore[no-untyped-def]
-    """Whether sample `k` lies in the grid."""
-    return ray.enter + (k.to(tl.float32) + 0.5) * STEP < ray.leave
+def _in_grid(grid, ray, k, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """Whether sample `k` lies in the grid. No ray has more than two for each voxel along each axis, but where distances far beyond the grid are rounded."""
+    most = 2 * (grid.shape.x + grid.shape.y + grid.shape.z) * BRICK + 4
+    return (ray.enter + (k.to(tl.float32) + 0.5) * STEP < ray.leave) & (k < most)
 
 
 @triton.jit
@@ -150,12 +151,12 @@ def march(  # type: ignore[no-untyped-def]
     state  a tuple with a `transmittance`, which ends a ray below STOP
     """
     k = tl.zeros_like(ray.enter).to(tl.int32)
-    alive = live & _in_grid(ray, k)
+    alive = live & _in_grid(grid, ray, k, BRICK)
     while tl.max(alive.to(tl.int32), 0) > 0:
         sample, k = _sample(grid, ray, k, alive, BRICK, NEAREST)
         if tl.max(sample.inside.to(tl.int32), 0) > 0:
             state = VISIT(scene, sample, state, BRICK, NEAREST, K, COLUMNS)
-        alive = alive & (state.transmittance >= STOP) & _in_grid(ray, k)
+        alive = alive & (state.transmittance >= STOP) & _in_grid(grid, ray, k, BRICK)
     return state
 
 

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from efficientnerf.asset import format
+from efficientnerf.asset import container, format
 from efficientnerf.asset.container import HEADER_LIMIT
 from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, save, serialize
 from efficientnerf.asset.metadata import MAJOR, STRUCTURE
@@ -123,7 +123,7 @@ def test_a_failed_save_leaves_the_older_file_alone(tmp_path: Path, monkeypatch: 
     def full(number: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(format.os, "fsync", full)
+    monkeypatch.setattr(container.os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
         save(random_tree(0), path)
     assert path.read_bytes() == before

@@ -123,7 +123,7 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
     side, owners = tree.brick + 2, np.random.default_rng(0).permutation(len(tree.voxel_index))
     values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
     direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
-    compute_view_colours(packed_of(tree), tree.brick, direction, np.float32(2), tree.degree, colours)
+    compute_view_colours(0, len(packed_of(tree).cells), packed_of(tree), tree.brick, direction, np.float32(2), tree.degree, colours)
     laid_out(packed_of(tree), colours, tree.brick, direction, nearest, tree.degree, owners, kind, values)
     back = np.argsort(owners)
     return values[back].reshape(-1, side, side, side, 4), kind[back]

@@ -35,7 +35,7 @@ class Pool(NamedTuple):
     slot_of       (B,) int32: the block of a brick, or -1
     brick_of      (S,) int32: the brick of a block, or -1
     kind          (S,) uint8: VIEW_COLOURS or VOXEL_INDICES
-    next          (1,) int64: the block that is filled next
+    next          (2,) int64: the block that is filled next, and how many voxels were filled in
     values        (S + 1, block_size) float32: density, red, green, blue of voxel (i - 1, j - 1, k - 1) of the brick at 4 ((i (b + 2) + j) (b + 2) + k); colours
                   that are not stored are NaN. For VOXEL_INDICES, red is the index of the stored voxel as int32, or -1
     ints          `values` as int32
@@ -114,6 +114,7 @@ def fill_block(owner, grid, view, pool):  # type: ignore[no-untyped-def]
     while _has_pending(slot, pool):
         slot = (slot + 1) % pool.capacity
     pool.next[0] = (slot + 1) % pool.capacity
+    pool.next[1] += pool.block_size // 4
     before = pool.brick_of[slot]
     if before >= 0:
         pool.slot_of[before] = -1

@@ -13,10 +13,14 @@ from efficientnerf.backends.numba.tree.march import STEP, Ray, RayScratch, march
 from efficientnerf.backends.numba.tree.normals import normal_into
 from efficientnerf.backends.numba.tree.ray_batch import clear_distance, ray_at, ray_pointers
 from efficientnerf.backends.numba.tree.view_colours import View, packed_pointers
+from efficientnerf.backends.numba.tree.walk import most_samples
 
 TILE = 8  # rays along each side of a tile
 SUBTILE = 4  # rays along each side of a subdivision of one
 RUNS = 32  # rectangles of neighbouring tiles per thread
+WORK = 2**25  # of a thread in one call, about 0.2 s: samples tested, and what is counted as so many of them
+INTERPOLATION, LOOKUP = 8, 32
+MARGIN = 1 / 16  # voxels that rounding may put the ends of a ray outside of the grid
 
 
 class Outputs(NamedTuple):
@@ -65,6 +69,12 @@ def _intersect_box(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untyp
     return t0, t1
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _in_box(x, y, z, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Whether a point lies in the box from 0 to (nx, ny, nz), but for rounding; what is not finite does not."""
+    return -MARGIN <= x <= nx + MARGIN and -MARGIN <= y <= ny + MARGIN and -MARGIN <= z <= nz + MARGIN
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _render_ray(row, column, clear, rays, grid, view, pool, scratch, result, normal):  # type: ignore[no-untyped-def]
     """Renders a ray that is clear up to `clear` into result (9,), see `march`, with the depth from the origin, and its normal into (3,)."""
@@ -74,7 +84,11 @@ def _render_ray(row, column, clear, rays, grid, view, pool, scratch, result, nor
         p = 3 * (row * rays.width + column)
         sh_x, sh_y, sh_z = rays.sh_directions[p], rays.sh_directions[p + 1], rays.sh_directions[p + 2]
     t0, t1 = _intersect_box(ox, oy, oz, dx, dy, dz, grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick)
-    last = int(np.ceil((t1 - t0) / STEP - 0.5)) if t1 > t0 else 0
+    nx, ny, nz = grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick
+    last = 0
+    # From so far away that rounding hides the grid nothing is seen; else samples would lie beside the blocks, and be more than the grid has room for.
+    if t1 > t0 and _in_box(ox + t0 * dx, oy + t0 * dy, oz + t0 * dz, nx, ny, nz) and _in_box(ox + t1 * dx, oy + t1 * dy, oz + t1 * dz, nx, ny, nz):
+        last = int(np.ceil(min((t1 - t0) / STEP - 0.5, most_samples(nx, ny, nz))))
     begin = int(min(max((clear - t0) / STEP - 0.5, 0.0), last))
     ex, ey, ez = np.float32(ox + t0 * dx), np.float32(oy + t0 * dy), np.float32(oz + t0 * dz)
     ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
@@ -96,9 +110,13 @@ def _run_size(down, across, threads):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs):  # type: ignore[no-untyped-def]
-    """Renders rows top to low and columns left to right."""
+def _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs, done, work):  # type: ignore[no-untyped-def]
+    """Renders rows top to low and columns left to right, but for the first `done` of their rays; returns how many are done, -1 for all, and the work left.
+
+    work  that may be done; ends with the ray that it is spent on
+    """
     result, normal = scratch.result, scratch.normal
+    ray, filled = 0, pool.next[1]
     known = clear_distance(top, low, left, right, 0.0, rays, grid)
     columns = (right - left + SUBTILE - 1) // SUBTILE
     for part in range((low - top + SUBTILE - 1) // SUBTILE * columns):
@@ -107,6 +125,9 @@ def _render_tile(top, low, left, right, rays, background, grid, view, voxel, poo
         clear = clear_distance(upper, lower, first, last, known, rays, grid) if known < np.inf else known
         for row in range(upper, lower):
             for column in range(first, last):
+                ray += 1
+                if ray <= done:
+                    continue
                 if clear == np.inf:
                     for m in range(9):
                         result[m] = np.float32(0)
@@ -124,14 +145,19 @@ def _render_tile(top, low, left, right, rays, background, grid, view, voxel, poo
                 if outputs.with_statistics:
                     for m in range(4):
                         outputs.statistics[4 * pixel + m] = np.int32(result[5 + m])
+                work -= np.int64(1 + result[5] + result[6] + INTERPOLATION * result[7] + LOOKUP * result[8]) + pool.next[1] - filled
+                filled = pool.next[1]
+                if work <= 0:
+                    return ray, work
+    return -1, work
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def render_batch(  # type: ignore[no-untyped-def]
-    batch, background, packed, brick, view_colours, direction_rate, min_distance, density_scale, degree, voxel, tile, threads, blocks,
+    batch, background, packed, brick, view_colours, direction_rate, min_distance, density_scale, degree, voxel, tile, threads, blocks, budget, progress,
     colour, opacity, depth, normal, statistics,
 ):  # fmt: skip
-    """Renders a RayBatch.
+    """Renders a RayBatch, or as much of it as each thread's budget allows; returns whether that was all.
 
     background     (3,) float32 colour to composite over
     packed         see `Packed`
@@ -140,6 +166,8 @@ def render_batch(  # type: ignore[no-untyped-def]
     voxel          size of a voxel, world units
     tile           (rows, columns) of a tile
     blocks         in a thread's pool
+    budget         of a thread's work, see WORK
+    progress       (threads, 3) int64, zero at first: the run, the tile in it and the ray in that which a thread goes on with
     colour         (H, W, 3) float32
     opacity        (H, W) float32
     depth          (H, W) float32, world units: along the view axis for a camera, along the ray for given rays
@@ -160,6 +188,7 @@ def render_batch(  # type: ignore[no-untyped-def]
     floats, ints = np.zeros((threads, 256), np.float32), values.view(np.int32)
     for worker in numba.prange(threads):
         values[worker, blocks * size :] = 0
+        work = np.int64(budget)
         integers[worker, 8 : 8 + QUEUE] = blocks * size
         pool = Pool(
             size,
@@ -189,14 +218,26 @@ def render_batch(  # type: ignore[no-untyped-def]
         view = View(pointer(batch.view_direction), direction_rate, min_distance, density_scale, degree)
         for run in range(runs):
             # Neighbouring runs, along rows and columns, go to different threads.
-            if (run // columns + run % columns) % threads != worker:
+            if (run // columns + run % columns) % threads != worker or run < progress[worker, 0]:
                 continue
-            for n in range(tall * wide):
+            for n in range(progress[worker, 1] if run == progress[worker, 0] else 0, tall * wide):
                 row, column = run // columns * tall + n // wide, run % columns * wide + n % wide
                 if row < down and column < across:
                     top, left = row * tile[0], column * tile[1]
                     low, right = min(top + tile[0], height), min(left + tile[1], width)
-                    _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs)
+                    done = progress[worker, 2] if run == progress[worker, 0] and n == progress[worker, 1] else 0
+                    done, work = _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs, done, work)
+                    if work <= 0:
+                        progress[worker, 0], progress[worker, 1], progress[worker, 2] = run, n if done >= 0 else n + 1, max(done, 0)
+                        break
+            if work <= 0:
+                break
+        if work > 0:
+            progress[worker, 0] = runs
+    left = 0
+    for worker in range(threads):
+        left += progress[worker, 0] < runs
+    return left == 0
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

@@ -36,6 +36,7 @@ SKIP_MARGIN = 1e-3  # steps by which a skip ends early, so that float32 rounding
 
 _HALF, _ONE = np.float32(0.5), np.float32(1)
 LOG2E = math.log2(math.e)
+PARALLEL = np.float32(1e-30)  # component of a unit direction below which a ray is parallel to a face
 _EXP2 = tuple(np.float32(c) for c in EXP2_COEFFICIENTS)
 
 
@@ -218,8 +219,10 @@ def march(ray, first, end, grid, view, pool, scratch, out):  # type: ignore[no-u
     big, none = np.float32(1e30), np.float32(0)
     row, layer = np.float32(side), np.float32(side * side)
     # A ray crosses the plane at x at (x - ex) * slope + never. The face of cell a, `far` cells ahead, is at (a + beside + far * ahead) * width.
-    slope_x, slope_y, slope_z = (_ONE / dx if dx != 0 else none), (_ONE / dy if dy != 0 else none), (_ONE / dz if dz != 0 else none)
-    never_x, never_y, never_z = (none if dx != 0 else big), (none if dy != 0 else big), (none if dz != 0 else big)
+    # Along an axis that it hardly moves on it never does; 1 / dx would be infinite, zero times that no number, and the ray would stay where it is.
+    moves_x, moves_y, moves_z = abs(dx) >= PARALLEL, abs(dy) >= PARALLEL, abs(dz) >= PARALLEL
+    slope_x, slope_y, slope_z = (_ONE / dx if moves_x else none), (_ONE / dy if moves_y else none), (_ONE / dz if moves_z else none)
+    never_x, never_y, never_z = (none if moves_x else big), (none if moves_y else big), (none if moves_z else big)
     ahead_x, ahead_y, ahead_z = (_ONE if dx > 0 else -_ONE), (_ONE if dy > 0 else -_ONE), (_ONE if dz > 0 else -_ONE)
     beside_x, beside_y, beside_z = (none if dx > 0 else _ONE), (none if dy > 0 else _ONE), (none if dz > 0 else _ONE)
     most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)

@@ -13,13 +13,14 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP, STEP
 from efficientnerf.backends.numba.tree.queries import normal_at
-from efficientnerf.backends.numba.tree.walk import SampleBuffer, TreeGrid, walk, walk_pointers
+from efficientnerf.backends.numba.tree.walk import SampleBuffer, TreeGrid, walk_on, walk_pointers
 from efficientnerf.rendering.harmonics import basis_numpy
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 BLOCK = 64  # rays per task
+CAPACITY = 256  # samples of a ray that are composited at once
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -50,16 +51,18 @@ def _composite(count, buffer, tree, basis, sh, rgb, colour):  # type: ignore[no-
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _render(grid, density, sh, origins, directions, bases, max_samples, colour, opacity, half_distance):  # type: ignore[no-untyped-def]
+def _render(grid, density, sh, origins, directions, bases, colour, opacity, half_distance):  # type: ignore[no-untyped-def]
     rays = len(origins)
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
-        index, fraction = np.full((max_samples, 8), -1, np.int32), np.zeros((max_samples, 3), np.float32)
-        alpha, transmittance, distance, rgb = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples), np.empty(3)
-        buffer = SampleBuffer(max_samples, pointer(index), pointer(fraction), pointer(alpha), pointer(transmittance), pointer(distance))
+        index, fraction = np.full((CAPACITY, 8), -1, np.int32), np.zeros((CAPACITY, 3), np.float32)
+        alpha, transmittance, distance, rgb = np.empty(CAPACITY), np.empty(CAPACITY), np.empty(CAPACITY), np.empty(3)
+        buffer = SampleBuffer(CAPACITY, pointer(index), pointer(fraction), pointer(alpha), pointer(transmittance), pointer(distance))
         tree = walk_pointers(grid, density)
         for ray in range(block * BLOCK, min(rays, block * BLOCK + BLOCK)):
-            count, left = walk(origins[ray], directions[ray], tree, EARLY_STOP, buffer)
-            half_distance[ray] = _composite(count, buffer, tree, bases[ray], sh, rgb, colour[ray])
+            k, left = 0, 1.0
+            while k >= 0:
+                count, left, k = walk_on(origins[ray], directions[ray], tree, EARLY_STOP, buffer, k, left)
+                half_distance[ray] = min(half_distance[ray], _composite(count, buffer, tree, bases[ray], sh, rgb, colour[ray]))
             opacity[ray] = 1 - left
 
 
@@ -67,12 +70,16 @@ def render_rays(
     tree: NerfTree, origins: np.ndarray, directions: np.ndarray, sh_directions: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Colour (R, 3) premultiplied, opacity (R,), distance (R,), normal (R, 3) of rays, float32; see `backends.numba.tree.rendering.render_rays`."""
+    from efficientnerf.backends.pieces import pieces
+
     origins, directions = np.asarray(origins, np.float64), np.ascontiguousarray(directions, np.float64)
     starts = np.ascontiguousarray((origins - tree.bounds_min) / tree.voxel)
     bases = np.ascontiguousarray(basis_numpy(np.asarray(directions if sh_directions is None else sh_directions, np.float32), tree.degree))
     colour, opacity, half_distance = np.zeros((len(starts), 3)), np.zeros(len(starts)), np.full(len(starts), np.inf)
     grid = TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, float(STEP * tree.voxel), nearest=True)
-    _render(grid, tree.density_values, tree.sh, starts, directions, bases, grid.max_samples, colour, opacity, half_distance)
+    for part in pieces(len(starts)):
+        given = (starts[part], directions[part], bases[part], colour[part], opacity[part], half_distance[part])
+        _render(grid, tree.density_values, tree.sh, *given)
     depth = half_distance * tree.voxel
     normal, hit = np.zeros((len(starts), 3), np.float32), np.isfinite(half_distance)
     if hit.any():

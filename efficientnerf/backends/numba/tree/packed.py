@@ -8,6 +8,7 @@ B bricks, N stored voxels, K harmonics, P entries of a palette; b = brick.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 SLOPE_VOXELS = 2**16  # voxels that `colour_slope` is estimated from
+VOXELS_PER_CALL = 2**23  # of bricks that one call of a kernel goes through, so that signals are answered between
 
 
 class Packed(NamedTuple):
@@ -82,12 +84,12 @@ def _block_has_density(owner, cells, brick, brick_index, voxel_index, values, de
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _has_density(cells, brick, brick_index, voxel_index, values, out):  # type: ignore[no-untyped-def]
-    """`Packed.has_density` into `out`, which is zero."""
+def _has_density(first, end, cells, brick, brick_index, voxel_index, values, out):  # type: ignore[no-untyped-def]
+    """`Packed.has_density` of bricks first <= B < end into `out`, which is zero."""
     side = brick + 2
-    for task in numba.prange((len(cells) + 255) // 256):
+    for task in numba.prange((end - first + 255) // 256):
         dense = np.empty((side, side, side), np.uint8)
-        for owner in range(256 * task, min(len(cells), 256 * task + 256)):
+        for owner in range(first + 256 * task, min(end, first + 256 * task + 256)):
             _block_has_density(owner, cells, brick, brick_index, voxel_index, values, dense)
             # Maximum over a voxel and its successor, one axis after the other.
             for i in range(side):
@@ -103,6 +105,12 @@ def _has_density(cells, brick, brick_index, voxel_index, values, out):  # type: 
                     for k in range(side - 1):
                         n = (i * side + j) * side + k
                         out[owner, n >> 6] |= np.int64(dense[i, j, k] | dense[i + 1, j, k]) << (n & 63)
+
+
+def brick_ranges(bricks: int, brick: int) -> Iterator[tuple[int, int]]:
+    """First brick and end of ranges of about VOXELS_PER_CALL voxels."""
+    each = max(256, VOXELS_PER_CALL // brick**3)
+    return ((first, min(bricks, first + each)) for first in range(0, bricks, each))
 
 
 def _stored_ranks(voxel_index: np.ndarray) -> np.ndarray:
@@ -159,13 +167,14 @@ def pack(tree: NerfTree) -> Packed:
         raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; render it by `backends.numba.tree.nearest`")
 
     tree = _in_order(tree)
-    occupied = np.argwhere(tree.brick_index >= 0)
-    cells = np.empty(occupied.shape, np.int32)
-    cells[tree.brick_index[tree.brick_index >= 0]] = occupied
+    occupied = np.flatnonzero(tree.brick_index.reshape(-1) >= 0)
+    cells = np.empty((len(occupied), 3), np.int32)
+    cells[tree.brick_index.reshape(-1)[occupied]] = np.stack(np.unravel_index(occupied, tree.shape), axis=1)
     has_density = np.zeros((len(cells), ((tree.brick + 2) ** 3 + 63) // 64), np.int64)
-    _has_density(cells, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, has_density)
-    full = tree.brick_index >= 0
-    full[full] = np.asarray(has_density.any(axis=1))[tree.brick_index[full]]
+    for first, end in brick_ranges(len(cells), tree.brick):
+        _has_density(first, end, cells, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, has_density)
+    full = np.zeros(tree.shape, bool)
+    full[tuple(cells[has_density.any(axis=1)].T)] = True
     harmonics = tree.harmonics
     if isinstance(harmonics, PaletteHarmonics):
         palette = np.zeros((harmonics.palette.shape[1], harmonics.palette.shape[0], 4), np.float32)

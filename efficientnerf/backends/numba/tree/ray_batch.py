@@ -136,6 +136,8 @@ def _clear_cone(origin, direction, radius, widening, t, grid):  # type: ignore[n
     """
     ox, oy, oz = origin
     dx, dy, dz = direction
+    if not np.isfinite(ox + oy + oz + dx + dy + dz + radius + widening + t):  # NaN must not become an index
+        return t
     nx, ny, nz = grid.nx * grid.brick / 2, grid.ny * grid.brick / 2, grid.nz * grid.brick / 2
     beyond = np.sqrt((ox - nx) ** 2 + (oy - ny) ** 2 + (oz - nz) ** 2) + np.sqrt(nx * nx + ny * ny + nz * nz) + 2 * radius
     for _ in range(MAX_ADVANCES):

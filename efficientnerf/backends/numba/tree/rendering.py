@@ -13,9 +13,9 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.blocks import MIN_BLOCKS, POOL_BYTES
-from efficientnerf.backends.numba.tree.image import TILE, downsample, render_batch
+from efficientnerf.backends.numba.tree.image import TILE, WORK, downsample, render_batch
 from efficientnerf.backends.numba.tree.march import LOG2E, STEP
-from efficientnerf.backends.numba.tree.packed import packed_of
+from efficientnerf.backends.numba.tree.packed import brick_ranges, packed_of
 from efficientnerf.backends.numba.tree.ray_batch import RayBatch
 from efficientnerf.backends.numba.tree.view_colours import compute_view_colours
 from efficientnerf.geometry.cameras import Camera, rays
@@ -46,8 +46,10 @@ class ViewColours(NamedTuple):
 
 
 def _view_colours(tree: NerfTree, view_direction: np.ndarray) -> ViewColours:
-    colours = np.empty((len(tree.density_values) + 1, 4), np.float32)
-    compute_view_colours(packed_of(tree), tree.brick, view_direction, _density_scale(tree), tree.degree, colours)
+    colours, packed = np.empty((len(tree.density_values) + 1, 4), np.float32), packed_of(tree)
+    colours[-1] = 0, np.nan, np.nan, np.nan
+    for first, end in brick_ranges(len(packed.cells), tree.brick):
+        compute_view_colours(first, end, packed, tree.brick, view_direction, _density_scale(tree), tree.degree, colours)
     return ViewColours(float(np.linalg.norm(view_direction[:, :3], 2)), _min_distance(tree), colours)
 
 
@@ -66,10 +68,14 @@ def _render(
     statistics: np.ndarray | None = None,
 ) -> None:  # fmt: skip
     statistics = np.zeros((0, 0, 4), np.int32) if statistics is None else statistics
-    render_batch(
+    threads = numba.get_num_threads()
+    progress = np.zeros((threads, 3), np.int64)
+    # In pieces: signals are answered between calls.
+    while not render_batch(
         batch, background, packed_of(tree), tree.brick, colours.colours, colours.direction_rate, colours.min_distance, _density_scale(tree), tree.degree,
-        float(tree.voxel), tile, numba.get_num_threads(), _capacity(tree), *out, statistics,
-    )  # fmt: skip
+        float(tree.voxel), tile, threads, _capacity(tree), WORK, progress, *out, statistics,
+    ):  # fmt: skip
+        pass
 
 
 def _capacity(tree: NerfTree) -> int:

@@ -251,17 +251,15 @@ def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def compute_view_colours(packed, brick, direction, density_scale, degree, out):  # type: ignore[no-untyped-def]
-    """Scaled density, and red, green and blue before the sigmoid, of each stored voxel along `direction` (see `View`) into out (N + 1, 4).
+def compute_view_colours(first, end, packed, brick, direction, density_scale, degree, out):  # type: ignore[no-untyped-def]
+    """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of the voxels of bricks first <= B < end into out (N + 1, 4).
 
-    The last row stands for voxels that are not stored: density 0, colour NaN.
+    The last row, of voxels that are not stored, is for the caller to fill: density 0, colour NaN.
     """
-    bricks, cube = len(packed.cells), brick * brick * brick
-    out[len(out) - 1, 0] = 0
-    out[len(out) - 1, 1:] = np.nan
-    for task in numba.prange((bricks + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
+    cube = brick * brick * brick
+    for task in numba.prange((end - first + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
         steps, stored, basis = np.empty(3 * cube, np.float32), np.empty(cube + 3, np.int64), np.empty(128, np.float32)
         grid, view = packed_pointers(packed, brick), View(pointer(direction), 0.0, 0.0, density_scale, degree)
         _voxel_steps(brick, view.direction, pointer(steps))
-        for owner in range(BRICKS_PER_TASK * task, min(bricks, BRICKS_PER_TASK * task + BRICKS_PER_TASK)):
+        for owner in range(first + BRICKS_PER_TASK * task, min(end, first + BRICKS_PER_TASK * task + BRICKS_PER_TASK)):
             _brick_colours(owner, grid, view, pointer(steps), pointer(stored), pointer(basis), pointer(out))

@@ -33,8 +33,7 @@ class TreeGrid(NamedTuple):
     @property
     def max_samples(self) -> int:
         """Samples on a ray, at most."""
-        sides = np.array(self.brick_index.shape) * self.brick
-        return int(np.ceil(np.linalg.norm(sides) / STEP)) + 2
+        return most_samples(*(side * self.brick for side in self.brick_index.shape))
 
 
 class WalkPointers(NamedTuple):
@@ -70,6 +69,12 @@ class SampleBuffer(NamedTuple):
     alpha: Any
     transmittance: Any
     distance: Any
+
+
+@numba.njit(cache=True, error_model="numpy")
+def most_samples(nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Samples on a ray through a grid of so many voxels, at most. Distances far beyond the grid are rounded to more than that."""
+    return int(np.ceil(np.sqrt(nx * nx + ny * ny + nz * nz) / STEP)) + 2
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -147,10 +152,17 @@ def _lookup_trilinear(u, v, w, tree, buffer, count):  # type: ignore[no-untyped-
 
 @numba.njit(cache=True, error_model="numpy")
 def walk(origin, direction, tree, stop, buffer):  # type: ignore[no-untyped-def]
-    """Writes the samples of a ray, voxel coordinates, that have density; returns their number and the transmittance behind them.
+    """Writes the samples of a ray, voxel coordinates, that have density, as many as the buffer holds; returns their number and the transmittance behind them.
 
     stop  transmittance below which the ray ends
     """
+    count, transmittance, _ = walk_on(origin, direction, tree, stop, buffer, 0, 1.0)
+    return count, transmittance
+
+
+@numba.njit(cache=True, error_model="numpy")
+def walk_on(origin, direction, tree, stop, buffer, k, transmittance):  # type: ignore[no-untyped-def]
+    """`walk` from sample k on, where so much light arrives; returns the number of samples, the transmittance behind them, and the k to go on with, or -1."""
     brick = tree.brick
     nx, ny, nz = tree.nx * brick, tree.ny * brick, tree.nz * brick
     ox, oy, oz = origin[0], origin[1], origin[2]
@@ -160,12 +172,13 @@ def walk(origin, direction, tree, stop, buffer):  # type: ignore[no-untyped-def]
     iz = 1 / dz if dz != 0 else 1e30
     t0 = max(min(-ox * ix, (nx - ox) * ix), min(-oy * iy, (ny - oy) * iy), min(-oz * iz, (nz - oz) * iz), 0.0)
     t1 = min(max(-ox * ix, (nx - ox) * ix), max(-oy * iy, (ny - oy) * iy), max(-oz * iz, (nz - oz) * iz))
-    transmittance = 1.0
     if not t1 > t0 or (dx == 0 and (ox < 0 or ox > nx)) or (dy == 0 and (oy < 0 or oy > ny)) or (dz == 0 and (oz < 0 or oz > nz)):
-        return 0, transmittance
-    count = k = 0
-    last = int(np.floor((t1 - t0) / STEP)) + 1
-    while k < last and count < buffer.capacity:
+        return 0, transmittance, -1
+    count = 0
+    last = int(np.floor(min((t1 - t0) / STEP, most_samples(nx, ny, nz)))) + 1
+    while k < last:
+        if count == buffer.capacity:
+            return count, transmittance, k
         t = t0 + (k + 0.5) * STEP
         if t >= t1:
             break
@@ -195,4 +208,4 @@ def walk(origin, direction, tree, stop, buffer):  # type: ignore[no-untyped-def]
             count += 1
             if transmittance < stop:
                 break
-    return count, transmittance
+    return count, transmittance, -1

@@ -1,0 +1,45 @@
+"""Memory that an asset takes, from its header: the rule of FORMAT.md, section 10, which keeps it in proportion to the file's size.
+
+A bit of a file may stand for four bytes of an index, and a stranger's file may have little else.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.asset.container import FormatError
+from efficientnerf.rendering.harmonics import harmonics_count
+
+TIMES, BESIDES = 8, 200_000_000  # of the file's size, and bytes
+CELL = 6  # its brick, how far a ray may leap from it, and whether it is full
+BRICK, SLOT = 72, 5  # where it lies, and which of its voxels are stored; for each of its voxels which of the stored ones it is
+VOXEL = 20  # its density, and its colour for a view
+PALETTE = 28  # a coefficient of a palette as a float, in two orders of the axes, one of them padded
+
+
+def needed(layout: str, meta: dict[str, Any], shapes: dict[str, tuple[int, ...]], types: dict[str, np.dtype[Any]]) -> int:
+    """Bytes of FORMAT.md, section 10.
+
+    layout  without its prefixes
+    shapes, types  of the layout's tensors
+    """
+    cube, coefficients = int(meta["brick"]) ** 3, 3 * harmonics_count(int(meta["sh_degree"]))
+    bricks = shapes["brick.density" if layout == "full" else "brick.mask"][0]
+    voxels = bricks * cube if layout == "full" else shapes["voxel.density"][0]
+    total = CELL * math.prod(meta["shape"]) + (BRICK + SLOT * cube) * bricks
+    if layout != "compact":
+        return total + (VOXEL + 4 * coefficients) * voxels
+    each = VOXEL + 3 + shapes["voxel.sh"][1] * types["voxel.sh"].itemsize
+    if str(meta["layout"]).startswith("nearest-"):
+        each += 4 * coefficients
+    return total + each * voxels + PALETTE * math.prod(shapes["sh.palette"][:2])
+
+
+def check_memory(name: str, size: int, needed_bytes: int) -> None:
+    """Raises FormatError where a file of `size` bytes needs more than the rule allows."""
+    if needed_bytes > TIMES * size + BESIDES:
+        found = f"{size / 1e6:.1f} MB that take {needed_bytes / 1e6:.0f} MB of memory; expected at most {TIMES} times the size and {BESIDES / 1e6:.0f} MB"
+        raise FormatError(f"{name}: {found}. Its cells or bricks are nearly all empty: bake it with other bricks (bake.brick_size), or do not trust it.")
