@@ -28,14 +28,14 @@ STRUCTURE = {
 def _number(name: str, meta: dict[str, Any], key: str, low: float, high: float, *, whole: bool) -> float:
     value = meta.get(key)
     if type(value) not in ((int,) if whole else (int, float)) or not low <= value <= high:  # type: ignore[operator]
-        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected a {'whole ' if whole else ''}number from {low} to {high}")
+        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected a {'whole ' if whole else ''}number from {low:g} to {high:g}")
     return value  # type: ignore[return-value]
 
 
 def _numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, high: float) -> list[float]:
     value = meta.get(key)
     if not (isinstance(value, list) and len(value) == count and all(type(x) in (int, float) and low <= x <= high for x in value)):
-        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected {count} numbers from {low} to {high}")
+        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected {count} numbers from {low:g} to {high:g}")
     return value
 
 
