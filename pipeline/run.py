@@ -269,7 +269,7 @@ def _field(path: Path, name: str, value: dict[str, Any]) -> Any:
     found = value.get(name, {"settings": {}, "created": 0.0}.get(name))
     try:
         checked = msgspec.convert(found, _FIELDS[name])
-        if name == "source" and checked is not None and ("\0" in checked or not os.fsencode(checked)):
+        if name == "source" and checked is not None and ("\0" in checked or not os.path.isabs(os.fsencode(checked))):
             raise ValueError
     except (ValueError, OverflowError):  # a path that no file system can name is a ValueError, too
         raise _damaged(path, name, found) from None

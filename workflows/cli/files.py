@@ -66,9 +66,9 @@ def _export_cameras(what: Path, path: Path, force: bool) -> int:
     from stages.io import scene
     from stages.io.exporters import cameras
     from workflows.cli.destination import writing
-    from workflows.cli.target import is_run
+    from workflows.cli.target import is_run, open_run
 
-    poses = PosesOutputs.of_run(what) if is_run(what) else PosesOutputs(what)
+    poses = PosesOutputs(open_run(what).folder("poses")) if is_run(what) else PosesOutputs(what)
     if not poses.scene.is_file():
         raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
     found = scene.load(poses.folder)

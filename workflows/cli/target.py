@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import BadInput, CorruptArtifact, UnknownSetting
+from pipeline.links import refuse_links
 from pipeline.run import NAME
 from stages.artifacts import BakeOutputs
 from stages.renamed_settings import moved_in
@@ -51,12 +52,13 @@ def check_names(run: Run) -> None:
 
 
 def asset_of(path: Path) -> Path:
-    """The asset file of a run, of its folder `bake`, or the file itself. Raises BadInput."""
+    """The asset file of a run, of its folder `bake`, or the file itself. Raises BadInput, and CorruptArtifact for a run that holds links."""
     if path.is_file():
         return path
     if not path.exists():
         raise BadInput(f"{path}: no such file or folder. Give a run or an asset ({ASSET}).")
     if is_run(path):
+        refuse_links(path)
         found = BakeOutputs.of_run(path).asset
         if not found.is_file():
             raise BadInput(f"{path}: has no asset yet. Make it first: enerf run --out {path} --until bake")

@@ -1,0 +1,91 @@
+"""Commands on a run that a stranger packed: nothing outside changes or is read, nothing hangs, and every exit code is a documented one."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.workflows.command import Enerf
+
+COMMANDS = (("status",), ("verify",), ("report",), ("run", "--out"), ("stage", "train"), ("inspect",), ("run", "--dry-run", "--out"))
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() if path.is_file() else b"" for path in sorted(folder.rglob("*"))}
+
+
+@pytest.fixture
+def canary(tmp_path: Path) -> Path:
+    folder = tmp_path / "canary"
+    (folder / "deep").mkdir(parents=True)
+    for name in ("thesis.txt", "deep/thesis.txt", "manifest.json", "run.json", "asset.nerftree"):
+        (folder / name).write_text("years of work")
+    return folder
+
+
+def paths_of(run: Path) -> list[str]:
+    """What a run holds, and the names that a kill may have left."""
+    found = [path.relative_to(run).as_posix() for path in sorted(run.rglob("*"))]
+    request = "a" * 64
+    killed = [f".work/train/{request}/out", f".work/train/{request}/scratch", f".work/train/{request}", ".work/train", ".work/old-train", ".work/trash-1-1"]
+    return list(dict.fromkeys([*found, ".cache", ".cache/hashes.json", ".work", *killed, "report.html", ".lock.json"]))
+
+
+@pytest.mark.parametrize("kind", ["link to a folder", "link to a file", "broken link", "pipe"])
+def test_links_and_pipes_in_the_place_of_everything(enerf: Enerf, toys: Path, tmp_path: Path, canary: Path, kind: str) -> None:
+    made = tmp_path / "made"
+    assert enerf("run", toys, "--out", made).code == 0
+    before = snapshot(canary)
+    for number, name in enumerate(paths_of(made)):
+        run = tmp_path / f"run{number}"
+        shutil.copytree(made, run)
+        path = run / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
+        if kind == "pipe":
+            os.mkfifo(path)
+        else:
+            path.symlink_to({"link to a folder": canary, "link to a file": canary / "thesis.txt", "broken link": canary / "new"}[kind])
+        codes = {enerf(*command, run).code for command in COMMANDS}
+        assert codes <= {0, 2, 4}, name
+        assert 4 in codes or name in ("report.html", "run.json"), name
+        assert snapshot(canary) == before, name
+
+
+@pytest.mark.parametrize("name", ["run.json", "train/manifest.json", ".lock.json", ".cache/hashes.json"])
+@pytest.mark.parametrize("text", ['{"a": 1e999}', "[" * 50_000, "9" * 5000, '{"\\ud800": "\\ud800"}', "null", "[]", "\0"])
+def test_json_of_any_kind(enerf: Enerf, toys: Path, tmp_path: Path, name: str, text: str) -> None:
+    run = tmp_path / "run"
+    enerf("run", toys, "--out", run)
+    (run / name).parent.mkdir(exist_ok=True)
+    for command in COMMANDS:
+        (run / name).write_text(text)
+        result = enerf(*command, run)
+        assert result.code in (0, 2, 4)
+        assert len(result.err.splitlines()) <= 6
+
+
+@pytest.mark.parametrize("value", [10**400, [[[]]], {"a": 1}, "\ud800", "a\x1b[31m\nb", "x" * 100_000, None, True, -(2**70), 1e300, "../.."], ids=range(11))
+def test_recorded_values_of_any_kind(enerf: Enerf, toys: Path, tmp_path: Path, value: object) -> None:
+    run = tmp_path / "run"
+    enerf("run", toys, "--out", run)
+    good = json.loads((run / "run.json").read_text())
+    settings = good["settings"]
+    changed = [{**good, key: value} for key in good] + [
+        {**good, "settings": {**settings, "train": {**settings["train"], "iterations": value}}},
+        {**good, "settings": {**settings, "train": {**settings["train"], "\ud800\x1b[31m": value}}},
+        {**good, "settings": {**settings, "\ud800\x1b[31m": {"a": value}}},
+    ]
+    for document in changed:
+        for command in (("status",), ("run", "--out")):
+            (run / "run.json").write_text(json.dumps(document))
+            result = enerf(*command, run)
+            assert result.code in (0, 2, 4), document
+            assert "\x1b[31m" not in result.err + result.out
+            assert "Traceback" not in result.err
