@@ -12,10 +12,10 @@ metrics are over the pixels that the photograph's alpha covers.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -30,6 +30,7 @@ from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, inpu
 from stages.compiling import compiling_kernels
 from stages.io.scene import Scene, View
 from stages.lpips_weights import load_lpips
+from stages.scratch import note, noted, once
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
@@ -60,6 +61,7 @@ class EvaluateSettings:
     )
 
 
+Measured = str | dict[str, int | float | None] | None  # the name of a view, or its metrics
 RenderTree = Callable[..., Any]  # (camera, background=...) -> Rendering
 
 
@@ -79,8 +81,6 @@ class GroundTruth:
 
 @compiling_kernels
 def run(job: Job) -> None:
-    from functools import partial
-
     from efficientnerf.asset import format
     from efficientnerf.asset.rendering import render
 
@@ -132,25 +132,45 @@ def evaluate(render_tree: RenderTree, load_field: Callable[[], Any], job: Job) -
     wanted = {"off": (), "both": NETWORKS}.get(settings.lpips, (settings.lpips,))
     perceptual = {f"lpips_{network}": load_lpips(network, given(settings.lpips_weights)) for network in wanted}
     field: Any = None
-    figures = []
+    figures, warn = [], once(job.warn)
     for k, view in enumerate(views):
         job.safe_point()
         job.progress(k, len(views), f"view {view.name}")
         done = job.work / f"view_{k:05d}.json"
-        if not done.exists():
+        check = partial(_check, job.work, k, view, with_field=k in rendered, perceptual=tuple(perceptual))
+        measured = noted(done, dict[str, Measured], warn, check)
+        if measured is None:
             needs_field = k in rendered or constant_background(scene) is None
             field = field or (load_field() if needs_field else None)
             measured, images = evaluate_view(
                 render_tree, field, scene, view, job, with_field=k in rendered, stride=stride if k in rendered else rest, perceptual=perceptual
             )
-            if k in rendered:
-                _save_thumbnails(images, job.work, k)
-            write_json(done, measured)
-        figures.append(json.loads(done.read_text(encoding="utf-8")))
+            note(done, measured, _save_thumbnails(images, job.work, k) if k in rendered else ())
+        figures.append(measured)
     job.progress(len(views), len(views))
     metrics = summary(figures, split=split, stride=stride, background=rest if constant_background(scene) is None else None, perceptual=tuple(perceptual))
     write_json(EvaluateOutputs(job.out).metrics, metrics)
     _write_sheet(metrics, sorted(rendered), job)
+
+
+def _check(folder: Path, k: int, view: View, measured: Mapping[str, Any], outputs: Collection[str], *, with_field: bool, perceptual: Sequence[str]) -> None:
+    """Raises where these are not the metrics of the k-th view as `evaluate_view` returns them, or a thumbnail is missing or can't be read."""
+    from stages.io.png import read_png
+
+    names = {"psnr", "ssim", "psnr_in_box", "width", "height", *perceptual}
+    asset, network = measured["asset"], measured["network"]
+    if measured["name"] != view.name or not names <= asset.keys() or with_field == (network is None):
+        raise ValueError("no metrics of this view")
+    if with_field and not {*names, *SAMPLE_SHARES} <= network.keys():
+        raise ValueError("no metrics of the field")
+    for path in _thumbnails(folder, k) if with_field else ():
+        if path.name not in outputs or read_png(path).shape[2] != 3:
+            raise ValueError(f"{path.name} is missing")
+
+
+def _thumbnails(folder: Path, k: int) -> list[Path]:
+    """The pictures of a view for the contact sheet, one a column."""
+    return [folder / f"picture_{k:05d}_{column}.png" for column in range(5)]
 
 
 def evaluation_views(scene: Scene) -> tuple[tuple[View, ...], str]:
@@ -343,12 +363,14 @@ def _clipped(image: np.ndarray, job: Job, what: str) -> np.ndarray:
     return np.clip(np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
 
 
-def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> None:
+def _save_thumbnails(images: Sequence[np.ndarray], folder: Path, k: int) -> list[Path]:
     from stages.figures.plots import thumbnail_of
     from stages.io.png import write_png
 
-    for column, image in enumerate(images):
-        write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), folder / f"picture_{k:05d}_{column}.png")
+    paths = _thumbnails(folder, k)
+    for path, image in zip(paths, images, strict=True):
+        write_png(np.asarray(thumbnail_of(image, THUMBNAIL)), path, durable=False)
+    return paths
 
 
 def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> None:
@@ -360,7 +382,7 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
         return psnr if found["ssim"] is None else f"{psnr}, SSIM {found['ssim']:.3f}"
 
     shown = [drawn[k] for k in evenly_spaced(len(drawn), SHEET_ROWS)]
-    rows = [[read_png(job.work / f"picture_{k:05d}_{column}.png") for column in range(5)] for k in shown]
+    rows = [[read_png(path) for path in _thumbnails(job.work, k)] for k in shown]
     labels = []
     for k in shown:
         view = metrics["views"][k]

@@ -23,7 +23,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.cores import use_all_cores
-from stages.training.budget import Budget
+from stages.training.budget import UNKNOWN, Budget
 from stages.training.checkpoints import Checkpoints
 from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, sparse_depth_of
 from stages.training.log import TrainLog
@@ -60,11 +60,11 @@ def run(job: Job) -> None:
 
     t = loop.trainer(m, len(views))
     checkpoints = Checkpoints(job)
-    spent = checkpoints.restore(t)
+    spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
     previews = Previews(FieldRenderer(m, near, far), folder, s, job.work, given(settings.preview_every))
     previews.draw(t.step)
-    budget = Budget(settings, job.work, spent, clock) if settings.time_budget != "off" else None
+    budget = Budget(settings, job.work, spent, clock, job.warn) if settings.time_budget != "off" else None
     if budget is not None:
         t.schedule = budget.schedule
 
@@ -95,7 +95,7 @@ def run(job: Job) -> None:
     write_report(outputs.report, job, t, log.seconds, previews.psnr)
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
-    previews.publish(outputs.previews)
+    previews.publish(outputs.previews, job.warn)
 
 
 def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:

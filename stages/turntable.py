@@ -80,7 +80,7 @@ def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None
         job.safe_point()
         job.progress(done, total, "frames")
 
-    written = render_frames(tree, cameras, job.work / "frames", options, each, reuse=True, draw=draw)
+    written = render_frames(tree, cameras, job.work / "frames", options, each, reuse=True, draw=draw, warn=job.warn)
     job.say("encoding the video")
     encode_frames([path for path in written if path.suffix == ".png"], TurntableOutputs(job.out).video, options, job.safe_point)
     for path in written:

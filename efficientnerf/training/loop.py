@@ -36,6 +36,8 @@ from efficientnerf.training.readback import AsyncReadback, StepCounts
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.sparse_depth import RAYS_PER_RAY, SparseDepthRays, sparse_depth_loss, sparse_depth_weight
 
+MAX_STEPS = 2**40  # of a run: more than anyone waits for
+
 
 @dataclass
 class Progress:
@@ -105,14 +107,33 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
 
 
 def restore(t: Trainer, state: dict[str, Tensor]) -> None:
-    """Put `state_of`'s tensors back."""
+    """Put `state_of`'s tensors back; ValueError names what does not fit, and then nothing has changed."""
+    step, samples_per_ray = _check(t, state)
     models.restore(t.model, state)
     if t.exposure is not None:
         t.exposure.data.copy_(state["exposure"])
     for name, pair in t.adam.moments.items():
         for k in (0, 1):
             pair[k].copy_(state[f"adam.{k}.{name}"])
-    t.step, t.samples_per_ray = int(state["progress"][0]), float(state["progress"][1])
+    t.step, t.samples_per_ray = step, samples_per_ray
+
+
+def _check(t: Trainer, state: dict[str, Tensor]) -> tuple[int, float]:
+    """The step and the samples on a ray of a state; ValueError where a tensor is missing, unknown or of another type or shape, or a number impossible."""
+    wanted = state_of(t)
+    for name, tensor in wanted.items():
+        if name not in state:
+            raise ValueError(f"tensor '{name}' is missing")
+        if state[name].shape != tensor.shape or state[name].dtype != tensor.dtype:
+            raise ValueError(f"tensor '{name}' is {state[name].dtype} {tuple(state[name].shape)}; expected {tensor.dtype} {tuple(tensor.shape)}")
+    if unknown := sorted(state.keys() - wanted.keys()):
+        raise ValueError(f"tensor '{unknown[0]}' is of no part of the model")
+    step, samples_per_ray = (float(number) for number in state["progress"])
+    if not (1 <= step <= MAX_STEPS and step == int(step)):
+        raise ValueError(f"step {step:g} is not from 1 to {MAX_STEPS}")
+    if not (math.isfinite(samples_per_ray) and samples_per_ray > 0):
+        raise ValueError(f"{samples_per_ray:g} samples on a ray")
+    return int(step), samples_per_ray
 
 
 def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = None, *, readback: AsyncReadback | None = None) -> Iterator[Progress]:

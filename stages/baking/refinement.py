@@ -7,16 +7,19 @@ the steps corrects for what is missing. An interrupted refinement goes on from i
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from efficientnerf.settings import given
-from pipeline.files import atomic
+from pipeline.files import atomic, exists, remove
 from pipeline.stage import Job
+from stages.scratch import opened, unusable
 
 if TYPE_CHECKING:
     from efficientnerf.asset.refinement.state import RefinementState
@@ -46,7 +49,7 @@ def refined(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[Nerf
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets)
     before = fit.error(tree, targets, sample, settings.seed)
-    state, pruned = _restored(job, tree) or (initial_state(tree, MAX_INITIAL_THICKNESS if steps else math.inf), False)
+    state, pruned = _restored(job, tree, steps) or (initial_state(tree, MAX_INITIAL_THICKNESS if steps else math.inf), False)
     del tree  # the state has values of its own
     if not pruned:
         _take_steps(job, state, targets, steps, steps // 2, pruned)
@@ -156,18 +159,29 @@ def _save_checkpoint(job: Job, state: RefinementState, pruned: bool) -> None:
     tensors["coordinates"] = voxel_coordinates(state.tree)
     tensors["progress"] = np.array([state.step, pruned], np.int64)
     with atomic(job.work / CHECKPOINT, durable=False) as temporary:
-        save_file(tensors, str(temporary))
+        save_file(tensors, str(temporary), metadata={"sha256": _digest(tensors)})
 
 
-def _restored(job: Job, tree: NerfTree) -> tuple[RefinementState, bool] | None:
-    """The state of the last checkpoint, and whether voxels were dropped by then; None where there is none that can be read."""
+def _digest(tensors: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 over names, types, shapes and bytes."""
+    digest = hashlib.sha256()
+    for name, values in sorted(tensors.items()):
+        digest.update(f"{name} {values.dtype} {values.shape}\n".encode())
+        digest.update(np.ascontiguousarray(values).data)
+    return digest.hexdigest()
+
+
+def _restored(job: Job, tree: NerfTree, steps: int) -> tuple[RefinementState, bool] | None:
+    """The state of the last checkpoint of so many steps, and whether voxels were dropped by then; None where there is none that fits the tree."""
     from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
     from efficientnerf.asset.tree import tree_from_voxels
 
-    found = _read(job.work / CHECKPOINT)
-    if found is None:
+    path = job.work / CHECKPOINT
+    if not exists(path):
         return None
     try:
+        found = _read(path)
+        _check(found, tree, steps)
         step, pruned = (int(x) for x in found["progress"])
         fitted = tree_from_voxels(
             tree.shape, tree.voxel, tree.bounds_min, found["coordinates"], found["density"], found["sh"].reshape(len(found["sh"]), -1, 3),
@@ -175,18 +189,48 @@ def _restored(job: Job, tree: NerfTree) -> tuple[RefinementState, bool] | None:
         )  # fmt: skip
         density, sh, visits = (np.array(found[name]) for name in MOMENTS)
         state = RefinementState(fitted, density, sh, visits, step)
-    except (KeyError, ValueError) as error:
-        job.warn(f"{CHECKPOINT} can't be used ({error}); the refinement begins again")
+    except (OSError, ValueError) as error:
+        job.warn(unusable(path, error))
+        remove(path)
         return None
     job.say(f"the refinement goes on from step {state.step}")
     return state, bool(pruned)
 
 
-def _read(path: Path) -> dict[str, np.ndarray] | None:
-    from safetensors import SafetensorError
-    from safetensors.numpy import load_file
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """The tensors of a checkpoint; ValueError or OSError where it is not as it was written."""
+    from safetensors import SafetensorError, safe_open
 
     try:
-        return load_file(str(path))
-    except (OSError, SafetensorError, ValueError):
-        return None
+        with opened(path), safe_open(str(path), framework="np") as file:
+            found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            written = (file.metadata() or {}).get("sha256")
+    except (SafetensorError, TypeError, AttributeError) as error:  # of a type that numpy does not have
+        raise ValueError(str(error)[:80]) from None
+    if _digest(found) != written:
+        raise ValueError("its values are not those that its SHA-256 was made of")
+    return found
+
+
+def _check(found: Mapping[str, np.ndarray], tree: NerfTree, steps: int) -> None:
+    """ValueError where the tensors are no state of a refinement of this tree, or a step in it is out of range."""
+    from efficientnerf.asset.tree import voxel_coordinates
+
+    kinds = {"density": "float32", "sh": "float32", "square_density": "float32", "square_sh": "float32", "visits": "int32"}
+    count = len(found["density"]) if "density" in found and found["density"].ndim else 0
+    shapes = dict.fromkeys(kinds, (count,)) | {"sh": (count, 3 * tree.harmonics_count), "coordinates": (count, 3), "progress": (2,)}
+    for name, kind in (kinds | {"coordinates": "int32", "progress": "int64"}).items():
+        if name not in found or found[name].dtype != kind or found[name].shape != shapes[name]:
+            raise ValueError(f"'{name}' is missing, or no {kind} {shapes[name]}")
+    step, pruned = (int(x) for x in found["progress"])
+    low, high = (steps // 2, steps) if pruned else (0, steps // 2)
+    if pruned not in (0, 1) or not low <= step <= high:
+        raise ValueError(f"step {step} is not from {low} to {high}")
+    size = tuple(side * tree.brick for side in tree.shape)
+    if (found["coordinates"] < 0).any() or (found["coordinates"] >= size).any():
+        raise ValueError("voxels outside of the grid")
+    ours, theirs = (np.ravel_multi_index(tuple(at.T), size) for at in (voxel_coordinates(tree), found["coordinates"]))
+    order = np.argsort(ours)
+    place = order[np.minimum(np.searchsorted(ours, theirs, sorter=order), len(ours) - 1)]  # in the tree that was baked
+    if not count or not np.array_equal(ours[place], theirs) or (np.diff(place) <= 0).any() or (count < len(ours) and not pruned):
+        raise ValueError("its voxels are not those that were baked, in their order")

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.stage import Job
-from stages.baking.scratch import read_npy, write_npy
+from stages.baking.scratch import read_arrays, write_arrays
+from stages.scratch import once, unusable
 
 if TYPE_CHECKING:
     from efficientnerf.geometry.spaces import Space
@@ -30,11 +31,16 @@ def baked_values(job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.nd
         sh[rows : rows + len(part)] = part[:, 1:].reshape(len(part), harmonics, 3)
         done, rows = done + 1, rows + len(part)
 
-    while done < blocks and (stored := read_npy(job.work / f"block_{done:06d}.npy")) is not None:
-        append(stored)
+    warn = once(job.warn)
+    while done < blocks and (stored := read_arrays(job.work / f"block_{done:06d}", {"values": ("float32", 2)}, warn)) is not None:
+        expected = min(max(1, bake.POINTS_PER_BLOCK // max(1, points)), len(indices) - rows), 1 + 3 * harmonics
+        if stored["values"].shape != expected:
+            warn(unusable(job.work / f"block_{done:06d}", f"{stored['values'].shape} values, expected {expected}"))
+            break
+        append(stored["values"])
     for some, colours in bake.voxel_values(m, indices, voxel, low, points, job.settings.seed, first=done, space=space):
         part = np.concatenate([some[:, None], colours.reshape(len(some), -1)], axis=1)
-        write_npy(part, job.work / f"block_{done:06d}.npy")
+        write_arrays({"values": part}, job.work / f"block_{done:06d}")
         append(part)
         job.progress(done, blocks, "baking voxels")
         job.safe_point()

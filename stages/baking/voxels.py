@@ -5,13 +5,15 @@ N voxels.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from efficientnerf.settings import given
 from pipeline.stage import Job
-from stages.baking.scratch import read_npy, write_npy
+from stages.baking.scratch import read_arrays, write_arrays
+from stages.scratch import unusable
 
 if TYPE_CHECKING:
     from efficientnerf.asset.bake import Visibility
@@ -99,21 +101,37 @@ def _visibility(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], v
     from efficientnerf.asset import bake
 
     settings: BakeSettings = job.settings
-    names = ("cells", "greatest", "chosen", "before", "behind")
-    stored = {name: part for name in names if (part := read_npy(job.work / f"visibility_{name}.npy")) is not None}
-    if len(stored) == len(names):
-        # before and behind are None with a constant background, and empty arrays in the files.
-        return bake.Visibility(**{name: None if name in ("before", "behind") and not len(part) else part for name, part in stored.items()})  # type: ignore[arg-type]
+    kinds = {"cells": ("int64", 1), "greatest": ("float32", 2), "chosen": ("int64", 1), "before": ("float16", 2), "behind": ("float16", 2)}
+    stored = read_arrays(job.work / "visibility", kinds, job.warn)
+    if stored is not None:
+        found = bake.Visibility(**{name: np.array(part) for name, part in stored.items()})
+        if _fits(found, int(np.prod(shape)), settings.brick_size**3, len(pixels), outside=m.background is None):
+            # With a constant background `before` and `behind` are None, and empty arrays in the files.
+            return found if m.background is None else replace(found, before=None, behind=None)
+        job.warn(unusable(job.work / "visibility", "of another grid or of other images"))
 
     def progress(done: int, total: int) -> None:
         job.progress(done, total, "rendering for visible voxels")
         job.safe_point()
 
     visibility = bake.visible_voxels(m, pixels, shape, voxel, low, settings.brick_size, settings.visibility_rays, progress, space)
-    for name in names:
-        part = getattr(visibility, name)
-        write_npy(np.empty(0, np.float16) if part is None else part, job.work / f"visibility_{name}.npy")
+    parts = {name: getattr(visibility, name) for name in kinds}
+    write_arrays({name: np.empty((0, 4), np.float16) if part is None else part for name, part in parts.items()}, job.work / "visibility")
     return visibility
+
+
+def _fits(found: Visibility, cells: int, per_cell: int, pixels: int, *, outside: bool) -> bool:
+    """Whether a visibility is of so many coarse cells with so many voxels each, and of so many pixels.
+
+    outside  whether `before` and `behind` are of each pixel; else they are empty
+    """
+    assert found.before is not None
+    assert found.behind is not None
+    ascending = not len(found.cells) or (found.cells[0] >= 0 and found.cells[-1] < cells and (np.diff(found.cells) > 0).all())
+    of_pixels = not len(found.chosen) or (found.chosen.min() >= 0 and found.chosen.max() < pixels)
+    rows = len(found.chosen) if outside else 0
+    shapes = found.greatest.shape == (len(found.cells), per_cell) and found.before.shape == (rows, 4) and len(found.behind) == rows
+    return bool(ascending and of_pixels and shapes and (not rows or found.behind.shape[1] == 3))
 
 
 def _heaviest_voxels(job: Job, visibility: Visibility, shape: tuple[int, int, int], most: int) -> np.ndarray:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from efficientnerf.geometry.cameras import Camera
 from stages.framing.camera_paths import similarity_of
+from stages.scratch import Warn, note, noted, once
 
 if TYPE_CHECKING:
     from efficientnerf.asset.rendering import Rendering
@@ -46,12 +48,14 @@ def render_frames(
     *,
     reuse: bool = False,
     draw: Callable[..., Rendering] | None = None,
+    warn: Warn = lambda text: None,
 ) -> list[Path]:
     """Write frame_0000.png and so on (and .exr) to a folder; returns the files in order.
 
     progress  called with (frames done, frames) before each and at the end; may raise to stop
-    reuse     keep frames that exist: only for a folder that this very request alone has written
+    reuse     keep frames that are whole by the note beside them: only for a scratch folder of this very request
     draw      `efficientnerf.asset.rendering.render`, unless another is given
+    warn      is told of frames that can't be kept
     """
     from efficientnerf.asset.rendering import render
     from stages.io.exporters.exr import write_exr
@@ -59,7 +63,7 @@ def render_frames(
     from stages.io.png import write_png
 
     background, similarity = background_from_text(options.background), similarity_of(tree)
-    draw = draw or render
+    draw, warn = draw or render, once(warn)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for k, camera in enumerate(cameras):
@@ -67,16 +71,28 @@ def render_frames(
             progress(k, len(cameras))
         png, exr = folder / f"frame_{k:04d}.png", folder / f"frame_{k:04d}.exr"
         with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
-        # The PNG is written last, atomically: where it exists, the frame is finished.
-        if not (reuse and png.exists()):
+        outputs = [png, exr] if with_exr else [png]
+        if not (reuse and noted(folder / f"frame_{k:04d}.json", list[str], warn, partial(_check, outputs, camera)) is not None):
             output = draw(tree, camera, supersample=options.supersample)
             if with_exr:
                 write_exr(exr, colour=output.colour, opacity=output.opacity, depth=output.depth, normal=output.normal, world_from_capture=similarity)
-            write_png(frame_from_rendering(output.colour, output.opacity, background), png)
-        written += [png, exr] if with_exr else [png]
+            write_png(frame_from_rendering(output.colour, output.opacity, background), png, durable=not reuse)
+            if reuse:
+                note(folder / f"frame_{k:04d}.json", [path.name for path in outputs], outputs)
+        written += outputs
     if progress is not None:
         progress(len(cameras), len(cameras))
     return written
+
+
+def _check(outputs: Sequence[Path], camera: Camera, value: list[str], names: Collection[str]) -> None:
+    """Raises where a frame's files are not all there, or its PNG is none of this size."""
+    from stages.io.png import read_png
+
+    if {path.name for path in outputs} != {*names}:
+        raise ValueError("files are missing")
+    if read_png(outputs[0]).shape[:2] != (camera.height, camera.width):
+        raise ValueError(f"{outputs[0].name} is of another size")
 
 
 def encode_frames(frames: Sequence[Path], path: Path, options: RenderOptions, each: Callable[[], None] | None = None) -> None:

@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from efficientnerf.training.settings import TrainSettings
@@ -18,6 +19,7 @@ from pipeline.text import printable
 from stages.artifacts import TrainOutputs
 from stages.io.json_file import shown
 from stages.renamed_settings import updated
+from stages.scratch import opened
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,6 +31,20 @@ if TYPE_CHECKING:
     from stages.io.scene import Scene
 
 FORMAT = 1
+
+Point = tuple[float, float, float]
+
+
+class _About(msgspec.Struct):
+    """What a field file says of the field."""
+
+    settings: dict[str, Any]
+    bounds: tuple[Point, Point]
+    contracted: bool
+    near: float
+    far: float
+    background: Point | None = None
+    ndc: dict[str, Any] | None = None
 
 
 def write_tensors(tensors: dict[str, Tensor], about: dict[str, Any], path: Path) -> None:
@@ -55,8 +71,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            about = json.loads((file.metadata() or {}).get("field", "null"))
+        with opened(path), safe_open(path, framework="pt", device="cpu") as file:
+            about = json.loads((file.metadata() or {}).get("field", "null"), parse_constant=_refused)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
     except (SafetensorError, ValueError, OSError, RecursionError, TypeError, AttributeError) as error:  # the last two: types that NumPy or torch lack
         raise CorruptArtifact(f"{printable(path)}: not a readable field file ({printable(error, 80)}). Train again.") from None
@@ -66,6 +82,10 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if digest_of(tensors) != about.get("sha256"):
         raise CorruptArtifact(f"{path}: damaged field file: its tensors are not those that its SHA-256 was made of. Train again.")
     return tensors, about
+
+
+def _refused(name: str) -> Any:
+    raise ValueError(f"{name} is no number")
 
 
 def space_of(s: Scene) -> Space:
@@ -128,22 +148,14 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
     from efficientnerf.rendering.field_renderer import FieldRenderer
 
     path = TrainOutputs(folder).field
-    tensors, about = read_tensors(path)
+    tensors, found = read_tensors(path)
     try:
-        background = about["background"]
-        if not isinstance(about["settings"], dict):
-            raise TypeError(f"'settings' is {shown(about['settings'])}")
-        ndc = None if about.get("ndc") is None else Ndc.from_json(about["ndc"])
-        space = space_from(np.asarray(about["bounds"], np.float64).reshape(2, 3), contracted=bool(about["contracted"]), ndc=ndc)
-        span = (float(about["near"]), float(about["far"]))
-        m = model(
-            space,
-            settings_from(TrainSettings, updated("train", TrainSettings, about["settings"])),
-            None if background is None else tuple(background),
-            device,
-            span,
-        )
+        about = msgspec.convert(found, _About)
+        ndc = None if about.ndc is None else Ndc.from_json(about.ndc)
+        space = space_from(np.asarray(about.bounds, np.float64), contracted=about.contracted, ndc=ndc)
+        settings = settings_from(TrainSettings, updated("train", TrainSettings, about.settings))
+        m = model(space, settings, about.background, device, (about.near, about.far))
         restore(m, tensors)
-        return FieldRenderer(m, *span)
+        return FieldRenderer(m, about.near, about.far)
     except (UsageError, KeyError, TypeError, ValueError, OverflowError, RecursionError, RuntimeError) as error:  # the last: torch's, of shapes
         raise CorruptArtifact(f"{printable(path)}: {printable(error, 300)}. Train again.") from None

@@ -5,7 +5,6 @@ See docs/experiments/sfm.md.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, rays
+from pipeline.files import remove
 from stages.sfm import matches
 from stages.sfm.matches import WorkImage
 
@@ -107,14 +107,14 @@ def _incremental_mapping(
             progress(registered, count, "registering images")
 
         output = work / "models"
-        shutil.rmtree(output, ignore_errors=True)
+        remove(output)
         output.mkdir()
         pycolmap.set_random_seed(seed)
         safe_point()
         models = pycolmap.incremental_mapping(
             matches.database_path(work), work / "images", output, options, initial_image_pair_callback=one_more, next_image_callback=one_more
         )
-        shutil.rmtree(output)
+        remove(output)
     safe_point()
     return [model for _, model in sorted(models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))]
 

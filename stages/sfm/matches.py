@@ -11,28 +11,31 @@ import ctypes
 import hashlib
 import json
 import os
-import shutil
 import signal
 import sqlite3
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
-from pipeline.files import rename, write_atomically, write_json
+from pipeline.files import remove, rename, write_atomically
 from stages.io.photo import DecodedPhoto, read_mask_file, read_photo
 from stages.io.pictures import UnreadableImage
-from stages.io.png import FAST, write_png
+from stages.io.png import FAST, read_png, write_png
+from stages.scratch import note, noted, once, opened
 
-LAYOUT = 1  # of the work folder; raise it when what is written there changes meaning
+LAYOUT = 2  # of the work folder; raise it when what is written there changes meaning
 BLOCK_SIZE = 8  # images along a side of a block of pairs: between two blocks lies a safe point, a second or three apart
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md
 OVERLAP = 10  # of sequential matching: images that follow each one
 KEYFRAMES = 40  # images of a sequence that are all matched with each other, for loop closure
 
+Side = Annotated[int, msgspec.Meta(ge=1, le=2**20)]  # pixels
 Progress = Callable[..., None]
 SafePoint = Callable[[], None]
 
@@ -51,11 +54,11 @@ class WorkImage:
 
     name: str
     file: str
-    width: int
-    height: int
-    work_width: int
-    work_height: int
-    focal: float | None
+    width: Side
+    height: Side
+    work_width: Side
+    work_height: Side
+    focal: Annotated[float, msgspec.Meta(gt=0)] | None
     camera_key: str
 
 
@@ -141,28 +144,31 @@ def prepare_images(
     request = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "photographs": _digests(paths, masks, safe_point)}
     text = json.dumps(request, indent=1, sort_keys=True)
     record = work / "request.json"
-    if not record.is_file() or record.read_text() != text:
-        for part in ("images", "masks", "copies"):
-            shutil.rmtree(work / part, ignore_errors=True)
-        remove_database(work)
-        for part in ("images", "masks", "copies"):
-            (work / part).mkdir(parents=True)
+    parts = work / "images", work / "masks"
+    work.mkdir(parents=True, exist_ok=True)
+    if not _holds(record, text.encode()) or any(part.is_symlink() or not part.is_dir() for part in parts):
+        for entry in list(work.iterdir()):
+            remove(entry)
+        for part in parts:
+            part.mkdir()
         write_atomically(record, text.encode(), durable=False)
     images: list[WorkImage] = []
     rejected: list[tuple[str, str]] = []
+    warn_once = once(warn)
     for index, name in enumerate(sorted(paths)):
         safe_point()
-        note = work / "copies" / f"{index:05d}.json"
-        if not note.is_file():
-            write_json(note, _copy(name, paths[name], index, max_side, masks.get(name), work), durable=False)
-        copied = json.loads(note.read_text())
-        if "reason" in copied:
-            rejected.append((name, copied["reason"]))
-            warn(f"{name}: {copied['reason']}; left out.")
+        record = work / f"copy_{index:05d}.json"
+        copied = noted(record, Copy, warn_once, partial(_check, name, index, max_side, work))
+        if copied is None:
+            copied, outputs = _copy(name, paths[name], index, max_side, masks.get(name), work)
+            note(record, msgspec.to_builtins(copied), outputs)
+        if copied.image is None:
+            rejected.append((name, copied.remark))
+            warn(f"{name}: {copied.remark}; left out.")
         else:
-            if copied["remark"]:
-                warn(f"{name}: {copied['remark']}")
-            images.append(WorkImage(**copied["image"]))
+            if copied.remark:
+                warn(f"{name}: {copied.remark}")
+            images.append(copied.image)
         progress(index + 1, len(paths), "reading photographs")
     return images, rejected
 
@@ -179,13 +185,26 @@ def _digests(paths: Mapping[str, Path], masks: Mapping[str, Path], safe_point: S
     return rows
 
 
-def _copy(name: str, path: Path, index: int, max_side: int, mask_path: Path | None, work: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Copy:
+    """What became of a photograph: its copy, or None where it could not be read; and a remark, or the reason."""
+
+    image: WorkImage | None
+    remark: str
+
+
+def _file(index: int) -> str:
+    return f"{index:05d}.png"
+
+
+def _copy(name: str, path: Path, index: int, max_side: int, mask_path: Path | None, work: Path) -> tuple[Copy, list[Path]]:
+    """Copy one photograph; with the files written."""
     try:
         photo: DecodedPhoto = read_photo(path, max_side)
     except UnreadableImage as error:
-        return {"reason": str(error)}
-    file = f"{index:05d}.png"
-    write_png(photo.rgb, work / "images" / file, compress_level=FAST, durable=False)
+        return Copy(None, str(error)), []
+    outputs = [work / "images" / _file(index)]
+    write_png(photo.rgb, outputs[0], compress_level=FAST, durable=False)
     mask, remark = photo.opaque, ""
     if mask_path is not None:
         try:
@@ -194,11 +213,38 @@ def _copy(name: str, path: Path, index: int, max_side: int, mask_path: Path | No
         except UnreadableImage as error:
             remark = f"its mask is not used: {error}"
     if mask is not None:
-        write_png(np.where(mask, np.uint8(255), np.uint8(0)), work / "masks" / f"{file}.png", compress_level=FAST, durable=False)
+        outputs.append(work / "masks" / f"{_file(index)}.png")
+        write_png(np.where(mask, np.uint8(255), np.uint8(0)), outputs[1], compress_level=FAST, durable=False)
     height, width = photo.rgb.shape[:2]
     focal = None if photo.focal is None else float(photo.focal)
     key = f"{photo.width}x{photo.height} {photo.maker} {focal if focal is None else round(focal, 1)}"
-    return {"image": WorkImage(name, file, photo.width, photo.height, width, height, focal, key).__dict__, "remark": remark}
+    return Copy(WorkImage(name, _file(index), photo.width, photo.height, width, height, focal, key), remark), outputs
+
+
+def _check(name: str, index: int, max_side: int, work: Path, copied: Copy, outputs: Collection[str]) -> None:
+    """Raises where this is not what became of a photograph, or its copy and mask are not there at working size."""
+    image = copied.image
+    if image is None:
+        return
+    if (image.name, image.file) != (name, _file(index)) or max(image.work_width, image.work_height) > max_side:
+        raise ValueError("of another photograph")
+    for path in (work / "images" / image.file, work / "masks" / f"{image.file}.png"):
+        there = path.relative_to(work).as_posix() in outputs
+        if there and read_png(path).shape[:2] != (image.work_height, image.work_width):
+            raise ValueError(f"{path.name} is of another size")
+        if not there and path.parent.name == "images":
+            raise ValueError(f"{path.name} is missing")
+        if not there:
+            remove(path)  # that of a photograph without a mask, of which only `extract_features` knows
+
+
+def _holds(path: Path, data: bytes) -> bool:
+    """Whether a plain file has exactly this content."""
+    try:
+        with opened(path) as file:
+            return file.read(len(data) + 1) == data
+    except OSError:
+        return False
 
 
 def database_path(work: Path) -> Path:
@@ -346,14 +392,14 @@ def match_pairs(work: Path, images: Sequence[WorkImage], *, how: str, seed: int,
         geometry = pycolmap.TwoViewGeometryOptions()
         geometry.ransac.random_seed = seed
         pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = work / "pairs.txt"
+        pairing.match_list_path = pairs = work / "pairs.txt"
         blocks = pairs_to_match(len(images), how)
         total, done = sum(map(len, blocks)), 0
         for block in blocks:
             safe_point()
             todo = [(i, j) for i, j in block if tuple(sorted((ids[images[i].file], ids[images[j].file]))) not in verified]
             if todo:
-                (work / "pairs.txt").write_text("".join(f"{images[i].file} {images[j].file}\n" for i, j in todo))
+                write_atomically(pairs, "".join(f"{images[i].file} {images[j].file}\n" for i, j in todo).encode(), durable=False)
                 pycolmap.match_image_pairs(database_path(work), matching, pairing, geometry, pycolmap.Device.cpu)
             done += len(block)
             progress(done, total, "matching pairs")

@@ -9,16 +9,18 @@ given it, on any machine with the same number of threads.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
+
+import msgspec
 
 from efficientnerf.settings import given
 from efficientnerf.training.schedule import Schedule, schedule_of
 from efficientnerf.training.settings import TrainSettings
-from pipeline.files import write_json
+from stages.scratch import Warn, note, noted, unusable
 
 FILE = "schedule.json"
 # docs/experiments/schedule.md
@@ -26,7 +28,22 @@ TIMED = 48  # steps after the warm-up that are timed
 MARKS = (0.15, 0.3, 0.5, 0.7, 0.85, 0.95)  # fractions of the budget at which the number of iterations is set again
 MIN_TIMED = 8  # steps that have to be timed before that
 RESERVE = 0.01  # of the budget, for what comes after the last step
+MAX_STEPS = 2**40
 UNKNOWN = 10_000_000  # iterations of a schedule whose number is not set yet
+
+
+class _State(msgspec.Struct):
+    """`Schedule.state`."""
+
+    iterations: Annotated[int, msgspec.Meta(ge=1, le=MAX_STEPS)]
+    hold: Annotated[int, msgspec.Meta(ge=1)]
+    aims: list[tuple[Annotated[int, msgspec.Meta(ge=1, le=MAX_STEPS)], Annotated[int, msgspec.Meta(ge=1)]]]
+
+
+def _fits(found: _State, hold: int) -> bool:
+    """Whether a budget with this hold can have written it: each revision after the one before it, and none after the end."""
+    steps = [hold, *(step for _, step in found.aims)]
+    return found.hold == hold and steps == sorted(steps) and (not found.aims or steps[-1] <= found.iterations)
 
 
 @dataclass
@@ -37,12 +54,14 @@ class Budget:
     work      scratch folder, where the schedule is written down
     spent     seconds that earlier attempts trained for
     clock     seconds, monotonic
+    warn      is told of a schedule that can't be used
     """
 
     settings: TrainSettings
     work: Path
     spent: float = 0.0
     clock: Callable[[], float] = time.monotonic
+    warn: Warn = lambda text: None
     budget: float = field(init=False)  # seconds
     schedule: Schedule = field(init=False)
     started: float = field(init=False)
@@ -51,9 +70,13 @@ class Budget:
 
     def __post_init__(self) -> None:
         self.started, self.budget = self.clock(), given(self.settings.time_budget) or 0.0
-        self.schedule = _read(self.work / FILE, self.settings) or replace(
-            schedule_of(self.settings), iterations=UNKNOWN, hold=self.settings.occupancy_warmup_steps + TIMED
-        )
+        hold = self.settings.occupancy_warmup_steps + TIMED
+        found = noted(self.work / FILE, _State, self.warn)
+        if found is not None and not _fits(found, hold):
+            self.warn(unusable(self.work / FILE, "no schedule of this run"))
+            found = None
+        # Of a schedule that is lost, the number of iterations is timed again.
+        self.schedule = schedule_of(self.settings, msgspec.to_builtins(found) if found else {"iterations": UNKNOWN, "hold": hold, "aims": []})
         self.marks = [fraction * self.budget for fraction in MARKS]
 
     @property
@@ -86,7 +109,7 @@ class Budget:
             iterations += max(0, int(((1 - RESERVE) * self.budget - now) / max(each, 1e-6)))
         self.schedule = self.schedule.with_iterations(iterations, step) if self.known else replace(self.schedule, iterations=iterations)
         self.timed = step, now
-        write_json(self.work / FILE, self.schedule.state())
+        note(self.work / FILE, self.schedule.state())
         return True
 
     def _due(self, step: int, now: float) -> bool:
@@ -100,10 +123,3 @@ class Budget:
         if due:
             self.marks = self.marks[len(passed) :]
         return due
-
-
-def _read(path: Path, settings: TrainSettings) -> Schedule | None:
-    try:
-        return schedule_of(settings, json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, KeyError, TypeError):
-        return None

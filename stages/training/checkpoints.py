@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from pipeline.errors import CorruptArtifact
+from pipeline.files import remove
+from pipeline.text import printable
 
 if TYPE_CHECKING:
     from efficientnerf.training.loop import Trainer
@@ -11,6 +17,14 @@ if TYPE_CHECKING:
     from stages.training.log import TrainLog
 
 KEPT = 2
+MAX_SECONDS = 1e10  # three centuries
+
+
+class _About(msgspec.Struct):
+    """What a checkpoint says of itself."""
+
+    step: Annotated[int, msgspec.Meta(ge=1)]
+    seconds: Annotated[float, msgspec.Meta(ge=0, le=MAX_SECONDS)]
 
 
 class Checkpoints:
@@ -29,25 +43,46 @@ class Checkpoints:
         from stages.io.field_file import write_tensors
 
         log.flush()
-        write_tensors(state_of(t), {"step": t.step, "seconds": log.seconds}, self.job.work / f"checkpoint_{t.step:08d}.safetensors")
+        write_tensors(state_of(t), {"step": t.step, "seconds": log.seconds}, self.job.work / _name(t.step))
         for old in self.paths()[:-KEPT]:
-            old.unlink()
+            remove(old)
 
-    def restore(self, t: Trainer) -> float:
-        """Restore the newest checkpoint that can be read, if there is one; the seconds that were trained up to it."""
-        from efficientnerf.training.loop import restore
-        from pipeline.errors import CorruptArtifact
-        from stages.io.field_file import read_tensors
+    def restore(self, t: Trainer, last: int) -> float:
+        """Restore the newest checkpoint that can be used, if there is one; the seconds that were trained up to it. One that can't be is removed, and
+        has changed nothing.
 
+        last  the step that training ends with
+        """
         for path in reversed(self.paths()):
             try:
-                tensors, about = read_tensors(path)
-                restore(t, tensors)
-                seconds = float(about["seconds"])
-            except (CorruptArtifact, KeyError, ValueError) as error:
-                self.job.warn(f"{path.name} can't be used ({error}); going on from the one before it")
-                path.unlink()
+                seconds = _restore(t, path, last)
+            except (CorruptArtifact, ValueError, OSError) as error:
+                self.job.warn(f"{path.name} can't be used ({printable(error, 300)}); going on from the one before it")
+                remove(path)
                 continue
             self.job.say(f"training goes on from step {t.step}")
             return seconds
         return 0.0
+
+
+def _restore(t: Trainer, path: Path, last: int) -> float:
+    """Restore a checkpoint: all of it, or nothing where this raises."""
+    from efficientnerf.training.loop import restore
+    from stages.io.field_file import read_tensors
+
+    tensors, about = read_tensors(path)
+    try:
+        about = msgspec.convert({"step": about.get("step"), "seconds": about.get("seconds")}, _About)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from None
+    progress = tensors.get("progress")
+    if path.name != _name(about.step) or progress is None or progress.numel() != 2 or float(progress.flatten()[0]) != about.step:
+        raise ValueError(f"it is of step {about.step}, by its own account")
+    if about.step >= last:
+        raise ValueError(f"step {about.step} of {last}")
+    restore(t, tensors)
+    return about.seconds
+
+
+def _name(step: int) -> str:
+    return f"checkpoint_{step:08d}.safetensors"

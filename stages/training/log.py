@@ -6,13 +6,26 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+
+from pipeline.files import atomic, remove, write_atomically
+from stages.scratch import opened
 
 if TYPE_CHECKING:
     from efficientnerf.training.loop import Progress
 
 EVERY = 10  # steps
 SMOOTHING = 0.95  # of the running mean of the loss
+
+
+class _Line(msgspec.Struct):
+    """What has to hold of a line that is read again."""
+
+    step: Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+    psnr: Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+    preview_psnr: Annotated[float, msgspec.Meta(ge=-1000, le=1000)] | None = None
 
 
 class TrainLog:
@@ -38,9 +51,9 @@ class TrainLog:
         self.loss, self.fraction = 0.0, 0.0
         self.rates: dict[str, Any] = {}
         self.unwritten: list[str] = []
-        if path.exists():
-            kept = [line for line in read_lines(path) if line["step"] <= step]
-            path.write_text("".join(json.dumps(line, sort_keys=True) + "\n" for line in kept), encoding="utf-8")
+        kept = [line for line in read_lines(path) if line["step"] <= step]
+        remove(path)  # a folder of that name could not be replaced
+        write_atomically(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode(), durable=False)
 
     @property
     def seconds(self) -> float:
@@ -106,7 +119,8 @@ class TrainLog:
         previews = [(x["step"], x["preview_psnr"]) for x in lines if x.get("preview_psnr") is not None]
         if previews:
             series["preview view"] = ([step for step, _ in previews], [psnr for _, psnr in previews])
-        curve(path, series, x_label="step", y_label="PSNR / dB")
+        with atomic(path, durable=False) as temporary:
+            curve(temporary, series, x_label="step", y_label="PSNR / dB")
 
 
 def psnr_of(loss: float) -> float:
@@ -115,13 +129,13 @@ def psnr_of(loss: float) -> float:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """The lines of a log, up to one that was cut short by a kill; none where there is no file yet."""
+    """The lines of a log, up to one that was cut short by a kill or is none of a log; none where there is no file yet."""
     out: list[dict[str, Any]] = []
-    if not path.exists():
-        return out
-    for text in path.read_text(encoding="utf-8").splitlines():
-        try:
-            out.append(json.loads(text))
-        except ValueError:
-            break
+    try:
+        with opened(path) as file:
+            for text in file:
+                msgspec.json.decode(text, type=_Line)
+                out.append(json.loads(text))
+    except (OSError, ValueError, msgspec.MsgspecError):
+        pass
     return out

@@ -9,6 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.text import printable
+from stages.scratch import Warn, digest_of, once
+
 if TYPE_CHECKING:
     from efficientnerf.rendering.field_renderer import FieldRenderer
     from stages.io.scene import Scene, View
@@ -47,13 +50,20 @@ class Previews:
         self.psnr = round(float(psnr(render, truth)), 2)
         return self.psnr
 
-    def publish(self, folder: Path) -> None:
-        """Copy all previews, those of earlier attempts too, into `folder`, which is made if there are any."""
-        drawn = sorted(self.work.glob("preview_*.png"))
-        if drawn:
-            folder.mkdir()
-            for path in drawn:
-                shutil.copyfile(path, folder / path.name)
+    def publish(self, folder: Path, warn: Warn) -> None:
+        """Copy all previews, those of earlier attempts too, into `folder`, which is made if there are any; without such as can't be read."""
+        from stages.io.png import read_png
+
+        warn = once(warn)
+        for path in sorted(self.work.glob("preview_*.png")):
+            try:
+                digest_of(path)  # a plain file
+                read_png(path)
+            except Exception as error:  # whatever a decoder raises
+                warn(f"{path.name} of an earlier attempt can't be used ({printable(error, 200)}); it is left out")
+                continue
+            folder.mkdir(exist_ok=True)
+            shutil.copyfile(path, folder / path.name)
 
 
 def preview_view(s: Scene) -> View | None:

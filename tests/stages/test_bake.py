@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
+from tests.stages.spoilers import SPOILERS
 
 QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512)
 
@@ -104,16 +107,81 @@ def test_stopped_anywhere_it_ends_in_the_same_bytes(inputs: dict[str, Path], tmp
             assert stop.count - baked_again <= calls - call + 1
 
 
-@pytest.mark.parametrize("damage", [b"", b"\x93NUMPY", None])
-def test_damaged_scratch_is_made_anew(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], damage: bytes | None) -> None:
-    digest, _, calls = undisturbed
-    with pytest.raises(Interrupted):
-        run(job(tmp_path, QUICK, stop=StopAt(calls), **inputs))
-    block = sorted((tmp_path / "work").glob("block_*.npy"))[1]
-    block.write_bytes(block.read_bytes()[:-7] if damage is None else damage)
-    (tmp_path / "work" / "voxels.npy").write_bytes(b"")
-    (tmp_path / "work" / ".block_000000.npy.123.part").write_bytes(b"half")
-    assert run(job(tmp_path, QUICK, **inputs)) == digest
+@pytest.fixture(scope="module")
+def stopped(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, undisturbed: tuple[str, Job, int]) -> Path:
+    """The scratch of a bake that was stopped at its last safe point."""
+    folder = tmp_path_factory.mktemp("stopped")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(baking, "POINTS_PER_BLOCK", 8192)
+        patch.setattr(baking, "RAYS_PER_BLOCK", 512)
+        with pytest.raises(Interrupted):
+            run(job(folder, QUICK, stop=StopAt(undisturbed[2]), **inputs))
+    return folder / "work"
+
+
+@pytest.mark.parametrize("how", SPOILERS)
+def test_every_scratch_file_may_be_damaged(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], stopped: Path, how: str) -> None:
+    shutil.copytree(stopped, tmp_path / "work")
+    assert {path.name.partition("_")[0] for path in stopped.iterdir()} == {"block", "visibility.json", "visibility", "refinement.safetensors"}
+    (tmp_path / "work" / ".block_000000_values.npy.123.part").write_bytes(b"half")
+    for path in stopped.iterdir():
+        SPOILERS[how](tmp_path / "work" / path.name)
+    events: list[dict[str, Any]] = []
+    assert run(job(tmp_path, QUICK, events=events, **inputs)) == undisturbed[0]
+    warned = [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"]
+    assert warned == ["visibility.json", "block_000000.json", "refinement.safetensors"]
+
+
+@pytest.mark.parametrize("pattern", ["visibility_greatest.npy", "block_000001_values.npy"])
+def test_an_array_that_is_zero_is_not_taken_for_whole(
+    inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], stopped: Path, pattern: str
+) -> None:
+    shutil.copytree(stopped, tmp_path / "work")
+    (tmp_path / "work" / "refinement.safetensors").unlink()
+    path = tmp_path / "work" / pattern
+    size = path.stat().st_size
+    path.write_bytes(path.read_bytes()[:128] + bytes(size - 128))  # as after a power cut: the right name, type and size
+    assert run(job(tmp_path, QUICK, **inputs)) == undisturbed[0]
+
+
+def step(value: int, pruned: int = 0) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(tensors: dict[str, np.ndarray]) -> None:
+        tensors["progress"] = np.array([value, pruned], np.int64)
+
+    return change
+
+
+def replaced(name: str, values: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(tensors: dict[str, np.ndarray]) -> None:
+        tensors[name] = np.ascontiguousarray(values(tensors[name]))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        step(-1), step(10**9), step(3, 7), replaced("square_sh", lambda v: v[:-1]), replaced("visits", lambda v: v.astype(np.float32)),
+        replaced("coordinates", lambda v: v + 1), replaced("coordinates", lambda v: v - 1), replaced("coordinates", lambda v: v[::-1]),
+        replaced("coordinates", lambda v: v[:1] + 0 * v), replaced("sh", lambda v: v[:, :-3]), replaced("density", lambda v: v[..., None]),
+        lambda tensors: tensors.pop("progress"),
+    ],
+)  # fmt: skip
+def test_a_refinement_that_does_not_fit_begins_again(
+    inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], stopped: Path, change: Callable[[dict[str, np.ndarray]], object]
+) -> None:
+    from safetensors.numpy import load_file, save_file
+
+    from stages.baking.refinement import _digest
+
+    shutil.copytree(stopped, tmp_path / "work")
+    path = tmp_path / "work" / "refinement.safetensors"
+    tensors = load_file(path)
+    change(tensors)
+    save_file(tensors, path, metadata={"sha256": _digest(tensors)})
+    events: list[dict[str, Any]] = []
+    assert run(job(tmp_path, QUICK, events=events, **inputs)) == undisturbed[0]
+    assert [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"] == [path.name]
 
 
 def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tuple[str, Job, int]) -> None:

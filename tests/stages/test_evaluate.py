@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,9 @@ from stages.framing.camera_paths import pose_on_sphere
 from stages.io.exporters.frames import frame_from_rendering
 from stages.io.png import write_png
 from stages.io.scene import Orbit, Scene, View, save
+from stages.scratch import note
 from tests.fakes import WHITE, BallField, BallTree
+from tests.stages.spoilers import SPOILERS
 
 TREE = BallTree()
 WIDTH, HEIGHT = 60, 44
@@ -209,6 +212,39 @@ def test_a_stop_and_going_on_gives_the_same_bytes_and_measures_no_view_twice(tmp
         assert hashlib.sha256((job.out / name).read_bytes()).digest() == hashlib.sha256((whole.out / name).read_bytes()).digest()
     finished = len(list((tmp_path / "work").glob("view_*.json"))) - len(second.calls)
     assert finished == moment // 2
+
+
+@pytest.mark.parametrize("how", SPOILERS)
+@pytest.mark.parametrize("pattern", ["view_*", "picture_*"])
+def test_every_scratch_file_of_an_evaluation_may_be_damaged(tmp_path: Path, pattern: str, how: str) -> None:
+    poses = make_scene(tmp_path / "poses", "tttt", background=None)
+    whole = job_in(tmp_path / "whole", poses, EvaluateSettings(field_views=2))
+    evaluate(TREE.render, lambda: BallField(TREE), whole)
+    shutil.copytree(whole.work, tmp_path / "work")
+    for path in sorted(whole.work.glob(pattern)):
+        SPOILERS[how](tmp_path / "work" / path.name)
+    events: list[dict[str, Any]] = []
+    job = job_in(tmp_path, poses, EvaluateSettings(field_views=2), report=events.append)
+    evaluate(TREE.render, lambda: BallField(TREE), job)
+    for name in ("metrics.json", "contact_sheet.png"):
+        assert (job.out / name).read_bytes() == (whole.out / name).read_bytes()
+    warned = [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"]
+    assert warned == ["view_00000.json" if pattern == "view_*" else "view_00001.json"]
+
+
+@pytest.mark.parametrize(
+    "value", [None, {}, {"name": "v0.png", "network": None, "asset": {}}, {"name": "v0.png", "network": None, "asset": None}, {"name": "v9.png"}]
+)
+def test_odd_metrics_in_scratch_are_measured_again(tmp_path: Path, value: Any) -> None:
+    poses = make_scene(tmp_path / "poses", "tt")
+    whole = job_in(tmp_path / "whole", poses, EvaluateSettings(field_views=1))
+    evaluate(TREE.render, lambda: BallField(TREE, background=WHITE), whole)
+    for k in range(2):
+        (tmp_path / "work").mkdir(exist_ok=True)
+        note(tmp_path / "work" / f"view_{k:05d}.json", value)
+    job = job_in(tmp_path, poses, EvaluateSettings(field_views=1))
+    evaluate(TREE.render, lambda: BallField(TREE, background=WHITE), job)
+    assert (job.out / "metrics.json").read_bytes() == (whole.out / "metrics.json").read_bytes()
 
 
 def test_the_field_is_not_loaded_where_nothing_needs_it(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from stages.framing.camera_paths import turntable_cameras
 from stages.io.png import read_png
 from stages.turntable import STAGE, TurntableSettings, render_turntable
 from tests.fakes import BallTree
+from tests.stages.spoilers import SPOILERS
 
 SETTINGS = TurntableSettings(frames=5, width=64, height=48, fps=10)
 
@@ -80,9 +81,27 @@ def test_half_written_frames_are_drawn_again(tmp_path: Path) -> None:
     frames.mkdir(parents=True)
     (frames / ".frame_0000.png.123.part").write_bytes(b"half")
     (frames / "frame_0000.exr").write_bytes(b"half")
+    (frames / "frame_0001.png").write_bytes(b"")  # without a note
     job = job_in(tmp_path)
     render_turntable(BallTree(), job, BallTree.render)
     assert digests(job.out) == digests(whole.out)
+
+
+@pytest.mark.parametrize("how", SPOILERS)
+@pytest.mark.parametrize("suffix", [".png", ".exr", ".json"])
+def test_every_scratch_file_of_a_turntable_may_be_damaged(tmp_path: Path, suffix: str, how: str) -> None:
+    whole = job_in(tmp_path / "whole")
+    render_turntable(BallTree(), whole, BallTree.render)
+    asked = iter(range(100))
+    with pytest.raises(Interrupted):
+        render_turntable(BallTree(), job_in(tmp_path, "first", stop=lambda: 2 if next(asked) >= 3 else None), BallTree.render)
+    for path in sorted((tmp_path / "work" / "frames").glob(f"*{suffix}")):
+        SPOILERS[how](path)
+    events: list[dict[str, Any]] = []
+    job = job_in(tmp_path, "second", report=events.append)
+    render_turntable(BallTree(), job, BallTree.render)
+    assert digests(job.out) == digests(whole.out)
+    assert [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"] == ["frame_0000.json"]
 
 
 def test_progress_ends_at_the_last_frame(tmp_path: Path) -> None:

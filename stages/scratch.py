@@ -1,0 +1,109 @@
+"""What a stage leaves in its scratch folder for a later attempt: each piece with a note of the SHA-256 of its files.
+
+Scratch is not synced: after a power cut a file may have its name and nothing, or half, of what was in it; and a run may come from someone else. A piece
+counts only where the note and all of its files are as they were written, and the note's value is of the type that is expected. Else the note is
+removed, and the piece is made again.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import os
+import stat
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from pipeline import files
+from pipeline.text import printable
+
+T = TypeVar("T")
+Warn = Callable[[str], object]
+
+
+class _Note(msgspec.Struct, forbid_unknown_fields=True):
+    """
+    value   whatever the stage needs to know again
+    files   SHA-256 of each file by its path relative to the note's folder
+    sha256  of all this
+    """
+
+    value: Any
+    files: dict[str, str]
+    sha256: str
+
+
+def note(path: Path, value: Any, outputs: Sequence[Path] = ()) -> None:
+    """Note that a piece is done: a value that JSON can hold, and the files that were written for it, in the note's folder or below. The last to be written."""
+    digests = {output.relative_to(path.parent).as_posix(): digest_of(output) for output in outputs}
+    text = json.dumps({"value": value, "files": digests, "sha256": _digest(value, digests)}, allow_nan=False)
+    files.write_atomically(path, text.encode(), durable=False)
+
+
+def noted(path: Path, kind: type[T], warn: Warn, check: Callable[[T, Collection[str]], object] | None = None) -> T | None:
+    """The value of a note, of this type as msgspec decodes it; None where there is none that counts.
+
+    warn   is told of a note that does not count
+    check  is given the value and the names of the files, and raises where they are not what the stage needs
+    """
+    try:
+        with opened(path) as file:
+            found = msgspec.convert(json.loads(file.read(files.MAX_JSON)), _Note)
+        if _digest(found.value, found.files) != found.sha256:
+            raise ValueError("it is not as it was written")
+        for name, digest in found.files.items():
+            if not files.is_safe_name(name) or digest_of(path.parent / name) != digest:
+                raise ValueError(f"{name} is not as it was written")
+        value = msgspec.convert(found.value, kind)
+        if check is not None:
+            check(value, found.files.keys())
+        return value
+    except Exception as error:  # whatever a decoder raises in a check
+        if not files.exists(path):
+            return None
+        reason = error.strerror if isinstance(error, OSError) else error
+    warn(unusable(path, reason))
+    files.remove(path)
+    return None
+
+
+def unusable(path: Path, reason: object) -> str:
+    """The warning about a piece of scratch that does not count."""
+    return f"{path.name} of an earlier attempt can't be used ({printable(reason, 200)}); what it stands for is made again"
+
+
+def once(warn: Warn) -> Warn:
+    """Pass on the first warning alone: a power cut damages many pieces at a time."""
+    said = False
+
+    def first(text: str) -> None:
+        nonlocal said
+        if not said:
+            said = True
+            warn(text)
+
+    return first
+
+
+def _digest(value: Any, digests: dict[str, str]) -> str:
+    return hashlib.sha256(json.dumps([value, digests]).encode()).hexdigest()
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a plain file. Raises OSError, for a link or a pipe too."""
+    with opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def opened(path: Path) -> io.BufferedReader:
+    """A plain file to read from. Raises OSError, for a link or a pipe too, which is not waited for."""
+    file = open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb")  # noqa: SIM115
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "no plain file", str(path))
+    return file
