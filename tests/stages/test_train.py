@@ -157,9 +157,9 @@ def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) ->
     folder = poses(tmp_path / "poses", points=True)
     s = scenes.load(folder)
     cameras = [view.camera for view in s.views]
-    xyz = np.array([[0.0, 0, 0], cameras[0].centre, cameras[1].centre - cameras[1].forward, [0.1, 0, 0], [np.nan, 0, 0]])
-    seen = ((0, 1, 2), (0, 1, 2), (1, 3, 4), (0, 1), (0, 1, 2))
-    points = SparsePoints(xyz, np.zeros((5, 3), np.uint8), np.zeros(5), seen)
+    xyz = np.array([[0.0, 0, 0], cameras[0].centre, cameras[1].centre - cameras[1].forward, [0.1, 0, 0]])
+    seen = ((0, 1, 2), (0, 1, 2), (1, 3, 4), (0, 1))
+    points = SparsePoints(xyz, np.zeros((4, 3), np.uint8), np.zeros(4), seen)
 
     def rays(points: SparsePoints) -> tuple[list[tuple[int, int]], Any]:
         """(point, camera) of each ray, found again from its ends."""

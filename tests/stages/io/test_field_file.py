@@ -72,7 +72,7 @@ def test_files_that_are_something_else_are_told(tmp_path: Path) -> None:
     with pytest.raises(CorruptArtifact, match="field file of format 2; this build reads 1"):
         read_tensors(path)
     write_tensors({"a": torch.zeros(1)}, {}, path)
-    with pytest.raises(CorruptArtifact, match=r"'background'\. Train again"):
+    with pytest.raises(CorruptArtifact, match=r"missing required field `settings`\. Train again"):
         load_renderer(tmp_path)
 
 
