@@ -40,7 +40,9 @@ FILES = {
     "report_bake": {"lone-surrogate-in-name.json": READ},
     "report_evaluate": dict.fromkeys(("psnr-of-400-digits.json", "ssim-of-400-digits.json", "view-of-a-number.json"), READ),
     "report_mesh": {"lone-surrogate.json": READ},
-    "report_poses": dict.fromkeys(("error-of-400-digits.json", "lone-surrogate-warning.json", "registered-number.json", "warnings-infinity.json"), READ),
+    "report_poses": dict.fromkeys(
+        ("error-of-400-digits.json", "lone-surrogate-name.json", "lone-surrogate-warning.json", "registered-number.json", "warnings-infinity.json"), READ
+    ),
     "transforms": {
         "angle-of-400-digits.json": FINITE,
         "camera-model-list.json": "camera_model a list of 0; supported are",

@@ -69,3 +69,5 @@ def read(path: Path, kind: type[T]) -> tuple[T, dict[str, Any]] | None:
         return None
     except (files.Unreadable, msgspec.ValidationError) as error:
         raise Damaged(f"{name}: damaged ({error})") from None
+    except UnicodeEncodeError:  # of msgspec, where it looks a name up
+        raise Damaged(f"{name}: damaged (a name in it is no text)") from None
