@@ -156,7 +156,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     voxels = math.prod(shapes["brick.density"]) if full else shapes["voxel.density"][0]
     sizes = {name: end - begin for name, (_, _, begin, end) in sorted(header.tensors.items())}
     per_voxel = sum(size for name, size in sizes.items() if name.startswith("brick." if full else "voxel."))
-    return {
+    facts = {
         "format": "nerftree",
         "format_version": meta["format_version"],
         "layout": meta["layout"],
@@ -176,5 +176,5 @@ def describe(path: str | Path) -> dict[str, Any]:
         "background": meta["background"],
         "lookup": lookup_of(header.name, meta),
         **({} if ndc_of(header.name, meta) is None else {"ndc": meta["ndc"]}),
-        **{key: meta[key] for key in sorted(meta) if key not in STRUCTURE},
     }
+    return facts | {key: meta[key] for key in sorted(meta) if key not in STRUCTURE and key not in facts}

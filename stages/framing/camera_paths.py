@@ -20,6 +20,7 @@ MAX_FITTED_FOV = 50.0  # degrees; with a larger one the camera would be too near
 FIT_MARGIN = 1.1  # of the field of view
 OUTLIER_FRACTION = 0.005  # of the occupied cells, that may lie outside of the image: floaters at the border of the box
 MAX_FITTED_POINTS = 4000
+LARGEST, SMALLEST = 1e30, 1e-30  # numbers of an asset beyond these overflow when they are squared
 SPIRAL_TURNS = 2
 SPIRAL_FOV_RATIO = 0.95  # field of view of a spiral over that which all images share
 
@@ -37,10 +38,11 @@ def orbit_of(tree: NerfTree) -> Orbit:
             forward_facing=bool(given.get("forward_facing", False)),
             heading=float(given.get("heading", 0.0)),
         )
-    except (AttributeError, TypeError, ValueError) as error:
-        raise BadInput(f"asset: its orbit cannot be read ({error}). Bake it again.") from error
-    if len(orbit.centre) != 3 or not np.isfinite([*orbit.centre, orbit.radius, orbit.elevation, orbit.heading]).all() or orbit.radius <= 0:
-        raise BadInput(f"asset: its orbit is {given}; expected a centre of three numbers, a positive radius and angles in degrees. Bake it again.")
+    except (AttributeError, OverflowError, TypeError, ValueError) as error:
+        raise BadInput(f"asset: its orbit cannot be read ({str(error)[:200]}). Bake it again.") from error
+    numbers = [*orbit.centre, orbit.radius, orbit.elevation, orbit.heading]
+    if len(orbit.centre) != 3 or not (np.abs(numbers) < LARGEST).all() or not orbit.radius > SMALLEST:
+        raise BadInput(f"asset: its orbit is {str(given)[:200]}; expected a centre of three numbers, a positive radius and angles in degrees. Bake it again.")
     return orbit
 
 
@@ -55,8 +57,8 @@ def similarity_of(tree: NerfTree) -> Similarity:
         good = rotation.shape == (3, 3) and translation.shape == (3,) and similarity.scale > 0 and np.isfinite([similarity.scale, *translation]).all()
         if not good or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5):
             raise ValueError("not a similarity")
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"asset: its world_from_capture cannot be read ({error}). Bake it again.") from error
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
+        raise BadInput(f"asset: its world_from_capture cannot be read ({str(error)[:200]}). Bake it again.") from error
     return similarity
 
 
@@ -97,9 +99,10 @@ def spiral_poses(middle: np.ndarray, radii: Sequence[float], focus: float, frame
     for turn in 2 * math.pi * SPIRAL_TURNS * np.arange(frames) / frames:
         place = middle[:3, 3] + middle[:3, :3] @ (np.array([math.cos(turn), math.sin(turn), math.sin(turn / SPIRAL_TURNS)]) * radii)
         forward = target - place
-        forward /= np.linalg.norm(forward)
-        right = np.cross(middle[:3, 1], forward)
-        right /= np.linalg.norm(right)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # not finite where the two points coincide
+            forward /= np.linalg.norm(forward)
+            right = np.cross(middle[:3, 1], forward)
+            right /= np.linalg.norm(right)
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], -1)
         pose[:3, 3] = place
@@ -188,6 +191,13 @@ def turntable_cameras(
     return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
 
 
+def _checked(poses: list[np.ndarray]) -> list[np.ndarray]:
+    """Poses with which something can be seen. Raises BadInput: an asset may state a spiral that ends in the point that it looks at."""
+    if not np.isfinite(poses).all():
+        raise BadInput("asset: its spiral and its reference camera give no poses: two points coincide, or a number is too large. Bake it again.")
+    return poses
+
+
 def _spiral_cameras(tree: NerfTree, ndc: Ndc, frames: int, width: int, height: int, fov: float | None) -> list[Camera]:
     """The cameras of `spiral_poses` by the asset's metadata; without, the reference camera in each frame. Raises BadInput."""
     given: Any = tree.metadata.get("spiral") or {}
@@ -195,11 +205,11 @@ def _spiral_cameras(tree: NerfTree, ndc: Ndc, frames: int, width: int, height: i
         radii = [float(x) for x in given.get("radii", (0.0, 0.0, 0.0))]
         focus = float(given.get("focus", 4 * ndc.near))
         across, down = (float(x) for x in given.get("tangents", (0.5, 0.5)))
-    except (AttributeError, TypeError, ValueError) as error:
-        raise BadInput(f"asset: its spiral cannot be read ({error}). Bake it again.") from error
-    if len(radii) != 3 or not np.isfinite([*radii, focus, across, down]).all() or min(focus, across, down) <= 0:
+    except (AttributeError, OverflowError, TypeError, ValueError) as error:
+        raise BadInput(f"asset: its spiral cannot be read ({str(error)[:200]}). Bake it again.") from error
+    if len(radii) != 3 or not (np.abs([*radii, focus, across, down]) < LARGEST).all() or not min(focus, across, down) > SMALLEST:
         raise BadInput(f"asset: its spiral is {str(given)[:200]}; expected three radii, a positive focus and two positive tangents. Bake it again.")
     half = SPIRAL_FOV_RATIO * min(down, across * height / width) if fov is None else math.tan(math.radians(fov / 2))
     focal = 0.5 * height / half
-    poses = spiral_poses(ndc.world_from_camera, radii, focus, frames)
+    poses = _checked(spiral_poses(ndc.world_from_camera, radii, focus, frames))
     return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]

@@ -74,6 +74,11 @@ def sentence(error: BaseException) -> str:
     return f"internal error: {type(error).__name__}: {text[:300]}. Run it again with --debug for the traceback."
 
 
+def _shortened(text: str) -> str:
+    """Without the middle of what is too long: the end says what to do."""
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]}…{text[-LONGEST // 2 :]}"
+
+
 def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
     """Print the error and return the exit code."""
     facts: dict[str, Any] = {}
@@ -90,7 +95,7 @@ def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
         import traceback
 
         traceback.print_exception(error, file=sys.stderr)
-    text = printable(sentence(error), LONGEST)
+    text = _shortened(printable(sentence(error)))
     print(f"enerf: {text}", file=sys.stderr, flush=True)
     if as_json:
         from workflows.cli.output import write_json

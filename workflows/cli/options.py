@@ -21,7 +21,18 @@ device_option = click.option("--device", type=click.Choice(["auto", "cpu", "cuda
 memory_option = click.option(
     "--memory", metavar="SIZE", help="Memory that may be taken, as 512m, 8g or 1.5GiB; auto: what the machine or its control group has. Changes no result."
 )
-folder_type = click.Path(path_type=Path)
+
+
+class PathOfAnything(click.Path):
+    """A path as it was given; what is at it is looked at later."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if "\0" in str(value):
+            self.fail("a path holds no NUL character.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+folder_type = PathOfAnything(path_type=Path)
 
 
 def workflow() -> Workflow:

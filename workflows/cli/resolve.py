@@ -14,8 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline import files
 from pipeline.errors import BadInput, UnknownSetting, UsageError
 from pipeline.stage import settings_dict, settings_from
+from pipeline.text import printable
 from stages.renamed_settings import moved, updated
 from stages.settings import SettingInfo, describe_settings
 from workflows.asset import WORKFLOW
@@ -23,6 +25,11 @@ from workflows.asset import WORKFLOW
 Table = Mapping[str, Mapping[str, Any]]
 # Beside the tables of the stages, a configuration file may hold what the dedicated options say.
 CONFIG_OPTIONS = ("preset", "device", "seed")
+MAX_TOML = 2**16  # bytes; all settings together are a tenth of it
+MAX_SHOWN = 200  # characters of a value in a message
+_MAX_DOTS = 1000  # on a line: tomllib takes memory by the square of a key's parts
+_MAX_DEPTH = 8  # of a setting's value
+_LARGEST = 2**63
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,7 @@ class Config:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """` Nearest: x.` or nothing, for the end of an error message."""
-    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    found = difflib.get_close_matches(name[:MAX_SHOWN], list(known), n=1, cutoff=0.5)
     return f" Nearest: {found[0]}." if found else ""
 
 
@@ -67,7 +74,7 @@ def read_preset(name: str, folder: Path = WORKFLOW.presets) -> Preset:
 
 def _read_preset(name: str, folder: Path, heirs: tuple[str, ...]) -> Preset:
     """heirs: the presets that led here, each of which inherits from the one after it."""
-    origin = f"preset {heirs[-1]}: inherits {name!r}" if heirs else f"--preset {name}"
+    origin = f"preset {heirs[-1]}: inherits {name!r}" if heirs else f"--preset {printable(name, MAX_SHOWN)}"
     if name not in preset_names(folder):
         raise UsageError(f"{origin}: no such preset.{nearest(name, preset_names(folder))} There are: {', '.join(preset_names(folder))}.")
     if name in heirs:
@@ -80,24 +87,56 @@ def _read_preset(name: str, folder: Path, heirs: tuple[str, ...]) -> Preset:
 
 
 def read_config(path: Path) -> Config:
+    """A configuration file. Raises UsageError, BadInput and UnknownSetting."""
     try:
-        text = path.read_text(encoding="utf-8")
+        with open(files.open_plain(path), "rb") as file:
+            data = file.read(MAX_TOML + 1)
     except OSError as error:
         raise UsageError(f"--config {path}: cannot be read ({error.strerror}).") from None
+    try:
+        content = _toml(data.decode("utf-8"))
     except UnicodeDecodeError:
         raise BadInput(f"--config {path}: not a text file; expected TOML in UTF-8.") from None
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise BadInput(f"--config {path}: not valid TOML: {error}.") from None
     options = {name: content.pop(name) for name in CONFIG_OPTIONS if name in content}
     for name, kind in (("preset", str), ("device", str), ("seed", int)):
         if name in options and type(options[name]) is not kind:
-            raise UsageError(f"--config {path}: {name}: found {options[name]!r}, expected {'a whole number' if kind is int else 'text'}.")
+            found = printable(_text_of(options[name]), MAX_SHOWN)
+            raise UsageError(f"--config {path}: {name}: found {found}, expected {'a whole number' if kind is int else 'text'}.")
     for name, value in content.items():
         if not isinstance(value, dict):
-            raise UnknownSetting(f"--config {path}: {name} stands outside a table; expected [stage] tables and {', '.join(CONFIG_OPTIONS)}.")
+            raise UnknownSetting(
+                f"--config {path}: {printable(name, MAX_SHOWN)} stands outside a table; expected [stage] tables and {', '.join(CONFIG_OPTIONS)}."
+            )
     return Config(content, options)
+
+
+def _toml(text: str) -> dict[str, Any]:
+    """A TOML document of anybody. Raises ValueError, UnicodeDecodeError and tomllib.TOMLDecodeError being such."""
+    if len(text) > MAX_TOML:
+        raise ValueError(f"larger than {MAX_TOML} bytes")
+    if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
+        raise ValueError(f"more than {_MAX_DOTS} dots on a line")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _is_plain(value: Any, depth: int = 0) -> bool:
+    """Whether a value is small enough to be a setting's: bounded numbers, bounded depth."""
+    if isinstance(value, int):
+        return -_LARGEST <= value < _LARGEST
+    if isinstance(value, (list, tuple, dict)):
+        items = value.values() if isinstance(value, dict) else value
+        return depth < _MAX_DEPTH and all(_is_plain(item, depth + 1) for item in items)
+    return True
+
+
+def _text_of(value: Any) -> str:
+    """A value as a message shows it; Python writes out no number of more than 4300 digits, and nothing that nests deeply."""
+    return repr(value) if _is_plain(value) else "a number beyond 64 bits, or a deep list"
 
 
 def parse_value(text: str) -> list[Any]:
@@ -105,8 +144,8 @@ def parse_value(text: str) -> list[Any]:
     readings: list[Any] = []
     for candidate in (text, f"[{text}]") if "," in text else (text,):
         try:
-            parsed = tomllib.loads(f"value = {candidate}")
-        except tomllib.TOMLDecodeError:
+            parsed = _toml(f"value = {candidate}")
+        except ValueError:
             continue
         if parsed.keys() == {"value"}:
             readings.append(parsed["value"])
@@ -117,7 +156,7 @@ def seconds_of(text: str) -> float:
     """Seconds in `90`, `90s`, `10m` or `1h30m`."""
     found = re.fullmatch(r"(?:(\d+(?:\.\d+)?)h)?(?:(\d+(?:\.\d+)?)m)?(?:(\d+(?:\.\d+)?)s?)?", text.strip())
     if found is None or not any(found.groups()):
-        raise UsageError(f"--budget {text}: expected a time, as in 90s, 10m or 1h30m.")
+        raise UsageError(f"--budget {printable(text, MAX_SHOWN)}: expected a time, as in 90s, 10m or 1h30m.")
     hours, minutes, seconds = (float(part or 0) for part in found.groups())
     return 3600 * hours + 60 * minutes + seconds
 
@@ -137,13 +176,13 @@ class Settings:
 
     def _info(self, stage: str, name: str, origin: str) -> SettingInfo:
         if stage not in self.about:
-            raise UnknownSetting(f"{origin}: no stage {stage!r}.{nearest(stage, self.about)} Stages: {', '.join(self.about)}.")
+            raise UnknownSetting(f"{origin}: no stage {printable(stage, MAX_SHOWN)!r}.{nearest(stage, self.about)} Stages: {', '.join(self.about)}.")
         if name not in self.about[stage] and (sentence := moved(stage, name)) is not None:
             raise UnknownSetting(f"{origin}: {sentence}")
         if name not in self.about[stage]:
             known = [f"{stage}.{entry}" for entry in self.about[stage]]
             close = nearest(f"{stage}.{name}", known) or nearest(name, [f"{s}.{n}" for s in self.about for n in self.about[s]])
-            raise UnknownSetting(f"{origin}: no setting {stage}.{name}.{close} 'enerf presets {stage}' lists them.")
+            raise UnknownSetting(f"{origin}: no setting {stage}.{printable(name, MAX_SHOWN)}.{close} 'enerf presets {stage}' lists them.")
         return self.about[stage][name]
 
     def put(self, stage: str, name: str, readings: Sequence[Any], origin: str) -> None:
@@ -152,6 +191,8 @@ class Settings:
         refused = None
         for reading in readings:
             try:
+                if not _is_plain(reading):
+                    raise UsageError(f"{stage}.{name}: holds a whole number beyond 64 bits, or nests too deeply.")
                 checked: Any = settings_from(self.types[stage], {name: reading}, where=stage)
                 self.values[stage][name] = getattr(checked, name)
                 return
@@ -182,15 +223,16 @@ class Settings:
         """One `--set stage.name=value`."""
         path, equals, value = text.partition("=")
         stage, dot, name = path.strip().partition(".")
+        origin = f"--set {printable(text, MAX_SHOWN)}"
         if not equals or not dot or not name:
-            raise UsageError(f"--set {text}: expected stage.name=value, as in --set train.iterations=2000.")
-        self.put(stage, name, parse_value(value.strip()), f"--set {text}")
+            raise UsageError(f"{origin}: expected stage.name=value, as in --set train.iterations=2000.")
+        self.put(stage, name, parse_value(value.strip()), origin)
 
     def put_seed(self, seed: int) -> None:
         """Set `seed` in every stage that has it."""
         for stage, entries in self.about.items():
             if "seed" in entries:
-                self.put(stage, "seed", [seed], f"--seed {seed}")
+                self.put(stage, "seed", [seed], f"--seed {printable(_text_of(seed), MAX_SHOWN)}")
 
     def resolved(self) -> dict[str, Any]:
         """{stage: an instance of its settings dataclass}."""

@@ -90,7 +90,7 @@ def _verify_asset(path: Path, as_json: bool, quiet: bool) -> None:
         facts = {key: about[key] for key in ("format_version", "layout", "voxels", "bytes")}
         write_json({"event": "summary", "ok": True, "asset": str(path), **facts, "damaged": [], "exit_code": 0})
     elif not quiet:
-        closing(f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(int(str(about['bytes'])))}, all as written")
+        closing(f"{path}: format {about['format_version']}, {about['layout']}, {about['voxels']} voxels, {size(path.stat().st_size)}, all as written")
 
 
 def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:

@@ -7,6 +7,7 @@ normal.X normal.Y normal.Z (unit, in the capture's frame; zero where nothing is 
 from __future__ import annotations
 
 import errno
+import io
 import os
 from pathlib import Path
 
@@ -42,13 +43,27 @@ def write_exr(
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic(path) as temporary:
         try:
-            OpenEXR.File(header, channels).write(str(temporary))
+            image = OpenEXR.File(header, channels)
+            if _in_utf8(str(temporary)):
+                image.write(str(temporary))
+            else:  # the library knows no other names
+                memory = io.BytesIO()
+                image.write(memory)
+                temporary.write_bytes(memory.getvalue())
         except RuntimeError as error:
             # The library has one exception for everything; a full disk is a case of its own.
             for number in (errno.ENOSPC, errno.EDQUOT):
                 if os.strerror(number) in str(error):
                     raise OSError(number, os.strerror(number), str(path)) from error
             raise
+
+
+def _in_utf8(name: str) -> bool:
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _plane(values: np.ndarray) -> np.ndarray:

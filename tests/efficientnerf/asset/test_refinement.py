@@ -241,9 +241,7 @@ def test_steps_are_those_of_the_formula() -> None:
         _, by_density, by_sh = gradients(o.result(), origins, directions, seen, np.float32, kernels.EARLY_STOP)
         _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
         hyperparameters = rmsprop.Hyperparameters(tree.voxel, 0.1, rates, 0.9, 1e-12)
-        rmsprop.rmsprop_step(
-            records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp, number, hyperparameters
-        )
+        rmsprop.rmsprop_step(records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp, number, hyperparameters)
         named = np.unique(records.index[np.concatenate([np.arange(c) + b * records.capacity for b, c in enumerate(counts)])])
         met = np.isin(np.arange(len(density)), named)
         visits += met

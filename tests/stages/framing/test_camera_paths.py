@@ -17,6 +17,8 @@ from stages.figures.frames import RenderOptions, render_path
 from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
+from tests.efficientnerf.trees import random_tree
+from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree
 
 ROTATION = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -224,3 +226,35 @@ def test_an_unknown_background_is_refused_before_anything_is_drawn(tmp_path: Pat
     with pytest.raises(UsageError, match="background"):
         render_path(BallTree(), cameras, tmp_path / "out", RenderOptions(background="paper"))
     assert not (tmp_path / "out").exists()
+
+
+ODD_NUMBERS = [10**400, 1e308, -1e308, 1e-308, 0, -1, 1e31, math.nan, math.inf, "1", [], None, {}, True]
+
+
+@pytest.mark.parametrize("name", ["radii", "focus", "tangents"])
+def test_an_odd_spiral_gives_cameras_or_is_refused(name: str) -> None:
+    tree = wall(voxels=12)
+    good: dict[str, Any] = {"radii": [0.1, 0.1, 0.1], "focus": 3.0, "tangents": [0.5, 0.5]}
+    spirals: list[Any] = [[], 3, "x", {name: {"a": 1}}, {**good, "radii": [0.0, 0.0, 12.0], "focus": 12.0}]
+    for odd in ODD_NUMBERS:
+        spirals += [{**good, name: odd}, {**good, name: [odd]}, {**good, name: [odd, 0.5, 0.5][: 2 if name == "tangents" else 3]}]
+    for spiral in spirals:
+        try:
+            cameras = turntable_cameras(tree.with_metadata(spiral=spiral), frames=8, width=32, height=24)
+        except BadInput:
+            continue
+        for camera in cameras:
+            assert np.isfinite(camera.world_from_camera).all()
+            assert np.isfinite(camera.params).all()
+
+
+@pytest.mark.parametrize("name", ["centre", "radius", "elevation", "heading"])
+def test_an_odd_orbit_gives_cameras_or_is_refused(name: str) -> None:
+    good: dict[str, Any] = {"centre": [0.0, 0.0, 0.0], "radius": 3.0, "elevation": 20.0, "heading": 0.0, "forward_facing": False}
+    for odd in ODD_NUMBERS:
+        tree = random_tree(1).with_metadata(orbit={**good, name: [odd, 0.0, 0.0] if name == "centre" else odd})
+        try:
+            cameras = turntable_cameras(tree, frames=3, width=32, height=24)
+        except BadInput:
+            continue
+        assert np.isfinite([camera.world_from_camera for camera in cameras]).all()

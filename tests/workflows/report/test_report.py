@@ -128,6 +128,7 @@ def write(run: Run, name: str, text: str) -> None:
 
 ODD = {
     "evaluate/metrics.json": [
+        '{"network": {"psnr": 1e999}}',
         '{"network": {"psnr": ' + "9" * 400 + ', "ssim": 1}}', '{"network": {"psnr": ' + "9" * 5000 + "}}",
         '{"views": 7}', '{"views": [3]}', '{"views": [{"name": ["x"]}]}', '{"network": []}', '{"split": {}}', "[1]", "3", "[" * 100_000,
         '{"network": {"psnr": NaN}}',
@@ -195,3 +196,16 @@ def test_what_vanishes_while_the_page_is_made_is_left_out(tmp_path: Path, monkey
     run = a_run(tmp_path / "run")
     monkeypatch.setattr(Path, "is_file", lambda path: True)  # it was there a moment ago
     assert links(page(run, [])) == []
+
+
+def test_two_reports_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    from workflows.report.page import write_report
+
+    run = a_run(tmp_path / "run")
+    with ThreadPoolExecutor(4) as pool:
+        for future in [pool.submit(write_report, run, []) for _ in range(40)]:
+            future.result()
+    assert sorted(path.name for path in run.path.iterdir()) == [".lock", "report.html", "run.json"]
+    links((run.path / "report.html").read_text(encoding="utf-8"))
