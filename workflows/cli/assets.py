@@ -55,10 +55,10 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     """
     from efficientnerf.asset.format import describe
     from pipeline.errors import UsageError
-    from workflows.cli.destination import check_files, writing
     from workflows.cli.output import closing, write_json
     from workflows.cli.progress import size
     from workflows.cli.target import asset_of
+    from workflows.destination import check_files, writing
     from workflows.inspection.convert import convert as convert_asset
 
     if out.suffix.lower() != ".nerftree":

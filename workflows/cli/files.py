@@ -34,8 +34,8 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, for
     """
     from pipeline.errors import UsageError
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
-    from workflows.cli.destination import check_files
     from workflows.cli.output import closing, write_json
+    from workflows.destination import check_files
 
     files = [first, *more]
     known = [*(POINT_EXPORTERS if as_points else MESH_EXPORTERS), CAMERAS]
@@ -65,8 +65,8 @@ def _export_cameras(what: Path, path: Path, force: bool) -> int:
     from stages.artifacts import PosesOutputs
     from stages.io import scene
     from stages.io.exporters import cameras
-    from workflows.cli.destination import writing
     from workflows.cli.target import is_run, open_run
+    from workflows.destination import writing
 
     poses = PosesOutputs(open_run(what).folder("poses")) if is_run(what) else PosesOutputs(what)
     if not poses.scene.is_file():
@@ -83,8 +83,8 @@ def _export_surface(
     from stages import mesh, points
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
     from stages.io.exporters.writing import source_frame
-    from workflows.cli.destination import writing
     from workflows.cli.target import load_asset
+    from workflows.destination import writing
 
     settings = _settings_for(what, sets, {"mesh": mesh.MeshSettings, "points": points.PointsSettings}).resolved()
     progress = _progress("export", show)
@@ -150,9 +150,9 @@ def render(
     from stages.io.camera_path import read_camera_path
     from stages.io.exporters.frames import background_from_text
     from stages.turntable import TurntableSettings, cameras_of
-    from workflows.cli.destination import check_files, check_folder, check_free, writing
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
+    from workflows.destination import check_files, check_folder, check_free, writing
 
     if video is not None and video.suffix.lower() != ".mp4":
         raise UsageError(f"--video {video}: the extension {video.suffix!r} is not known; expected .mp4.")

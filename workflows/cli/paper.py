@@ -23,10 +23,10 @@ def paper(table: str, data: Path | None, out: Path, scale: float, device: str | 
     """Reproduce TABLE of the paper: 1 shares of samples, 2 quality and speed, 3 N1 to N4, 4 sizes of the networks, 5 modules one by one, 6 sampling
     strategies, 7 NerfTree against other structures. Writes DIR/table_N.md, .json and, where something is trained, .png.
     """
-    from workflows.cli.destination import check_folder
     from workflows.cli.device import resolve_device
     from workflows.cli.output import closing, write_json
     from workflows.cli.progress import display
+    from workflows.destination import check_folder
     from workflows.paper.document import Request, make
 
     check_folder(out)

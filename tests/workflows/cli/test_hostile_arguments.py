@@ -237,6 +237,7 @@ CONFIGS = {
     "a table in a table": "[train.rate]\na = 1", "a list as preset": "preset = []", "a table as device": "[device]", "an unknown device": 'device = "tpu"',
     "a flag as seed": "seed = true", "dots": ".".join("a" for _ in range(30_000)) + " = 1", "large": "#" * 70_000 + "\n", "binary": "\0\1\2",
     "a key with escapes": '[train]\n"\\u001b[31m\\n" = 1', "a stage with escapes": '["\\u001b[31m\\n"]\na = 1', "a surrogate": 'a = "\\ud800"',
+    "deep tables": "a = " + "{a = " * 400 + "1" + "}" * 400, "deeper tables": "train = " + "{a = " * 5000 + "1" + "}" * 5000,
     "escapes outside": '"\\u001b\\n" = 1',
 }  # fmt: skip
 

@@ -39,7 +39,7 @@ def test_settings_that_another_run_changed_meanwhile_are_kept(enerf: Enerf, toys
 
 
 def test_nobody_changes_the_settings_while_stages_run(toys: Path, tmp_path: Path, enerf: Enerf) -> None:
-    from tests.workflows.conftest import TOYS
+    from tests.workflows.toys import TOYS
 
     plan = plan_run(tmp_path / "run", Workflow(TOYS, toys.parent / "presets"), Options(source=toys))
     with plan.written() as run, pytest.raises(RunLocked):

@@ -53,7 +53,7 @@ def commands(target: Callable[[str], Path]) -> Iterator[list[object]]:
 
 
 def called(enerf: Enerf, what: Path, command: list[object], *more: str) -> tuple[int, str]:
-    result = enerf(command[0], what, *command[1:], *more)
+    result = enerf(command[0], what, *command[1:], *more, "--quiet")
     assert result.code == 0 or len(result.err.splitlines()) <= 2, result.err
     return result.code, result.err
 
