@@ -133,7 +133,8 @@ ODD = {
         '{"views": 7}', '{"views": [3]}', '{"views": [{"name": ["x"]}]}', '{"network": []}', '{"split": {}}', "[1]", "3", "[" * 100_000,
         '{"network": {"psnr": NaN}}',
     ],
-    "poses/report.json": ['{"registered": 5}', '{"rejected": {"a": 1}}', '{"rejected": [{"name": 3}]}', '{"warnings": 4}', '"\\ud800"', '{"\\ud800": 1}', '{"reprojection_error": "far"}'],
+    "poses/report.json": ['{"registered": 5}', '{"rejected": {"a": 1}}', '{"rejected": [{"name": 3}]}', '{"warnings": 4}', '"\\ud800"',
+        '{"\\ud800": 1}', '{"reprojection_error": "far"}'],
     "bake/report.json": ["[]", '"text"', '{"voxels": ' + "9" * 5000 + "}", "\0"],
     "mesh/report.json": ["[]"],
 }  # fmt: skip
