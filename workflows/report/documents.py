@@ -67,7 +67,7 @@ def read(path: Path, kind: type[T]) -> tuple[T, dict[str, Any]] | None:
         return msgspec.convert(found, kind, strict=True), found
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (files.Unreadable, msgspec.ValidationError, UnicodeEncodeError) as error:  # the last of a key with half a surrogate pair
+    except (files.Unreadable, msgspec.ValidationError) as error:
         raise Damaged(f"{name}: damaged ({error})") from None
     except UnicodeEncodeError:  # of msgspec, where it looks a name up
         raise Damaged(f"{name}: damaged (a name in it is no text)") from None
