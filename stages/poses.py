@@ -161,8 +161,10 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
     assert job.source is not None
     source = Source(job.source, settings.allow_outside)
-    paths = {source.name_of(path): source.real(path) for path in photographs(source)}
-    masks = {source.name_of(image): source.real(mask) for image, mask in masks_of(source, photographs(source)).items()}
+    with importers.one_line_errors(source.root):
+        images = photographs(source)
+        paths = {source.name_of(path): source.real(path) for path in images}
+        masks = {source.name_of(image): source.real(mask) for image, mask in masks_of(source, images).items()}
     for sentence in source.run_warnings():
         warn(sentence)
     sizes = []

@@ -170,10 +170,7 @@ def load(folder: Path) -> Scene:
     path = PosesOutputs(folder).scene
     if not path.is_file():
         raise BadInput(f"{printable(path)}: no such file. Run the poses stage first.")
-    try:
-        found = read_json(path, AGAIN)
-    except BadInput as error:
-        raise CorruptArtifact(str(error)) from error
+    found = _json_of_run(path)
     version = found.get("format") if isinstance(found, dict) else None
     if type(version) is int and version > FORMAT:
         newer = str(version) if version < 10**6 else "of many digits"
@@ -182,6 +179,14 @@ def load(folder: Path) -> Scene:
         return _scene_from(decoded(found, SceneDocument, path, AGAIN))
     except ValueError as error:
         raise CorruptArtifact(f"{printable(path)}: {printable(error)}. {AGAIN}") from error
+
+
+def _json_of_run(path: Path) -> Any:
+    """The value in a file that a stage wrote; CorruptArtifact where it is damaged."""
+    try:
+        return read_json(path, AGAIN)
+    except BadInput as error:
+        raise CorruptArtifact(str(error)) from error
 
 
 def _scene_from(document: SceneDocument) -> Scene:
@@ -323,7 +328,7 @@ def describe(folder: Path) -> dict[str, Any]:
 
 def _report_warnings(folder: Path) -> list[str]:
     path = PosesOutputs(folder).report
-    report = read_json(path, AGAIN) if path.is_file() else {}
+    report = _json_of_run(path) if path.is_file() else {}
     found = report.get("warnings", []) if isinstance(report, dict) else []
     return [printable(sentence, 1000) for sentence in found if isinstance(sentence, str)] if isinstance(found, list) else []
 

@@ -105,8 +105,7 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alph
     found = decode(photo.image)
     height, width = found.pixels.shape[:2]
     if (width, height) != (photo.camera.width, photo.camera.height):
-        before = f"{photo.camera.width}x{photo.camera.height}"
-        raise BadInput(f"{photo.image}: {width}x{height} pixels, but {before} a moment ago. Leave the source alone while it is read.")
+        raise UnreadableImage(f"unreadable: {width}x{height} pixels, but {photo.camera.width}x{photo.camera.height} by its header, or it was changed")
     size = working_size(width, height, max_side)
     usable, warnings = (None, []) if photo.mask is None else _usable(photo, size, found.orientation)
     pixels = _resized(found.pixels, size)
@@ -191,8 +190,8 @@ def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.n
     found = mask.shape[1], mask.shape[0]
     sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
     if not same_aspect(found, expected):
-        raise BadInput(f"{photo.mask}: {sizes}, of another aspect. Make the mask for this image.")
-    warnings = [] if found == expected else [f"{photo.mask.name}: {sizes}; it was resized."]
+        raise BadInput(f"{printable(photo.mask)}: {sizes}, of another aspect. Make the mask for this image.")
+    warnings = [] if found == expected else [f"{printable(photo.mask.name)}: {sizes}; it was resized."]
     rows = ((np.arange(size[1]) + 0.5) * found[1] / size[1]).astype(int)
     columns = ((np.arange(size[0]) + 0.5) * found[0] / size[0]).astype(int)
     # Lossy files have no clean zero.

@@ -33,18 +33,18 @@ class Importer:
 
     def recognises(self, folder: Path, allow_outside: bool = False) -> bool:
         """Whether a folder holds files of this format; BadInput where they cannot be read."""
-        with _shown(folder):
+        with one_line_errors(folder):
             return bool(self._function("recognises")(folder, allow_outside, *self._dialect))
 
     def read(self, folder: Path, settings: ImportSettings) -> Capture:
         """The capture, whose names and sentences may be shown; raises BadInput."""
-        with _shown(folder):
+        with one_line_errors(folder):
             capture: Capture = self._function("read")(folder, settings, *self._dialect)
         return replace(capture, warnings=tuple(map(printable, capture.warnings)))
 
     def files(self, folder: Path, settings: ImportSettings) -> list[Path]:
         """What the capture depends on; raises BadInput."""
-        with _shown(folder):
+        with one_line_errors(folder):
             paths: list[Path] = self._function("files")(folder, settings)
         return paths
 
@@ -57,7 +57,7 @@ class Importer:
 
 
 @contextmanager
-def _shown(folder: Path) -> Iterator[None]:
+def one_line_errors(folder: Path) -> Iterator[None]:
     """BadInput whose text is one line that may be shown, whatever the names in it hold; also where a file or folder of the source cannot be read."""
     try:
         yield
@@ -98,7 +98,7 @@ def candidates(folder: Path, allow_outside: bool = False) -> list[str]:
     if not found:
         from stages.io.importers.photographs import photographs
 
-        with _shown(folder):
+        with one_line_errors(folder):
             photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
         found.append("photographs")
     return found

@@ -11,7 +11,7 @@ import numpy as np
 
 from efficientnerf.settings import Auto
 from stages.io.capture import Capture
-from stages.io.importers import IMPORTERS, candidates
+from stages.io.importers import IMPORTERS, candidates, one_line_errors
 from stages.io.importers.photographs import masks_of, photographs
 from stages.io.importers.source import Source
 from stages.io.pictures import UnreadableImage, read_header
@@ -30,7 +30,8 @@ def describe_source(folder: Path, format: str = "auto") -> dict[str, Any]:
     """What `enerf inspect SOURCE` prints of a data set: count, resolutions, camera models, bounds, warnings. Raises BadInput."""
     possible = candidates(folder, Defaults.allow_outside)
     name = possible[0] if format == "auto" else format
-    described = _posed(IMPORTERS[name].read(folder, Defaults())) if IMPORTERS[name].posed else _photographs(folder)
+    with one_line_errors(folder):
+        described = _posed(IMPORTERS[name].read(folder, Defaults())) if IMPORTERS[name].posed else _photographs(folder)
     others = [other for other in possible if other not in (name, "photographs")]
     if others:
         described["warnings"].append(f"can also be read --as {' or '.join(others)}.")

@@ -160,8 +160,12 @@ def test_messages_about_hostile_names_are_one_printable_line(tmp_path: Path) -> 
         assert described["rejected"][0]["name"] in SHOWN
         os.unlink(source / name)
         (source / name).symlink_to("/etc/hostname")
+        for attempt in (lambda source=source: importers.files(source, Settings()), lambda source=source: describe_source(source)):
+            with pytest.raises(BadInput) as caught:
+                attempt()
+            assert str(caught.value).isprintable()
         with pytest.raises(BadInput) as caught:
-            importers.files(source, Settings())
+            run(source, tmp_path / "out")
         assert str(caught.value).isprintable()
 
 
