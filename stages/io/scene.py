@@ -178,7 +178,7 @@ def load(folder: Path) -> Scene:
     try:
         return _scene_from(decoded(found, SceneDocument, path, AGAIN))
     except ValueError as error:
-        raise CorruptArtifact(f"{printable(path)}: {printable(error)}. {AGAIN}") from error
+        raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {AGAIN}") from error
 
 
 def _json_of_run(path: Path) -> Any:

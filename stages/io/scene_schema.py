@@ -91,4 +91,4 @@ def decoded(document: Any, kind: type[T], path: Path, remedy: str) -> T:
     try:
         return msgspec.convert(document, kind)
     except (msgspec.ValidationError, RecursionError) as error:
-        raise CorruptArtifact(f"{printable(path)}: {printable(error)}. {remedy}") from error
+        raise CorruptArtifact(f"{printable(path)}: {printable(error, 400)}. {remedy}") from error
