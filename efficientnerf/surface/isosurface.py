@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from efficientnerf.surface.filled import dense_voxels, filled_blocks, filled_parts
 from efficientnerf.surface.mesh import (
     Mesh,
     PointCloud,
@@ -28,8 +29,8 @@ from efficientnerf.surface.volume import NdcVolume, Volume
 
 Progress = Callable[[int, int, str], None]
 ViewDirections = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
+LARGEST_SIDE = 4096  # voxels along a side of a grid that is baked
 BLOCK = 64  # voxels a side that are in memory at a time
-MOST_SLAB_VOXELS = 2**25  # that are in memory while enclosed space is found; more where a layer of its cells has more
 CHUNK = 1 << 16  # points whose colours are looked up at a time
 
 
@@ -46,8 +47,15 @@ def _grid(volume: Volume) -> np.ndarray:
 
 
 def pool_of(volume: Volume) -> int:
-    """Voxels along a side of the cells in which enclosed space is found: two; more where that were over 256 cells a side, for the memory."""
-    return 2 * max(1, -(-int(_grid(volume).max()) // 512))
+    """Voxels along a side of the cells in which enclosed space is found: two; more where that were over 256 cells a side, for the memory.
+
+    Of grids beyond the sides that are baked, which may be a line of cells, the least that makes no more than 256^3 cells.
+    """
+    grid = _grid(volume)
+    pool = 2 * max(1, -(-int(grid.max()) // 512))
+    if grid.max() > LARGEST_SIDE:
+        pool = next(each for each in range(2, pool + 1, 2) if each == pool or np.prod(-(-grid // each)) <= 256**3)
+    return pool
 
 
 def automatic_threshold(volume: Volume, lines: int = 24) -> float:
@@ -72,11 +80,14 @@ def automatic_threshold(volume: Volume, lines: int = 24) -> float:
                 low, high = np.zeros(3, np.int64), grid.copy()
                 low[first], low[second] = i * brick, j * brick
                 high[first], high[second] = low[first] + brick, low[second] + brick
-                block = np.asarray(volume.density_block(low, high), np.float64)
-                sigma = np.moveaxis(block, axis, -1).reshape(-1, grid[axis])  # (R, S)
+                blocks = [np.asarray(volume.density_block(*part)) for part in filled_parts(volume, axis, low, high)]
+                if not blocks:
+                    continue
+                block = np.concatenate(blocks, axis)
+                sigma = np.moveaxis(block, axis, -1).reshape(-1, block.shape[axis]).astype(np.float64)  # (R, S)
                 highest = max(highest, float(sigma.max()))
                 found += [_densities_on_entry(ray, voxel) for ray in (sigma, sigma[:, ::-1])]
-    levels = np.concatenate(found)
+    levels = np.concatenate(found) if found else np.zeros(0)
     if not len(levels):
         raise NoSurface(f"no ray through the volume loses half its light; the highest density found is {highest:.3g} per unit and a voxel is {voxel:.3g} wide")
     return float(min(np.log(2) / voxel, np.quantile(levels, 0.25)))
@@ -107,13 +118,8 @@ def enclosed_cells(volume: Volume, threshold: float, viewpoints: np.ndarray) -> 
     grid, pool = _grid(volume), pool_of(volume)
     cells = -(-grid // pool)
     dense = np.zeros(cells + 2, bool)  # an empty cell all around: the outside
-    step = pool * int(np.clip(MOST_SLAB_VOXELS // (pool**3 * int(cells[1]) * int(cells[2])), 1, 16))
-    for start in range(0, int(grid[0]), step):
-        sigma = np.asarray(volume.density_block((start, 0, 0), (start + step, *(cells[1:] * pool).tolist())))
-        pooled = np.any((sigma >= threshold).reshape(step // pool, pool, cells[1], pool, cells[2], pool), axis=(1, 3, 5))
-        first = start // pool
-        last = min(first + len(pooled), int(cells[0]))
-        dense[1 + first : 1 + last, 1:-1, 1:-1] = pooled[: last - first]
+    for voxels in dense_voxels(volume, threshold):
+        dense[tuple((voxels // pool + 1).T)] = True
     region = np.empty(dense.shape, np.int32)
     label(~dense, output=region)
     outside = {int(region[0, 0, 0])}
@@ -161,26 +167,23 @@ def isosurface(
 
     grid = _grid(volume)
     starts = [np.arange(-1, grid[axis], block) for axis in range(3)]
-    total = int(np.prod([len(each) for each in starts]))
-    positions, faces, seams, joined, count, done = [], [], [], [], 0, 0
-    for x in starts[0]:
-        for y in starts[1]:
-            for z in starts[2]:
-                low = np.array([x, y, z])
-                high = np.minimum(low + block, grid)  # the last sample, included
-                opacity = _opacity(_filled_block(volume, low, high + 1, threshold, enclosed), low, threshold)
-                done += 1
-                progress(done, total, "marching cubes")
-                if opacity.min() > 0.5 or opacity.max() < 0.5:
-                    continue
-                local, triangles, _, _ = marching_cubes(opacity, 0.5, gradient_direction="ascent")  # "ascent" is the one that winds outward here
-                local = local.astype(np.float64)  # (V, 3) in voxels from `low`
-                rows, keys = _on_seams(local, low, high, grid)
-                positions.append(local + low)
-                faces.append(triangles.astype(np.int64) + count)
-                seams.append(rows + count)
-                joined.append(keys)
-                count += len(local)
+    blocks = filled_blocks(volume, [len(each) for each in starts], block)
+    positions, faces, seams, joined, count = [], [], [], [], 0
+    for done, number in enumerate(blocks):
+        low = number * block - 1
+        high = np.minimum(low + block, grid)  # the last sample, included
+        opacity = _opacity(_filled_block(volume, low, high + 1, threshold, enclosed), low, threshold)
+        progress(done + 1, len(blocks), "marching cubes")
+        if opacity.min() > 0.5 or opacity.max() < 0.5:
+            continue
+        local, triangles, _, _ = marching_cubes(opacity, 0.5, gradient_direction="ascent")  # "ascent" is the one that winds outward here
+        local = local.astype(np.float64)  # (V, 3) in voxels from `low`
+        rows, keys = _on_seams(local, low, high, grid)
+        positions.append(local + low)
+        faces.append(triangles.astype(np.int64) + count)
+        seams.append(rows + count)
+        joined.append(keys)
+        count += len(local)
     if not faces:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     target = np.arange(count)

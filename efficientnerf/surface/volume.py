@@ -7,6 +7,7 @@ beyond the far limit is left out, for it reaches to infinity.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -21,6 +22,7 @@ from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
+VOXELS_AT_ONCE = 2**20  # of bricks, while dense voxels are found
 FARTHEST = 50.0  # times the near plane's depth: the far limit where the asset does not say
 
 
@@ -72,6 +74,22 @@ class WorldVolume:
     def density_block(self, low: Any, high: Any) -> np.ndarray:
         return queries.density_block(self.tree, low, high)
 
+    @cached_property
+    def cells(self) -> np.ndarray:
+        """(B, 3) coarse cells that own a brick, in order: density is nowhere else. A grid may be vast, and nearly empty."""
+        return np.stack(np.unravel_index(np.flatnonzero(self.tree.brick_index.reshape(-1) >= 0), self.shape), axis=1)
+
+    def dense_voxels(self, threshold: float) -> Iterator[np.ndarray]:
+        """(M, 3) voxels of at least this density, above zero, some bricks at a time."""
+        tree, each = self.tree, max(1, VOXELS_AT_ONCE // self.brick**3)
+        bricks = tree.brick_index[tuple(self.cells.T)]
+        for begin in range(0, len(bricks), each):
+            voxel = tree.voxel_index[bricks[begin : begin + each]]
+            dense = voxel >= 0
+            dense[dense] = tree.density_values[voxel[dense]] >= threshold
+            brick, local = np.nonzero(dense)
+            yield self.cells[begin + brick] * self.brick + np.stack(np.unravel_index(local, (self.brick,) * 3), axis=1)
+
     def density(self, points: np.ndarray) -> np.ndarray:
         return frame_queries.density_at(self.tree, points)
 
@@ -96,6 +114,10 @@ class NdcVolume(WorldVolume):
         block = super().density_block(low, high)
         block[..., max(0, self.layers - int(low[2])) :] = 0
         return block
+
+    def dense_voxels(self, threshold: float) -> Iterator[np.ndarray]:
+        """None from the far limit on."""
+        return (found[found[:, 2] < self.layers] for found in super().dense_voxels(threshold))
 
     def view_directions(self, points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
         """Unit view directions (N, 3) of the world to points of the frame, from the reference camera and from about as far beside, above and below it as

@@ -18,6 +18,8 @@ from efficientnerf.asset.format import FormatError, describe, load
 from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays, render_reference
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.surface.isosurface import NoSurface, surface
+from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.hostile import HOSTILE, filled
 from tests.efficientnerf.trees import looking, random_tree, uniform_tree
 
@@ -138,6 +140,25 @@ def test_memory_that_a_file_would_take_is_known_before_it_is_taken(which: str, t
             read(path)
     assert tracemalloc.get_traced_memory()[1] < 2**20
     tracemalloc.stop()
+
+
+@pytest.mark.parametrize("cells", [(300, 300, 300), (65536, 20, 20), (20, 65536, 1)])
+def test_the_surface_of_a_few_voxels_in_a_vast_grid(cells: tuple[int, int, int], tmp_path: Path) -> None:
+    """Neither memory nor time go with the grid."""
+    path = tmp_path / "a.nerftree"
+    path.write_bytes(filled(cells, 20, brick=16))
+    tree = load(path)
+    tree.density_values[:] = 1e3
+    begin = time.perf_counter()
+    mesh = surface(volume_of(tree), 500.0)
+    assert len(mesh.faces) > 0
+    assert time.perf_counter() - begin < 20  # two where nothing else runs
+
+
+def test_a_grid_whose_columns_are_empty_has_no_surface() -> None:
+    tree = random_tree(0, shape=(3, 3, 3), share=0.0)
+    with pytest.raises(NoSurface, match="no ray"):
+        surface(volume_of(tree))
 
 
 MEASURE = """

@@ -173,14 +173,15 @@ def test_a_step_has_the_samples_of_its_batch_or_of_its_rays() -> None:
     assert samples_of(dataclasses.replace(small, max_rays_per_batch=1), 100) == 132
 
 
-def test_enclosed_space_is_found_in_slabs_of_any_thickness(made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_enclosed_space_is_found_with_any_number_of_bricks_at_once(made: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     from efficientnerf.asset.format import load
     from efficientnerf.surface import isosurface
+    from efficientnerf.surface import volume as volumes
     from efficientnerf.surface.volume import volume_of
 
     volume = volume_of(load(made["bake"] / BakeOutputs.asset))
     whole = isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3)))
-    monkeypatch.setattr(isosurface, "MOST_SLAB_VOXELS", 1)
+    monkeypatch.setattr(volumes, "VOXELS_AT_ONCE", 1)
     assert np.array_equal(isosurface.enclosed_cells(volume, 1e-3, np.zeros((0, 3))), whole)
 
 
