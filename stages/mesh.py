@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from stages.io.exporters.writing import SourceFrame
 
 
+PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
+STEPS = 500  # of the progress of each
+
+
 @dataclass(frozen=True)
 class MeshSettings:
     """How the surface is meshed."""
@@ -44,10 +48,20 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             viewpoints=orbit_points(tree.metadata),
-            progress=progress,
+            progress=whole_progress(progress),
         )
     except NoSurface as error:
         raise StageFailed(f"mesh: {error}. {remedy('mesh', given(settings.density_threshold))}") from error
+
+
+def whole_progress(progress: Callable[[int, int, str], None]) -> Callable[[int, int, str], None]:
+    """Progress over the parts of a surface together: a bar that never goes back."""
+
+    def part(done: int, total: int, text: str) -> None:
+        before = PARTS.index(text)
+        progress(before * STEPS + (STEPS * done // total if total else STEPS), len(PARTS) * STEPS, text)
+
+    return part
 
 
 def orbit_points(metadata: Mapping[str, Any]) -> np.ndarray:
@@ -124,7 +138,7 @@ def run(job: Job) -> None:
     if not report["watertight"]:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['non_manifold_edges']} non-manifold edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}
-    job.say(f"{report['faces']} faces in {report['components']} components", **facts)
+    job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}", **facts)
 
 
 STAGE = Stage(name="mesh", version=1, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

@@ -13,7 +13,7 @@ from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
-from stages.mesh import orbit_points, remedy
+from stages.mesh import orbit_points, remedy, whole_progress
 
 if TYPE_CHECKING:
     from efficientnerf.surface.mesh import PointCloud
@@ -48,7 +48,7 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
             rounds=settings.smoothing_iterations,
             seed=settings.seed,
             viewpoints=orbit_points(tree.metadata),
-            progress=progress,
+            progress=whole_progress(progress),
         )
     except NoSurface as error:
         raise StageFailed(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error

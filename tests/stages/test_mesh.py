@@ -76,6 +76,7 @@ def test_the_mesh_lies_in_the_captures_frame(ball: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(report["bounds"], mesh.bounds, atol=1e-5)
     assert report["volume"] == pytest.approx(4 / 3 * np.pi * (RADIUS * 4) ** 3, rel=0.03)
     assert [event["faces"] for event in events if "faces" in event] == [report["faces"]]
+    assert events[-1]["text"] == f"{report['faces']} faces in 1 component"
 
     standing = trimesh.load(tmp_path / "out" / "mesh.glb", force="mesh", process=False)
     np.testing.assert_allclose(standing.vertices, mesh.vertices * [1, -1, -1], atol=1e-5)
@@ -107,3 +108,12 @@ def test_an_empty_asset_names_the_remedy(tmp_path: Path) -> None:
 def test_a_signal_stops_it(ball: Path, tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
         stage.run(Job(settings=MeshSettings(), inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work", stop=lambda: 2))
+
+
+def test_progress_never_goes_back(ball: Path) -> None:
+    tree = format.load(ball / "asset.nerftree")
+    told: list[tuple[int, int, str]] = []
+    stage.mesh_of(tree, MeshSettings(max_faces=500), lambda *each: told.append(each))
+    assert [each[:2] for each in told] == sorted(each[:2] for each in told)
+    assert {each[2] for each in told} == set(stage.PARTS)
+    assert told[-1][0] == told[-1][1]
