@@ -13,8 +13,9 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.files import remove
-from stages.sfm import matches
-from stages.sfm.matches import WorkImage
+from stages.sfm.colmap import quiet_pycolmap
+from stages.sfm.database import database_path, verified_pairs
+from stages.sfm.images import Progress, SafePoint, WorkImage
 
 MIN_MODEL_SIZE = 3  # registered photographs
 
@@ -33,7 +34,7 @@ ATTEMPTS: tuple[Mapping[str, Mapping[str, object]], ...] = (
 MIN_REGISTERED_RATIO = 0.9  # of the photographs; with more registered, the third attempt is not made
 
 
-def best_models(work: Path, images: Sequence[WorkImage], seed: int, progress: matches.Progress, safe_point: matches.SafePoint) -> list[Any]:
+def best_models(work: Path, images: Sequence[WorkImage], seed: int, progress: Progress, safe_point: SafePoint) -> list[Any]:
     """The sub-models of the best attempt, by the number of registered photographs times `match_agreement`, largest first."""
     best: list[Any] = []
     best_score = -1.0
@@ -54,8 +55,8 @@ def _with_exif_focal(
     seed: int,
     options_of_attempt: Mapping[str, Mapping[str, object]],
     models: list[Any],
-    progress: matches.Progress,
-    safe_point: matches.SafePoint,
+    progress: Progress,
+    safe_point: SafePoint,
 ) -> list[Any]:
     """`models`; or, where a focal length contradicts its EXIF data (forward motion does not determine it), those found with intrinsics fixed at
     the EXIF data, if they register as many photographs with about the same reprojection error."""
@@ -83,13 +84,13 @@ def _incremental_mapping(
     count: int,
     seed: int,
     options_of_attempt: Mapping[str, Mapping[str, object]],
-    progress: matches.Progress,
-    safe_point: matches.SafePoint,
+    progress: Progress,
+    safe_point: SafePoint,
     *,
     refine_camera: bool = True,
 ) -> list[Any]:
     """All sub-models, by the number of registered photographs, then of points. On one thread: with two the results vary."""
-    with matches.quiet_pycolmap() as pycolmap:
+    with quiet_pycolmap() as pycolmap:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = options.mapper.num_threads = 1
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -112,14 +113,14 @@ def _incremental_mapping(
         pycolmap.set_random_seed(seed)
         safe_point()
         models = pycolmap.incremental_mapping(
-            matches.database_path(work), work / "images", output, options, initial_image_pair_callback=one_more, next_image_callback=one_more
+            database_path(work), work / "images", output, options, initial_image_pair_callback=one_more, next_image_callback=one_more
         )
         remove(output)
     safe_point()
     return [model for _, model in sorted(models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))]
 
 
-def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_point: matches.SafePoint) -> Any:
+def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_point: SafePoint) -> Any:
     """The model after a final bundle adjustment with Cauchy's loss at the scale of its own mean reprojection error: the mapper's squared loss is not
     robust to matches that are wrong by a few pixels.
 
@@ -127,7 +128,7 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
     parameters; unless the focal lengths then differ by 2 %, or fewer matches agree, which shows that the motion does not determine the intrinsics.
     Intrinsics fixed at the EXIF data stay.
     """
-    with matches.quiet_pycolmap() as pycolmap:
+    with quiet_pycolmap() as pycolmap:
         fixed = {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.focal_length == prior}
         safe_point()
         _bundle_adjust(pycolmap, model, fixed)
@@ -200,11 +201,11 @@ def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: floa
     cameras  by COLMAP's image id, at working size
     """
     agreeing = total = 0
-    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
         directions = {
             image_id: rays(camera, np.asarray(database.read_keypoints(image_id), np.float64)[:, :2])[1] for image_id, camera in cameras.items()
         }  # (N, 3) each
-        for first, second in matches.verified_pairs(matches.database_path(work)):
+        for first, second in verified_pairs(database_path(work)):
             if first not in cameras or second not in cameras:
                 continue
             inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)

@@ -23,7 +23,9 @@ from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import mapping, matches, process
-from stages.sfm.matches import WorkImage
+from stages.sfm.colmap import quiet_pycolmap
+from stages.sfm.database import database_path, open_database, remove_database, verified_pairs
+from stages.sfm.images import WorkImage, prepare_images
 
 MAX_EXHAUSTIVE = 100  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
 WAIT = 0.05  # seconds between two looks at a lock
@@ -64,12 +66,12 @@ def find_cameras(
     arguments: dict[str, Any] = {"folder": os.path.abspath(folder), "names": {name: os.path.abspath(path) for name, path in paths.items()}}
     arguments |= {"max_side": max_side, "features": features, "matching": matching, "seed": seed, "threads": threads}
     arguments |= {"masks": {name: os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
-    resumed = matches.database_path(work).exists()
+    resumed = database_path(work).exists()
     try:
         found = process.run(arguments, progress=progress, safe_point=safe_point, warn=warn)
     except process.ChildAborted:
         if resumed:  # what was left by an earlier attempt may be what COLMAP cannot bear
-            matches.remove_database(work)
+            remove_database(work)
         raise
     return _capture_from(found, folder, paths, masks)
 
@@ -123,7 +125,7 @@ def reconstruct(
 ) -> Capture:
     """`find_cameras` in this process."""
     work.mkdir(parents=True, exist_ok=True)
-    images, unreadable = matches.prepare_images(
+    images, unreadable = prepare_images(
         folder,
         [*names],
         max_side=max_side,
@@ -144,7 +146,7 @@ def reconstruct(
     if matching == "auto":
         matching = "exhaustive" if len(images) <= MAX_EXHAUSTIVE else "sequential"
     with _full_disk_named(work):
-        matches.open_database(work, images)
+        open_database(work, images, warn)
         matches.extract_features(work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
         matches.match_pairs(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
         models = mapping.best_models(work, images, seed, progress, safe_point)
@@ -212,11 +214,11 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
     missing = [image for image in images if not of_model or image.file not in of_model[0]]
     if not missing:
         return []
-    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(work)) as database:
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
         ids = {image.name: image.image_id for image in database.read_all_images()}
         features = {image.file: database.num_keypoints_for_image(ids[image.file]) for image in missing}
         best: dict[int, int] = {}
-        for pair in matches.verified_pairs(matches.database_path(work)):
+        for pair in verified_pairs(database_path(work)):
             inliers = len(database.read_two_view_geometry(*pair).inlier_matches)
             for image_id in pair:
                 best[image_id] = max(best.get(image_id, 0), inliers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -19,7 +20,11 @@ from pipeline.errors import BadInput
 from stages.io import photo as reading
 from stages.io.capture import Capture
 from stages.sfm import matches
+from stages.sfm.colmap import num_threads, quiet_pycolmap
+from stages.sfm.database import FEATURES, PAIRS, database_path, open_database, record
+from stages.sfm.images import WorkImage, prepare_images
 from stages.sfm.reconstruction import find_cameras, reconstruct
+from tests.stages.spoilers import SPOILERS
 
 ROOT = Path(__file__).resolve().parents[3]
 STILL_LIFE = ROOT / "examples" / "still_life"
@@ -226,27 +231,87 @@ def test_killed_and_resumed_gives_the_same_bits(ten: tuple[list[str], Path, Capt
 def test_damaged_database_is_made_anew(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
     names, work, capture = ten
     shutil.copytree(work, tmp_path / "work")
-    path = matches.database_path(tmp_path / "work")
+    path = database_path(tmp_path / "work")
     size = path.stat().st_size
     with open(path, "r+b") as file:
         file.truncate(size * 2 // 3)
     assert numbers(find(STILL_LIFE, names, tmp_path / "work")) == numbers(capture)
 
 
-def test_half_written_database_is_not_trusted(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+@pytest.fixture
+def resumed(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> tuple[Path, list[WorkImage]]:
+    """A copy of the work folder, and its images."""
     names, work, _ = ten
     shutil.copytree(work, tmp_path / "work")
-    images, _ = matches.prepare_images(
+    images, _ = prepare_images(
         STILL_LIFE, names, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
         progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
     )  # fmt: skip
-    assert matches.open_database(tmp_path / "work", images)
-    with sqlite3.connect(matches.database_path(tmp_path / "work")) as connection:
+    return tmp_path / "work", images
+
+
+def rows_of(work: Path) -> dict[str, set[int]]:
+    with contextlib.closing(sqlite3.connect(database_path(work))) as connection:
+        return {table: {row[0] for row in connection.execute(f"SELECT {column} FROM {table}")} for table, column in (*FEATURES, *PAIRS)}
+
+
+def test_rows_are_kept_where_they_are_as_they_were_written(resumed: tuple[Path, list[WorkImage]]) -> None:
+    work, images = resumed
+    before, said = rows_of(work), []
+    assert open_database(work, images, said.append)
+    assert rows_of(work) == before
+    assert len(before["keypoints"]) == 10
+    assert len(before["matches"]) == 45
+    with contextlib.closing(sqlite3.connect(database_path(work))) as connection, connection:
         connection.execute("DELETE FROM descriptors WHERE image_id = 3")
-    connection.close()
-    assert not matches.open_database(tmp_path / "work", images)
-    assert matches.open_database(tmp_path / "work", images)  # the new one lists the images
-    assert not matches.open_database(tmp_path / "work", images[:-1])  # and is not taken for another set
+        connection.execute("UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 5")
+        connection.execute("UPDATE matches SET data = zeroblob(length(data)) WHERE pair_id = (SELECT max(pair_id) FROM matches)")
+    assert open_database(work, images, said.append)
+    after = rows_of(work)
+    assert before["keypoints"] - after["keypoints"] == before["descriptors"] - after["descriptors"] == {3, 5}
+    assert max(before["matches"]) not in after["matches"]
+    assert len(said) == 1
+    open_database(work, images[:-1], said.append)
+    assert max(rows_of(work)["keypoints"]) == 9
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE keypoints SET rows = 1000000 WHERE image_id = 1", "UPDATE keypoints SET cols = 3 WHERE image_id = 1",
+        "UPDATE descriptors SET cols = 64, rows = 2 * rows WHERE image_id = 1", "UPDATE keypoints SET rows = -1 WHERE image_id = 1",
+        "UPDATE two_view_geometries SET data = replace(hex(data), '0', 'F')", "UPDATE matches SET data = NULL", "UPDATE two_view_geometries SET F = x'00'",
+        "UPDATE matches SET rows = 'many'", "DROP TABLE matches", "ALTER TABLE matches RENAME TO other; CREATE VIEW matches AS SELECT * FROM other",
+        "UPDATE matches SET data = (SELECT data FROM keypoints LIMIT 1), rows = (SELECT length(data) / 8 FROM keypoints LIMIT 1)",
+    ],
+)  # fmt: skip
+def test_a_database_that_colmap_could_not_bear_is_not_handed_to_it(resumed: tuple[Path, list[WorkImage]], statement: str) -> None:
+    """With notes that say it was written so."""
+    work, images = resumed
+    with contextlib.closing(sqlite3.connect(database_path(work))) as connection:
+        connection.executescript(statement)
+    with contextlib.suppress(sqlite3.Error):
+        record(work, "features_00000", FEATURES, range(1, 11))
+        record(work, "pairs_000000", PAIRS, sorted(rows_of(work)["two_view_geometries"]))
+    for path in sorted(work.glob("features_*"))[1:] + sorted(work.glob("pairs_*.json"))[1:]:
+        path.unlink()
+    said: list[str] = []
+    open_database(work, images, said.append)
+    assert len(said) == 1
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
+        assert len(database.read_all_images()) == 10
+    found = rows_of(work)
+    assert 1 not in found["keypoints"] or not found["matches"]
+
+
+@pytest.mark.parametrize("how", ["zero", "link"])
+def test_every_scratch_file_of_finding_cameras_may_be_damaged(ten: tuple[list[str], Path, Capture], tmp_path: Path, how: str) -> None:
+    names, work, capture = ten
+    shutil.copytree(work, tmp_path / "work")
+    for k, path in enumerate(sorted(path for path in work.rglob("*") if path.is_file() and path.name != "request.json")):
+        if k % 3 == len(how) % 3 or path.name.startswith("database"):
+            SPOILERS[how](tmp_path / "work" / path.relative_to(work))
+    assert numbers(find(STILL_LIFE, names, tmp_path / "work")) == numbers(capture)
 
 
 def test_interrupted_while_registering_images(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
@@ -336,12 +401,12 @@ def test_masked_parts_give_no_features(tmp_path: Path) -> None:
     mask[:, 240:] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
     quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
-    images, _ = matches.prepare_images(
+    images, _ = prepare_images(
         STILL_LIFE, names, max_side=240, features=500, seed=0, masks={names[1]: tmp_path / "mask.png"}, work=tmp_path / "w", warn=print, **quiet
     )
-    matches.open_database(tmp_path / "w", images)
+    open_database(tmp_path / "w", images, print)
     matches.extract_features(tmp_path / "w", images, features=500, **quiet)
-    with matches.quiet_pycolmap() as pycolmap, pycolmap.Database.open(matches.database_path(tmp_path / "w")) as database:
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(tmp_path / "w")) as database:
         columns = [database.read_keypoints(i)[:, 0] for i in (1, 2, 3)]
     assert columns[0].min() < 100
     assert len(columns[1]) > 10
@@ -383,7 +448,7 @@ def test_one_thread_compares_descriptors(ten: tuple[list[str], Path, Capture], t
     connection.close()
     asked: list[int] = []
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda path, matching, *rest: asked.append(matching.num_threads))
-    images, _ = matches.prepare_images(
+    images, _ = prepare_images(
         STILL_LIFE, names, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
         progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
     )  # fmt: skip
@@ -397,7 +462,7 @@ from dataclasses import replace
 from pathlib import Path
 from pipeline.errors import PipelineError
 from pipeline.runner import run_stages
-from stages.sfm.matches import quiet_pycolmap
+from stages.sfm.colmap import quiet_pycolmap
 from tests.pipeline.toy import STAGES, make_run
 
 def work(job):
@@ -426,7 +491,7 @@ def test_colmap_leaves_sigterm_as_it_was(tmp_path: Path, engine: bool, code: int
 
 WHILE_IMPORTING = """
 import os, signal, sys
-from stages.sfm.matches import quiet_pycolmap
+from stages.sfm.colmap import quiet_pycolmap
 
 sent = 0
 def answer(number, frame):
@@ -452,4 +517,4 @@ def test_sigterm_while_colmap_is_imported_is_answered_by_us() -> None:
 
 
 def test_threads_are_those_allowed() -> None:
-    assert 1 <= matches.num_threads() <= (os.cpu_count() or 1)
+    assert 1 <= num_threads() <= (os.cpu_count() or 1)

@@ -28,7 +28,7 @@ def hook(event, arguments):
     if event == "import" and arguments[0] == "pycolmap":
         at_import.extend(name in sys.modules for name in ("zlib", "numpy", "PIL.Image"))
 sys.addaudithook(hook)
-from stages.sfm.matches import import_pycolmap
+from stages.sfm.colmap import import_pycolmap
 import_pycolmap()
 import zlib
 zlib.compress(b"x" * 100_000)

@@ -1,0 +1,62 @@
+"""pycolmap, imported without harm and without its log."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+# glog installs handlers of these when pycolmap is imported; they print a stack trace and abort, at SIGTERM too.
+_GLOG_SIGNALS = (signal.SIGSEGV, signal.SIGILL, signal.SIGFPE, signal.SIGABRT, signal.SIGBUS, signal.SIGTERM)
+_SIGACTION_BYTES = 1024  # bytes; a struct sigaction takes 152 on Linux
+
+
+def import_pycolmap() -> Any:
+    """pycolmap, the only place that imports it.
+
+    zlib, numpy and Pillow come first: the libraries inside of pycolmap 4 hide those of the same names that are loaded later, and zlib then frees what
+    it never had. Signal handlers are restored afterwards, by sigaction(2): Python's signal module knows nothing of handlers that faulthandler or
+    another library has set, and works in the main thread only.
+    """
+    if "pycolmap" not in sys.modules:
+        import zlib  # noqa: F401
+
+        import numpy  # noqa: F401
+        import PIL.Image  # noqa: F401
+
+        libc = ctypes.CDLL(None)
+        handlers = [(number, ctypes.create_string_buffer(_SIGACTION_BYTES)) for number in _GLOG_SIGNALS]
+        for number, handler in handlers:
+            libc.sigaction(int(number), None, handler)
+        # A SIGTERM that arrives meanwhile is delivered to the restored handler.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        try:
+            import pycolmap
+        finally:
+            for number, handler in handlers:
+                libc.sigaction(int(number), handler, None)
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    import pycolmap
+
+    return pycolmap
+
+
+@contextlib.contextmanager
+def quiet_pycolmap() -> Iterator[Any]:
+    """pycolmap with its log silenced, except for fatal errors."""
+    pycolmap = import_pycolmap()
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 3
+    try:
+        yield pycolmap
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def num_threads() -> int:
+    """CPUs this process may use."""
+    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)

@@ -1,0 +1,181 @@
+"""Copies of the photographs that COLMAP reads: after EXIF rotation, at working size, with their masks. What a killed call left is used again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from pipeline.files import remove, write_atomically
+from stages.io.photo import DecodedPhoto, read_mask_file, read_photo
+from stages.io.pictures import UnreadableImage
+from stages.io.png import FAST, read_png, write_png
+from stages.scratch import note, noted, once, opened
+
+LAYOUT = 3  # of the work folder; raise it when what is written there changes meaning
+
+Side = Annotated[int, msgspec.Meta(ge=1, le=2**20)]  # pixels
+Progress = Callable[..., None]
+SafePoint = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class WorkImage:
+    """The copy of one photograph after EXIF rotation.
+
+    name            of the photograph
+    file            of the copy: numbers in sorted order of name
+    width, height   of the photograph after EXIF rotation, pixels
+    work_width, work_height  of the copy
+    focal           pixels of the photograph, from its EXIF data, or None
+    camera_key      photographs with equal keys share a COLMAP camera: same size, maker and focal length
+    """
+
+    name: str
+    file: str
+    width: Side
+    height: Side
+    work_width: Side
+    work_height: Side
+    focal: Annotated[float, msgspec.Meta(gt=0)] | None
+    camera_key: str
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def prepare_images(
+    folder: Path,
+    names: Sequence[str],
+    *,
+    max_side: int,
+    features: int,
+    seed: int,
+    masks: Mapping[str, Path],
+    paths: Mapping[str, Path] | None = None,
+    work: Path,
+    progress: Progress,
+    safe_point: SafePoint,
+    warn: Callable[..., None],
+) -> tuple[list[WorkImage], list[tuple[str, str]]]:
+    """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
+
+    paths    of some or all names: the file that is read, where it is not the name below the folder
+    returns  the copies in sorted order of name, and (name, reason) of each photograph left out
+
+    What an earlier, killed call with the same photographs and settings left in `work` is kept, anything else there is removed.
+    """
+    paths = {name: folder / name for name in names} | dict(paths or {})
+    request = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "photographs": _digests(paths, masks, safe_point)}
+    text = json.dumps(request, indent=1, sort_keys=True)
+    record = work / "request.json"
+    parts = work / "images", work / "masks"
+    work.mkdir(parents=True, exist_ok=True)
+    if not _holds(record, text.encode()) or any(part.is_symlink() or not part.is_dir() for part in parts):
+        for entry in list(work.iterdir()):
+            remove(entry)
+        for part in parts:
+            part.mkdir()
+        write_atomically(record, text.encode(), durable=False)
+    images: list[WorkImage] = []
+    rejected: list[tuple[str, str]] = []
+    warn_once = once(warn)
+    for index, name in enumerate(sorted(paths)):
+        safe_point()
+        record = work / f"copy_{index:05d}.json"
+        copied = noted(record, Copy, warn_once, partial(_check, name, index, max_side, work))
+        if copied is None:
+            copied, outputs = _copy(name, paths[name], index, max_side, masks.get(name), work)
+            note(record, msgspec.to_builtins(copied), outputs)
+        if copied.image is None:
+            rejected.append((name, copied.remark))
+            warn(f"{name}: {copied.remark}; left out.")
+        else:
+            if copied.remark:
+                warn(f"{name}: {copied.remark}")
+            images.append(copied.image)
+        progress(index + 1, len(paths), "reading photographs")
+    return images, rejected
+
+
+def _digests(paths: Mapping[str, Path], masks: Mapping[str, Path], safe_point: SafePoint) -> list[list[str | None]]:
+    rows: list[list[str | None]] = []
+    for name in sorted(paths):
+        safe_point()
+        try:
+            digest = _sha256(paths[name])
+        except OSError as error:
+            digest = str(error.strerror)
+        rows.append([name, digest, _sha256(masks[name]) if name in masks else None])
+    return rows
+
+
+@dataclass(frozen=True)
+class Copy:
+    """What became of a photograph: its copy, or None where it could not be read; and a remark, or the reason."""
+
+    image: WorkImage | None
+    remark: str
+
+
+def _file(index: int) -> str:
+    return f"{index:05d}.png"
+
+
+def _copy(name: str, path: Path, index: int, max_side: int, mask_path: Path | None, work: Path) -> tuple[Copy, list[Path]]:
+    """Copy one photograph; with the files written."""
+    try:
+        photo: DecodedPhoto = read_photo(path, max_side)
+    except UnreadableImage as error:
+        return Copy(None, str(error)), []
+    outputs = [work / "images" / _file(index)]
+    write_png(photo.rgb, outputs[0], compress_level=FAST, durable=False)
+    mask, remark = photo.opaque, ""
+    if mask_path is not None:
+        try:
+            given = read_mask_file(mask_path, photo)
+            mask = given if mask is None else mask & given
+        except UnreadableImage as error:
+            remark = f"its mask is not used: {error}"
+    if mask is not None:
+        outputs.append(work / "masks" / f"{_file(index)}.png")
+        write_png(np.where(mask, np.uint8(255), np.uint8(0)), outputs[1], compress_level=FAST, durable=False)
+    height, width = photo.rgb.shape[:2]
+    focal = None if photo.focal is None else float(photo.focal)
+    key = f"{photo.width}x{photo.height} {photo.maker} {focal if focal is None else round(focal, 1)}"
+    return Copy(WorkImage(name, _file(index), photo.width, photo.height, width, height, focal, key), remark), outputs
+
+
+def _check(name: str, index: int, max_side: int, work: Path, copied: Copy, outputs: Collection[str]) -> None:
+    """Raises where this is not what became of a photograph, or its copy and mask are not there at working size."""
+    image = copied.image
+    if image is None:
+        return
+    if (image.name, image.file) != (name, _file(index)) or max(image.work_width, image.work_height) > max_side:
+        raise ValueError("of another photograph")
+    for path in (work / "images" / image.file, work / "masks" / f"{image.file}.png"):
+        there = path.relative_to(work).as_posix() in outputs
+        if there and read_png(path).shape[:2] != (image.work_height, image.work_width):
+            raise ValueError(f"{path.name} is of another size")
+        if not there and path.parent.name == "images":
+            raise ValueError(f"{path.name} is missing")
+        if not there:
+            remove(path)  # that of a photograph without a mask, of which only `extract_features` knows
+
+
+def _holds(path: Path, data: bytes) -> bool:
+    """Whether a plain file has exactly this content."""
+    try:
+        with opened(path) as file:
+            return file.read(len(data) + 1) == data
+    except OSError:
+        return False
