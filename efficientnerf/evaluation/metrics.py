@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 WINDOW = 11  # pixels a side of SSIM's Gaussian window
+BAND = 256  # rows of an image whose windows are compared at a time; changes memory alone
 
 
 def mean_squared_error(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -66,11 +67,16 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     image, truth, _ = _checked(image, truth, None)
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"ssim: an image of {image.shape[1]} x {image.shape[0]} pixels is smaller than the window of {WINDOW} x {WINDOW}")
-    _, similarity = structural_similarity(
-        truth, image, data_range=1.0, channel_axis=2 if image.ndim == 3 else None, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
-    )
     border = WINDOW // 2  # where scikit-image mirrors the image
-    return np.asarray(similarity[border:-border, border:-border])
+    similarity = np.zeros(image.shape)
+    for top in range(border, len(image) - border, BAND):
+        rows = slice(top - border, min(top + BAND, len(image) - border) + border)
+        _, part = structural_similarity(
+            truth[rows], image[rows], data_range=1.0, channel_axis=2 if image.ndim == 3 else None, gaussian_weights=True, sigma=1.5,
+            use_sample_covariance=False, full=True,
+        )  # fmt: skip
+        similarity[rows][border:-border] = part[border:-border]
+    return similarity[border:-border, border:-border]
 
 
 def _checked(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -86,4 +92,4 @@ def _checked(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> t
             raise ValueError(f"metrics: a mask of shape {mask.shape} for images of shape {image.shape}")
         if not mask.any():
             raise ValueError("metrics: the mask leaves no pixel to compare")
-    return image.astype(np.float64), truth.astype(np.float64), mask
+    return image.astype(np.float64, copy=False), truth.astype(np.float64, copy=False), mask

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # Bytes. Of a stored voxel: vertices and faces while they are joined, cleaned and decimated, as many as a thin shell has; of a cell in which enclosed space
 # is found, and of a voxel of the bricks that these are made from; of a point with what its colour is looked up by.
-VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 450
+VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
 
 
 def surface_needed(tree: NerfTree, points: int = 0) -> Need:
