@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pipeline.errors import UsageError
-from pipeline.executors.memory import available_now, size_text
+from pipeline.executors.memory import Limit, available_now, size_text
 from pipeline.stage import Job
 
 MIB = 2**20
@@ -57,12 +57,20 @@ def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:
     remedy  what to do about it, a sentence: which settings, with their values
     """
     record(job, need)
-    if job.memory is not None and need.total > job.memory.bytes:
-        limit = f"{size_text(job.memory.bytes)} may be taken ({job.memory.whose})"
-        raise UsageError(f"{job.stage}: needs {need.text()}; {limit}. {remedy} Or give more by --memory.")
+    refuse_more_than(job.memory, job.stage, need, remedy)
     now = available_now() if job.memory is not None else None
     if now is not None and need.total > now:
         job.warn(f"{job.stage} needs {need.text()}; other programs leave {size_text(now)} at the moment. Close some, should it fail.")
+
+
+def refuse_more_than(limit: Limit | None, what: str, need: Need, remedy: str) -> None:
+    """UsageError where a need is more than the limit; None: no limit is known.
+
+    what    has the need, the beginning of the sentence
+    remedy  as for `refuse_what_does_not_fit`
+    """
+    if limit is not None and need.total > limit.bytes:
+        raise UsageError(f"{what}: needs {need.text()}; {size_text(limit.bytes)} may be taken ({limit.whose}). {remedy} Or give more by --memory.")
 
 
 def record(job: Job, need: Need) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of the
 # samples of a supersampled pixel where each ray is rendered on its own; of a test view with its photograph, renders, errors and windows of SSIM.
-TREE, FRAME, SAMPLE, COMPARED = 3, 100, 80, 230
+TREE, FRAME, SAMPLE, COMPARED = 3, 100, 80, 160
 FIELD = 150  # bytes of a ray through the field, with what lies before and behind the box
 
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option, set_option
+from workflows.cli.options import common_options, folder_type, force_option, json_option, memory_limit, memory_option, quiet_option, set_option
 
 if TYPE_CHECKING:
+    from pipeline.executors.memory import Limit
     from workflows.cli.resolve import Settings
 
 CAMERAS = ".json"
@@ -22,11 +23,14 @@ CAMERAS = ".json"
 @click.option("--to", "first", required=True, metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
 @click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
 @force_option
+@memory_option
 @set_option
 @json_option
 @quiet_option
 @common_options
-def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, force: bool, sets: tuple[str, ...], as_json: bool, quiet: bool) -> None:
+def export(
+    what: Path, first: Path, more: tuple[Path, ...], as_points: bool, force: bool, memory: str | None, sets: tuple[str, ...], as_json: bool, quiet: bool
+) -> None:
     """Write the surface of RUN or ASSET as .ply, .glb or .obj, with --points as .ply or .xyz; or the cameras of RUN as .json (nerfstudio).
 
     Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. Settings of the stages mesh and points
@@ -37,7 +41,7 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, for
     from workflows.cli.output import closing, write_json
     from workflows.destination import check_files
 
-    files = [first, *more]
+    files, limit = [first, *more], memory_limit(memory)
     known = [*(POINT_EXPORTERS if as_points else MESH_EXPORTERS), CAMERAS]
     for path in files:
         if path.suffix.lower() not in known:
@@ -51,7 +55,7 @@ def export(what: Path, first: Path, more: tuple[Path, ...], as_points: bool, for
         for path in cameras:
             written.append({"path": str(path.absolute()), "cameras": _export_cameras(what, path, force)})
         if surfaces:
-            written += _export_surface(what, surfaces, as_points, force, sets, show)
+            written += _export_surface(what, surfaces, as_points, force, limit, sets, show)
     if as_json:
         write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
     elif not quiet:
@@ -78,11 +82,13 @@ def _export_cameras(what: Path, path: Path, force: bool) -> int:
 
 
 def _export_surface(
-    what: Path, files: list[Path], as_points: bool, force: bool, sets: tuple[str, ...], show: Callable[[dict[str, Any]], None]
+    what: Path, files: list[Path], as_points: bool, force: bool, limit: Limit | None, sets: tuple[str, ...], show: Callable[[dict[str, Any]], None]
 ) -> list[dict[str, Any]]:
     from stages import mesh, points
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
     from stages.io.exporters.writing import source_frame
+    from stages.memory.need import refuse_more_than
+    from stages.memory.surface import surface_needed
     from workflows.cli.target import load_asset
     from workflows.destination import writing
 
@@ -90,6 +96,9 @@ def _export_surface(
     progress = _progress("export", show)
     tree = load_asset(what)
     frame = source_frame(tree.metadata)
+    number = settings["points"].num_points if as_points else 0
+    remedy = f"Lower points.num_points ({number})." if as_points else "Take an asset of fewer voxels: enerf convert --resolution."
+    refuse_more_than(limit, str(what), surface_needed(tree, number), remedy)
     if as_points:
         cloud = points.points_of(tree, settings["points"], frame, progress)
         for path in files:
@@ -130,6 +139,7 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb.")
 @click.option("--video", metavar="FILE", type=folder_type, help="Also write the frames as an MP4 (H.264).")
 @force_option
+@memory_option
 @set_option
 @json_option
 @quiet_option
@@ -149,6 +159,8 @@ def render(
     from stages.framing.camera_paths import similarity_of
     from stages.io.camera_path import read_camera_path
     from stages.io.exporters.frames import background_from_text
+    from stages.memory.need import refuse_more_than
+    from stages.memory.rendering import frames_needed
     from stages.turntable import TurntableSettings, cameras_of
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
@@ -161,6 +173,7 @@ def render(
     check_files([] if video is None else [video], force=force, inputs=read)
     if camera_path is not None and given["frames"] is not None:
         raise UsageError("--frames: the path says how many there are; give either --path or --frames.")
+    limit = memory_limit(given.pop("memory"))
     settings = _settings_for(what, sets, {"turntable": TurntableSettings}).resolved()["turntable"]
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
     background_from_text(settings.background)
@@ -170,6 +183,8 @@ def render(
         cameras, fps = list(path.cameras), path.fps or settings.fps
     else:
         cameras, fps = cameras_of(tree, settings), settings.fps
+    most = max((camera.width * camera.height for camera in cameras), default=0)
+    refuse_more_than(limit, str(what), frames_needed(tree, most, settings.supersample), "Render smaller frames (--width, --height).")
     for k in range(len(cameras)):
         for kind in ("png", "exr"):
             check_free(out / f"frame_{k:04d}.{kind}", force=force, inputs=read)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from pipeline.executors.memory import Limit
     from workflows.asset import Workflow
 
 C = TypeVar("C", bound=Callable[..., Any])
@@ -33,6 +34,13 @@ class PathOfAnything(click.Path):
 
 
 folder_type = PathOfAnything(path_type=Path)
+
+
+def memory_limit(text: str | None) -> Limit | None:
+    """What --memory says, or what the machine has where it is "auto" or not given. Raises UsageError."""
+    from pipeline.executors.memory import limit_for, parse_size
+
+    return limit_for(None if text in (None, "auto") else parse_size(text), None)
 
 
 def workflow() -> Workflow:

@@ -200,6 +200,7 @@ def test_debug_shows_the_traceback(enerf: Enerf, toys: Path, tmp_path: Path) -> 
         (["--as", "photograph"], "Did you mean photographs?"),
         (["--device", "cuda"], "no CUDA device was found"),
         (["--device", "tpu"], "'tpu' is not one of"),
+        (["--memory", "lots"], "--memory lots: expected a size, as in 512m, 8g or 1.5GiB."),
         (["--frob"], "No such option"),
         (["--seed", "x"], "not a valid integer"),
     ],
@@ -213,6 +214,21 @@ def test_usage_errors_leave_nothing_behind(enerf: Enerf, toys: Path, tmp_path: P
     in_json = enerf("run", toys, "--out", tmp_path / "run", *arguments, "--json").objects
     assert in_json[-1]["exit_code"] == 2
     assert not in_json[-1]["ok"]
+
+
+def test_memory_is_recorded_like_the_device_and_makes_nothing_stale(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert enerf("run", toys, "--out", run, "--memory", "1.5g").code == 0
+    assert json.loads((run / "run.json").read_text())["memory"] == 3 * 2**29
+    before = recorded(run)
+    result = enerf("run", "--out", run)
+    assert (result.code, recorded(run)) == (0, before)
+    assert json.loads((run / "run.json").read_text())["memory"] == 3 * 2**29
+    more = enerf("run", "--out", run, "--memory", "1000t")
+    assert (more.code, recorded(run)) == (0, before)
+    assert "--memory 1000t" in more.err  # than the machine has
+    assert enerf("run", "--out", run, "--memory", "auto").code == 0
+    assert json.loads((run / "run.json").read_text())["memory"] is None
 
 
 def test_a_run_that_is_being_written_is_left_alone(enerf: Enerf, toys: Path, tmp_path: Path) -> None:

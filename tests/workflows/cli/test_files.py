@@ -70,6 +70,9 @@ def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
         (["--to", "no/where/ball.ply"], 2, "does not exist"),
         (["--to", "cameras.json"], 2, "has no cameras"),
         (["--to", "ball.ply", "--set", "mesh.max_facs=3"], 2, "Nearest: mesh.max_faces."),
+        (["--to", "ball.ply", "--memory", "100m"], 2, "100 MiB may be taken (--memory)"),
+        (["--to", "ball.ply", "--points", "--set", "points.num_points=1000000000"], 2, "Lower points.num_points (1000000000)"),
+        (["--to", "ball.ply", "--memory", "much"], 2, "expected a size, as in 512m, 8g or 1.5GiB"),
         (["--to", "ball.ply", "--set", "mesh.density_threshold=1e9"], 3, "Lower mesh.density_threshold"),
         ([], 2, "--to"),
     ],
@@ -106,6 +109,13 @@ def test_a_camera_path(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     assert np.asarray(Image.open(tmp_path / "frames/frame_0000.png")).shape == (30, 40, 3)
     path.write_text('{"frames": []}', encoding="utf-8")
     assert enerf("render", ball, "--out", tmp_path / "frames", "--path", path).code == 2
+
+
+def test_frames_that_do_not_fit_into_memory_are_refused(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    result = enerf("render", ball, "--out", tmp_path / "frames", "--width", 8192, "--height", 8192, "--memory", "2g")
+    assert result.code == 2
+    assert "2.0 GiB may be taken (--memory). Render smaller frames (--width, --height)." in result.err
+    assert not (tmp_path / "frames").exists()
 
 
 def test_what_cannot_be_rendered(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
