@@ -40,6 +40,9 @@ _ORIENTATION = 274
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 # The fault of the process or the machine, not of one file: to leave pictures out for these would change results in silence.
 NOT_THE_FILES_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+# Nor may these leave a picture out: the engine has read all of the file just before, for its digest, so that they may be over by the next run, which would
+# take the artifact without the picture for a fresh one.
+_PASSING = (errno.EIO, errno.EACCES, errno.EPERM)
 
 
 class UnreadableImage(Exception):
@@ -70,7 +73,7 @@ class Header:
 @contextmanager
 def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     """A Pillow image of one of `formats`, whose pixels are not decoded yet. Nothing but decoding belongs into the block: whatever is raised in it becomes
-    UnreadableImage, but for MemoryError, and OSError where the process has no more memory or open files.
+    UnreadableImage, but for MemoryError, and OSError where the process has no more memory or open files, or the file cannot be read now.
     """
     from PIL import Image
 
@@ -83,7 +86,7 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     except (UnreadableImage, MemoryError, PipelineError):
         raise
     except OSError as error:
-        if error.errno in NOT_THE_FILES_FAULT:
+        if error.errno in (*NOT_THE_FILES_FAULT, *_PASSING):
             raise
         raise UnreadableImage(f"unreadable: {_reason(error)}") from error
     except Exception as error:  # decoders raise whatever they stumble over: struct.error, TypeError, KeyError, RecursionError ...

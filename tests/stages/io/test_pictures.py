@@ -365,8 +365,8 @@ def test_the_true_reason_is_said_and_want_of_memory_stays_one(tmp_path: Path, mo
         pictures.read_header(tmp_path / "none.png")
     captures.write_picture(tmp_path / "a.png", captures.picture())
     for raised, expected, text in [
-        (OSError(errno.EIO, os.strerror(errno.EIO)), UnreadableImage, "unreadable: Input/output error"),
-        (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), UnreadableImage, "unreadable: Permission denied"),
+        (OSError(errno.EIO, os.strerror(errno.EIO)), OSError, "Input/output error"),
+        (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), OSError, "Permission denied"),
         (OSError(errno.EMFILE, os.strerror(errno.EMFILE)), OSError, "Too many open files"),
         (MemoryError("none left"), MemoryError, "none left"),
     ]:
