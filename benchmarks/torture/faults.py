@@ -5,8 +5,9 @@
 A case is one operation of one stage, which fails with one of ENOSPC, EIO, EROFS, EACCES, EMFILE, once or with all that follow. The stage replaces an
 older artifact; those before and after it are there. Then
 
-    the exit code is 3, or 2 where it is the user's: the source cannot be read, or the run folder cannot be written before the first stage begins.
-    It is 0 where the run can do without the operation, with the right artifacts
+    the exit code is 3. It is 2 where the user can help: the source cannot be read, the run may not be read or written (EACCES, EROFS), or it could not begin;
+    4 where a broken disk (EIO) keeps a file of the run from being read, which then counts as damaged; 0 where the run can do without the operation, or
+    makes anew what it lost, with the right artifacts
     the message has one or two lines, names the file, its folder or its stage, and is no traceback
     every artifact that is there verifies
     the next run, without faults, ends with the artifacts of an undisturbed run and an empty .work
@@ -94,15 +95,17 @@ def _log_all(prepared: Sequence[Prepared], stages: Sequence[str], logs: Path) ->
 def planned(prepared: Sequence[Prepared], stages: Sequence[str], logs: Path) -> tuple[list[Case], dict[str, dict[str, int]]]:
     """(all cases, scenario -> "stage kind" -> number of operations that an undisturbed run makes)."""
     cases: list[Case] = []
-    seen = {}
+    seen = {}  # of a new run, up to its second stage: later ones are met where a stage is replaced
     for each, stage in _scenarios(prepared, stages):
         of_kind: dict[tuple[str, str], list[Operation]] = defaultdict(list)
-        for operation in operations(logs / f"{each.source.kind}_{stage}"):
+        found = operations(logs / f"{each.source.kind}_{stage}")
+        second = next((index for index, operation in enumerate(found) if operation.stage == STAGES[1] and operation.kind == "mkdir"), len(found))
+        for operation in found[:second] if stage == NEW else found:
             of_kind[operation.stage, operation.kind].append(operation)
-        seen[f"{each.source.kind} {stage}"] = {" ".join(which): len(found) for which, found in sorted(of_kind.items())}
-        for (where, kind), found in sorted(of_kind.items()):
+        seen[f"{each.source.kind} {stage}"] = {" ".join(which): len(some) for which, some in sorted(of_kind.items())}
+        for (where, kind), some in sorted(of_kind.items()):
             if where == stage or (where == "engine" and (kind != "read" or stage == NEW)) or (where == "source" and stage == "poses"):
-                cases += _of_kind(each, stage, kind, _thinned(found))
+                cases += _of_kind(each, stage, kind, _thinned(some))
         if stage != NEW:
             cases += [Case(each.source.kind, stage, stage, "write", 1, errno.ENOSPC, True, deadly) for deadly in DEADLY]
     return cases, seen
