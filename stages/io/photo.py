@@ -83,15 +83,24 @@ def read_alpha(path: Path) -> np.ndarray | None:
 def read_mask_file(path: Path, photo: DecodedPhoto) -> np.ndarray:
     """(h, w) bool at the photograph's working size, True where the mask is not black; raises UnreadableImage."""
     with opened(path) as image:
-        mask = grey_of(image)
-    if photo.orientation >= 5 and same_aspect(mask.shape[::-1], (photo.height, photo.width)):
-        mask = apply_exif_orientation(mask, photo.orientation)  # a mask of the pixels as stored
+        mask = apply_exif_orientation(grey_of(image), orientation_of(image))
+    mask = upright_mask(mask, photo.orientation, photo.width, photo.height)
     if not same_aspect(mask.shape, (photo.height, photo.width)):
         raise UnreadableImage(f"{path.name} is {mask.shape[1]}x{mask.shape[0]}, the photograph {photo.width}x{photo.height}")
     height, width = photo.rgb.shape[:2]
     rows = ((np.arange(height) + 0.5) * mask.shape[0] / height).astype(int)
     columns = ((np.arange(width) + 0.5) * mask.shape[1] / width).astype(int)
     return mask[rows][:, columns] > 0
+
+
+def upright_mask(mask: np.ndarray, orientation: int, width: int, height: int) -> np.ndarray:
+    """The mask (H, W) of an image as the image is meant to be seen.
+
+    orientation    of the image, which a mask of its pixels as stored is turned by; a mask that has the aspect of the upright image is taken for upright
+    width, height  of the image after EXIF rotation, pixels
+    """
+    turned = orientation >= 5 and not same_aspect(mask.shape, (height, width))
+    return apply_exif_orientation(mask, orientation) if turned else mask
 
 
 def same_aspect(size: tuple[int, ...], other: tuple[int, ...]) -> bool:

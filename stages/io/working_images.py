@@ -15,7 +15,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo
-from stages.io.photo import apply_exif_orientation, same_aspect, working_size
+from stages.io.photo import apply_exif_orientation, same_aspect, upright_mask, working_size
 from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, read_header, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
@@ -183,10 +183,8 @@ def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.n
         decoded = decode(photo.mask)
     except UnreadableImage as error:
         raise UnreadableImage(f"its mask {printable(photo.mask.name)} is {error}") from error
-    mask = decoded.pixels[..., :3].max(-1)  # any colour counts as not black
     expected = photo.camera.width, photo.camera.height
-    if orientation >= 5 and not same_aspect(mask.shape[::-1], expected):
-        mask = apply_exif_orientation(mask, orientation)  # a mask of the pixels as stored
+    mask = upright_mask(decoded.pixels[..., :3].max(-1), orientation, *expected)  # any colour counts as not black
     found = mask.shape[1], mask.shape[0]
     sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
     if not same_aspect(found, expected):

@@ -118,6 +118,29 @@ def test_mask_must_fit(tmp_path: Path) -> None:
         reading.read_mask_file(tmp_path / "m.png", photo)
 
 
+@pytest.mark.parametrize("size", [(40, 40), (40, 30)])
+@pytest.mark.parametrize("tagged", [False, True])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_masks_are_turned_alike_for_features_and_for_working_images(tmp_path: Path, orientation: int, tagged: bool, size: tuple[int, int]) -> None:
+    from efficientnerf.geometry.cameras import Camera
+    from stages.io import working_images
+    from stages.io.capture import Photo
+
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.new("RGB", size).save(tmp_path / "a.png", exif=exif)
+    marked = np.zeros(size[::-1], np.uint8)
+    marked[2:8, 5:30] = 255
+    Image.fromarray(marked).save(tmp_path / "m.png", exif=exif if tagged else None)
+    photo = reading.read_photo(tmp_path / "a.png", 100)
+    for_features = reading.read_mask_file(tmp_path / "m.png", photo)
+    camera = Camera("a.png", photo.width, photo.height, "SIMPLE_PINHOLE", (40.0, 20.0, 20.0), np.eye(4))
+    written = working_images.write(Photo(camera, tmp_path / "a.png", tmp_path / "m.png"), tmp_path / "out", "a.png", max_side=100, keep_alpha=False)
+    assert written.mask is not None
+    with Image.open(tmp_path / "out" / written.mask) as mask:
+        np.testing.assert_array_equal(np.asarray(mask) > 0, for_features)
+
+
 # ------------------------------------------------------------------------------------------------------------------- pairs
 
 
