@@ -11,7 +11,11 @@ from pipeline.errors import BadInput, DiskFull, Interrupted, PipelineError, Stag
 from pipeline.text import printable
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-_BROKEN = (errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # nothing that other options or permissions would change
+# What the user can put right at the path itself. Everything else is of the disk or the system.
+_OF_THE_PATH = (
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENOTEMPTY, errno.ELOOP, errno.EINVAL,
+    errno.ENAMETOOLONG, errno.EXDEV, errno.ENXIO, errno.ENODEV, errno.ESPIPE, errno.EBUSY, errno.ETXTBSY,
+)  # fmt: skip
 _FULL_TEXTS = ("no space left on device", "disk quota exceeded", "disk is full", "disk full")  # of libraries that drop the number of the error
 _NOTHING_FREE = 2**16  # bytes
 
@@ -82,13 +86,13 @@ def cannot_write(path: Path, error: OSError) -> BadInput | StageFailed:
     if is_disk_full(error):
         return disk_full(path, str(path))
     text = f"{path}: cannot be written ({printable(error.strerror or error, 200)})."
-    return StageFailed(text) if error.errno in _BROKEN else BadInput(text)
+    return BadInput(text) if error.errno in _OF_THE_PATH else StageFailed(text)
 
 
 def failed(path: Path, error: OSError) -> BadInput | StageFailed:
-    """For a failure outside of a stage, while a run was looked at or put right: as `cannot_write`, naming the file."""
+    """For a failure outside of a stage, while a run was read or put right: as `cannot_write`, naming the file."""
     if is_disk_full(error):
         return disk_full(path, str(path))
     where = f" at {printable(error.filename, 300)}" if isinstance(error.filename, str | bytes) else ""
     text = f"{path}: {printable(error.strerror or error, 200)}{where}. What was published before is not lost."
-    return StageFailed(text) if error.errno in _BROKEN else BadInput(text)
+    return BadInput(text) if error.errno in _OF_THE_PATH else StageFailed(text)

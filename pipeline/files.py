@@ -31,7 +31,8 @@ _RANDOM = 8  # bytes; nobody guesses the name of a temporary file
 _TEMPORARY = re.compile(r"\.(.+)\.(?:[0-9a-f]{16}|[0-9]{1,10})\.part", re.DOTALL)
 _TRASH = re.compile(r"trash-(?:[0-9a-f]{16}|[0-9]{1,10}-[0-9]{1,20})")
 _LONGEST = 200  # bytes of a file's name that its temporary's repeats: file systems allow 255
-_NOT_ITS_FAULT = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EACCES, errno.EPERM)
+# Errors that speak of the file itself. All others are of the system, and say nothing about what was written.
+_ITS_FAULT = (errno.ELOOP, errno.EISDIR, errno.ENOTDIR, errno.EINVAL, errno.ENXIO, errno.ENAMETOOLONG, errno.ENOENT)
 _KINDS = {
     stat.S_IFLNK: "a link",
     stat.S_IFIFO: "a pipe",
@@ -45,7 +46,7 @@ _KINDS = {
 class Unreadable(ValueError):
     """A JSON file that is too large, cut off or not valid; the text says why.
 
-    denied  the error of the system where nothing is wrong with the file: no permission, too many open files, no memory
+    denied  the error of the system where that would not read the file; see `is_denied`
     """
 
     def __init__(self, text: str, denied: OSError | None = None) -> None:
@@ -64,8 +65,8 @@ def pretty_json(value: Any, *, sort_keys: bool = True, default: Callable[[Any], 
 
 
 def is_denied(error: OSError) -> bool:
-    """Whether nothing is wrong with the file: no permission, too many open files, no memory."""
-    return error.errno in _NOT_ITS_FAULT
+    """Whether the system would not read the file, whatever is in it: no permission, too many open files, no memory, a failing disk."""
+    return error.errno not in _ITS_FAULT
 
 
 def kind_of(mode: int) -> str:

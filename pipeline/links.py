@@ -14,7 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline import files
-from pipeline.errors import BadInput, CorruptArtifact
+from pipeline.errors import CorruptArtifact
+from pipeline.failures import failed
 from pipeline.text import printable
 
 RUN = "run.json"
@@ -34,7 +35,7 @@ def is_stage_name(name: str) -> bool:
 
 
 def refuse_links(run: Path) -> None:
-    """Raise CorruptArtifact if a run holds what is neither a file nor a folder under a name that is used; BadInput if it cannot be listed.
+    """Raise CorruptArtifact if a run holds what is neither a file nor a folder under a name that is used; see `failed` where it cannot be listed.
 
     Takes no lock: what another process removes meanwhile is not there.
     """
@@ -42,7 +43,7 @@ def refuse_links(run: Path) -> None:
         for name, status in _used(run):
             _check(run, name, status)
     except OSError as error:
-        raise BadInput(f"{run}: cannot be listed ({error.strerror or error}).") from None
+        raise failed(run, error) from None
 
 
 def _used(run: Path) -> Iterator[tuple[str, os.stat_result]]:

@@ -25,7 +25,7 @@ import msgspec
 from pipeline import files
 from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.executors.memory import MOST
-from pipeline.failures import cannot_write
+from pipeline.failures import cannot_write, failed
 from pipeline.links import CACHE, HOLDER, LOCK, RUN, refuse_links
 from pipeline.lock import Holder, holder_of, lock
 
@@ -251,7 +251,7 @@ def _recorded(run: Path) -> dict[str, Any]:
         raise BadInput(f"{run}: is not a run (it has no {NAME}).") from None
     except files.Unreadable as error:
         if error.denied is not None:
-            raise BadInput(f"{path}: cannot be read ({error}).") from None
+            raise failed(run, error.denied) from None
         raise CorruptArtifact(f"{path}: {error}. Restore it, or start a new run.", (NAME,)) from None
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise BadInput(f"{path}: not of a run (expected format {FORMAT!r}).")

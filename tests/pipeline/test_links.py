@@ -185,7 +185,7 @@ def test_folders_nested_too_deeply_are_refused(tmp_path: Path) -> None:
 def test_a_run_that_cannot_be_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = make_run(tmp_path)
     monkeypatch.setattr(os, "listdir", raising(PermissionError(13, "Permission denied")))
-    with pytest.raises(BadInput, match=r"cannot be listed \(Permission denied\)"):
+    with pytest.raises(BadInput, match="Permission denied"):
         refuse_links(run.path)
 
 
