@@ -67,6 +67,8 @@ class Checkpoints:
 
 def _restore(t: Trainer, path: Path, last: int) -> float:
     """Restore a checkpoint: all of it, or nothing where this raises."""
+    import torch
+
     from efficientnerf.training.loop import restore
     from stages.io.field_file import read_tensors
 
@@ -76,7 +78,9 @@ def _restore(t: Trainer, path: Path, last: int) -> float:
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from None
     progress = tensors.get("progress")
-    if path.name != _name(about.step) or progress is None or progress.numel() != 2 or float(progress.flatten()[0]) != about.step:
+    if progress is None or progress.dtype != torch.float64 or progress.shape != (2,):  # other types do not even convert
+        raise ValueError("tensor 'progress' is missing, or no two float64")
+    if path.name != _name(about.step) or float(progress[0]) != about.step:
         raise ValueError(f"it is of step {about.step}, by its own account")
     if about.step >= last:
         raise ValueError(f"step {about.step} of {last}")

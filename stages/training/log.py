@@ -136,6 +136,6 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
             for text in file:
                 msgspec.json.decode(text, type=_Line)
                 out.append(json.loads(text))
-    except (OSError, ValueError, msgspec.MsgspecError):
+    except (OSError, ValueError, RecursionError, msgspec.MsgspecError):
         pass
     return out
