@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import hashlib
 import json
+import tempfile
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -14,7 +17,9 @@ import numpy as np
 from benchmarks.fuzz import datasets, json_text, lines, safetensors_bytes
 from benchmarks.fuzz.reader import Opened, Reader
 
-QUICK = {"iterations": 13, "sample_batch_size": 256, "log2_hashmap_size": 6, "occupancy_resolution": 4}
+QUICK = {"iterations": 13, "sample_batch_size": 256, "log2_hashmap_size": 8, "occupancy_resolution": 4}
+
+STEP = 5  # of the checkpoints
 
 
 @cache
@@ -40,14 +45,13 @@ def _digest(t: Any) -> str:
 
 
 def checkpoint_seeds() -> list[bytes]:
-    import tempfile
-
     from efficientnerf.training.loop import state_of
     from stages.io.field_file import write_tensors
 
+    t = dataclasses.replace(_trainer(), step=STEP)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.safetensors"
-        write_tensors(state_of(_trainer()), {"step": 5, "seconds": 1.5}, path)
+        write_tensors(state_of(t), {"step": STEP, "seconds": 1.5}, path)
         return [path.read_bytes()]
 
 
@@ -82,16 +86,19 @@ def open_checkpoint(folder: Path) -> Opened:
 
     t = _trainer()
     job = Job(settings=None, out=folder / "out", work=folder / "work")
+    t.step = 1  # not that of the checkpoint
     before = {name: tensor.detach().clone() for name, tensor in state_of(t).items()}
     digest = _digest(t)
 
+    path = job.work / f"checkpoint_{STEP:08d}.safetensors"
+
     def read(data: bytes) -> None:
-        (job.work / "checkpoint_00000005.safetensors").write_bytes(data)
+        path.write_bytes(data)
         try:
-            seconds = Checkpoints(job).restore(t)
-            taken = (job.work / "checkpoint_00000005.safetensors").exists()
+            seconds = Checkpoints(job).restore(t, QUICK["iterations"])
             assert np.isfinite(seconds), "seconds that are not finite"
-            assert taken or _digest(t) == digest, "half of a refused checkpoint was restored"
+            assert t.step == (STEP if path.exists() else 1), "another step than the checkpoint's"
+            assert path.exists() or _digest(t) == digest, "half of a refused checkpoint was restored"
         finally:
             restore(t, before)
             for left in job.work.iterdir():
@@ -101,8 +108,6 @@ def open_checkpoint(folder: Path) -> Opened:
 
 
 def field_seeds() -> list[bytes]:
-    import tempfile
-
     from stages.io.field_file import save_model
 
     t = _trainer()
@@ -179,14 +184,112 @@ def open_schedule(folder: Path) -> Opened:
 
 
 def open_blocks(folder: Path) -> Opened:
-    """Arrays that a bake goes on from."""
-    from stages.baking.scratch import read_npy
+    """Arrays that a bake goes on from, noted as they are."""
+    from stages.baking.scratch import read_arrays
+    from stages.scratch import note
 
-    path = folder / "block_000000.npy"
+    piece = folder / "block_000000"
+    path = folder / "block_000000_values.npy"
 
     def read(data: bytes) -> None:
         path.write_bytes(data)
-        read_npy(path)
+        note(piece.with_name("block_000000.json"), ["values"], [path])
+        arrays = read_arrays(piece, {"values": ("float64", 2)}, lambda text: None)
+        assert arrays is None or (arrays["values"].dtype == "float64" and arrays["values"].ndim == 2), "an array of another type"
+
+    return Opened(read)
+
+
+def note_seeds() -> list[bytes]:
+    made = []
+    with tempfile.TemporaryDirectory() as folder:
+        _write_note(Path(folder))
+        made.append((Path(folder) / "view_00000.json").read_bytes())
+    return made
+
+
+def _write_note(folder: Path) -> None:
+    from stages.scratch import note
+
+    for name in ("a.png", "b.png"):
+        (folder / name).write_bytes(b"pixels")
+    note(folder / "view_00000.json", {"name": "a", "asset": {"psnr": 20.5, "width": 4, "ssim": None}}, [folder / "a.png", folder / "b.png"])
+
+
+def note_changed(rng: Random, data: bytes) -> bytes:
+    """A change of a value, the digest put right in most."""
+    found = json_text.changed(rng, data)
+    document = json_text.parsed(found)
+    if rng.random() < 0.3 or not isinstance(document, dict):
+        return found
+    with contextlib.suppress(KeyError, ValueError, RecursionError):
+        document["sha256"] = hashlib.sha256(json.dumps([document["value"], document["files"]]).encode()).hexdigest()
+        return json.dumps(document).encode()
+    return found
+
+
+def open_note(folder: Path) -> Opened:
+    """What a stage noted of a piece that is done."""
+    from stages.scratch import noted
+
+    _write_note(folder)
+
+    def read(data: bytes) -> None:
+        (folder / "view_00000.json").write_bytes(data)
+        value = noted(folder / "view_00000.json", dict[str, str | dict[str, int | float | None] | None], lambda text: text.encode())
+        assert value is None or isinstance(value, dict), "a value of another type"
+
+    return Opened(read)
+
+
+def _refinement() -> tuple[Any, Any]:
+    """A tree and the state of its refinement half way."""
+    from efficientnerf.asset.refinement.state import initial_state
+    from tests.efficientnerf.hostile import tiny
+
+    tree = tiny()
+    state = initial_state(tree, 1.0)
+    state.step = STEP
+    return tree, state
+
+
+def refinement_seeds() -> list[bytes]:
+    from pipeline.stage import Job
+    from stages.baking import refinement
+
+    with tempfile.TemporaryDirectory() as folder:
+        job = Job(settings=None, out=Path(folder) / "out", work=Path(folder) / "work")
+        refinement._save_checkpoint(job, _refinement()[1], pruned=False)
+        return [(job.work / refinement.CHECKPOINT).read_bytes()]
+
+
+def refinement_changed(rng: Random, data: bytes) -> bytes:
+    """A change, the digest put right in most."""
+    from safetensors.numpy import load
+
+    from stages.baking.refinement import _digest as digest
+
+    found = safetensors_bytes.changed(rng, data)
+    parts = safetensors_bytes.parts(found)
+    if rng.random() < 0.15 or parts is None:
+        return found
+    with contextlib.suppress(Exception):
+        return safetensors_bytes.joined({**parts[0], "__metadata__": {"sha256": digest(load(found))}}, parts[1])
+    return found
+
+
+def open_refinement(folder: Path) -> Opened:
+    """The state that a refinement goes on from."""
+    from pipeline.stage import Job
+    from stages.baking import refinement
+
+    tree, _ = _refinement()
+    job = Job(settings=None, out=folder / "out", work=folder / "work")
+
+    def read(data: bytes) -> None:
+        (job.work / refinement.CHECKPOINT).write_bytes(data)
+        found = refinement._restored(job, tree, 2 * STEP)
+        assert found is None or 0 <= found[0].step <= 2 * STEP, "a step out of range"
 
     return Opened(read)
 
@@ -199,5 +302,7 @@ READERS = {
         Reader("log", "log.jsonl of a training run", log_seeds, log_changed, open_log, share=0.25),
         Reader("schedule", "schedule.json of a time budget", schedule_seeds, json_text.changed, open_schedule, share=0.25),
         Reader("blocks", "arrays that a bake goes on from", datasets.npy_seeds, datasets.npy_changed, open_blocks, share=0.25),
+        Reader("note", "notes of what a stage has done", note_seeds, note_changed, open_note, share=0.25),
+        Reader("refinement", "checkpoints of a bake's refinement", refinement_seeds, refinement_changed, open_refinement, share=0.25),
     )
 }

@@ -17,6 +17,7 @@ WHOLE = "is not a whole number"
 
 # reader: {file: words of the message, or READ}
 FILES = {
+    "blocks": dict.fromkeys(("dtype-empty-tuple.npy", "header-cut-off.npy", "header-longer-than-memory.npy", "shape-with-true.npy", "zip-cut-off.npy"), READ),
     "camera_path": {"fov-of-nothing.json": "expected degrees between 0 and 180"},
     "colmap_cameras_txt": {"superscript-digit.txt": WHOLE, "two-minus-signs.txt": WHOLE},
     "colmap_images_bin": {
@@ -25,8 +26,10 @@ FILES = {
     },
     "colmap_images_txt": {"two-minus-signs.txt": WHOLE},
     "colmap_points3D_txt": {"superscript-digit.txt": WHOLE},
+    "config": dict.fromkeys(("nested-arrays.toml", "nested-keys.toml", "nested-tables.toml"), "nested|nests too deeply"),
     "images": {"dds.png": NO_PICTURE, "exif-without-directory.jpg": "unreadable", "idat-length-beyond-memory.png": "unreadable"},
     "lock": dict.fromkeys(("host-nul.json", "since-1e30.json", "since-1e38.json", "since-beyond-time_t.json"), READ),
+    "log": dict.fromkeys(("a-number.jsonl", "no-step.jsonl", "not-utf8.jsonl", "null.jsonl"), READ),
     "masks": {"bomb.png": "more than 178 million pixels", "exif-without-directory.png": "unreadable: damaged", "idat-length-beyond-memory.png": "unreadable"},
     "options": {"byte-of-no-encoding.txt": "expected a time", "byte-of-no-encoding-in-list.txt": "expected a time"},
     "posed_images": {"dds.png": READ, "exif-without-directory.jpg": READ},  # left out with a warning
@@ -36,14 +39,17 @@ FILES = {
             "zip-damaged.npy",
         ),
         NUMPY,
-    ),
+    )
+    | {"shape-with-true.npy": "not finite"},
     "report_bake": {"lone-surrogate-in-name.json": READ},
     "report_evaluate": dict.fromkeys(("psnr-of-400-digits.json", "ssim-of-400-digits.json", "view-of-a-number.json"), READ),
     "report_mesh": {"lone-surrogate.json": READ},
     "report_poses": dict.fromkeys(
         ("error-of-400-digits.json", "lone-surrogate-name.json", "lone-surrogate-warning.json", "registered-number.json", "warnings-infinity.json"), READ
     ),
+    "schedule": {"iterations-infinity.json": READ},
     "transforms": {
+        "angle-of-nothing.json": "expected an angle",
         "angle-of-400-digits.json": FINITE,
         "camera-model-list.json": "camera_model a list of 0; supported are",
         "camera-model-object.json": "camera_model an object; supported are",
@@ -62,10 +68,21 @@ JSON = {
     "manifest": "not valid JSON",
     "scene": "not valid JSON",
 }
-IGNORED = ("lock", "hashes", "report_bake", "report_evaluate", "report_mesh", "report_poses")
+IGNORED = ("log", "schedule", "note", "lock", "hashes", "report_bake", "report_evaluate", "report_mesh", "report_poses")
+
+
+def checkpoint_of_complex_progress() -> bytes:
+    from benchmarks.fuzz import safetensors_bytes, scratch
+
+    found = safetensors_bytes.parts(scratch.checkpoint_seeds()[0])
+    assert found is not None
+    return scratch.with_digest(safetensors_bytes.joined({**found[0], "progress": {**found[0]["progress"], "dtype": "C64"}}, found[1]))
+
+
 MADE: dict[tuple[str, str], tuple[Callable[[], bytes], str]] = {
     **{(reader, f"nested {name}"): (lambda data=data: data, says) for name, data in NESTED.items() for reader, says in JSON.items()},  # type: ignore[misc]
     **{(reader, f"nested {name}"): (lambda data=data: data, READ) for name, data in NESTED.items() for reader in IGNORED},  # type: ignore[misc]
     **{(reader, "integer of 5000 digits"): (lambda: b"1" * 5000, says.replace("nested too deeply|", "")) for reader, says in JSON.items()},
+    ("checkpoint", "progress of complex numbers"): (checkpoint_of_complex_progress, READ),
     **{(reader, "nothing"): (lambda: b"", "the file is empty") for reader in JSON},
 }  # fmt: skip
