@@ -60,7 +60,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="readers at a time")
     parser.add_argument("--shrink", type=float, default=5.0, metavar="SECONDS", help="to make the input of a finding smaller")
     parser.add_argument("--findings", type=Path, default=ROOT / "build" / "fuzz", metavar="DIR", help="where the inputs of findings go")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="result to write")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="result to write; what it holds of other readers stays")
     parser.add_argument("--file", type=Path, metavar="FILE", help="try this one input on READER")
     parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -114,6 +114,11 @@ def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: boo
         except importlib.metadata.PackageNotFoundError:
             continue
     asset = json.loads(FORMAT_RESULT.read_text(encoding="utf-8")) if FORMAT_RESULT.exists() else {}
+    former = json.loads(path.read_text(encoding="utf-8"))["readers"] if path.exists() else {}
+    readers = {
+        **former,
+        **{name: {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]]} for name, each in found.items()},
+    }
     result = {
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "machine": processor(),
@@ -121,13 +126,11 @@ def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: boo
         "versions": versions,
         "seed": seed,
         "guided_by": "coverage (atheris)" if coverage else "outcomes",
-        "inputs": sum(each["inputs"] for each in found.values()),
-        "findings": sum(len(each["findings"]) for each in found.values()),
+        "inputs": sum(each["inputs"] for each in readers.values()),
+        "findings": sum(len(each["findings"]) for each in readers.values()),
         "limit_s": 5.0,
         "room_mib": worker.EXTRA_MEMORY // 2**20,
-        "readers": {
-            name: {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]]} for name, each in found.items()
-        },
+        "readers": readers,
         "asset": {key: asset[key] for key in ("inputs", "read", "refused", "seed", "slowest_s", "peak_rss_mib") if key in asset} | {"file": FORMAT_RESULT.name},
     }
     path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
