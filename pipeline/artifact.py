@@ -128,6 +128,9 @@ def differences(folder: Path, outputs: dict[str, Output], hashes: Hashes | None 
 
 def prepare(place: Workplace, trash: Path) -> bool:
     """Make the folders of a request: an empty out/, scratch/ as it was; other requests' work is removed. Returns whether scratch/ held anything."""
+    for folder in (place.root, place.folder, place.scratch):
+        if files.exists(folder) and not files.is_folder(folder):
+            files.discard(folder, trash)  # anybody may have put a file there
     place.root.mkdir(parents=True, exist_ok=True)
     for other in list(place.root.iterdir()):
         if other.name != place.request:

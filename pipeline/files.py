@@ -23,9 +23,10 @@ from typing import Any
 
 SafePoint = Callable[[], None]
 
-MAX_JSON = 64 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
+MAX_JSON = 32 * 2**20  # bytes; a manifest of 100,000 files has about 15 MiB
 MAX_DEPTH = 100  # of nested JSON; whoever walks through a value by recursion stays far from Python's limit
 
+_CONTAINERS = 2**20  # lists and objects that a small file may hold; each takes about a hundred bytes of memory, and two in the file
 _RANDOM = 8  # bytes; nobody guesses the name of a temporary file
 # Names that `atomic` and `discard` give now, and those with a process's number that they gave before release 0.2.
 _TEMPORARY = re.compile(r"\.(.+)\.(?:[0-9a-f]{16}|[0-9]{1,10})\.part", re.DOTALL)
@@ -114,6 +115,8 @@ def read_json(path: Path, limit: int = MAX_JSON, *, follow: bool = True) -> Any:
         raise Unreadable(f"larger than {limit} bytes")
     if not data.strip():
         raise Unreadable("the file is empty")
+    if data.count(b"[") + data.count(b"{") > _CONTAINERS + len(data) // 64:
+        raise Unreadable("it holds too many lists and objects")
     try:
         value = json.loads(data, parse_constant=_refused)
         _check_values(value)

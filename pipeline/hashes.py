@@ -101,6 +101,6 @@ def _identity(stat: os.stat_result) -> tuple[int, int, int, int]:
 
 def _read(path: Path) -> dict[str, Entry]:
     try:
-        return msgspec.convert(files.read_json(path, limit=4 * files.MAX_JSON, follow=False), _Memory).files
+        return msgspec.convert(files.read_json(path, follow=False), _Memory).files
     except (OSError, ValueError):  # unreadable, or of another form; both of msgspec's errors are ValueErrors
         return {}

@@ -28,13 +28,16 @@ def test_names_that_leave_or_are_not_the_only_spelling(name: str) -> None:
         (b"[" * 100_000, "nested too deeply"),
         (b"1" * 5000, "not valid JSON"),
         (b" " * 30000, "larger than"),
+        (b"[1e999]", "no number"),
+        (b"[" * 101 + b"]" * 101, "nested too deeply"),
+        (b"[" + b"[]," * 2**21 + b"[]]", "too many lists"),
     ],
 )
 def test_json_from_anybody(tmp_path: Path, data: bytes, message: str) -> None:
     path = tmp_path / "a.json"
     path.write_bytes(data)
     with pytest.raises(files.Unreadable, match=message) as caught:
-        files.read_json(path, limit=200_000 if data.startswith(b"[[") else 20_000)
+        files.read_json(path, limit=20_000_000 if data.startswith(b"[[") else 20_000)
     assert "\n" not in str(caught.value)
 
 

@@ -261,6 +261,17 @@ def test_only_names_that_the_engine_gives_are_put_right(done: Run) -> None:
     verify(done, STAGES)
 
 
+@pytest.mark.parametrize("name", [f"{WORK}/count", f"{WORK}/count/REQUEST", f"{WORK}/count/REQUEST/out", f"{WORK}/count/REQUEST/scratch", "count", "double"])
+def test_a_file_in_the_place_of_a_folder_is_replaced(done: Run, name: str) -> None:
+    request = next(iter(path.name for path in (done.path / WORK / "count").iterdir()))
+    path = done.path / name.replace("REQUEST", request)
+    files.remove(path)
+    path.write_text("a file")
+    run_stages(done, STAGES)
+    verify(done, STAGES)
+    assert os.listdir(done.path / WORK) == []
+
+
 @pytest.mark.parametrize("there", [True, False])
 def test_what_is_set_aside_counts_only_if_it_is_an_artifact_of_the_stage(done: Run, there: bool) -> None:
     work = done.path / WORK

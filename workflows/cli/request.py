@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.artifact import listed
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit, limit_for, parse_size, size_text
 from pipeline.run import NAME, Run
@@ -93,7 +94,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         check_names(standing)
         dropped = settings.put_recorded(standing.settings)
         if dropped:
-            warnings.append(f"settings that this version does not have are left out: {', '.join(dropped)}")
+            warnings.append(f"settings that this version does not have are left out: {listed(dropped)}")
     settings.put_table(config.table, f"--config {options.config}")
     for text in options.sets:
         settings.put_option(text)

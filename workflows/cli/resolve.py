@@ -213,6 +213,9 @@ class Settings:
         dropped = []
         for stage, entries in table.items():
             for name, value in (updated(stage, self.types[stage], entries) if stage in self.types else entries).items():
+                if name not in self.about.get(stage, {}):
+                    dropped.append(f"{stage}.{name}")  # without a search for the nearest: there may be any number
+                    continue
                 try:
                     self.put(stage, name, [value], "run.json")
                 except UsageError:
