@@ -5,8 +5,13 @@ tests/data/hostile/READER/FILE was found by `make fuzz` and made smaller; large 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+from benchmarks.fuzz import safetensors_bytes, scratch
+from benchmarks.fuzz.table import READERS
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "hostile"
 READ = "read"  # what a file that is not a reason to stop is answered with: it only saves time, or tells people something
@@ -71,18 +76,41 @@ JSON = {
 IGNORED = ("log", "schedule", "note", "lock", "hashes", "report_bake", "report_evaluate", "report_mesh", "report_poses")
 
 
-def checkpoint_of_complex_progress() -> bytes:
-    from benchmarks.fuzz import safetensors_bytes, scratch
+def with_entry(reader: str, tensor: str, **changes: Any) -> bytes:
+    """The valid file with another header entry of one tensor, digests put right where they can be."""
+    header, body = _valid(reader)
+    return scratch.with_digest(safetensors_bytes.joined({**header, tensor: {**header[tensor], **changes}}, body))
 
-    found = safetensors_bytes.parts(scratch.checkpoint_seeds()[0])
+
+def with_about(reader: str, text: str | None = None, **changes: Any) -> bytes:
+    """The valid field file or checkpoint with another text, or other values, in its metadata."""
+    header, body = _valid(reader)
+    text = text or json.dumps(json.loads(header["__metadata__"]["field"]) | changes)
+    return safetensors_bytes.joined({**header, "__metadata__": {"field": text}}, body)
+
+
+def _valid(reader: str) -> tuple[dict[str, Any], bytes]:
+    found = safetensors_bytes.parts(READERS[reader].seeds()[0])
     assert found is not None
-    return scratch.with_digest(safetensors_bytes.joined({**found[0], "progress": {**found[0]["progress"], "dtype": "C64"}}, found[1]))
+    return found
 
 
+DEEP = '{"a":' * 900 + "1" + "}" * 900
 MADE: dict[tuple[str, str], tuple[Callable[[], bytes], str]] = {
     **{(reader, f"nested {name}"): (lambda data=data: data, says) for name, data in NESTED.items() for reader, says in JSON.items()},  # type: ignore[misc]
     **{(reader, f"nested {name}"): (lambda data=data: data, READ) for name, data in NESTED.items() for reader in IGNORED},  # type: ignore[misc]
     **{(reader, "integer of 5000 digits"): (lambda: b"1" * 5000, says.replace("nested too deeply|", "")) for reader, says in JSON.items()},
-    ("checkpoint", "progress of complex numbers"): (checkpoint_of_complex_progress, READ),
+    ("checkpoint", "progress of complex numbers"): (lambda: with_entry("checkpoint", "progress", dtype="C64"), READ),
+    ("checkpoint", "progress on its side"): (lambda: with_entry("checkpoint", "progress", shape=[2, 1]), READ),
+    ("checkpoint", "a table of another shape"): (lambda: with_entry("checkpoint", "fine.table", shape=_valid("checkpoint")[0]["fine.table"]["shape"][::-1]), READ),
+    ("checkpoint", "a moment of whole numbers"): (lambda: with_entry("checkpoint", "adam.0.fine.table", dtype="I32"), READ),
+    ("checkpoint", "a list of seconds"): (lambda: with_about("checkpoint", seconds=[1.5]), READ),
+    ("checkpoint", "seconds as a text of infinity"): (lambda: with_about("checkpoint", seconds="1e999"), READ),
+    ("checkpoint", "nested metadata"): (lambda: with_about("checkpoint", DEEP), READ),
+    ("field", "nested metadata"): (lambda: with_about("field", DEEP), "field file of format nothing|not a readable field file"),
+    ("field", "settings that are no object"): (lambda: with_about("field", settings=[1]), "settings"),
+    ("field", "names that are no list"): (lambda: with_about("field", exposed=5), "expected a list of names"),
+    ("points", "observers of complex numbers"): (lambda: with_entry("points", "observer_counts", dtype="C64"), "points"),
+    ("points", "coordinates in one row"): (lambda: with_entry("points", "xyz", shape=[180]), "points"),
     **{(reader, "nothing"): (lambda: b"", "the file is empty") for reader in JSON},
 }  # fmt: skip
