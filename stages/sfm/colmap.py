@@ -8,10 +8,16 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
+
+from pipeline.errors import StageFailed
+from pipeline.files import open_plain, remove
+from pipeline.text import printable
 
 # glog installs handlers of these when pycolmap is imported; they print a stack trace and abort, at SIGTERM too.
 _GLOG_SIGNALS = (signal.SIGSEGV, signal.SIGILL, signal.SIGFPE, signal.SIGABRT, signal.SIGBUS, signal.SIGTERM)
+_LOG = "colmap_log."  # beginning of the names of its files; glog adds the time and the process
 _SIGACTION_BYTES = 1024  # bytes; a struct sigaction takes 152 on Linux
 
 
@@ -55,6 +61,36 @@ def quiet_pycolmap() -> Iterator[Any]:
         yield pycolmap
     finally:
         pycolmap.logging.minloglevel = before
+
+
+@contextlib.contextmanager
+def every_image_read(pycolmap: Any, folder: Path) -> Iterator[None]:
+    """Raise StageFailed where COLMAP could not read an image within: of that it says a word in its log, and goes on to another result.
+
+    folder  for the log, which is removed
+    """
+    log = pycolmap.logging
+    names = ("minloglevel", "stderrthreshold", "logtostderr", "alsologtostderr")
+    before = {name: getattr(log, name) for name in names}
+    log.set_log_destination(log.WARNING, str(folder / _LOG))
+    log.minloglevel, log.stderrthreshold, log.logtostderr, log.alsologtostderr = 1, 3, False, False
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(log, name, value)
+        log.set_log_destination(log.WARNING, "")
+        said = [line for path in sorted(folder.glob(f"{_LOG}*")) for line in _lines(path)]
+        for path in folder.glob(f"{_LOG}*"):
+            remove(path)
+    unread = next((line for line in said if "Could not read image" in line), None)
+    if unread is not None:
+        raise StageFailed(f"poses: {printable(unread.partition('] ')[2], 300)} Run again: what is done is kept.")
+
+
+def _lines(path: Path) -> list[str]:
+    with open(open_plain(path, follow=False), encoding="utf-8", errors="replace") as file:
+        return file.read(2**20).splitlines()
 
 
 def num_threads() -> int:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.errors import StageFailed
 from pipeline.files import remove, rename
 from stages.scratch import Warn, note, noted, once, opened, unusable
 from stages.sfm.colmap import import_pycolmap, quiet_pycolmap
@@ -75,6 +76,11 @@ def _list_images(aside: Path, work: Path, images: Sequence[WorkImage]) -> None:
             options = pycolmap.ImageReaderOptions()
             options.existing_camera_id = cameras[image.camera_key]
             pycolmap.import_images(aside, work / "images", pycolmap.CameraMode.SINGLE, [image.file], options)
+        with pycolmap.Database.open(aside) as database:
+            listed = {image.name for image in database.read_all_images()}
+    for image in images:
+        if image.file not in listed:  # COLMAP leaves out without a word what it cannot read
+            raise StageFailed(f"poses: {work / 'images' / image.file}: could not be read by COLMAP. Run again: what is done is kept.")
 
 
 def _first_guess(image: WorkImage) -> Any:

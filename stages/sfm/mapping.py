@@ -13,7 +13,7 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.files import remove
-from stages.sfm.colmap import quiet_pycolmap
+from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import database_path, verified_pairs
 from stages.sfm.images import Progress, SafePoint, WorkImage
 
@@ -112,9 +112,10 @@ def _incremental_mapping(
         output.mkdir()
         pycolmap.set_random_seed(seed)
         safe_point()
-        models = pycolmap.incremental_mapping(
-            database_path(work), work / "images", output, options, initial_image_pair_callback=one_more, next_image_callback=one_more
-        )
+        with every_image_read(pycolmap, work):  # for the colours of its points
+            models = pycolmap.incremental_mapping(
+                database_path(work), work / "images", output, options, initial_image_pair_callback=one_more, next_image_callback=one_more
+            )
         remove(output)
     safe_point()
     return [model for _, model in sorted(models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,12 +49,30 @@ def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, 
             for start in range(0, len(todo), 2 * threads):
                 safe_point()
                 some = [image.file for image in todo[start : start + 2 * threads]]
-                pycolmap.extract_features(
-                    database_path(work), work / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
-                )
+                for _ in range(2):
+                    pycolmap.extract_features(
+                        database_path(work), work / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+                    )
+                    if not _check_readable(work, _without_features(pycolmap, work, ids, some)):
+                        break
                 record(work, f"features_{Path(some[0]).stem}", FEATURES, [ids[file] for file in some])
                 done += len(some)
                 progress(done, len(images), "detecting features")
+
+
+def _without_features(pycolmap: Any, work: Path, ids: Mapping[str, int], files: Sequence[str]) -> list[str]:
+    """Those that COLMAP has written no features of, not even that there are none."""
+    with pycolmap.Database.open(database_path(work)) as database:
+        return [file for file in files if not database.exists_descriptors(ids[file])]
+
+
+def _check_readable(work: Path, files: Sequence[str]) -> bool:
+    """Whether there are any; raises the OSError that may have kept COLMAP from reading one, for it goes on without."""
+    for file in files:
+        (work / "images" / file).read_bytes()
+        if (mask := work / "masks" / f"{file}.png").exists():
+            mask.read_bytes()
+    return bool(files)
 
 
 def pairs_to_match(count: int, how: str) -> list[list[tuple[int, int]]]:

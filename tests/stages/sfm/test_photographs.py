@@ -10,16 +10,17 @@ import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from benchmarks.poses import aligned_errors, true_centres
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, StageFailed
 from stages.io import photo as reading
 from stages.io.capture import Capture
-from stages.sfm import matches
+from stages.sfm import mapping, matches
 from stages.sfm.colmap import num_threads, quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, open_database, record
 from stages.sfm.images import WorkImage, prepare_images
@@ -259,6 +260,26 @@ def test_damaged_database_is_made_anew(ten: tuple[list[str], Path, Capture], tmp
     with open(path, "r+b") as file:
         file.truncate(size * 2 // 3)
     assert numbers(find(STILL_LIFE, names, tmp_path / "work")) == numbers(capture)
+
+
+def test_an_image_that_colmap_cannot_read_is_not_left_out(resumed: tuple[Path, list[WorkImage]]) -> None:
+    work, images = resumed
+    quiet: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
+    last = work / "images" / images[-1].file
+    last.rename(work / "hidden.png")
+    with pytest.raises(StageFailed, match=r"poses: Could not read image \"?\w+.png"):
+        mapping.best_models(work, images, 0, **quiet)
+    assert not list(work.glob("colmap_log*"))
+    with pytest.raises(StageFailed, match=r"poses: .*could not be read by COLMAP"):
+        open_database(work, images, lambda *a, **k: None)
+    (work / "hidden.png").rename(last)
+    with contextlib.closing(sqlite3.connect(database_path(work))) as connection:
+        for table, _ in (*FEATURES, *PAIRS):
+            connection.execute(f"DELETE FROM {table}")
+        connection.commit()
+    last.rename(work / "hidden.png")
+    with pytest.raises(FileNotFoundError, match=r"No such file"):
+        matches.extract_features(work, images[-2:], features=256, **quiet)
 
 
 @pytest.fixture
