@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from workflows.asset import NAMES as STAGES
 
-KEPT = (".lock",)  # the lock's file may stay, and so may the digests that are remembered
+# What may stay: the lock's file and the digests that are remembered; and for a day a temporary file of the page, which is written without a lock and may be
+# that of another process.
+KEPT = re.compile(r"\.lock|\.work/|\.cache/hashes\.json|\.report\.html\.[0-9a-f]+\.part")
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ def names(run: Path) -> frozenset[str]:
         if not folders and not files and relative.parts:
             found.add(f"{relative.as_posix()}/")
         found.update((relative / name).as_posix() for name in files)
-    return frozenset(name for name in found if name not in KEPT and name not in (".work/", ".cache/hashes.json"))
+    return frozenset(name for name in found if not KEPT.fullmatch(name))
 
 
 def expected(run: Path) -> Expected:

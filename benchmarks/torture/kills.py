@@ -175,6 +175,8 @@ class Rounds:
         began = bool(child.events)
         hit.stage = child.stage or ("between stages" if began else "start")
         if not sent:
+            if child.armed is not None:
+                child.armed.disarm()
             child.signal(_number(hit.signal), group=hit.whom == "group")
         if hit.signal == "INT INT":
             time.sleep(self.random.uniform(0.0, 0.05))
@@ -188,6 +190,8 @@ class Rounds:
                 self.kills += 1
         child.end()
         hit.code = child.code or 0
+        if hit.signal == "INT" and not sent and child.armed is not None and child.armed.fired:
+            hit.signal = "INT INT"  # the trap was quicker than its end
         wrong += _judged(hit, child, began, prepared.stages[-1])
         self._note(hit, child, wrong)
         if hit.signal == "KILL":

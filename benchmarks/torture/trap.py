@@ -89,6 +89,11 @@ class Armed:
         """Operations of the trap's stage and kinds."""
         return self._read()[0]
 
+    def disarm(self) -> None:
+        """No operation is the one that is meant from now on."""
+        with open(self.state, "r+b") as file:
+            file.write(struct.pack("q", 2**40))
+
     @property
     def fired(self) -> bool:
         return bool(self._read()[1])
