@@ -125,7 +125,7 @@ def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: boo
         "python": platform.python_version(),
         "versions": versions,
         "seed": seed,
-        "guided_by": "coverage (atheris)" if coverage else "outcomes",
+        "guided_by": f"coverage (atheris): {campaign.GUIDED:.0%} of the inputs; outcomes: the rest" if coverage else "outcomes",
         "inputs": sum(each["inputs"] for each in readers.values()),
         "findings": sum(len(each["findings"]) for each in readers.values()),
         "limit_s": 5.0,

@@ -16,6 +16,7 @@ from typing import Any
 from benchmarks.fuzz.reader import ROOT
 from benchmarks.fuzz.worker import NOTE
 
+GUIDED = 0.25  # of the inputs are guided by coverage, which takes twice the time; the rest begin with what those found
 BATCH = 25_000  # inputs of one process
 MEMORY = "/dev/shm"  # files there are written ten times as fast as on a disk
 STUCK = 60.0  # seconds without a new input after which a process is ended: it does not answer to signals
@@ -28,7 +29,9 @@ def fuzz(name: str, inputs: int, seed: int, *, coverage: bool, shrink: float, sa
     with tempfile.TemporaryDirectory(prefix=f"fuzz-{name}-", dir=MEMORY if os.path.isdir(MEMORY) else None) as folder:
         first = 0
         while first < inputs and len(deaths) < 20:
-            found = _batch(name, seed + first, first, min(BATCH, inputs - first), Path(folder), coverage=coverage, shrink=shrink)
+            guided = coverage and first < GUIDED * inputs
+            last = min(round(GUIDED * inputs) if guided else inputs, first + BATCH)
+            found = _batch(name, seed + first, first, last - first, Path(folder), coverage=guided, shrink=shrink)
             if "died" in found:
                 deaths.append(found)
                 first = found["index"] + 1

@@ -43,6 +43,7 @@ def _commands(folder: Path) -> tuple[tuple[tuple[str, ...], ...], Callable[[byte
     return (
         ("inspect", str(folder)),
         ("inspect", str(folder), "--json"),
+        ("inspect", str(folder)),
         ("run", str(folder), "--out", str(run), "--until", "poses", "--preset", "tiny", "--quiet"),
     ), lambda data: shutil.rmtree(run, ignore_errors=True)
 

@@ -1,7 +1,8 @@
 """A process that tries inputs on one reader, and prints what came of them as a line of JSON.
 
 With atheris the readers' modules report which branches they take, and libFuzzer keeps the inputs that lead somewhere new and changes them again, by
-the same mutations; without, an input is kept when its outcome is new. Either way the same seed gives the same inputs. The input that is being tried is on
+the same mutations; without, an input is kept when its outcome is new, and those that libFuzzer kept before are changed too. Either way the same seed
+gives the same inputs. The input that is being tried is on
 disk before it is read, so that one that ends this process is known.
 """
 
@@ -29,6 +30,7 @@ from benchmarks.fuzz.reader import Opened, Outcome, Reader, address_space, comma
 
 EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
 NOTE = "input"  # a file: the number of the input that is being tried, a line's end, the input
+CORPUS = "corpus"  # a folder: the inputs that libFuzzer kept
 KEPT = 200  # inputs that are changed again, beside the seeds
 INSTRUMENTED = ["pipeline", "stages.io", "stages.training", "workflows.cli", "workflows.report", "workflows.inspection"]
 
@@ -129,9 +131,9 @@ def changed(reader: Reader, rng: Random, data: bytes) -> bytes:
 
 
 def plainly(tally: Tally, seed: int, count: int) -> None:
-    """Inputs by mutation of the seeds, and of inputs whose outcome was new."""
+    """Inputs by mutation of the seeds, and of inputs whose outcome, or whose way through the code, was new."""
     seeds = tally.reader.seeds()
-    kept: list[bytes] = []
+    kept = [path.read_bytes() for path in sorted((tally.folder / CORPUS).glob("*"))[-KEPT:]]
     known: set[tuple[str, str]] = set()
     for index in range(tally.index, tally.index + count):
         rng = random_of(seed, index)
@@ -149,7 +151,7 @@ def guided(tally: Tally, seed: int, count: int, finish: Callable[[], None]) -> N
     """Inputs by libFuzzer, which never returns: `finish` is called after the last input, and ends the process."""
     import atheris
 
-    corpus = tally.folder / "corpus"
+    corpus = tally.folder / CORPUS
     corpus.mkdir(exist_ok=True)
     seeds = tally.reader.seeds()
     for number, data in enumerate(seeds):

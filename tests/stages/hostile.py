@@ -102,7 +102,7 @@ MADE: dict[tuple[str, str], tuple[Callable[[], bytes], str]] = {
     **{(reader, "integer of 5000 digits"): (lambda: b"1" * 5000, says.replace("nested too deeply|", "")) for reader, says in JSON.items()},
     ("checkpoint", "progress of complex numbers"): (lambda: with_entry("checkpoint", "progress", dtype="C64"), READ),
     ("checkpoint", "progress on its side"): (lambda: with_entry("checkpoint", "progress", shape=[2, 1]), READ),
-    ("checkpoint", "a table of another shape"): (lambda: with_entry("checkpoint", "fine.table", shape=_valid("checkpoint")[0]["fine.table"]["shape"][::-1]), READ),
+    ("checkpoint", "a table on its side"): (lambda: with_entry("checkpoint", "fine.table", shape=_valid("checkpoint")[0]["fine.table"]["shape"][::-1]), READ),
     ("checkpoint", "a moment of whole numbers"): (lambda: with_entry("checkpoint", "adam.0.fine.table", dtype="I32"), READ),
     ("checkpoint", "a list of seconds"): (lambda: with_about("checkpoint", seconds=[1.5]), READ),
     ("checkpoint", "seconds as a text of infinity"): (lambda: with_about("checkpoint", seconds="1e999"), READ),
