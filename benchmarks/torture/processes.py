@@ -183,6 +183,10 @@ def start(
                 program = FRESH_WATCHED if watched_by_python and armed is not None else FRESH
                 os.execv(sys.executable, [sys.executable, *program, *arguments])
             code = _run(arguments, armed, watched_by_python, workflow)
+        except KeyboardInterrupt:  # as Python itself ends
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            os.kill(os.getpid(), signal.SIGINT)
+            code = 1
         except BaseException:
             traceback.print_exc()
             code = 1
