@@ -1,9 +1,11 @@
-"""Peak memory and time of each stage for many large images: by default 100 of 12 megapixels, rendered here, with known cameras.
+"""Peak memory and time of each stage for many large images, with several limits: by default 100 of 12 megapixels, rendered here, with known cameras.
 
-    python benchmarks/memory.py [--count 100] [--width 4000] [--set train.iterations=300] [--json FILE] [--keep FOLDER]
+    python benchmarks/memory.py [--memory 2g --memory 4g --memory auto] [--count 100] [--width 4000] [--set train.iterations=300] [--json FILE] [--keep FOLDER]
 
 The scene is a patterned ball over a patterned floor under a plain sky, written as JPEGs and a transforms.json. It is trained at full size
-(`poses.max_image_size` is the width), for a few hundred steps, and baked with a few refinement steps: quality is not measured.
+(`poses.max_image_size` is the width), for a few hundred steps, and baked with a few refinement steps: quality is not measured. Each stage is a process of
+its own; where one is refused for its memory, those after it are not tried. Peaks and estimates are those in the manifests. At last features are detected
+in a few of the photographs without their cameras.
 """
 
 from __future__ import annotations
@@ -12,14 +14,21 @@ import argparse
 import json
 import os
 import platform
+import shutil
+import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stage_runs import cost_of
 
+STAGES = ("poses", "train", "bake", "evaluate", "turntable", "mesh", "points")
+QUICK = (
+    "poses.test_every=50", "train.iterations=150", "train.preview_every=off", "bake.refine_steps=4", "bake.visibility_rays=60000", "bake.max_mib=8",
+    "bake.samples_per_voxel=1", "evaluate.field_views=1", "evaluate.field_background_rays=10000", "turntable.frames=2",
+)  # fmt: skip
 UPSAMPLED = 4  # pixels a side of an image for each that is computed; noise is added
 
 
@@ -71,38 +80,82 @@ def write_images(folder: Path, count: int, width: int) -> None:
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}), encoding="utf-8")
 
 
-def measured(photographs: Path, run: Path, sets: list[str]) -> dict[str, dict[str, float]]:
-    """Seconds and peak of resident memory of each stage, made by a process of its own."""
-    rows = {}
-    for stage in ("poses", "train", "bake"):
-        source = [str(photographs)] if stage == "poses" else []
-        command = [sys.executable, "-m", "workflows.cli.main", "run", *source, "--out", str(run), "--until", stage, "--quiet"]
-        for text in sets if stage == "poses" else []:
+def measured(source: Path, run: Path, memory: str, sets: list[str], stages: tuple[str, ...] = STAGES) -> dict[str, dict[str, Any]]:
+    """What each stage took, what it had stated, and what it said of memory; the stage that was refused is the last."""
+    rows: dict[str, dict[str, Any]] = {}
+    for stage in stages:
+        command = [
+            sys.executable,
+            "-m",
+            "workflows.cli.main",
+            "run",
+            *([str(source)] if stage == stages[0] else []),
+            "--out",
+            str(run),
+            "--until",
+            stage,
+            "--json",
+        ]
+        for text in sets if stage == stages[0] else []:
             command += ["--set", text]
-        rows[stage] = cost_of(command)
-        print(f"{stage:8}{rows[stage]['seconds']:8.0f} s{rows[stage]['cpu_seconds']:8.0f} s cpu{rows[stage]['peak_mib']:8.0f} MiB", flush=True)
+        done = subprocess.run([*command, "--memory", memory], capture_output=True, text=True, check=False)
+        events = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+        said = [event["text"] for event in events if event.get("event") == "warning" and "memory" in event["text"]]
+        if done.returncode:
+            refused = next((event.get("text") or event.get("error") for event in reversed(events) if event.get("exit_code")), done.stderr)
+            rows[stage] = {"exit_code": done.returncode, "refused": refused, "said": said}
+            print(f"{memory:6}{stage:10} exit code {done.returncode}: {refused}", flush=True)
+            break
+        made = json.loads((run / stage / "manifest.json").read_text(encoding="utf-8"))
+        peak, stated = made["peak_memory"] / 2**20, made["facts"]["memory"]
+        rows[stage] = {
+            "seconds": round(made["seconds"], 1), "cpu_seconds": round(made["cpu_seconds"], 1), "peak_mib": round(peak), "stated_mib": stated["needed"] >> 20,
+            "limit_mib": stated["limit"] and stated["limit"] >> 20, "terms_mib": {what: size >> 20 for what, size in stated["terms"].items()}, "said": said,
+            "digest": made["digest"],
+        }  # fmt: skip
+        print(
+            f"{memory:6}{stage:10}{made['seconds']:8.0f} s{peak:8.0f} MiB of {stated['needed'] >> 20} stated{'  ' + said[0][:80] if said else ''}", flush=True
+        )
     return rows
+
+
+def photographs_alone(photographs: Path, folder: Path, count: int) -> Path:
+    """A folder of some of the photographs, without their cameras: neighbours, so that structure from motion has something to find."""
+    folder.mkdir()
+    for path in sorted(photographs.glob("*.jpg"))[:count]:
+        shutil.copyfile(path, folder / path.name)
+    return folder
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--memory", action="append", help="limit, as for enerf; may be given again (2g, 4g and auto)")
     parser.add_argument("--count", type=int, default=100, help="photographs")
     parser.add_argument("--width", type=int, default=4000, help="of each, pixels; three quarters as high")
+    parser.add_argument("--features", type=int, default=4, help="photographs in which features are detected at full size; 0: none")
     parser.add_argument("--set", dest="sets", action="append", default=[], help="a setting of the run, as for enerf; may be given again")
     parser.add_argument("--json", type=Path, help="where to write the figures")
-    parser.add_argument("--keep", type=Path, help="folder that is kept, with the photographs and the run; else one that is removed")
+    parser.add_argument("--keep", type=Path, help="folder that is kept, with the photographs and the runs; else one that is removed")
     arguments = parser.parse_args()
-    sets = [f"poses.max_image_size={arguments.width}", "train.iterations=300", "train.preview_every=off", "bake.refine_steps=8", *arguments.sets]
+    sets = [f"poses.max_image_size={arguments.width}", *QUICK, *arguments.sets]
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.keep or Path(temporary)
-        (folder / "photographs").mkdir(parents=True, exist_ok=True)
+        photographs = folder / "photographs"
+        if not (photographs / "transforms.json").exists():
+            photographs.mkdir(parents=True)
+            write_images(photographs, arguments.count, arguments.width)
         load = os.getloadavg()
-        write_images(folder / "photographs", arguments.count, arguments.width)
-        rows = measured(folder / "photographs", folder / "run", sets)
+        limits = {memory: measured(photographs, folder / f"run_{memory}", memory, sets) for memory in arguments.memory or ["2g", "4g", "auto"]}
+        features = {}
+        if arguments.features:
+            few = photographs_alone(photographs, folder / "few", arguments.features)
+            wanted = [f"poses.feature_image_size={arguments.width}", "poses.format=photographs"]
+            features = {memory: measured(few, folder / f"few_{memory}", memory, wanted, ("poses",)) for memory in ("1g", "2g", "auto")}
     if arguments.json is not None:
         report: dict[str, Any] = {
-            "photographs": arguments.count, "width": arguments.width, "height": 3 * arguments.width // 4, "settings": sets, "stages": rows,
-            "cores": len(os.sched_getaffinity(0)), "processor": platform.machine(), "load_before": load, "load_after": os.getloadavg(),
+            "date": time.strftime("%Y-%m-%d"), "photographs": arguments.count, "width": arguments.width, "height": 3 * arguments.width // 4, "settings": sets,
+            "stages": limits, "features": features, "cores": len(os.sched_getaffinity(0)), "processor": platform.machine(), "load_before": load,
+            "load_after": os.getloadavg(),
         }  # fmt: skip
         arguments.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from stages.memory.need import Need, libraries
+from stages.memory.need import MIB, Need, libraries
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 # samples of a supersampled pixel where each ray is rendered on its own; of a test view with its photograph, renders, errors and windows of SSIM.
 TREE, FRAME, SAMPLE, COMPARED = 3, 100, 80, 160
 FIELD = 150  # bytes of a ray through the field, with what lies before and behind the box
+FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose density voxels prune nothing yet
 
 
 def tree_bytes(tree: NerfTree) -> int:
@@ -46,7 +47,7 @@ def views_needed(tree: NerfTree, cameras: Sequence[Camera], rays: int, field: in
     most = max((camera.width * camera.height for camera in cameras), default=0)
     return Need({
         "a view": most * COMPARED,
-        "its rays": rays * FIELD,
+        "its rays": rays * FIELD + FIELD_BLOCK,
         "the asset": tree_bytes(tree),
         "the field": 3 * field,
         "libraries": libraries(device),

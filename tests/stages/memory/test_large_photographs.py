@@ -1,0 +1,63 @@
+"""A hundred photographs of 12 megapixels under a limit of the system: their pixels alone are 3.4 GiB, and the process gets 1.6."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.memory import write_images
+
+ROOT = Path(__file__).resolve().parents[3]
+COUNT, DIFFERENT, WIDTH = 100, 5, 4000
+LIMIT = int(1.6 * 2**30)
+RUN = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv.pop(1)),) * 2)
+from workflows.cli.main import main
+sys.exit(main())
+"""
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few pictures under a hundred names."""
+    folder = tmp_path_factory.mktemp("photographs")
+    write_images(folder, DIFFERENT, WIDTH)
+    described = json.loads((folder / "transforms.json").read_text(encoding="utf-8"))
+    for number in range(DIFFERENT, COUNT):
+        frame = described["frames"][number % DIFFERENT]
+        os.link(folder / frame["file_path"], folder / f"{number:04d}.jpg")
+        described["frames"].append({**frame, "file_path": f"{number:04d}.jpg"})
+    (folder / "transforms.json").write_text(json.dumps(described), encoding="utf-8")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_DATA holds for what is mapped on Linux alone")
+@pytest.mark.timeout(1200)
+def test_they_are_trained_on_and_baked_under_a_limit_of_the_system(photographs: Path, tmp_path: Path) -> None:
+    sets = [f"poses.max_image_size={WIDTH}", "train.iterations=20", "train.preview_every=off", "bake.refine_steps=2"]
+    command = [sys.executable, "-c", RUN, str(LIMIT), "run", str(photographs), "--out", str(tmp_path / "run"), "--preset", "tiny", "--until", "bake", "--json"]
+    done = subprocess.run([*command, *(word for text in sets for word in ("--set", text))], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr + done.stdout[-2000:]
+    warnings = [event["text"] for event in map(json.loads, done.stdout.splitlines()) if event["event"] == "warning"]
+    assert sum("are kept in a file" in text for text in warnings) == 2  # by train and by bake
+    for stage in ("poses", "train", "bake"):
+        made = json.loads((tmp_path / "run" / stage / "manifest.json").read_text(encoding="utf-8"))
+        stated = made["facts"]["memory"]
+        assert made["peak_memory"] <= stated["needed"] <= stated["limit"] < LIMIT
+
+
+@pytest.mark.slow
+def test_where_not_one_of_them_fits_the_run_is_refused(photographs: Path, tmp_path: Path) -> None:
+    """Before any is decoded."""
+    command = [sys.executable, "-m", "workflows.cli.main", "run", str(photographs), "--out", str(tmp_path / "run"), "--preset", "tiny", "--until", "poses"]
+    done = subprocess.run([*command, "--memory", "200m"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "poses: needs about" in done.stderr
+    assert not (tmp_path / "run/poses").exists()
