@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.files import write_atomically
@@ -154,8 +155,24 @@ def load_renderer(folder: Path, device: str = "cpu") -> FieldRenderer:
         ndc = None if about.ndc is None else Ndc.from_json(about.ndc)
         space = space_from(np.asarray(about.bounds, np.float64), contracted=about.contracted, ndc=ndc)
         settings = settings_from(TrainSettings, updated("train", TrainSettings, about.settings))
+        _check_sizes(tensors, settings, space)
         m = model(space, settings, about.background, device, (about.near, about.far))
         restore(m, tensors)
         return FieldRenderer(m, about.near, about.far)
     except (UsageError, KeyError, TypeError, ValueError, OverflowError, RecursionError, RuntimeError) as error:  # the last: torch's, of shapes
         raise CorruptArtifact(f"{printable(path)}: {printable(error, 300)}. Train again.") from None
+
+
+def _check_sizes(tensors: dict[str, Tensor], settings: TrainSettings, space: Space) -> None:
+    """ValueError where the large tensors are not of the sizes that the settings state: the model would take that memory before it is filled."""
+    side = given(settings.occupancy_resolution) or space.occupancy_resolution
+    expected: dict[str, tuple[int, ...]] = {"voxels": (side, side, side)}
+    if settings.field == "hash":
+        from efficientnerf.fields.hash import FEATURES, grids, level_sizes
+
+        for name, grid in zip(("coarse", "fine"), grids(settings), strict=True):
+            expected[f"{name}.table"] = sum(level_sizes(**grid)[1]), FEATURES
+    for name, shape in expected.items():
+        if name not in tensors or tuple(tensors[name].shape) != shape:
+            found = f"{tensors[name].dtype} {tuple(tensors[name].shape)}" if name in tensors else "missing"
+            raise ValueError(f"tensor '{name}' is {found}; expected {shape}")

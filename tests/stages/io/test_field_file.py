@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import state_of
+from efficientnerf.training.settings import TrainSettings
 from pipeline.errors import CorruptArtifact
 from stages.artifacts import TrainOutputs
 from stages.io.field_file import GAINS, load_gains, load_renderer, read_tensors, save_model, write_tensors
@@ -151,3 +153,18 @@ def test_hostile_values_of_a_field_are_refused_in_a_line(tmp_path: Path, name: s
         load_renderer(tmp_path)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 600
+
+
+def test_a_small_file_takes_no_memory_for_the_tables_that_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a model of three gigabytes was made")
+
+    monkeypatch.setattr("efficientnerf.model.model", refuse)
+    stated = dataclasses.asdict(TrainSettings(field="hash", num_levels=24, log2_hashmap_size=24, finest_resolution=8192))
+    about = {"settings": stated, "bounds": [[-1, -1, -1], [1, 1, 1]], "contracted": False, "near": 1.0, "far": 5.0, "background": None}
+    side = stated["occupancy_resolution"] if isinstance(stated["occupancy_resolution"], int) else 128
+    write_tensors(
+        {"voxels": torch.zeros(side, side, side), "fine.table": torch.zeros(1, 2), "coarse.table": torch.zeros(1, 2)}, about, tmp_path / TrainOutputs.field
+    )
+    with pytest.raises(CorruptArtifact, match=r"tensor '(coarse.table|voxels)' is torch.float32 \(.*\); expected \("):
+        load_renderer(tmp_path)
