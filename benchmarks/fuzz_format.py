@@ -1,21 +1,23 @@
-"""Fuzzing of the asset format: valid files of every layout, changed at random, must be read or refused.
+"""Fuzzing of the asset format: files of every layout, valid or changed at random, must be read or refused; and what is read, be rendered and converted.
 
-    python benchmarks/fuzz_format.py [--inputs 100000] [--seed 0] [--json FILE]
+    python benchmarks/fuzz_format.py [--inputs 100000] [--seed 0] [--workers 1] [--json FILE]
 
-Four kinds of mutation: bytes anywhere; bytes of the header; JSON values of the header and the metadata, valid or nearly so; bytes of a tensor with
-its digest recomputed, so that the checks after the digests are reached. Files that are read are rendered and saved again.
+Mutations (`benchmarks/format_mutations.py`): bytes anywhere; bytes of the header; JSON values of the header and the metadata, valid or nearly so; bytes, or all
+values, of tensors; numbers that places follow from; and sound files of odd proportions, made from nothing. In the last four the digests are right, so
+that what comes after them is reached. Files that are read are described, rendered from inside, outside, far away, along a face and by odd lenses, looked up at
+points, meshed and written in another layout.
 
 A child process runs each batch, its address space limited to 1 GiB more than after its imports. Each input is written to disk before it is opened, so
-that an input that kills the child is known. Failures are: any exception but FormatError, a child that dies, an input that takes more than ten
-seconds. The same seed gives the same inputs.
+that an input that kills the child is known; one that stands still is ended. Failures are: any exception but FormatError, a child that
+dies, a step that takes more than SLOW seconds. The same seed gives the same inputs.
 """
 
 from __future__ import annotations
 
 import argparse
-import copy
-import hashlib
+import datetime
 import json
+import os
 import platform
 import re
 import resource
@@ -24,161 +26,152 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from efficientnerf.asset.rendering import render_rays
+from format_mutations import Rng, changed, number
+from machine import processor
 
 HERE = Path(__file__).resolve().parent
 GOLDEN = HERE.parent / "tests" / "data" / "golden"
 EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
-SLOW = 10  # seconds
-BATCH = 20000
-NUMBERS = [0, 1, -1, 2, 3, 7, 8, 16, 17, 63, 64, 65, 255, 256, 257, 2**16, 2**31, 2**32, 2**53, 2**63, 2**64, 10**30, 0.5, -0.0, 1e-30, 1e30, 1e300, 1e-320]
-TEXTS = [
-    "", "sparse", "compact", "full", "ndc-sparse", "ndc-compact", "ndc-full", "U8", "U16", "U64", "F16", "F32", "F64", "1.0", "1.9", "2.0",
-    "x.a", "nerftree", "\ud7ff\0", "9" * 50,
-]  # fmt: skip
-Rng = np.random.Generator
+SLOW = 5  # seconds of a step
+BATCH = 5000
+MOST_CONVERTED = 2000  # voxels of assets whose palettes are sought: that takes seconds of honest work for more
+SIZE = 16  # pixels along a side of a picture
 
 
-def number(rng: Rng, below: int) -> int:
-    return int(rng.integers(below))
+class TooSlow(BaseException):
+    """A step that takes more than SLOW seconds; no library takes it for an error of its own."""
 
 
-def header_of(data: bytes) -> tuple[dict[str, Any], dict[str, Any], bytes]:
-    """The header's entries, the metadata and the data of a valid file."""
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    return header, json.loads(header.pop("__metadata__")["nerftree"]), data[8 + length :]
+@contextmanager
+def step(name: str, took: dict[str, float]) -> Iterator[None]:
+    """A step of at most SLOW seconds of the processor, and the most that it took so far: other programs may run beside."""
+    signal.setitimer(signal.ITIMER_PROF, SLOW)
+    begin = time.process_time()
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        took[name] = max(took.get(name, 0.0), time.process_time() - begin)
 
 
-def file_of(header: dict[str, Any], meta: Any, data: bytes) -> bytes:
-    raw = json.dumps({"__metadata__": {"nerftree": json.dumps(meta)}, **header}).encode("utf-8", "surrogatepass")
-    return len(raw).to_bytes(8, "little") + raw + data
+def pose(forward: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Camera to world."""
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.9 else [1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    out = np.eye(4)
+    out[:3, 0], out[:3, 1], out[:3, 2], out[:3, 3] = right, np.cross(forward, right), forward, centre
+    return out
 
 
-def with_bytes(rng: Rng, data: bytes, begin: int, end: int) -> bytes:
-    """A few changes of bytes between `begin` and `end`: flipped, overwritten, put in, taken out, copied, cut off."""
-    out = bytearray(data)
-    for _ in range(1 + number(rng, 4)):
-        end = min(end, len(out))
-        if end <= begin:
-            break
-        at, count = begin + number(rng, end - begin), 1 + number(rng, 8)
-        kind = number(rng, 7)
-        if kind == 0:
-            out[at] ^= 1 << number(rng, 8)
-        elif kind == 1:
-            out[at : at + count] = rng.bytes(count)
-        elif kind == 2:
-            out[at:at] = rng.bytes(count)
-        elif kind == 3:
-            del out[at : at + count]
-        elif kind == 4:
-            source = number(rng, len(out))
-            out[at : at + count] = out[source : source + count]
-        elif kind == 5:
-            out[at : at + 1] = b'0123456789-.eE[]{},:"\\ '[number(rng, 23) :][:1]
-        else:
-            del out[at:]
-    return bytes(out)
+def views(tree: Any, rng: Rng) -> Iterator[Any]:
+    """Cameras inside, outside, far and very far away, on a face, beside and behind; lenses from a point to the whole sky, with and without distortion."""
+    from efficientnerf.geometry.cameras import Camera
+
+    low, high = tree.bounds_min, tree.bounds_max
+    middle, extent = (low + high) / 2, float(np.max(high - low))
+    if tree.ndc is not None:  # of the world: before the near plane
+        middle, extent = tree.ndc.world_from_camera[:3, 3], float(tree.ndc.near)
+    towards = rng.normal(size=3)
+    places = [
+        (towards, middle), (towards, middle - towards / np.linalg.norm(towards) * extent * 2), (towards, middle - towards * extent * 1e6),
+        (towards, middle - towards * extent * float(10.0 ** rng.uniform(6, 20))), (np.eye(3)[number(rng, 3)], low), (np.array([1.0, 1e-9, 0]), high),
+        (-towards, middle - towards * extent * 3), (np.eye(3)[number(rng, 3)], middle - np.eye(3)[number(rng, 3)] * extent),
+    ]  # fmt: skip
+    chosen = rng.permutation(len(places))[:2]
+    for n in chosen:
+        forward, centre = places[n]
+        focal = float([SIZE, SIZE, 1e-6, 1e9, 10.0 ** rng.uniform(-12, 12)][number(rng, 5)])
+        lens: tuple[str, tuple[float, ...]] = ("SIMPLE_PINHOLE", (focal, SIZE / 2, SIZE / 2))
+        if not number(rng, 4):
+            lens = ("OPENCV_FISHEYE", (focal, focal, SIZE / 2, SIZE / 2, *(float(x) for x in rng.normal(size=4) * 0.1)))
+        yield Camera("view", SIZE, SIZE, *lens, pose(forward, centre))
 
 
-def value(rng: Rng, depth: int = 0) -> Any:
-    """Any JSON value, of kinds that break readers."""
-    kind = number(rng, 8 if depth < 3 else 5)
-    if kind == 0:
-        return [None, True, False][number(rng, 3)]
-    if kind in (1, 2):
-        return NUMBERS[number(rng, len(NUMBERS))]
-    if kind in (3, 4):
-        return TEXTS[number(rng, len(TEXTS))]
-    if kind == 5:
-        return {TEXTS[number(rng, len(TEXTS))]: value(rng, depth + 1) for _ in range(number(rng, 3))}
-    return [value(rng, depth + 1) for _ in range(number(rng, 5))]
+def checked(rendering: Any) -> None:
+    """Opacities are those of pictures; nothing is NaN where the asset has finite values."""
+    if not (np.isfinite(rendering.opacity).all() and (rendering.opacity >= -1e-6).all() and (rendering.opacity <= 1 + 1e-6).all()):
+        raise AssertionError("an opacity outside of 0 to 1")
+    if not np.isfinite(rendering.colour).all():
+        raise AssertionError("a colour that is not finite")
 
 
-def with_values(rng: Rng, root: Any) -> Any:
-    """The JSON with one value changed, anywhere: by another, by a near one, or gone."""
-    root = copy.deepcopy(root)
-    node = root
-    while True:
-        keys: list[Any] = list(node) if isinstance(node, dict) else list(range(len(node)))
-        if not keys:
-            return root
-        key = keys[number(rng, len(keys))]
-        if isinstance(node[key], (dict, list)) and node[key] and number(rng, 4):
-            node = node[key]
-            continue
-        kind = number(rng, 4)
-        if kind == 0 and isinstance(node[key], (int, float)) and not isinstance(node[key], bool):
-            node[key] = node[key] + [-1, 1, 0.5, 8][number(rng, 4)]
-        elif kind == 1:
-            del node[key]
-        elif kind == 2 and isinstance(node, dict):
-            node[TEXTS[number(rng, len(TEXTS))]] = node[key]
-        else:
-            node[key] = value(rng)
-        return root
+def draw(tree: Any, rng: Rng, took: dict[str, float]) -> None:
+    from efficientnerf.asset import queries
+    from efficientnerf.asset.rendering import render
+
+    for camera in views(tree, rng):
+        with step("render", took):
+            checked(render(tree, camera, supersample=1 + (not number(rng, 8))))
+    with step("queries", took):
+        points = np.concatenate([rng.uniform(-1, 1, (8, 3)), rng.normal(size=(8, 3)) * 10.0 ** rng.uniform(-20, 20, (8, 1)), [[np.nan] * 3, [np.inf] * 3]])
+        queries.density_at(tree, points), queries.normal_at(tree, points)
+        queries.colour_at(tree, points, np.tile([0.0, 0.0, 1.0], (len(points), 1)))
 
 
-def with_tensor(rng: Rng, data: bytes) -> bytes:
-    """Bytes of one tensor changed and its digest put right."""
-    header, meta, body = header_of(data)
-    name = sorted(header)[number(rng, len(header))]
-    begin, end = header[name]["data_offsets"]
-    out = bytearray(body)
-    for _ in range(1 + number(rng, 4)):
-        if end > begin:
-            at = begin + number(rng, end - begin)
-            out[at] = [0, 255, 0x7C, 0x7E, 0x80, number(rng, 256)][number(rng, 6)]
-    meta["sha256"][name] = hashlib.sha256(out[begin:end]).hexdigest()
-    if not number(rng, 3):
-        meta = with_values(rng, meta)
-    return file_of(header, meta, bytes(out))
+def use(tree: Any, rng: Rng, took: dict[str, float]) -> None:
+    """All that is done with an asset: rendered, and sometimes turned, meshed and converted. FormatError where a layout cannot hold it."""
+    from efficientnerf.asset.conversion import pruned, with_degree, with_resolution
+    from efficientnerf.asset.format import WRITERS, FormatError, serialize
+    from efficientnerf.surface.isosurface import NoSurface, points, surface
+    from efficientnerf.surface.volume import volume_of
+    from pipeline.errors import BadInput
+    from stages.framing.camera_paths import turntable_cameras
+
+    draw(tree, rng, took)
+    if not number(rng, 4):
+        with step("turntable", took), suppress(BadInput):
+            for camera in turntable_cameras(tree, frames=2, width=SIZE, height=SIZE):
+                checked(draw_one(tree, camera))
+    if not number(rng, 6):
+        with step("surface", took), suppress(NoSurface):
+            level = None if number(rng, 2) else float(10.0 ** rng.uniform(-3, 4))
+            volume = volume_of(tree)
+            surface(volume, level, faces=200) if number(rng, 2) else points(volume, 100, level)
+    if not number(rng, 4):
+        with step("convert", took):
+            smaller = [lambda: with_degree(tree, number(rng, tree.degree + 1)), lambda: pruned(tree), lambda: tree][number(rng, 3)]()
+            if max(tree.resolution) <= 64 and not number(rng, 2):
+                smaller = with_resolution(tree, 1 + number(rng, max(tree.resolution)))
+            with suppress(FormatError):
+                serialize(smaller, [None, *WRITERS][number(rng, 1 + len(WRITERS))] if len(tree.density_values) <= MOST_CONVERTED else None)
 
 
-def changed(rng: Rng, seeds: list[bytes]) -> tuple[str, bytes]:
-    """The kind of mutation, and the file."""
-    data = seeds[number(rng, len(seeds))]
-    kind = number(rng, 4)
-    if kind == 0:
-        return "bytes", with_bytes(rng, data, 0, len(data))
-    if kind == 1:
-        return "header bytes", with_bytes(rng, data, 0, 8 + int.from_bytes(data[:8], "little"))
-    if kind == 2:
-        header, meta, body = header_of(data)
-        for _ in range(1 + number(rng, 2)):
-            header, meta = (with_values(rng, header), meta) if number(rng, 2) else (header, with_values(rng, meta))
-        return "json", file_of(header, meta, body)
-    return "tensor", with_tensor(rng, data)
+def draw_one(tree: Any, camera: Any) -> Any:
+    from efficientnerf.asset.rendering import render
+
+    return render(tree, camera)
 
 
-def try_file(path: Path) -> str | None:
-    """None if the file is read, rendered and saved; else the reason why it is refused. Anything else is raised."""
-    from efficientnerf.asset.format import FormatError, describe, load, serialize
+def try_file(path: Path, rng: Rng, took: dict[str, float]) -> str | None:
+    """None if the file is read and used; else the reason why it is refused. Anything else is raised."""
+    from efficientnerf.asset.format import FormatError, describe, load
 
     refusal = None
-    try:
-        describe(path)
-    except FormatError as error:
-        refusal = str(error)
-    try:
-        tree = load(path)
-    except FormatError as error:
-        return str(error)
+    with step("describe", took):
+        try:
+            describe(path)
+        except FormatError as error:
+            refusal = str(error)
+    with step("load", took):
+        try:
+            tree = load(path)
+        except FormatError as error:
+            return str(error)
     if refusal is not None:
         raise AssertionError(f"read, but not described: {refusal}")
-    if tree.degree <= 2 and max(tree.resolution) <= 64:
-        centre = (tree.bounds_min + tree.bounds_max) / 2
-        with np.errstate(all="ignore"):
-            render_rays(tree, centre - tree.voxel * np.array([[50.0, 3.0, 2.0]]), np.array([[1.0, 0.0, 0.0]]))
-    serialize(tree)
+    with np.errstate(all="ignore"):
+        use(replace(tree), rng, took)
     return None
 
 
@@ -187,96 +180,141 @@ def rule(message: str) -> str:
     return re.sub(r"'[^']*'|SHA-256.*|[0-9]+|\(.*\)", "*", message.partition(": ")[2])[:60]
 
 
-def batch(seed: int, first: int, count: int, folder: Path, report: Callable[[dict[str, Any]], None]) -> None:
+def batch(seed: int, first: int, count: int, folder: Path, keep: Path | None) -> dict[str, Any]:
     """Inputs `first` to `first + count` - 1, in this process."""
     seeds = [path.read_bytes() for path in sorted(GOLDEN.glob("*.nerftree"))]
     path = folder / "fuzzed.nerftree"
     kinds: Counter[str] = Counter()
     refusals: Counter[str] = Counter()
-    slowest, read, failures = 0.0, 0, []
+    took: dict[str, float] = {}
+    used: Counter[str] = Counter()
+    failures: list[dict[str, Any]] = []
 
     def alarm(*_: Any) -> None:
-        raise TimeoutError(f"more than {SLOW} s")
+        raise TooSlow(f"more than {SLOW} s")
 
-    signal.signal(signal.SIGALRM, alarm)
+    signal.signal(signal.SIGPROF, alarm)
     for index in range(first, first + count):
-        kind, data = changed(np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, index])), seeds)
+        rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 0, index]))
+        kind, data = changed(rng, seeds)
         path.write_bytes(data)
         (folder / "index").write_text(str(index))
-        begin = time.process_time()
-        signal.alarm(SLOW)
         try:
-            refusal = try_file(path)
-        except Exception as error:
-            failures.append({"index": index, "kind": kind, "error": f"{type(error).__name__}: {error}"[:300]})
+            refusal = try_file(path, rng, took)
+        except (Exception, TooSlow) as error:
+            frames = [f"{Path(frame.filename).name}:{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)[-4:]]
+            failures.append({"index": index, "kind": kind, "error": f"{type(error).__name__}: {error}"[:300], "at": frames})
+            if keep is not None:
+                (keep / f"{index}.nerftree").write_bytes(data)
             refusal = "failed"
-        signal.alarm(0)
-        slowest = max(slowest, time.process_time() - begin)
         kinds[kind] += 1
-        read += refusal is None
-        if refusal is not None:
+        if refusal is None:
+            used[kind] += 1
+        else:
             refusals[rule(refusal)] += 1
-    report({"inputs": count, "kinds": dict(kinds), "read": read, "refusals": dict(refusals), "slowest_s": slowest, "failures": failures,
-            "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024})  # fmt: skip
+    return {"inputs": count, "kinds": dict(kinds), "read": dict(used), "refusals": dict(refusals), "slowest_s": took, "failures": failures,
+            "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024}  # fmt: skip
 
 
-def child(seed: int, first: int, count: int, folder: Path) -> None:
-    """Imports and compiles, then limits its memory, then works."""
+def child(seed: int, first: int, count: int, folder: Path, keep: Path | None) -> None:
+    """Imports and loads kernels, then limits its memory, then works."""
     import warnings
 
-    warnings.simplefilter("error")
+    sys.path.insert(0, str(HERE.parent))
+    warm = np.random.Generator(np.random.Philox(key=1))
+    signal.signal(signal.SIGPROF, signal.SIG_IGN)
     for path in sorted(GOLDEN.glob("*.nerftree")):
-        try_file(path)
+        for _ in range(6):
+            try_file(path, warm, {})
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     if pages:
         limit = pages * resource.getpagesize() + EXTRA_MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    batch(seed, first, count, folder, lambda found: print(json.dumps({**found, "rss_before_mib": before}), flush=True))
+    warnings.simplefilter("error")
+    print(json.dumps({**batch(seed, first, count, folder, keep), "rss_before_mib": before}), flush=True)
+
+
+def attended(seed: int, first: int, count: int, keep: Path | None) -> list[dict[str, Any]]:
+    """Results of a batch's children: another goes on behind an input that one died of."""
+    found: list[dict[str, Any]] = []
+    end = first + count
+    while first < end:
+        with tempfile.TemporaryDirectory() as folder:
+            command = [sys.executable, __file__, "--seed", str(seed), "--child", str(first), str(end - first), "--folder", folder]
+            command += [] if keep is None else ["--keep", str(keep)]
+            code, out, error = watched(command, Path(folder) / "index")
+            if code == 0:
+                return [*found, json.loads(out)]
+            at = int((Path(folder) / "index").read_text()) if (Path(folder) / "index").exists() else first
+            if keep is not None and (Path(folder) / "fuzzed.nerftree").exists():
+                (keep / f"{at}.nerftree").write_bytes((Path(folder) / "fuzzed.nerftree").read_bytes())
+            found.append({"failures": [{"index": at, "error": f"the process ended with {code}: {error[-300:]}"}]})
+            first = at + 1
+    return found
+
+
+def watched(command: list[str], index: Path) -> tuple[int, str, str]:
+    """Exit code, output and errors of a child, ended where its index stands still for twenty times SLOW."""
+    with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as error:
+        process = subprocess.Popen(command, stdout=out, stderr=error, env={**os.environ, "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+        while process.poll() is None:
+            time.sleep(0.2)
+            if index.exists() and time.time() - index.stat().st_mtime > 20 * SLOW:
+                process.kill()
+        out.seek(0)
+        error.seek(0)
+        return process.returncode, out.read(), error.read()
+
+
+def summary(found: list[dict[str, Any]], seed: int, seconds: float) -> dict[str, Any]:
+    totals: dict[str, Counter[str]] = {name: Counter() for name in ("kinds", "read", "refusals")}
+    slowest: dict[str, float] = {}
+    for part in found:
+        for name, total in totals.items():
+            total.update(part.get(name, {}))
+        for name, value in part.get("slowest_s", {}).items():
+            slowest[name] = max(slowest.get(name, 0.0), value)
+    return {
+        "inputs": sum(part.get("inputs", 0) for part in found), "seed": seed, "kinds": dict(sorted(totals["kinds"].items())),
+        "read": sum(totals["read"].values()), "read_by_kind": dict(sorted(totals["read"].items())), "refused": sum(totals["refusals"].values()),
+        "failures": [failure for part in found for failure in part["failures"]],
+        "slowest_s": {name: round(value, 3) for name, value in sorted(slowest.items())},
+        "limit_s": SLOW, "peak_rss_mib": max((part.get("peak_rss_mib", 0) for part in found), default=0),
+        "rss_before_mib": max((part.get("rss_before_mib", 0) for part in found), default=0), "room_mib": EXTRA_MEMORY // 2**20, "seconds": round(seconds),
+        "date": datetime.date.today().isoformat(), "processor": processor(), "python": platform.python_version(), "numpy": np.__version__,
+        "most_common_refusals": dict(totals["refusals"].most_common(40)),
+    }  # fmt: skip
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=100_000)
+    parser.add_argument("--first", type=int, default=0, help="number of the first input")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--keep", type=Path, help="folder for inputs that fail")
     parser.add_argument("--json", type=Path, default=HERE / "results" / "fuzz_format.json")
     parser.add_argument("--child", type=int, nargs=2, metavar=("FIRST", "COUNT"), help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
-        child(given.seed, *given.child, given.folder)
+        child(given.seed, *given.child, given.folder, given.keep)
         return 0
-    found: list[dict[str, Any]] = []
-    failures: list[dict[str, Any]] = []
-    begin = time.time()
-    for first in range(0, given.inputs, BATCH):
-        count = min(BATCH, given.inputs - first)
-        with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, __file__, "--seed", str(given.seed), "--child", str(first), str(count), "--folder", folder]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode:
-                at = (Path(folder) / "index").read_text() if (Path(folder) / "index").exists() else "the beginning"
-                failures.append({"index": at, "error": f"the process ended with {done.returncode} at input {at}: {done.stderr[-300:]}"})
-                continue
-        found.append(json.loads(done.stdout))
-        failures += found[-1]["failures"]
-        print(f"{first + count} inputs, {len(failures)} failures", flush=True)
-    refusals, kinds = Counter[str](), Counter[str]()
-    for part in found:
-        refusals.update(part["refusals"])
-        kinds.update(part["kinds"])
-    result = {
-        "inputs": sum(part["inputs"] for part in found), "seed": given.seed, "kinds": dict(sorted(kinds.items())),
-        "read": sum(part["read"] for part in found), "refused": sum(refusals.values()),
-        "failures": failures, "slowest_s": round(max((part["slowest_s"] for part in found), default=0), 3),
-        "peak_rss_mib": max((part["peak_rss_mib"] for part in found), default=0), "rss_before_mib": max((part["rss_before_mib"] for part in found), default=0),
-        "room_mib": EXTRA_MEMORY // 2**20, "seconds": round(time.time() - begin), "python": platform.python_version(), "numpy": np.__version__,
-        "most_common_refusals": dict(refusals.most_common(40)),
-    }  # fmt: skip
+    if given.keep is not None:
+        given.keep.mkdir(parents=True, exist_ok=True)
+    begin, found = time.time(), []
+    end = given.first + given.inputs
+    with ThreadPoolExecutor(given.workers) as pool:
+        parts = [pool.submit(attended, given.seed, first, min(BATCH, end - first), given.keep) for first in range(given.first, end, BATCH)]
+        for part in parts:
+            found += part.result()
+            print(f"{sum(each.get('inputs', 0) for each in found)} inputs, {sum(len(each['failures']) for each in found)} failures", flush=True)
+    result = summary(found, given.seed, time.time() - begin)
     given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    print(f"{result['inputs']} inputs: {result['read']} read, {result['refused']} refused, {len(failures)} failures; "
-          f"peak {result['peak_rss_mib']} MiB ({result['rss_before_mib']} after imports), slowest {result['slowest_s']} s")  # fmt: skip
-    return 1 if failures else 0
+    print(f"{result['inputs']} inputs: {result['read']} read, {result['refused']} refused, {len(result['failures'])} failures; "
+          f"peak {result['peak_rss_mib']} MiB ({result['rss_before_mib']} after imports), slowest {result['slowest_s']}")  # fmt: skip
+    return 1 if result["failures"] else 0
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ def density_block(tree: NerfTree, low: tuple[int, int, int], high: tuple[int, in
     inside = [(a >= 0) & (a < n) for a, n in zip(axes, tree.resolution, strict=True)]
     out = np.zeros(tuple(high_a - low_a), np.float32)
     i, j, k = (a[m] for a, m in zip(axes, inside, strict=True))
-    if not (len(i) and len(j) and len(k) and len(tree.voxel_index)):
+    if not (len(i) and len(j) and len(k) and len(tree.density_values)):
         return out
     d = tree.brick
     brick = tree.brick_index[np.ix_(i // d, j // d, k // d)]

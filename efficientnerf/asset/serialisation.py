@@ -153,8 +153,8 @@ def _full(tree: NerfTree, dtype: str = "<f2") -> Written:
     limit = LIMIT if dtype == "<f2" else np.inf
     density = np.minimum(np.where(stored, tree.density_values[index] if len(tree.density_values) else 0, 0), limit).astype(dtype)
     sh = np.zeros((len(index), voxels, harmonics, 3), dtype)
-    at = np.argwhere(np.ones((tree.brick,) * 3, bool))
-    away = ((at[:, None] - at) ** 2).sum(axis=2)
+    line = np.subtract.outer(np.arange(tree.brick, dtype=np.int32), np.arange(tree.brick, dtype=np.int32)) ** 2
+    away = (line[:, None, None, :, None, None] + line[:, None, None, :, None] + line[:, None, None, :]).reshape(voxels, voxels)  # squared distances
     near = (1 / np.maximum(away, 1).astype(np.float32) ** 3) * (away > 0)  # (b^3, b^3)
     each = max(1, FILL_BLOCK // (voxels * harmonics))
     for begin in range(0, len(index), each):

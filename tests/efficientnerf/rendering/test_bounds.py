@@ -39,6 +39,18 @@ def test_rays_from_far_away_end(lookup: str, distance: float) -> None:
     assert torch.isfinite(reference[0]).all()
 
 
+def test_rays_whose_stretch_in_the_grid_is_rounded_see_nothing() -> None:
+    """Both ends of the stretch seem to lie in the grid, and what is between is far longer than that."""
+    tree = replace(uniform_tree((8, 2, 3), brick=12), voxel=1.0, bounds_min=np.zeros(3))
+    rng = np.random.default_rng(0)
+    directions = np.concatenate([rng.normal(size=(20000, 3)), rng.normal(size=(20000, 3)) * 10.0 ** rng.uniform(-20, 0, (20000, 3))])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = rng.uniform(0, 12, directions.shape) - directions * 10.0 ** rng.uniform(14, 22, (len(directions), 1))
+    found = render_rays(tree, origins, directions)
+    assert np.isfinite(found.colour).all()
+    assert ((found.opacity >= 0) & (found.opacity <= 1)).all()
+
+
 def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
     tree = random_tree(0)
     origins, directions = np.full((4, 3), 0.5), np.full((4, 3), 0.5)

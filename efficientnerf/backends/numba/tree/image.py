@@ -85,10 +85,12 @@ def _render_ray(row, column, clear, rays, grid, view, pool, scratch, result, nor
         sh_x, sh_y, sh_z = rays.sh_directions[p], rays.sh_directions[p + 1], rays.sh_directions[p + 2]
     t0, t1 = _intersect_box(ox, oy, oz, dx, dy, dz, grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick)
     nx, ny, nz = grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick
-    last = 0
-    # From so far away that rounding hides the grid nothing is seen; else samples would lie beside the blocks, and be more than the grid has room for.
-    if t1 > t0 and _in_box(ox + t0 * dx, oy + t0 * dy, oz + t0 * dz, nx, ny, nz) and _in_box(ox + t1 * dx, oy + t1 * dy, oz + t1 * dz, nx, ny, nz):
-        last = int(np.ceil(min((t1 - t0) / STEP - 0.5, most_samples(nx, ny, nz))))
+    last = int(np.ceil(min((t1 - t0) / STEP - 0.5, most_samples(nx, ny, nz)))) if t1 > t0 else 0
+    # From so far away that rounding hides the grid nothing is seen: samples, which go on from the first, would lie beside the blocks.
+    s = max(last - 0.5, 0.0) * STEP
+    x, y, z = ox + t0 * dx, oy + t0 * dy, oz + t0 * dz
+    if not (_in_box(x, y, z, nx, ny, nz) and _in_box(x + s * dx, y + s * dy, z + s * dz, nx, ny, nz)):
+        last = 0
     begin = int(min(max((clear - t0) / STEP - 0.5, 0.0), last))
     ex, ey, ez = np.float32(ox + t0 * dx), np.float32(oy + t0 * dy), np.float32(oz + t0 * dz)
     ax, ay, az = np.float32(dx), np.float32(dy), np.float32(dz)
