@@ -28,6 +28,7 @@ STAGES = ("poses", "train", "bake", "evaluate", "turntable", "mesh", "points")
 QUICK = (
     "poses.test_every=50", "train.iterations=150", "train.preview_every=off", "bake.refine_steps=4", "bake.visibility_rays=60000", "bake.max_mib=8",
     "bake.samples_per_voxel=1", "evaluate.field_views=1", "evaluate.field_background_rays=10000", "turntable.frames=2",
+    "mesh.density_threshold=2.0", "points.density_threshold=2.0",
 )  # fmt: skip
 UPSAMPLED = 4  # pixels a side of an image for each that is computed; noise is added
 

@@ -54,8 +54,8 @@ def run(job: Job) -> None:
 
     s: TurntableSettings = job.settings
     tree = format.load(inputs_of(TurntableInputs, job.inputs).bake.asset).to(job.device)
-    remedy = f"Lower turntable.width ({s.width}), turntable.height ({s.height}) or turntable.supersample ({s.supersample})."
-    refuse_what_does_not_fit(job, frames_needed(tree, s.width * s.height, s.supersample, job.device), remedy)
+    remedy = f"Lower turntable.width ({s.width}) or turntable.height ({s.height})."
+    refuse_what_does_not_fit(job, frames_needed(tree, s.width * s.height, job.device), remedy)
     render_turntable(tree, job)
 
 

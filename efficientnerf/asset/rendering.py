@@ -131,18 +131,23 @@ def _render_by_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, supersam
         along = (part.depth * (directions @ camera.forward)).astype(np.float32)
         values = np.concatenate([part.colour, part.opacity[:, None], along[:, None], part.normal], axis=1, dtype=np.float32)
         rows = len(y) // n
-        bands.append(values.reshape(rows, n, width, n, 8).swapaxes(1, 2).reshape(rows, width, n * n, 8))
-    samples = np.concatenate(bands)  # (H, W, n^2, 8)
+        bands.append(_merged(values.reshape(rows, n, width, n, 8).swapaxes(1, 2).reshape(rows, width, n * n, 8), behind))
+    return Rendering(*(np.concatenate(parts) for parts in zip(*bands, strict=True)))
+
+
+def _merged(samples: np.ndarray, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The fields of a Rendering from the samples of its pixels, (H, W, n^2, 8): colour, opacity, depth and normal of each."""
+    count = samples.shape[2]
     colour, opacity = samples[..., :3].mean(axis=2), samples[..., 3].mean(axis=2)
     # The nearest half of the samples decides; the mean of a near and a far surface would lie on neither.
     near = np.sort(samples[..., 4], axis=2)
-    middle = np.clip(np.isfinite(near).sum(axis=2, keepdims=True) - 1, 0, (n * n - 1) // 2)  # less than half may do, where others are half transparent
+    middle = np.clip(np.isfinite(near).sum(axis=2, keepdims=True) - 1, 0, (count - 1) // 2)  # less than half may do, where others are half transparent
     depth = np.take_along_axis(near, middle, axis=2)[..., 0]
     facing = samples[..., 5:].sum(axis=2)
     normal = facing / np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-12)
     depth[opacity < 0.5] = np.inf
     normal[opacity < 0.5] = 0
-    return Rendering(colour + (1 - opacity[..., None]) * behind, opacity, depth, normal)
+    return colour + (1 - opacity[..., None]) * behind, opacity, depth, normal
 
 
 def tree_density(tree: NerfTree, points: Tensor, values: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,9 +11,10 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.cameras import Camera
 
-# Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of the
-# samples of a supersampled pixel where each ray is rendered on its own; of a test view with its photograph, renders, errors and windows of SSIM.
-TREE, FRAME, SAMPLE, COMPARED = 3, 100, 80, 160
+# Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of a
+# test view with its photograph, renders, errors and windows of SSIM.
+TREE, FRAME, COMPARED = 3, 100, 160
+BAND = 160 * MIB  # rays at a time where each is rendered on its own
 FIELD = 150  # bytes of a ray through the field, with what lies before and behind the box
 FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose density voxels prune nothing yet
 
@@ -28,11 +29,10 @@ def tree_bytes(tree: NerfTree) -> int:
     return TREE * (tree.brick_index.nbytes + tree.voxel_index.nbytes + tree.density_values.nbytes + stored) + colours
 
 
-def frames_needed(tree: NerfTree, pixels: int, supersample: int, device: str = "cpu") -> Need:
+def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
     """What it takes to render and write frames of so many pixels, one at a time."""
-    by_rays = supersample > 1 and (tree.ndc is not None or tree.lookup == "nearest")
     return Need({
-        "a frame": pixels * (FRAME + (SAMPLE * supersample**2 if by_rays else 0)),
+        "a frame": pixels * FRAME + (0 if tree.ndc is None and tree.lookup == "trilinear" else BAND),
         "the asset": tree_bytes(tree),
         "libraries": libraries(device),
     })  # fmt: skip

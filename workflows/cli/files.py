@@ -184,7 +184,7 @@ def render(
     else:
         cameras, fps = cameras_of(tree, settings), settings.fps
     most = max((camera.width * camera.height for camera in cameras), default=0)
-    refuse_more_than(limit, str(what), frames_needed(tree, most, settings.supersample), "Render smaller frames (--width, --height).")
+    refuse_more_than(limit, str(what), frames_needed(tree, most), "Render smaller frames (--width, --height).")
     for k in range(len(cameras)):
         for kind in ("png", "exr"):
             check_free(out / f"frame_{k:04d}.{kind}", force=force, inputs=read)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -149,10 +150,12 @@ def test_depth_is_finite_just_where_half_of_the_light_is_absorbed(supersample: i
     assert ((np.abs(length - 1) < 1e-3) | (length == 0)).all()
 
 
-def test_renders_do_not_depend_on_how_they_are_cut() -> None:
-    tree = random_tree(0, share=0.7)
-    whole = render(tree, looking(tree), supersample=2)
-    cut = render(tree, looking(tree), supersample=2, rays_per_band=100)
+@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
+@pytest.mark.parametrize("supersample", [2, 3])
+def test_renders_do_not_depend_on_how_they_are_cut(lookup: str, supersample: int) -> None:
+    tree = replace(random_tree(0, share=0.7), lookup=lookup)
+    whole = render(tree, looking(tree), supersample=supersample)
+    cut = render(tree, looking(tree), supersample=supersample, rays_per_band=100)
     for name in ("colour", "opacity", "depth", "normal"):
         assert np.array_equal(getattr(whole, name), getattr(cut, name)), name
 
