@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import shutil
@@ -109,7 +110,7 @@ def test_any_manifest(run: Run) -> None:
     path = run.folder("count") / "manifest.json"
     good = json.loads(path.read_text())
     good = {**good, "versions": {"python": "3"}, "outputs": {"count.txt": good["outputs"]["count.txt"]}}
-    for value in mutants(good):
+    for value in itertools.islice(mutants(good), 0, None, 3):
         if isinstance(value, dict):
             value.pop("checksum", None)
             value["checksum"] = hashlib.sha256(files.canonical_json(value)).hexdigest()
