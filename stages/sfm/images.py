@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from pipeline.files import remove, write_atomically
+from pipeline.files import open_plain, remove, write_atomically
 from stages.io.photo import DecodedPhoto, read_mask_file, read_photo
 from stages.io.pictures import UnreadableImage
 from stages.io.png import FAST, read_png, write_png
@@ -49,8 +49,12 @@ class WorkImage:
 
 
 def _sha256(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Of a plain file, or what keeps it from being read: a pipe among the photographs would be waited for."""
+    try:
+        with open(open_plain(path), "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        return str(error.strerror)
 
 
 def prepare_images(
@@ -111,11 +115,7 @@ def _digests(paths: Mapping[str, Path], masks: Mapping[str, Path], safe_point: S
     rows: list[list[str | None]] = []
     for name in sorted(paths):
         safe_point()
-        try:
-            digest = _sha256(paths[name])
-        except OSError as error:
-            digest = str(error.strerror)
-        rows.append([name, digest, _sha256(masks[name]) if name in masks else None])
+        rows.append([name, _sha256(paths[name]), _sha256(masks[name]) if name in masks else None])
     return rows
 
 

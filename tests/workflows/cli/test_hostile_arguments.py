@@ -289,6 +289,22 @@ def test_metadata_of_a_stranger_are_described(enerf: Enerf, tmp_path: Path, asse
             json.loads(result.out.splitlines()[-1] if arguments[0] == "verify" else result.out)
 
 
+def test_pipes_among_photographs_are_not_waited_for(tmp_path: Path) -> None:
+    from stages.sfm.images import prepare_images
+
+    names = ["a.png", "b.png"]
+    for name in (*names, "mask.png"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "work").mkdir()
+    signal.alarm(SECONDS)
+    images, rejected = prepare_images(
+        tmp_path, names, max_side=64, features=100, seed=0, masks={"a.png": tmp_path / "mask.png"}, work=tmp_path / "work",
+        progress=lambda *_: None, safe_point=lambda: None, warn=lambda *_, **__: None,
+    )  # fmt: skip
+    assert images == []
+    assert [name for name, _ in rejected] == names
+
+
 def test_help_answers_within_a_second() -> None:
     done = subprocess.run([sys.executable, "-X", "importtime", "-m", "workflows.cli.main", "--help"], capture_output=True, text=True, check=True)
     lines = [line.split("|") for line in done.stderr.splitlines() if line.startswith("import time:") and line.split("|")[1].strip().isdigit()]
