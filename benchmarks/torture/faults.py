@@ -30,6 +30,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ RESULT = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EACCES, errno.EMFILE)
 OF_READING = (errno.EIO, errno.EACCES, errno.EMFILE)
 MANY, ENDS, EACH = 24, 3, 40
+CASE = tuple(field.name for field in fields(Case))
 DEADLY = (1, 2, 3, 5)  # the failing operation at which a run on a full disk is killed
 
 
@@ -54,6 +56,9 @@ def main() -> int:
     parser.add_argument("--stages", default=",".join((NEW, *STAGES)), help="of the Blender set; of the others it is poses")
     parser.add_argument("--share", type=int, default=1, help="one case in so many, for a look")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop then, and say how many cases are left; they come in a random order")
+    parser.add_argument(
+        "--done", type=Path, nargs="*", default=[], help="book_N.jsonl of an earlier call that was stopped: its cases count, and are not repeated"
+    )
     parser.add_argument("--json", type=Path, default=RESULT, help="where the result goes")
     parser.add_argument("--folder", type=Path, help="where the runs go; default: a temporary folder, removed unless a case is wrong")
     given = parser.parse_args()
@@ -67,9 +72,16 @@ def main() -> int:
     cases, seen = planned(prepared, given.stages.split(","), logs)
     random.Random(0).shuffle(cases)
     cases = cases[: -(-len(cases) // given.share)]
+    former = [json.loads(line) for path in given.done for line in path.read_text(encoding="utf-8").splitlines()]
+    done = {tuple(line[name] for name in CASE) for line in former if line["event"] == "case"}
+    cases = [case for case in cases if astuple(case) not in done]
     print(f"{len(cases)} cases", flush=True)
     lines = _all(cases, prepared, folder, given.jobs, given.minutes)
-    result = summary(lines, seen, len(cases)) | report.circumstances(begun, python_alone=python_alone(), jobs=given.jobs, seed=0)
+    result = (
+        summary([*former, *lines], seen, len(done) + len(cases))
+        | {"of_earlier_calls": len(done)}
+        | report.circumstances(begun, python_alone=python_alone(), jobs=given.jobs, seed=0)
+    )
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     found = f"{result['cases']} cases at {result['operations_covered']} operations, {result['elapsed_seconds']:.0f} s: {len(result['wrong'])} wrong"
