@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.files import is_denied
 from pipeline.text import printable
 from stages.scratch import Warn, digest_of, once
 
@@ -60,6 +61,8 @@ class Previews:
                 digest_of(path)  # a plain file
                 read_png(path)
             except Exception as error:  # whatever a decoder raises
+                if isinstance(error, OSError) and is_denied(error):
+                    raise  # nothing is wrong with the file
                 warn(f"{path.name} of an earlier attempt can't be used ({printable(error, 200)}); it is left out")
                 continue
             folder.mkdir(exist_ok=True)
