@@ -10,7 +10,7 @@ import platform
 import sys
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +43,12 @@ def main() -> int:
         return name, campaign.fuzz(name, count, given.seed, coverage=coverage, shrink=given.shrink, say=lambda text: print(text, flush=True))
 
     with ThreadPoolExecutor(given.jobs) as threads:
-        for name, result in threads.map(fuzz, given.readers or READERS):
+        for done in as_completed(threads.submit(fuzz, name) for name in given.readers or READERS):
+            name, result = done.result()
             found[name] = result
             _tell(name, result, given.findings)
             if given.json is not None:
-                write(given.json, found, given.seed, coverage)
+                write(given.json, {name: result}, given.seed, coverage)
     return 1 if any(each["findings"] for each in found.values()) else 0
 
 
@@ -60,7 +61,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--jobs", type=int, default=1, help="readers at a time")
     parser.add_argument("--shrink", type=float, default=5.0, metavar="SECONDS", help="to make the input of a finding smaller")
     parser.add_argument("--findings", type=Path, default=ROOT / "build" / "fuzz", metavar="DIR", help="where the inputs of findings go")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="result to write; what it holds of other readers stays")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="result to write; is added to what it holds")
     parser.add_argument("--file", type=Path, metavar="FILE", help="try this one input on READER")
     parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -105,6 +106,7 @@ def _tell(name: str, found: dict[str, Any], folder: Path) -> None:
 
 def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: bool) -> None:
     """The result, with the fuzzing of the asset's format beside it."""
+    from benchmarks.fuzz.table import READERS
     from benchmarks.machine import processor
 
     versions = {}
@@ -114,23 +116,23 @@ def write(path: Path, found: dict[str, dict[str, Any]], seed: int, coverage: boo
         except importlib.metadata.PackageNotFoundError:
             continue
     asset = json.loads(FORMAT_RESULT.read_text(encoding="utf-8")) if FORMAT_RESULT.exists() else {}
-    former = json.loads(path.read_text(encoding="utf-8"))["readers"] if path.exists() else {}
-    readers = {
-        **former,
-        **{name: {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]]} for name, each in found.items()},
-    }
+    former = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"readers": {}, "seeds": []}
+    readers = dict(former["readers"])
+    for name, each in found.items():
+        now = {**each, "findings": [{key: one[key] for key in ("by", "place", "count")} for one in each["findings"]]}
+        readers[name] = campaign.added(readers[name], now) if name in readers else now
     result = {
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "machine": processor(),
         "python": platform.python_version(),
         "versions": versions,
-        "seed": seed,
+        "seeds": sorted({*former["seeds"], seed}),
         "guided_by": f"coverage (atheris): {campaign.GUIDED:.0%} of the inputs; outcomes: the rest" if coverage else "outcomes",
         "inputs": sum(each["inputs"] for each in readers.values()),
         "findings": sum(len(each["findings"]) for each in readers.values()),
         "limit_s": 5.0,
         "room_mib": worker.EXTRA_MEMORY // 2**20,
-        "readers": readers,
+        "readers": {name: readers[name] for name in READERS if name in readers},
         "asset": {key: asset[key] for key in ("inputs", "read", "refused", "seed", "slowest_s", "peak_rss_mib") if key in asset} | {"file": FORMAT_RESULT.name},
     }
     path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from benchmarks.fuzz.reader import ROOT
 from benchmarks.fuzz.worker import NOTE
 
 GUIDED = 0.25  # of the inputs are guided by coverage, which takes twice the time; the rest begin with what those found
-BATCH = 25_000  # inputs of one process
+BATCH = 75_000  # inputs of one process
 MEMORY = "/dev/shm"  # files there are written ten times as fast as on a disk
 STUCK = 60.0  # seconds without a new input after which a process is ended: it does not answer to signals
 
@@ -78,27 +78,44 @@ def _wait(process: subprocess.Popen[bytes], note: Path) -> int | None:
 
 
 def summed(name: str, parts: list[dict[str, Any]]) -> dict[str, Any]:
-    refused, codes = Counter[str](), Counter[str]()
     findings: dict[tuple[str, str], dict[str, Any]] = {}
-    for part in parts:
-        refused.update(part["refused"])
-        codes.update(part.get("codes", {}))
-        for each in part["findings"]:
-            known = findings.setdefault((each["by"], each["place"]), {**each, "reader": name, "count": 0})
-            known["count"] += each["count"]
-            if len(each["data"]) < len(known["data"]):
-                known["data"] = each["data"]
+    for each in (each for part in parts for each in part["findings"]):
+        known = findings.setdefault((each["by"], each["place"]), {**each, "reader": name, "count": 0})
+        known["count"] += each["count"]
+        if len(each["data"]) < len(known["data"]):
+            known["data"] = each["data"]
     inputs, seconds = sum(part["inputs"] for part in parts), sum(part.get("cpu_s", 0.0) for part in parts)
     return {
         "inputs": inputs,
         "accepted": sum(part["accepted"] for part in parts),
-        "refused": dict(sorted(refused.items())),
+        "refused": _counts(part["refused"] for part in parts),
         "command_lines": sum(part.get("commands", 0) for part in parts),
-        "exit_codes": dict(sorted(codes.items())),
+        "exit_codes": _counts(part.get("codes", {}) for part in parts),
         "findings": list(findings.values()),
         "slowest_s": round(max((part.get("slowest_s", 0.0) for part in parts), default=0.0), 3),
         "peak_rss_mib": max((part.get("peak_rss_mib", 0) for part in parts), default=0),
         "rss_before_mib": max((part.get("rss_before_mib", 0) for part in parts), default=0),
         "inputs_per_cpu_s": round(inputs / max(seconds, 1e-9)),
-        "cpu_seconds": round(seconds),
+        "cpu_seconds": round(seconds, 1),
     }
+
+
+def added(former: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """The results of two campaigns on the same reader as one; findings are those of `now`, for those of before may have been mended."""
+    inputs, seconds = former["inputs"] + now["inputs"], former["cpu_seconds"] + now["cpu_seconds"]
+    return {
+        **now,
+        "inputs": inputs,
+        **{key: former[key] + now[key] for key in ("accepted", "command_lines")},
+        **{key: _counts((former[key], now[key])) for key in ("refused", "exit_codes")},
+        **{key: max(former[key], now[key]) for key in ("slowest_s", "peak_rss_mib", "rss_before_mib")},
+        "inputs_per_cpu_s": round(inputs / max(seconds, 1e-9)),
+        "cpu_seconds": round(seconds, 1),
+    }
+
+
+def _counts(parts: Iterable[dict[str, int]]) -> dict[str, int]:
+    total = Counter[str]()
+    for part in parts:
+        total.update(part)
+    return dict(sorted(total.items()))

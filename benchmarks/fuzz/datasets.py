@@ -16,6 +16,7 @@ from benchmarks.fuzz.reader import Opened, Reader
 from tests.stages import captures
 
 COUNT = 3  # images of a data set
+EVERY = 100  # of so many inputs one goes through the command line: a whole poses stage takes as long as a hundred of them
 NGP = {"is_fisheye": False, "k1": 0.01}
 
 
@@ -148,8 +149,8 @@ def npy_changed(rng: Random, data: bytes) -> bytes:
 
 
 _READERS = [
-    Reader("transforms", "transforms.json, three dialects", transforms_seeds, json_text.changed, _opened(captures.nerfstudio, "transforms.json")),
-    Reader("poses_bounds", "poses_bounds.npy of LLFF", npy_seeds, npy_changed, _opened(captures.llff, "poses_bounds.npy")),
+    Reader("transforms", "transforms.json, three dialects", transforms_seeds, json_text.changed, _opened(captures.nerfstudio, "transforms.json"), every=EVERY),
+    Reader("poses_bounds", "poses_bounds.npy of LLFF", npy_seeds, npy_changed, _opened(captures.llff, "poses_bounds.npy"), every=EVERY),
 ]
 for _suffix, _write, _changed in ((".bin", captures.colmap_bin, binary.changed_bytes), (".txt", captures.colmap_txt, lines.changed)):
     for _part in ("cameras", "images", "points3D"):
@@ -161,6 +162,7 @@ for _suffix, _write, _changed in ((".bin", captures.colmap_bin, binary.changed_b
                 lambda write=_write, name=_name: [_shorter(_bytes_of(write, name))],  # type: ignore[misc]
                 _changed,
                 _opened(_write, _name),
+                every=EVERY,
                 share=1 / 3,
             )
         )
