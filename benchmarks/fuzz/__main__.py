@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib.metadata
 import importlib.util
 import json
 import platform
 import sys
 import tempfile
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fuzz import campaign, worker
+from benchmarks.fuzz import campaign, nursery, worker
 from benchmarks.fuzz.reader import ROOT
 
 RESULT = ROOT / "benchmarks" / "results" / "fuzz.json"
@@ -25,9 +27,9 @@ LIBRARIES = ("atheris", "msgspec", "numpy", "pillow", "pillow-heif", "safetensor
 def main() -> int:
     given = _arguments()
     coverage = not given.plain and importlib.util.find_spec("atheris") is not None
-    if given.worker:
-        first, count, folder = given.worker
-        worker.work(given.readers[0], given.seed, int(first), int(count), Path(folder), coverage=coverage, shrink=given.shrink)
+    if given.serve:
+        nursery.serve(coverage)
+        return 0
     from benchmarks.fuzz.table import READERS
 
     unknown = [name for name in given.readers if name not in READERS]
@@ -38,17 +40,26 @@ def main() -> int:
         return _again(given.readers[0], given.file)
     found: dict[str, dict[str, Any]] = {}
 
+    local, all_nurseries = threading.local(), []
+
+    def begin() -> None:
+        local.nurseries = campaign.Nurseries()
+        all_nurseries.append(local.nurseries)
+
     def fuzz(name: str) -> tuple[str, dict[str, Any]]:
         count = round(given.inputs * READERS[name].share)
-        return name, campaign.fuzz(name, count, given.seed, coverage=coverage, shrink=given.shrink, say=lambda text: print(text, flush=True))
+        say = functools.partial(print, flush=True)
+        return name, campaign.fuzz(name, count, given.seed, local.nurseries, coverage=coverage, shrink=given.shrink, say=say)
 
-    with ThreadPoolExecutor(given.jobs) as threads:
-        for done in as_completed(threads.submit(fuzz, name) for name in given.readers or READERS):
+    with ThreadPoolExecutor(given.jobs, initializer=begin) as threads:
+        for done in as_completed([threads.submit(fuzz, name) for name in given.readers or READERS]):
             name, result = done.result()
             found[name] = result
             _tell(name, result, given.findings)
             if given.json is not None:
                 write(given.json, {name: result}, given.seed, coverage)
+    for each in all_nurseries:
+        each.close()
     return 1 if any(each["findings"] for each in found.values()) else 0
 
 
@@ -63,7 +74,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--findings", type=Path, default=ROOT / "build" / "fuzz", metavar="DIR", help="where the inputs of findings go")
     parser.add_argument("--json", type=Path, metavar="FILE", help="result to write; is added to what it holds")
     parser.add_argument("--file", type=Path, metavar="FILE", help="try this one input on READER")
-    parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     return parser.parse_args()
 
 

@@ -1,37 +1,47 @@
-"""Many inputs on many readers: workers are started one after another, and again where one dies; what they report is added up."""
+"""Many inputs on many readers, in batches, and on after the input of which a worker died; what the workers report is added up."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-import tempfile
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fuzz.reader import ROOT
+from benchmarks.fuzz.nursery import Nursery, scratch_folder
 from benchmarks.fuzz.worker import NOTE
 
 GUIDED = 0.25  # of the inputs are guided by coverage, which takes twice the time; the rest begin with what those found
 BATCH = 75_000  # inputs of one process
-MEMORY = "/dev/shm"  # files there are written ten times as fast as on a disk
-STUCK = 60.0  # seconds without a new input after which a process is ended: it does not answer to signals
 
 
-def fuzz(name: str, inputs: int, seed: int, *, coverage: bool, shrink: float, say: Callable[[str], None]) -> dict[str, Any]:
+class Nurseries:
+    """Those of one thread, made when they are needed."""
+
+    def __init__(self) -> None:
+        self.made: dict[bool, Nursery] = {}
+
+    def of(self, coverage: bool) -> Nursery:
+        if coverage not in self.made:
+            self.made[coverage] = Nursery(coverage)
+        return self.made[coverage]
+
+    def close(self) -> None:
+        for each in self.made.values():
+            each.close()
+
+
+def fuzz(name: str, inputs: int, seed: int, nurseries: Nurseries, *, coverage: bool, shrink: float, say: Callable[[str], None]) -> dict[str, Any]:
     """All inputs of one reader; the sum of what its processes reported."""
     parts: list[dict[str, Any]] = []
     deaths: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory(prefix=f"fuzz-{name}-", dir=MEMORY if os.path.isdir(MEMORY) else None) as folder:
+    with scratch_folder(f"fuzz-{name}-") as folder:
         first = 0
         while first < inputs and len(deaths) < 20:
             guided = coverage and first < GUIDED * inputs
             last = min(round(GUIDED * inputs) if guided else inputs, first + BATCH)
-            found = _batch(name, seed + first, first, last - first, Path(folder), coverage=guided, shrink=shrink)
+            job = {"name": name, "seed": seed + first, "first": first, "count": last - first, "folder": folder, "coverage": guided, "shrink": shrink}
+            found = _batch(job, nurseries.of(guided))
             if "died" in found:
                 deaths.append(found)
                 first = found["index"] + 1
@@ -43,13 +53,11 @@ def fuzz(name: str, inputs: int, seed: int, *, coverage: bool, shrink: float, sa
     return summed(name, parts)
 
 
-def _batch(name: str, seed: int, first: int, count: int, folder: Path, *, coverage: bool, shrink: float) -> dict[str, Any]:
-    command = [sys.executable, "-m", "benchmarks.fuzz", name, "--seed", str(seed), "--worker", str(first), str(count), str(folder), "--shrink", str(shrink)]
+def _batch(job: dict[str, Any], nursery: Nursery) -> dict[str, Any]:
+    folder, first = Path(job["folder"]), job["first"]
     note = folder / NOTE
     note.unlink(missing_ok=True)
-    with open(folder / "stderr", "wb") as err, open(folder / "stdout", "wb") as out:
-        process = subprocess.Popen(command + ([] if coverage else ["--plain"]), cwd=ROOT, stdout=out, stderr=err)
-        code = _wait(process, note)
+    code = nursery.work(job, note)
     text = (folder / "stdout").read_text(errors="replace").strip().splitlines()
     if code == 0 and text:
         found: dict[str, Any] = json.loads(text[-1])
@@ -59,22 +67,6 @@ def _batch(name: str, seed: int, first: int, count: int, folder: Path, *, covera
     last = (folder / "stderr").read_text(errors="replace")[-2000:]
     what = "stuck" if code is None else f"the process ended with {code}"
     return {"died": True, "first": first, "index": index, "by": what, "place": "", "text": last, "trace": last, "count": 1, "command": None, "data": data.hex()}
-
-
-def _wait(process: subprocess.Popen[bytes], note: Path) -> int | None:
-    """The exit code; None where the process had to be killed because it came to no new input."""
-    last, since = b"", time.monotonic()
-    while True:
-        try:
-            return process.wait(timeout=1)
-        except subprocess.TimeoutExpired:
-            now = note.read_bytes()[:20] if note.exists() else b""
-            if now != last:
-                last, since = now, time.monotonic()
-            if time.monotonic() - since > (STUCK if now else 5 * STUCK):  # importing takes longer
-                process.kill()
-                process.wait()
-                return None
 
 
 def summed(name: str, parts: list[dict[str, Any]]) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import io
 import json
 import os
 import re
@@ -26,7 +25,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from benchmarks.fuzz.reader import Opened, Outcome, Reader, address_space, commanded, judged, quiet
+from benchmarks.fuzz.reader import Opened, Outcome, Reader, address_space, commanded, judged
 
 EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
 NOTE = "input"  # a file: the number of the input that is being tried, a line's end, the input
@@ -183,11 +182,9 @@ def guided(tally: Tally, seed: int, count: int, finish: Callable[[], None]) -> N
 
 
 def work(name: str, seed: int, first: int, count: int, folder: Path, *, coverage: bool, shrink: float = 0.0) -> None:
-    """Try `count` inputs from number `first` on and print the report."""
-    quiet()
+    """Try `count` inputs from number `first` on, print the report and end the process."""
     tempfile.tempdir = str(folder)
-    os.environ.update(NUMBA_NUM_THREADS="1", OMP_NUM_THREADS="1")
-    tally = opened_reader(name, folder, first, coverage)
+    tally = opened_reader(name, folder, first)
     address_space(EXTRA_MEMORY)
     out = os.dup(1)
 
@@ -204,31 +201,15 @@ def work(name: str, seed: int, first: int, count: int, folder: Path, *, coverage
         finish()
 
 
-def opened_reader(name: str, folder: Path, first: int, coverage: bool = False) -> Tally:
-    """A reader in a new folder, its modules imported and warm."""
-    if coverage:
-        import atheris
+def opened_reader(name: str, folder: Path, first: int) -> Tally:
+    """A reader in a new folder, each valid file read once."""
+    from benchmarks.fuzz.table import READERS
 
-        with atheris.instrument_imports(include=INSTRUMENTED), contextlib.redirect_stderr(io.StringIO()):
-            from benchmarks.fuzz.table import READERS
-
-            reader, opened = _warm(READERS[name], folder)
-    else:
-        from benchmarks.fuzz.table import READERS
-
-        reader, opened = _warm(READERS[name], folder)
-    gc.collect()
-    return Tally(reader, opened, folder, first)
-
-
-def _warm(reader: Reader, folder: Path) -> tuple[Reader, Opened]:
-    """The reader opened, with all that it imports: each valid file read once, each command called once."""
+    reader = READERS[name]
     shutil.rmtree(folder / "place", ignore_errors=True)
     (folder / "place").mkdir(parents=True)
     opened = reader.open(folder / "place")
     for data in reader.seeds():
         judged(lambda data=data: opened.read(data), reader.refusals)  # type: ignore[misc]
-    for arguments in opened.commands:
-        opened.prepare(reader.seeds()[0])
-        commanded(arguments)
-    return reader, opened
+    gc.collect()
+    return Tally(reader, opened, folder, first)
