@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -15,12 +17,25 @@ def test_the_pages_are_up_to_date() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_links_of_the_readme_lead_somewhere() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize("page", ["README.md", "SECURITY.md", "docs/trust.md"])
+def test_links_lead_somewhere(page: str) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
     assert links
     for link in links:
-        assert (ROOT / link).exists(), link
+        assert ((ROOT / page).parent / link).exists(), link
+
+
+def test_findings_name_tests_that_exist() -> None:
+    rows = [line for line in (ROOT / "docs/trust.md").read_text(encoding="utf-8").splitlines() if ".py`" in line]
+    assert len(rows) > 25
+    for row in rows:
+        source = ""
+        for name in re.findall(r"`([^`]+)`", row.split("|")[3]):
+            if name.endswith(".py"):
+                source = (ROOT / "tests" / name).read_text(encoding="utf-8")
+            else:
+                assert f"def {name}(" in source, row
 
 
 def test_commands_of_the_readme_exist() -> None:
