@@ -46,6 +46,7 @@ ERRORS = (errno.ENOSPC, errno.EIO, errno.EROFS, errno.EACCES, errno.EMFILE)
 OF_READING = (errno.EIO, errno.EACCES, errno.EMFILE)
 MANY, ENDS, EACH = 24, 3, 40
 CASE = tuple(field.name for field in fields(Case))
+OPERATION = CASE[: CASE.index("errno")]
 DEADLY = (1, 2, 3, 5)  # the failing operation at which a run on a full disk is killed
 
 
@@ -74,7 +75,8 @@ def main() -> int:
     cases = cases[: -(-len(cases) // given.share)]
     former = [json.loads(line) for path in given.done for line in path.read_text(encoding="utf-8").splitlines()]
     done = {tuple(line[name] for name in CASE) for line in former if line["event"] == "case"}
-    cases = [case for case in cases if astuple(case) not in done]
+    met = {which[: len(OPERATION)] for which in done}
+    cases = sorted((case for case in cases if astuple(case) not in done), key=lambda case: astuple(case)[: len(OPERATION)] in met)  # new operations first
     print(f"{len(cases)} cases", flush=True)
     lines = _all(cases, prepared, folder, given.jobs, given.minutes)
     result = (
@@ -171,7 +173,7 @@ def _all(cases: Sequence[Case], prepared: Sequence[Prepared], folder: Path, jobs
 
 def summary(lines: Iterable[dict[str, Any]], seen: dict[str, dict[str, int]], planned: int) -> dict[str, Any]:
     """Counts of what was done, and all that was wrong."""
-    lines = list(lines)
+    lines = list({tuple(line.get(name) for name in ("event", "how", *CASE)): line for line in lines}.values())
     read_only = [line for line in lines if line["event"] == "read-only"]
     cases = [line for line in lines if line["event"] == "case"]
     reached = [case for case in cases if case["reached"]]
