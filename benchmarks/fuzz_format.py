@@ -43,7 +43,7 @@ HERE = Path(__file__).resolve().parent
 GOLDEN = HERE.parent / "tests" / "data" / "golden"
 EXTRA_MEMORY = 2**30  # bytes of address space beyond what the imports took
 SLOW = 5  # seconds of a step
-BATCH = 5000
+BATCH = 10_000
 MOST_CONVERTED = 2000  # voxels of assets whose palettes are sought: that takes seconds of honest work for more
 SIZE = 16  # pixels along a side of a picture
 
