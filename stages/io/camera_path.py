@@ -15,6 +15,7 @@ from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
 
 MAX_FILE = 64 << 20
 MAX_SIZE = 16384
+MAX_PIXELS = 2**27  # that `efficientnerf.asset.rendering` renders at once, which a test compares
 MAX_CAMERAS = 100_000
 MIN_ANGLE = 1e-3  # degrees
 
@@ -47,6 +48,8 @@ def read_camera_path(path: Path, world_from_capture: Similarity, *, width: int |
     if not 1 <= len(entries) <= MAX_CAMERAS:
         raise BadInput(f"{path}: camera_path holds {len(entries)} cameras; expected 1 to {MAX_CAMERAS}.")
     size = _size(document, path, width, height)
+    if size[0] * size[1] > MAX_PIXELS:
+        raise BadInput(f"{path}: pictures of {size[0]} x {size[1]} pixels; expected at most {MAX_PIXELS} pixels. Give --width and --height.")
     cameras = []
     for k, entry in enumerate(entries):
         where = f"{path}: camera_path[{k}]"

@@ -11,6 +11,7 @@ import av
 import numpy as np
 import pytest
 
+from efficientnerf.asset.rendering import MOST_PIXELS
 from efficientnerf.geometry.cameras import Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError
 from stages.figures.frames import RenderOptions, render_path
@@ -185,6 +186,7 @@ IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
         ({"fov": True}, "fov: found True"),
         ({"render_width": 0}, "render_width"),
         ({"render_width": 10.5}, "whole number"),
+        ({"render_width": 16384, "render_height": 16384}, f"expected at most {MOST_PIXELS} pixels"),
         ({"render_height": 1e9}, "render_height"),
         ({"fps": "fast"}, "fps"),
     ],
