@@ -187,16 +187,14 @@ class Rounds:
             if self.random.random() < 0.8:
                 child.listen(self.random.uniform(0.0, 0.2))
                 child.signal(signal.SIGKILL, group=True)
-                self.kills += 1
         child.end()
         hit.code = child.code or 0
         if hit.signal == "INT" and not sent and child.armed is not None and child.armed.fired:
             hit.signal = "INT INT"  # the trap was quicker than its end
         wrong += _judged(hit, child, began, prepared.stages[-1])
         self._note(hit, child, wrong)
-        if hit.signal == "KILL":
-            self.kills += 1
-        elif child.leftover():
+        self.kills += child.code == -signal.SIGKILL
+        if hit.signal != "KILL" and child.leftover():
             hit.wrong.append("a child process lives on")
         self.hits[hit.stage] += 1
         if self.random.randrange(SHARE_VERIFIED) == 0 and (run / "run.json").exists():
