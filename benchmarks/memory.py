@@ -4,8 +4,8 @@
 
 The scene is a patterned ball over a patterned floor under a plain sky, written as JPEGs and a transforms.json. It is trained at full size
 (`poses.max_image_size` is the width), for a few hundred steps, and baked with a few refinement steps: quality is not measured. Each stage is a process of
-its own; where one is refused for its memory, those after it are not tried. Peaks and estimates are those in the manifests. At last features are detected
-in a few of the photographs without their cameras.
+its own; where one is refused for its memory, those after it are not tried. Peaks and estimates are those in the manifests. At last the cameras
+of a few photographs of that width are found, which are those of the still life, enlarged.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -30,6 +29,7 @@ QUICK = (
     "bake.samples_per_voxel=1", "evaluate.field_views=1", "evaluate.field_background_rays=10000", "turntable.frames=2",
     "mesh.density_threshold=2.0", "points.density_threshold=2.0",
 )  # fmt: skip
+STILL_LIFE = Path(__file__).parents[1] / "examples/still_life"
 UPSAMPLED = 4  # pixels a side of an image for each that is computed; noise is added
 
 
@@ -120,11 +120,14 @@ def measured(source: Path, run: Path, memory: str, sets: list[str], stages: tupl
     return rows
 
 
-def photographs_alone(photographs: Path, folder: Path, count: int) -> Path:
-    """A folder of some of the photographs, without their cameras: neighbours, so that structure from motion has something to find."""
+def photographs_alone(folder: Path, count: int, width: int) -> Path:
+    """A folder of photographs without cameras: neighbours of the still life, enlarged."""
+    from PIL import Image
+
     folder.mkdir()
-    for path in sorted(photographs.glob("*.jpg"))[:count]:
-        shutil.copyfile(path, folder / path.name)
+    for path in sorted(STILL_LIFE.glob("*.jpg"))[:count]:
+        with Image.open(path) as image:
+            image.resize((width, width * image.height // image.width), Image.Resampling.BICUBIC).save(folder / path.name, quality=92)
     return folder
 
 
@@ -133,7 +136,7 @@ def main() -> None:
     parser.add_argument("--memory", action="append", help="limit, as for enerf; may be given again (2g, 4g and auto)")
     parser.add_argument("--count", type=int, default=100, help="photographs")
     parser.add_argument("--width", type=int, default=4000, help="of each, pixels; three quarters as high")
-    parser.add_argument("--features", type=int, default=4, help="photographs in which features are detected at full size; 0: none")
+    parser.add_argument("--features", type=int, default=8, help="photographs of the still life, enlarged to the same width, whose cameras are found; 0: none")
     parser.add_argument("--set", dest="sets", action="append", default=[], help="a setting of the run, as for enerf; may be given again")
     parser.add_argument("--json", type=Path, help="where to write the figures")
     parser.add_argument("--keep", type=Path, help="folder that is kept, with the photographs and the runs; else one that is removed")
@@ -149,9 +152,9 @@ def main() -> None:
         limits = {memory: measured(photographs, folder / f"run_{memory}", memory, sets) for memory in arguments.memory or ["2g", "4g", "auto"]}
         features = {}
         if arguments.features:
-            few = photographs_alone(photographs, folder / "few", arguments.features)
+            few = photographs_alone(folder / "few", arguments.features, arguments.width)
             wanted = [f"poses.feature_image_size={arguments.width}", "poses.format=photographs"]
-            features = {memory: measured(few, folder / f"few_{memory}", memory, wanted, ("poses",)) for memory in ("1g", "2g", "auto")}
+            features = {memory: measured(few, folder / f"few_{memory}", memory, wanted, ("poses",)) for memory in ("1g", "1500m", "auto")}
     if arguments.json is not None:
         report: dict[str, Any] = {
             "date": time.strftime("%Y-%m-%d"), "photographs": arguments.count, "width": arguments.width, "height": 3 * arguments.width // 4, "settings": sets,
