@@ -19,7 +19,7 @@ from benchmarks.fuzz import worker
 from benchmarks.fuzz.reader import ROOT, commanded, judged, quiet
 
 MEMORY = "/dev/shm"  # files there are written ten times as fast as on a disk
-STUCK = 60.0  # seconds without a new input after which a worker is ended: it does not answer to signals
+STUCK = 180.0  # seconds without a new input after which a worker is ended: it does not answer to signals
 IMPORTING = 600.0  # seconds
 
 

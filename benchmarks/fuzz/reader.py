@@ -22,7 +22,8 @@ from random import Random
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMIT = 5.0  # seconds for an input
+LIMIT = 5.0  # seconds of processor time for an input
+WAITING = 60.0  # seconds for one that waits, as for a pipe that nobody writes to; other programs may keep the machine busy for some
 LONGEST = 1500  # characters of a message
 CODES = {0, 2, 3, 4, 5, 6}  # that a file may lead to; 130 and 143 are signals'
 OURS = tuple(str(ROOT / package) + os.sep for package in ("pipeline", "stages", "efficientnerf", "workflows"))
@@ -67,7 +68,7 @@ class Reader:
 
 
 class Hang(BaseException):
-    """An input took longer than LIMIT; no `except Exception` stops it."""
+    """An input took too long; no `except Exception` stops it."""
 
 
 @dataclass
@@ -87,17 +88,22 @@ class Outcome:
 
 
 @contextlib.contextmanager
-def time_limit(seconds: float = LIMIT) -> Iterator[None]:
-    def alarm(*_: Any) -> None:
-        raise Hang(f"more than {seconds:g} s")
+def time_limit() -> Iterator[None]:
+    """Raise Hang after LIMIT seconds of processor time, or WAITING seconds."""
 
-    before = signal.signal(signal.SIGALRM, alarm)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    def alarm(number: int, _: Any) -> None:
+        raise Hang(f"more than {LIMIT:g} s of processor time" if number == signal.SIGPROF else f"more than {WAITING:g} s")
+
+    limits = ((signal.SIGPROF, signal.ITIMER_PROF, LIMIT), (signal.SIGALRM, signal.ITIMER_REAL, WAITING))
+    before = [signal.signal(number, alarm) for number, _, _ in limits]
+    for _, timer, seconds in limits:
+        signal.setitimer(timer, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+        for (number, timer, _), handler in zip(limits, before, strict=True):
+            signal.setitimer(timer, 0)
+            signal.signal(number, handler)
 
 
 def judged(read: Callable[[], None], refusals: tuple[str, ...]) -> Outcome:
