@@ -107,6 +107,7 @@ MADE: dict[tuple[str, str], tuple[Callable[[], bytes], str]] = {
     ("checkpoint", "a list of seconds"): (lambda: with_about("checkpoint", seconds=[1.5]), READ),
     ("checkpoint", "seconds as a text of infinity"): (lambda: with_about("checkpoint", seconds="1e999"), READ),
     ("checkpoint", "nested metadata"): (lambda: with_about("checkpoint", DEEP), READ),
+    ("config", "a table of a long name, twice"): (lambda: (b"[" + b".".join([b"a"] * 300) + b"]\n") * 2, "not valid TOML: .*a"),
     ("field", "nested metadata"): (lambda: with_about("field", DEEP), "field file of format nothing|not a readable field file"),
     ("field", "settings that are no object"): (lambda: with_about("field", settings=[1]), "settings"),
     ("field", "names that are no list"): (lambda: with_about("field", exposed=5), "expected a list of names"),

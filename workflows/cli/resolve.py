@@ -98,7 +98,7 @@ def read_config(path: Path) -> Config:
     except UnicodeDecodeError:
         raise BadInput(f"--config {path}: not a text file; expected TOML in UTF-8.") from None
     except ValueError as error:
-        raise BadInput(f"--config {path}: not valid TOML: {error}.") from None
+        raise BadInput(f"--config {path}: not valid TOML: {printable(error, 300)}.") from None
     options = {name: content.pop(name) for name in CONFIG_OPTIONS if name in content}
     for name, kind in (("preset", str), ("device", str), ("seed", int)):
         if name in options and type(options[name]) is not kind:
