@@ -56,10 +56,10 @@ def _import_all(folder: Path, coverage: bool) -> None:
         for reader in READERS.values():
             (folder / reader.name).mkdir()
             opened, data = reader.open(folder / reader.name), reader.seeds()[0]
-            judged(lambda opened=opened, data=data: opened.read(data), reader.refusals)  # type: ignore[misc]
+            judged(lambda opened=opened, data=data: opened.read(data), reader.refusals, limited=False)  # type: ignore[misc]
             for arguments in opened.commands:
                 opened.prepare(data)
-                commanded(arguments)
+                commanded(arguments, limited=False)  # what is cut short while it is imported stays broken
 
 
 def _be_born(job: dict[str, Any]) -> None:

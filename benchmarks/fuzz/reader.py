@@ -106,10 +106,10 @@ def time_limit() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def judged(read: Callable[[], None], refusals: tuple[str, ...]) -> Outcome:
-    """The outcome of reading an input."""
+def judged(read: Callable[[], None], refusals: tuple[str, ...], *, limited: bool = True) -> Outcome:
+    """The outcome of reading an input; `limited` in time."""
     try:
-        with time_limit():
+        with time_limit() if limited else contextlib.nullcontext():
             read()
     except (Exception, Hang) as error:
         names = {each.__name__ for each in type(error).__mro__}
@@ -129,13 +129,13 @@ def wrong_message(text: str, code: int) -> str:
     return ""
 
 
-def commanded(arguments: tuple[str, ...]) -> Outcome:
-    """The outcome of a command line: its exit code and what it prints."""
+def commanded(arguments: tuple[str, ...], *, limited: bool = True) -> Outcome:
+    """The outcome of a command line: its exit code and what it prints; `limited` in time."""
     from workflows.cli.main import main
 
     out, err = io.StringIO(), io.StringIO()
     try:
-        with time_limit(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        with time_limit() if limited else contextlib.nullcontext(), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             code = main(list(arguments))
     except (Exception, SystemExit, Hang) as error:
         return _finding(f"{arguments[0]}: {type(error).__name__}", error)
