@@ -44,11 +44,13 @@ def write_exr(
     with atomic(path) as temporary:
         try:
             image = OpenEXR.File(header, channels)
-            if _in_utf8(str(temporary)):
-                image.write(str(temporary))
-            else:  # the library knows no other names
-                memory = io.BytesIO()
+            # In memory: to a file the library writes without looking at what became of it, and leaves a damaged one after an error.
+            memory = io.BytesIO()
+            try:
                 image.write(memory)
+            except TypeError:  # versions that write to files alone
+                image.write(str(temporary))
+            else:
                 temporary.write_bytes(memory.getvalue())
         except RuntimeError as error:
             # The library has one exception for everything; a full disk is a case of its own.
@@ -56,14 +58,6 @@ def write_exr(
                 if os.strerror(number) in str(error):
                     raise OSError(number, os.strerror(number), str(path)) from error
             raise
-
-
-def _in_utf8(name: str) -> bool:
-    try:
-        name.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _plane(values: np.ndarray) -> np.ndarray:

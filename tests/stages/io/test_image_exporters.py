@@ -92,6 +92,17 @@ def test_exr_is_linear_premultiplied_and_in_the_capture_frame(tmp_path: Path) ->
     np.testing.assert_allclose(normal[18, 24], rotation.T @ [0, -1, 0], atol=0.05)
 
 
+def test_exr_whose_writing_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(path: Path, data: bytes) -> int:
+        raise OSError(errno.EIO, "Input/output error", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", failing)
+    seen = BallTree().render(CAMERA)
+    with pytest.raises(OSError, match=r"Input/output error"):
+        write_exr(tmp_path / "a.exr", colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal)
+    assert not list(tmp_path.iterdir())
+
+
 def test_exr_of_a_view_that_is_not_contiguous(tmp_path: Path) -> None:
     seen = BallTree().render(CAMERA)
     write_exr(tmp_path / "a.exr", colour=seen.colour[:, ::-1], opacity=seen.opacity[:, ::-1], depth=seen.depth[:, ::-1], normal=seen.normal[:, ::-1])
