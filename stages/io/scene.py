@@ -249,7 +249,7 @@ def read_mask(folder: Path, view: View) -> np.ndarray | None:
 
 def save_points(points: SparsePoints, folder: Path) -> None:
     """Write folder/points.safetensors; `points` in the training frame, tracks as indices into the scene's views."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     counts = np.array([len(track) for track in points.tracks], np.int64)
     tensors = {
@@ -259,7 +259,7 @@ def save_points(points: SparsePoints, folder: Path) -> None:
         "observer_counts": counts,
         "observers": np.array([view for track in points.tracks for view in track], np.int64),
     }
-    save_file(tensors, str(PosesOutputs(folder).points))
+    PosesOutputs(folder).points.write_bytes(save(tensors))  # save_file() would leave it to its owner alone, whatever the umask
 
 
 def read_points(folder: Path) -> SparsePoints:

@@ -165,7 +165,11 @@ def test_points_come_back_as_they_were(tmp_path: Path) -> None:
         np.testing.assert_array_equal(again.xyz, points.xyz)
         np.testing.assert_array_equal(again.rgb, points.rgb)
         assert again.tracks == tracks
-    (tmp_path / "points.safetensors").write_bytes(b"nothing")
+    saved = tmp_path / "points.safetensors"
+    beside = tmp_path / "beside"
+    beside.write_bytes(b"nothing")
+    assert saved.stat().st_mode == beside.stat().st_mode  # whoever may read the run can verify it
+    saved.write_bytes(b"nothing")
     with pytest.raises(CorruptArtifact, match=r"points\.safetensors"):
         scene.read_points(tmp_path)
 
