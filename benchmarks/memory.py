@@ -124,9 +124,11 @@ def photographs_alone(folder: Path, count: int, width: int) -> Path:
     """A folder of photographs without cameras: neighbours of the still life, enlarged."""
     from PIL import Image
 
+    from stages.io.pictures import opened
+
     folder.mkdir()
     for path in sorted(STILL_LIFE.glob("*.jpg"))[:count]:
-        with Image.open(path) as image:
+        with opened(path) as image:
             image.resize((width, width * image.height // image.width), Image.Resampling.BICUBIC).save(folder / path.name, quality=92)
     return folder
 

@@ -105,7 +105,7 @@ def test_four_points_are_interpolated_over_the_stored_corners() -> None:
 def laid_out(packed, colours, brick, direction, nearest, degree, owners, kind, values):  # type: ignore[no-untyped-def]
     """Blocks of some bricks, one after the other, as a thread lays them out: what they hold, and their kinds."""
     blocks, size = values.shape
-    slot, owner, after = np.full(len(packed.cells), -1, np.int32), np.full(blocks, -1, np.int32), np.zeros(1, np.int64)
+    slot, owner, after = np.full(len(packed.cells), -1, np.int32), np.full(blocks, -1, np.int32), np.zeros(2, np.int64)
     words, voxels, waiting = values.view(np.int32), np.zeros(size // 4, np.int32), np.full(4, blocks * size)
     pool = Pool(
         size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(colours), len(colours) - 1,
@@ -123,6 +123,7 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
     side, owners = tree.brick + 2, np.random.default_rng(0).permutation(len(tree.voxel_index))
     values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
     direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
+    colours[-1, 1:] = np.nan
     compute_view_colours(0, len(packed_of(tree).cells), packed_of(tree), tree.brick, direction, np.float32(2), tree.degree, colours)
     laid_out(packed_of(tree), colours, tree.brick, direction, nearest, tree.degree, owners, kind, values)
     back = np.argsort(owners)
