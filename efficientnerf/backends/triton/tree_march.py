@@ -68,7 +68,9 @@ def ray_in_grid(grid, origin, direction, BRICK: tl.constexpr):  # type: ignore[n
     iy, ay, by = _slab(origin.y, direction.y, grid.shape.y * BRICK)
     iz, az, bz = _slab(origin.z, direction.z, grid.shape.z * BRICK)
     enter = tl.maximum(tl.maximum(ax, ay), tl.maximum(az, 0.0))
-    return Ray(origin, direction, Vec3(ix, iy, iz), enter, tl.minimum(tl.minimum(bx, by), bz))
+    # No ray is longer in the grid than its sides together, but where distances far beyond it are rounded: so its samples are bounded, too.
+    longest = (grid.shape.x + grid.shape.y + grid.shape.z) * BRICK + 2.0
+    return Ray(origin, direction, Vec3(ix, iy, iz), enter, tl.minimum(tl.minimum(tl.minimum(bx, by), bz), enter + longest))
 
 
 @triton.jit
@@ -134,10 +136,9 @@ def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  #
 
 
 @triton.jit
-def _in_grid(grid, ray, k, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Whether sample `k` lies in the grid. No ray has more than two for each voxel along each axis, but where distances far beyond the grid are rounded."""
-    most = 2 * (grid.shape.x + grid.shape.y + grid.shape.z) * BRICK + 4
-    return (ray.enter + (k.to(tl.float32) + 0.5) * STEP < ray.leave) & (k < most)
+def _in_grid(ray, k):  # type: ignore[no-untyped-def]
+    """Whether sample `k` lies in the grid."""
+    return ray.enter + (k.to(tl.float32) + 0.5) * STEP < ray.leave
 
 
 @triton.jit
@@ -151,12 +152,12 @@ def march(  # type: ignore[no-untyped-def]
     state  a tuple with a `transmittance`, which ends a ray below STOP
     """
     k = tl.zeros_like(ray.enter).to(tl.int32)
-    alive = live & _in_grid(grid, ray, k, BRICK)
+    alive = live & _in_grid(ray, k)
     while tl.max(alive.to(tl.int32), 0) > 0:
         sample, k = _sample(grid, ray, k, alive, BRICK, NEAREST)
         if tl.max(sample.inside.to(tl.int32), 0) > 0:
             state = VISIT(scene, sample, state, BRICK, NEAREST, K, COLUMNS)
-        alive = alive & (state.transmittance >= STOP) & _in_grid(grid, ray, k, BRICK)
+        alive = alive & (state.transmittance >= STOP) & _in_grid(ray, k)
     return state
 
 
