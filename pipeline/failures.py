@@ -11,7 +11,6 @@ from pipeline.errors import BadInput, DiskFull, Interrupted, PipelineError, Stag
 from pipeline.text import printable
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-# What the user can put right at the path itself. Everything else is of the disk or the system.
 _OF_THE_PATH = (
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENOTEMPTY, errno.ELOOP, errno.EINVAL,
     errno.ENAMETOOLONG, errno.EXDEV, errno.ENXIO, errno.ENODEV, errno.ESPIPE, errno.EBUSY, errno.ETXTBSY,
@@ -74,6 +73,11 @@ def is_disk_full(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _FULL
 
 
+def is_of_the_path(error: OSError) -> bool:
+    """Whether the user can put it right at the path itself; everything else is of the disk or the system."""
+    return error.errno in _OF_THE_PATH
+
+
 def disk_full(folder: Path, what: str) -> DiskFull:
     """The error that names the disk that is full and the space left on it."""
     there = next((path for path in (folder, *folder.parents) if path.is_dir()), Path("/"))
@@ -86,7 +90,7 @@ def cannot_write(path: Path, error: OSError) -> BadInput | StageFailed:
     if is_disk_full(error):
         return disk_full(path, str(path))
     text = f"{path}: cannot be written ({printable(error.strerror or error, 200)})."
-    return BadInput(text) if error.errno in _OF_THE_PATH else StageFailed(text)
+    return BadInput(text) if is_of_the_path(error) else StageFailed(text)
 
 
 def failed(path: Path, error: OSError) -> BadInput | StageFailed:
@@ -95,4 +99,4 @@ def failed(path: Path, error: OSError) -> BadInput | StageFailed:
         return disk_full(path, str(path))
     where = f" at {printable(error.filename, 300)}" if isinstance(error.filename, str | bytes) else ""
     text = f"{path}: {printable(error.strerror or error, 200)}{where}. What was published before is not lost."
-    return BadInput(text) if error.errno in _OF_THE_PATH else StageFailed(text)
+    return BadInput(text) if is_of_the_path(error) else StageFailed(text)

@@ -7,12 +7,9 @@ removed, and the piece is made again.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
-import os
-import stat
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -102,8 +99,4 @@ def digest_of(path: Path) -> str:
 
 def opened(path: Path) -> io.BufferedReader:
     """A plain file to read from. Raises OSError, for a link or a pipe too, which is not waited for."""
-    file = open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb")  # noqa: SIM115
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
-        raise OSError(errno.EINVAL, "no plain file", str(path))
-    return file
+    return open(files.open_plain(path, follow=False), "rb")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import sys
 from typing import Any
 
@@ -12,11 +11,6 @@ from pipeline.text import printable
 
 INTERNAL = 1  # a defect of this program; the documented codes are those of the errors in pipeline/errors.py
 LONGEST = 4000  # characters of an error; a path may have 4096
-# What is wrong with a path that was given; other errors of the system are no fault of the request.
-OF_THE_PATH = {
-    errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENOTEMPTY, errno.EACCES, errno.EPERM, errno.EROFS, errno.ENAMETOOLONG, errno.ELOOP,
-    errno.EINVAL, errno.EXDEV, errno.ENXIO, errno.ENODEV, errno.ESPIPE, errno.EBUSY, errno.ETXTBSY,
-}  # fmt: skip
 
 
 class Reported(Exception):
@@ -40,7 +34,9 @@ def exit_code(error: BaseException) -> int:
     if isinstance(error, click.ClickException):
         return 2
     if isinstance(error, OSError):
-        return 2 if error.errno in OF_THE_PATH else 3
+        from pipeline.failures import is_of_the_path
+
+        return 2 if is_of_the_path(error) else 3
     if isinstance(error, MemoryError):
         return 3
     if isinstance(error, UnicodeEncodeError):
@@ -62,8 +58,10 @@ def sentence(error: BaseException) -> str:
         context = getattr(error, "ctx", None)
         return f"{text} Try '{context.command_path} --help'." if context is not None else text
     if isinstance(error, OSError):
+        from pipeline.failures import is_disk_full
+
         what = error.strerror or type(error).__name__
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if is_disk_full(error):
             return f"{error.filename or 'the disk'}: {what}. Free some space and run the same command again; nothing is lost."
         return f"{error.filename}: {what}." if error.filename else f"{what}."
     if isinstance(error, MemoryError):
