@@ -20,6 +20,7 @@ SUBTILE = 4  # rays along each side of a subdivision of one
 RUNS = 32  # rectangles of neighbouring tiles per thread
 WORK = 2**25  # of a thread in one call, about 0.2 s: samples tested, and what is counted as so many of them
 INTERPOLATION, LOOKUP = 8, 32
+ALL_RUNS = 2**62  # as the run that a thread goes on with: it is done
 MARGIN = 1 / 16  # voxels that rounding may put the ends of a ray outside of the grid
 
 
@@ -154,6 +155,33 @@ def _render_tile(top, low, left, right, rays, background, grid, view, voxel, poo
     return -1, work
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _render_runs(worker, threads, budget, progress, height, tile, rays, background, grid, view, voxel, pool, scratch, outputs):  # type: ignore[no-untyped-def]
+    """Renders a thread's share of an image from where `progress` says, see `render_batch`, until it is done or the budget is spent.
+
+    Each thread takes runs of tiles from all over the image, for tiles of background are cheap; neighbouring tiles share bricks.
+    """
+    width, work = outputs.width, np.int64(budget)
+    down, across = (height + tile[0] - 1) // tile[0], (width + tile[1] - 1) // tile[1]
+    tall, wide = _run_size(down, across, threads)
+    columns = (across + wide - 1) // wide
+    for run in range(progress[worker, 0], (down + tall - 1) // tall * columns):
+        # Neighbouring runs, along rows and columns, go to different threads.
+        if (run // columns + run % columns) % threads != worker:
+            continue
+        for n in range(progress[worker, 1] if run == progress[worker, 0] else 0, tall * wide):
+            row, column = run // columns * tall + n // wide, run % columns * wide + n % wide
+            if row < down and column < across:
+                top, left = row * tile[0], column * tile[1]
+                low, right = min(top + tile[0], height), min(left + tile[1], width)
+                done = progress[worker, 2] if run == progress[worker, 0] and n == progress[worker, 1] else 0
+                done, work = _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs, done, work)
+                if work <= 0:
+                    progress[worker, 0], progress[worker, 1], progress[worker, 2] = run, n if done >= 0 else n + 1, max(done, 0)
+                    return
+    progress[worker, 0] = ALL_RUNS
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def render_batch(  # type: ignore[no-untyped-def]
     batch, background, packed, brick, view_colours, direction_rate, min_distance, density_scale, degree, voxel, tile, threads, blocks, budget, progress,
@@ -178,11 +206,6 @@ def render_batch(  # type: ignore[no-untyped-def]
     """
     # numba removes writes to arrays that come out of a tuple argument: outputs are arguments of their own.
     height, width = opacity.shape
-    down, across = (height + tile[0] - 1) // tile[0], (width + tile[1] - 1) // tile[1]
-    # Each thread takes runs of tiles from all over the image, for tiles of background are cheap; neighbouring tiles share bricks.
-    tall, wide = _run_size(down, across, threads)
-    columns = (across + wide - 1) // wide
-    runs = (down + tall - 1) // tall * columns
     bricks, size = len(packed.cells), 4 * (brick + 2) ** 3
     slot_of, brick_of = np.full((threads, bricks), -1, np.int32), np.full((threads, blocks), -1, np.int32)
     kind, integers = np.zeros((threads, blocks), np.uint8), np.zeros((threads, 16), np.int64)
@@ -190,7 +213,6 @@ def render_batch(  # type: ignore[no-untyped-def]
     floats, ints = np.zeros((threads, 256), np.float32), values.view(np.int32)
     for worker in numba.prange(threads):
         values[worker, blocks * size :] = 0
-        work = np.int64(budget)
         integers[worker, 8 : 8 + QUEUE] = blocks * size
         pool = Pool(
             size,
@@ -218,27 +240,10 @@ def render_batch(  # type: ignore[no-untyped-def]
         outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), pointer(statistics), len(normal) > 0, len(statistics) > 0)
         grid, rays = packed_pointers(packed, brick), ray_pointers(batch)
         view = View(pointer(batch.view_direction), direction_rate, min_distance, density_scale, degree)
-        for run in range(runs):
-            # Neighbouring runs, along rows and columns, go to different threads.
-            if (run // columns + run % columns) % threads != worker or run < progress[worker, 0]:
-                continue
-            for n in range(progress[worker, 1] if run == progress[worker, 0] else 0, tall * wide):
-                row, column = run // columns * tall + n // wide, run % columns * wide + n % wide
-                if row < down and column < across:
-                    top, left = row * tile[0], column * tile[1]
-                    low, right = min(top + tile[0], height), min(left + tile[1], width)
-                    done = progress[worker, 2] if run == progress[worker, 0] and n == progress[worker, 1] else 0
-                    done, work = _render_tile(top, low, left, right, rays, background, grid, view, voxel, pool, scratch, outputs, done, work)
-                    if work <= 0:
-                        progress[worker, 0], progress[worker, 1], progress[worker, 2] = run, n if done >= 0 else n + 1, max(done, 0)
-                        break
-            if work <= 0:
-                break
-        if work > 0:
-            progress[worker, 0] = runs
+        _render_runs(worker, threads, budget, progress, height, tile, rays, background, grid, view, voxel, pool, scratch, outputs)
     left = 0
     for worker in range(threads):
-        left += progress[worker, 0] < runs
+        left += progress[worker, 0] != ALL_RUNS
     return left == 0
 
 
