@@ -170,7 +170,7 @@ def _targets(s: Scene, pixels: Pixels, visibility: Visibility) -> Targets:
 def _most_voxels(settings: BakeSettings, m: Any, space: Space, choice: Choice, mib: int) -> int:
     """How many voxels an asset of `mib` MiB holds."""
     from efficientnerf.asset.bake import grid_of
-    from efficientnerf.asset.serialisation import most_voxels
+    from efficientnerf.asset.file.serialisation import most_voxels
 
     shape, _ = grid_of(space.bounds, choice.resolution, settings.brick_size)
     return most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick_size)

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
-from efficientnerf.asset.layouts import LAYOUTS
-from efficientnerf.asset.memory import check_memory, needed
-from efficientnerf.asset.metadata import MAJOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of
-from efficientnerf.asset.serialisation import WRITERS, written_as
+from efficientnerf.asset.file.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
+from efficientnerf.asset.file.layouts import LAYOUTS
+from efficientnerf.asset.file.memory import check_memory, needed
+from efficientnerf.asset.file.metadata import MAJOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of
+from efficientnerf.asset.file.serialisation import WRITERS, written_as
 from efficientnerf.asset.tree import NerfTree
 
 __all__ = ["LAYOUTS", "WRITERS", "FormatError", "contents", "describe", "load", "save", "serialize"]

@@ -7,15 +7,17 @@ R rays, N stored voxels, K harmonics.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.backends import dispatch
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.rendering import environment
 from efficientnerf.rendering.harmonics import basis
 
 if TYPE_CHECKING:
@@ -183,8 +185,27 @@ def tree_density(tree: NerfTree, points: Tensor, values: Tensor) -> tuple[Tensor
     return sigma, index, weight
 
 
+def ray_parts(tree: NerfTree, origins: Tensor, directions: Tensor) -> list[tuple[int, Tensor, Tensor]]:
+    """What of rays (R, 3) of the tree's frame lies in which cascade, from front to back: the cascade, and the distances (R,) at which a part of each ray begins
+    and ends, units of the frame; a part that ends before it begins is none. The box of the cascade before is cut out of each, so that a ray may have two parts
+    in one."""
+    bounds = [torch.as_tensor(cascade.bounds(tree.brick), device=origins.device, dtype=origins.dtype) for cascade in cascades_of(tree)]
+    met = []
+    for low, high in bounds:
+        one, other = (low - origins) / directions, (high - origins) / directions
+        met.append((torch.minimum(one, other).nan_to_num(-1e30).amax(dim=-1).clamp(min=0), torch.maximum(one, other).nan_to_num(1e30).amin(dim=-1)))
+    front, back = [], []
+    for n in range(1, len(met)):
+        (enter, leave), (inner_enter, inner_leave) = met[n], met[n - 1]
+        meets = inner_leave > inner_enter
+        front.append((n, enter, torch.where(meets, inner_enter, leave)))
+        back.append((n, torch.where(meets, inner_leave, leave), leave))
+    return [*reversed(front), (0, *met[0]), *back]
+
+
 def render_reference(tree: NerfTree, origins: Tensor, directions: Tensor, density: Tensor | None = None, sh: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Colour (R, 3), premultiplied, and opacity (R,) of rays by plain sums over every step; differentiable in `density` and `sh`.
+    """Colour (R, 3), premultiplied or over the tree's environment, and opacity (R,) of rays by plain sums over every step; differentiable in `density` and
+    `sh`.
 
     origins, directions  (R, 3) world frame, unit directions
     density, sh          values to use in place of the tree's own
@@ -194,28 +215,31 @@ def render_reference(tree: NerfTree, origins: Tensor, directions: Tensor, densit
     sh = torch.as_tensor(tree.sh, device=device, dtype=dtype) if sh is None else sh
     view_directions = directions
     origins, directions, *_ = tree.frame.rays(origins, directions)
-    start = (origins - torch.as_tensor(tree.bounds_min, device=device, dtype=dtype)) / tree.voxel
-    size = torch.tensor(tree.resolution, device=device, dtype=dtype)
-    to_low, to_high = -start / directions, (size - start) / directions
-    enter = torch.minimum(to_low, to_high).nan_to_num(-1e30).amax(dim=-1).clamp(min=0)  # (R,)
-    leave = torch.maximum(to_low, to_high).nan_to_num(1e30).amin(dim=-1)
-    step = 0.5
-    most = 2 * sum(tree.resolution) + 4  # samples of a ray through the grid; distances far beyond it are rounded to more
-    count = max(0, int(torch.ceil((leave - enter).clamp(min=0).max() / step).clamp(max=most).item()) + 1) if len(enter) else 0
-    transmittance = torch.ones_like(enter)
-    colour = torch.zeros(len(enter), 3, device=device, dtype=dtype)
+    transmittance, colour = torch.ones_like(origins[:, 0]), torch.zeros_like(origins)
     harmonics = basis(view_directions, tree.degree)
-    for k in range(count):
-        t = enter + (k + 0.5) * step
-        sigma, index, weight = tree_density(tree, start + t[:, None] * directions, density)
-        alpha = 1 - torch.exp(-sigma * step * tree.voxel)
-        alpha = torch.where(t < leave, alpha, 0)
-        stored = torch.where(index >= 0, weight, 0)
-        share = stored / stored.sum(dim=-1, keepdim=True).clamp(min=1e-12)
-        mixed = torch.zeros(len(t), harmonics.shape[1], 3, device=device, dtype=dtype)
-        if len(sh):
-            mixed = (share[..., None, None] * sh[index.clamp(min=0)]).sum(dim=1)
-        rgb = torch.sigmoid((harmonics[:, :, None] * mixed).sum(dim=1))  # (R, 3)
-        colour = colour + (transmittance * alpha)[:, None] * rgb
-        transmittance = transmittance * (1 - alpha)
+    cascades = cascades_of(tree)
+    for n, begin, end in ray_parts(tree, origins, directions):
+        cascade = cascades[n]
+        grid = replace(tree, shape=cascade.shape, voxel=cascade.voxel, bounds_min=cascade.bounds_min, brick_index=cascade.brick_index, outer=())
+        start = (origins - torch.as_tensor(cascade.bounds_min, device=device, dtype=dtype)) / cascade.voxel
+        enter, leave = begin / cascade.voxel, end / cascade.voxel
+        step = 0.5
+        most = 2 * sum(grid.resolution) + 4  # samples of a ray through the grid; distances far beyond it are rounded to more
+        count = max(0, int(torch.ceil((leave - enter).clamp(min=0).max() / step).clamp(max=most).item()) + 1) if len(enter) else 0
+        for k in range(count):
+            t = enter + (k + 0.5) * step
+            sigma, index, weight = tree_density(grid, start + t[:, None] * directions, density)
+            alpha = 1 - torch.exp(-sigma * step * cascade.voxel)
+            alpha = torch.where(t < leave, alpha, 0)
+            stored = torch.where(index >= 0, weight, 0)
+            share = stored / stored.sum(dim=-1, keepdim=True).clamp(min=1e-12)
+            mixed = torch.zeros(len(t), harmonics.shape[1], 3, device=device, dtype=dtype)
+            if len(sh):
+                mixed = (share[..., None, None] * sh[index.clamp(min=0)]).sum(dim=1)
+            rgb = torch.sigmoid((harmonics[:, :, None] * mixed).sum(dim=1))  # (R, 3)
+            colour = colour + (transmittance * alpha)[:, None] * rgb
+            transmittance = transmittance * (1 - alpha)
+    if tree.environment is not None:
+        behind = environment.lookup(tree.environment, view_directions.detach().cpu().numpy())
+        colour = colour + transmittance[:, None] * torch.as_tensor(behind, device=device, dtype=dtype)
     return colour, 1 - transmittance

@@ -21,7 +21,9 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.cascades import Cascade, brick_ranges, cascades_of
 from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.region import Region
 from efficientnerf.geometry.ndc import WORLD, Frame, Ndc
 from efficientnerf.rendering.harmonics import harmonics_count
 
@@ -46,6 +48,10 @@ class NerfTree:
     ndc          the reference camera whose normalised device coordinates are the frame, or None: the frame is the world
     lookup       value of a point: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
                  where that one is not stored (EfficientNeRF, section 4.1, has the field trained on such coordinates)
+    outer        the cascades around this grid, which is cascade 0, where the tree holds a whole scene (`efficientnerf.asset.cascades`). The arrays of bricks
+                 and voxels are those of all cascades, one after the other
+    environment  (H, 2 H, 3) float32 sRGB colours by direction of what lies beyond all cascades (`efficientnerf.rendering.environment`), or None
+    region       the foreground region, or None: all is foreground (`efficientnerf.asset.region`)
     derived      what renderers made of the arrays, by name; made when first rendered, so that arrays changed in place later are not seen
 
     `sh` has the harmonics as plain floats; decoding a palette takes 12 K bytes a voxel and is cached. Renderers read `harmonics` instead.
@@ -64,6 +70,9 @@ class NerfTree:
     device: str = "cpu"
     ndc: Ndc | None = None
     lookup: str = "trilinear"
+    outer: tuple[Cascade, ...] = ()
+    environment: np.ndarray | None = None
+    region: Region | None = None
     derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -194,13 +203,14 @@ def tree_from_voxels(
 
 
 def voxel_coordinates(tree: NerfTree) -> np.ndarray:
-    """Coordinates (N, 3) int32 of the stored voxels, in their order."""
-    owner = np.full(len(tree.voxel_index), 0, np.int64)
-    cells = np.flatnonzero(tree.brick_index.reshape(-1) >= 0)
-    owner[tree.brick_index.reshape(-1)[cells]] = cells
-    brick, local = np.nonzero(tree.voxel_index >= 0)
-    cell = np.stack(np.unravel_index(owner[brick], tree.shape), axis=-1)
-    index = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
+    """Coordinates (N, 3) int32 of the stored voxels in their own cascade, in their order."""
     out = np.empty((len(tree.density_values), 3), np.int32)
-    out[tree.voxel_index[brick, local]] = index
+    for cascade, (first, end) in zip(cascades_of(tree), brick_ranges(tree) if tree.outer else [(0, len(tree.voxel_index))], strict=True):
+        owner = np.zeros(end - first, np.int64)
+        cells = np.flatnonzero(cascade.brick_index.reshape(-1) >= 0)
+        owner[cascade.brick_index.reshape(-1)[cells] - first] = cells
+        rows = tree.voxel_index[first:end]
+        brick, local = np.nonzero(rows >= 0)
+        cell = np.stack(np.unravel_index(owner[brick], cascade.shape), axis=-1)
+        out[rows[brick, local]] = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
     return out

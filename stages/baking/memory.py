@@ -78,7 +78,7 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], space: 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     from efficientnerf.asset.bake import grid_of
-    from efficientnerf.asset.serialisation import most_voxels
+    from efficientnerf.asset.file.serialisation import most_voxels
     from stages.baking.voxels import MAX_OVERSHOOT, finest_choice
 
     settings, degree = job.settings, m.fine.degree

@@ -45,7 +45,8 @@ def voxel_space(job: Job, m: Any) -> Space:
 
 def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) -> tuple[Choice, Visibility, np.ndarray]:
     """The resolution, the visibility of voxels at it, and the coordinates (N, 3) of the voxels to bake."""
-    from efficientnerf.asset import bake, serialisation
+    from efficientnerf.asset import bake
+    from efficientnerf.asset.file import serialisation
     from stages.baking.resolution import affordable_resolution
 
     settings: BakeSettings = job.settings

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.container import DTYPES
+from efficientnerf.asset.file.container import DTYPES
 from efficientnerf.asset.format import LAYOUTS, serialize
 from efficientnerf.asset.tree import NerfTree
 from tests.efficientnerf.trees import random_tree

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from efficientnerf.asset.cascades import cascade_grids, nested
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from tests.efficientnerf.balls import pose
@@ -33,6 +35,17 @@ def uniform_tree(shape: tuple[int, int, int] = (4, 4, 4), *, brick: int = 4, vox
     indices = np.argwhere(np.ones(np.array(shape) * brick, bool))
     sh = np.full((len(indices), 1, 3), logit / 0.28209479177387814, np.float32)
     return tree_from_voxels(shape, voxel, LOW, indices, np.full(len(indices), sigma, np.float32), sh, brick=brick)
+
+
+def random_cascades(seed: int = 0, *, count: int = 3, cells: int = 4, brick: int = 3, degree: int = 1, share: float = 0.25, **more: Any) -> NerfTree:
+    """Nested random trees, each twice as wide as the one before, with an environment map."""
+    rng = np.random.default_rng(seed)
+    bounds = np.stack([LOW, LOW + cells * brick * 0.1])
+    trees = []
+    for shape, voxel, low in cascade_grids(bounds, 0.1, brick, count):
+        one = random_tree(int(rng.integers(2**31)), shape=shape, brick=brick, degree=degree, share=share, sigma=30.0 * 0.1 / voxel)
+        trees.append(replace(one, voxel=voxel, bounds_min=low, **more))
+    return nested(trees, rng.integers(0, 256, (8, 16, 3)).astype(np.float32) / np.float32(255))
 
 
 def rays_at(tree: NerfTree, count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

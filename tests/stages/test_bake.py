@@ -15,7 +15,8 @@ import pytest
 import torch
 
 from efficientnerf.asset import bake as baking
-from efficientnerf.asset import format, serialisation
+from efficientnerf.asset import format
+from efficientnerf.asset.file import serialisation
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
 from efficientnerf.rendering.compositing import activate

@@ -9,7 +9,7 @@ import click
 from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option
 
 DIFFERENT = 6  # exit code of `enerf diff`; 1 would be that of a defect
-LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asset.serialisation.WRITERS, which a test compares; that import is heavy
+LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asset.file.serialisation.WRITERS, which a test compares; that import is heavy
 
 
 @click.command(short_help="Compare two assets: metadata, tensors, renders.")

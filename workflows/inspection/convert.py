@@ -13,7 +13,7 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
     Raises UsageError for a degree or a resolution above its own, BadInput and CorruptArtifact as `load_asset`.
     """
     from efficientnerf.asset import conversion, format
-    from efficientnerf.asset.metadata import layout_of
+    from efficientnerf.asset.file.metadata import layout_of
     from pipeline.errors import UsageError
     from workflows.cli.target import asset_of, load_asset
 
@@ -39,7 +39,7 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
 
 def writer_of(about: dict[str, Any]) -> str:
     """The writer that made a file of this description, or the nearest one."""
-    from efficientnerf.asset.metadata import layout_of
+    from efficientnerf.asset.file.metadata import layout_of
 
     layout = layout_of(about)
     if layout == "compact":

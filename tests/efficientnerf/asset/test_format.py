@@ -17,10 +17,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from efficientnerf.asset import container, format
-from efficientnerf.asset.container import HEADER_LIMIT
+from efficientnerf.asset import format
+from efficientnerf.asset.file import container
+from efficientnerf.asset.file.container import HEADER_LIMIT
+from efficientnerf.asset.file.metadata import MAJOR, STRUCTURE
 from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, save, serialize
-from efficientnerf.asset.metadata import MAJOR, STRUCTURE
 from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.container import FormatError
+from efficientnerf.asset.file.container import FormatError
 from efficientnerf.geometry.ndc import NUMBERS, Ndc
 from efficientnerf.rendering.harmonics import MAX_DEGREE
 

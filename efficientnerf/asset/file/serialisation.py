@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.container import FormatError
-from efficientnerf.asset.layouts import LIMIT
+from efficientnerf.asset.file.container import FormatError
+from efficientnerf.asset.file.layouts import LIMIT
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.harmonics import harmonics_count

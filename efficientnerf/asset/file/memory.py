@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.container import FormatError
+from efficientnerf.asset.file.container import FormatError
 from efficientnerf.rendering.harmonics import harmonics_count
 
 TIMES, BESIDES = 8, 200_000_000  # of the file's size, and bytes

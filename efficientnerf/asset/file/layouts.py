@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.container import FormatError
+from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.rendering.harmonics import harmonics_count
 

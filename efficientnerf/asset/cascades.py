@@ -1,0 +1,165 @@
+"""The nested grids of a tree that holds a whole scene (instant-ngp's cascades).
+
+Cascade 0 is the tree's own grid. Each one after it has voxels twice as large and encloses the one before, which is cut out of it: a point belongs to the
+first cascade whose box holds it. Rays are straight throughout. The faces of each box lie on faces of the next cascade's coarse cells. What lies beyond the
+last box is the tree's environment map.
+
+Voxels of a cascade may be stored inside of the box before: values just outside of that box are interpolated from them.
+
+B bricks, N stored voxels of all cascades, R rays, L cascades.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.asset.palettes import PaletteHarmonics
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+MAX_CASCADES = 16
+ALIGNED_CELLS = 4  # coarse cells of cascade 0 along an axis are a multiple of this, so that a box of twice the size has its cells on this one's faces
+
+
+@dataclass(frozen=True, eq=False)
+class Cascade:
+    """A grid of a tree, in the tree's frame.
+
+    shape        coarse cells along x, y, z
+    voxel        side of a voxel
+    bounds_min   (3,) float64 corner
+    brick_index  shape int32: rows of the tree's `voxel_index`, -1 where a cell is empty
+    """
+
+    shape: tuple[int, int, int]
+    voxel: float
+    bounds_min: np.ndarray
+    brick_index: np.ndarray
+
+    def bounds(self, brick: int) -> np.ndarray:
+        """(2, 3) corners, for so many voxels along a coarse cell."""
+        return np.stack([self.bounds_min, self.bounds_min + np.asarray(self.shape) * brick * self.voxel])
+
+
+def cascade_grids(bounds: np.ndarray, voxel: float, brick: int, count: int) -> list[tuple[tuple[int, int, int], float, np.ndarray]]:
+    """Shape, voxel side and corner (3,) of `count` cascades of which the innermost covers `bounds` (2, 3), with some room where that does not fit its cells;
+    each box has twice the sides of the one before, about the same centre."""
+    bounds = np.asarray(bounds, np.float64)
+    if count == 1:
+        cells = np.ceil(np.round((bounds[1] - bounds[0]) / (voxel * brick), 6)).astype(int).clip(1)
+        return [((int(cells[0]), int(cells[1]), int(cells[2])), float(voxel), bounds[0].copy())]
+    cells = ALIGNED_CELLS * np.ceil(np.round((bounds[1] - bounds[0]) / (voxel * brick * ALIGNED_CELLS), 6)).astype(int).clip(1)
+    centre = bounds.mean(axis=0)
+    shape = (int(cells[0]), int(cells[1]), int(cells[2]))
+    return [(shape, voxel * 2.0**n, centre - cells * (brick * voxel * 2.0**n / 2)) for n in range(count)]
+
+
+def cascades_of(tree: NerfTree) -> tuple[Cascade, ...]:
+    """All grids of a tree, the innermost first."""
+    return Cascade(tree.shape, tree.voxel, tree.bounds_min, tree.brick_index), *tree.outer
+
+
+def check_cascades(tree: NerfTree) -> None:
+    """Raises ValueError unless the cascades nest as the module says."""
+    cascades = cascades_of(tree)
+    if len(cascades) > MAX_CASCADES:
+        raise ValueError(f"{len(cascades)} cascades; expected at most {MAX_CASCADES}")
+    if len(cascades) > 1 and tree.ndc is not None:
+        raise ValueError("cascades around normalised device coordinates, which reach to infinity themselves")
+    for n in range(1, len(cascades)):
+        inner, outer = cascades[n - 1], cascades[n]
+        if outer.voxel != tree.voxel * 2.0**n:
+            raise ValueError(f"cascade {n} has voxels of {outer.voxel:g}; expected {tree.voxel * 2.0**n:g}")
+        cells = (inner.bounds(tree.brick) - outer.bounds_min) / (outer.voxel * tree.brick)  # (2, 3)
+        if np.abs(cells - np.round(cells)).max() > 1e-3:
+            raise ValueError(f"the box of cascade {n - 1} does not lie on faces of the coarse cells of cascade {n}")
+        if (np.round(cells[0]) < 0).any() or (np.round(cells[1]) > outer.shape).any():
+            raise ValueError(f"cascade {n} does not enclose cascade {n - 1}")
+
+
+def brick_ranges(tree: NerfTree) -> list[tuple[int, int]]:
+    """First brick and end of each cascade; ValueError where the bricks of a cascade do not follow those of the one before."""
+    ranges, first = [], 0
+    for cascade in cascades_of(tree):
+        owned = cascade.brick_index[cascade.brick_index >= 0]
+        if len(owned) and (owned.min() != first or owned.max() != first + len(owned) - 1):
+            raise ValueError("the bricks of the cascades are not one after the other")
+        ranges.append((first, first + len(owned)))
+        first += len(owned)
+    return ranges
+
+
+def voxel_cascades(tree: NerfTree) -> np.ndarray:
+    """(N,) uint8: the cascade of each stored voxel."""
+    out = np.zeros(len(tree.density_values), np.uint8)
+    for n, (first, end) in enumerate(brick_ranges(tree)):
+        rows = tree.voxel_index[first:end]
+        out[rows[rows >= 0]] = n
+    return out
+
+
+def voxel_sides(tree: NerfTree) -> np.ndarray:
+    """(N,) float32: side of each stored voxel."""
+    return np.asarray([cascade.voxel for cascade in cascades_of(tree)], np.float32)[voxel_cascades(tree)]
+
+
+def cascade_tree(tree: NerfTree, number: int) -> NerfTree:
+    """One cascade as a tree of its own, without the environment."""
+    cascade, (first, end) = cascades_of(tree)[number], brick_ranges(tree)[number]
+    rows = tree.voxel_index[first:end]
+    voxels = rows[rows >= 0]
+    index = np.full(rows.shape, -1, np.int32)
+    index[rows >= 0] = np.arange(len(voxels), dtype=np.int32)
+    harmonics = tree.harmonics.subset(voxels) if isinstance(tree.harmonics, PaletteHarmonics) else tree.harmonics[voxels]
+    return replace(
+        tree, shape=cascade.shape, voxel=cascade.voxel, bounds_min=cascade.bounds_min,
+        brick_index=np.where(cascade.brick_index >= 0, cascade.brick_index - first, -1).astype(np.int32),
+        voxel_index=index, density_values=tree.density_values[voxels], harmonics=harmonics, outer=(), environment=None, region=None,
+    )  # fmt: skip
+
+
+def nested(trees: Sequence[NerfTree], environment: np.ndarray | None = None) -> NerfTree:
+    """One tree of several, the innermost first, each of which becomes a cascade; metadata and background are those of the first. Harmonics must be plain.
+
+    Raises ValueError, see `check_cascades`.
+    """
+    bricks = voxels = 0
+    cascades, rows = [], []
+    for tree in trees:
+        if tree.outer or isinstance(tree.harmonics, PaletteHarmonics):
+            raise ValueError("a cascade is one grid of voxels with plain harmonics")
+        cascades.append(Cascade(tree.shape, tree.voxel, tree.bounds_min, np.where(tree.brick_index >= 0, tree.brick_index + bricks, -1).astype(np.int32)))
+        rows.append(np.where(tree.voxel_index >= 0, tree.voxel_index + voxels, -1).astype(np.int32))
+        bricks, voxels = bricks + len(tree.voxel_index), voxels + len(tree.density_values)
+    joined = replace(
+        trees[0], brick_index=cascades[0].brick_index, voxel_index=np.concatenate(rows), density_values=np.concatenate([tree.density_values for tree in trees]),
+        harmonics=np.concatenate([tree.sh for tree in trees]), outer=tuple(cascades[1:]), environment=environment,
+    )  # fmt: skip
+    check_cascades(joined)
+    return joined
+
+
+def subset(tree: NerfTree, keep: np.ndarray) -> NerfTree:
+    """The tree with some of its voxels, (N,) bool, alone, in their order; bricks without any are dropped."""
+    keep = np.asarray(keep, bool)
+    new = np.where(keep, np.cumsum(keep) - 1, -1).astype(np.int32)
+    rows = np.where(tree.voxel_index >= 0, new[tree.voxel_index], -1).astype(np.int32) if len(new) else tree.voxel_index
+    used = (rows >= 0).any(axis=1)
+    number = np.where(used, np.cumsum(used) - 1, -1).astype(np.int32)
+
+    def renumbered(index: np.ndarray) -> np.ndarray:
+        return np.where(index >= 0, number[index], -1).astype(np.int32) if len(number) else index
+
+    harmonics = tree.harmonics.subset(np.flatnonzero(keep)) if isinstance(tree.harmonics, PaletteHarmonics) else tree.harmonics[keep]
+    region = tree.region
+    if region is not None and region.bricks is not None:
+        region = replace(region, bricks=region.bricks[used])
+    return replace(
+        tree, brick_index=renumbered(tree.brick_index), voxel_index=rows[used], density_values=tree.density_values[keep], harmonics=harmonics,
+        outer=tuple(replace(cascade, brick_index=renumbered(cascade.brick_index)) for cascade in tree.outer), region=region,
+    )  # fmt: skip

@@ -1,0 +1,108 @@
+"""Nested grids: how they nest, which voxels belong to which, and the reference render of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.asset.cascades import (
+    brick_ranges,
+    cascade_grids,
+    cascade_tree,
+    cascades_of,
+    check_cascades,
+    nested,
+    subset,
+    voxel_cascades,
+    voxel_sides,
+)
+from efficientnerf.asset.rendering import render_reference
+from efficientnerf.asset.tree import voxel_coordinates
+from efficientnerf.rendering import environment
+from tests.efficientnerf.trees import LOW, random_cascades, rays_at, uniform_tree
+
+
+def rendered(tree, origins, directions):  # type: ignore[no-untyped-def]
+    return [part.numpy() for part in render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))]
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_grids_nest_and_cover_the_bounds(count: int) -> None:
+    bounds = np.array([[-1.0, -0.7, -0.2], [1.0, 0.4, 0.3]])
+    grids = cascade_grids(bounds, 0.013, 4, count)
+    assert len(grids) == count
+    shape, voxel, low = grids[0]
+    assert (low <= bounds[0] + 1e-9).all()
+    assert (low + np.array(shape) * 4 * voxel >= bounds[1] - 1e-9).all()
+    trees = [replace(uniform_tree((1, 1, 1)), shape=s, voxel=v, bounds_min=b, brick_index=np.full(s, -1, np.int32),
+                     voxel_index=np.zeros((0, 64), np.int32), density_values=np.zeros(0, np.float32), harmonics=np.zeros((0, 1, 3), np.float32))
+             for s, v, b in grids]  # fmt: skip
+    check_cascades(nested(trees))
+
+
+def test_cascades_come_apart_again() -> None:
+    tree = random_cascades(3)
+    assert len(cascades_of(tree)) == 3
+    ranges, cascade_of = brick_ranges(tree), voxel_cascades(tree)
+    assert ranges[0][0] == 0
+    assert ranges[-1][1] == len(tree.voxel_index)
+    parts = [cascade_tree(tree, n) for n in range(3)]
+    np.testing.assert_array_equal(np.concatenate([part.density_values for part in parts]), tree.density_values)
+    np.testing.assert_array_equal(np.concatenate([voxel_coordinates(part) for part in parts]), voxel_coordinates(tree))
+    np.testing.assert_allclose(voxel_sides(tree), tree.voxel * 2.0**cascade_of, rtol=1e-6)
+    again = nested(parts, tree.environment)
+    np.testing.assert_array_equal(again.voxel_index, tree.voxel_index)
+    for one, other in zip(again.outer, tree.outer, strict=True):
+        np.testing.assert_array_equal(one.brick_index, other.brick_index)
+
+
+def test_a_subset_renders_as_the_tree_with_the_others_emptied() -> None:
+    tree = random_cascades(4)
+    keep = np.random.default_rng(0).random(len(tree.density_values)) < 0.4
+    origins, directions = rays_at(tree, 40)
+    some = rendered(subset(tree, keep), origins, directions)[1]
+    emptied = rendered(replace(tree, density_values=np.where(keep, tree.density_values, 0).astype(np.float32)), origins, directions)[1]
+    np.testing.assert_allclose(some, emptied, atol=1e-6)
+    assert some.max() > 0.05
+
+
+def test_a_uniform_medium_absorbs_by_the_length_of_the_path() -> None:
+    """Whatever the cascades: opacity = 1 - exp(-density length)."""
+    sigma, grids = 0.8, cascade_grids(np.stack([LOW, LOW + 1.6]), 0.1, 4, 3)
+    tree = nested([replace(uniform_tree(shape, brick=4, sigma=sigma), voxel=voxel, bounds_min=low) for shape, voxel, low in grids])
+    _, _, low = grids[-1]
+    start = low + np.array([0.02, 3.1, 3.2])
+    origins, directions = start[None], np.array([[1.0, 0.0, 0.0]])
+    opacity = rendered(tree, origins, directions)[1][0]
+    assert abs(opacity - (1 - np.exp(-sigma * (6.4 - 0.02)))) < 0.02
+
+
+def test_rays_that_meet_nothing_show_the_environment() -> None:
+    tree = random_cascades(5)
+    empty = replace(tree, density_values=np.zeros_like(tree.density_values))
+    origins, directions = rays_at(tree, 20)
+    colour, opacity = rendered(empty, origins, directions)
+    assert tree.environment is not None
+    np.testing.assert_allclose(colour, environment.lookup(tree.environment, directions), atol=1e-6)
+    assert (opacity == 0).all()
+
+
+def test_directions_of_texels_look_up_their_texels() -> None:
+    image = np.random.default_rng(1).random((6, 12, 3)).astype(np.float32)
+    np.testing.assert_allclose(environment.lookup(image, environment.directions_of(6, 12).reshape(-1, 3)), image.reshape(-1, 3), atol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", ["voxel", "shifted", "smaller"])
+def test_cascades_that_do_not_nest_are_refused(wrong: str) -> None:
+    tree = random_cascades(6)
+    first = tree.outer[0]
+    changed = {
+        "voxel": replace(first, voxel=first.voxel * 1.01),
+        "shifted": replace(first, bounds_min=first.bounds_min + 0.5 * first.voxel),
+        "smaller": replace(first, bounds_min=tree.bounds_min + 2 * tree.brick * first.voxel),
+    }[wrong]
+    with pytest.raises(ValueError, match="cascade"):
+        check_cascades(replace(tree, outer=(changed, *tree.outer[1:])))
