@@ -1,13 +1,24 @@
 """The foreground region of a tree: what of a whole scene is its subject, chosen when it is rendered or exported.
 
+`foreground` and `cropped` return a tree with less in it, which everything downstream takes as any other.
+
 B bricks, N stored voxels.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+from efficientnerf.asset.cascades import brick_ranges, cascades_of, subset
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Similarity
+
+REGIONS = ("foreground", "all")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,3 +35,77 @@ class Region:
     corner_radius: float = 0.0
     fade: float = 0.0
     bricks: np.ndarray | None = None
+
+
+def inside_distance(region: Region, points: np.ndarray) -> np.ndarray:
+    """(N,) how far points (N, 3) of the tree's frame lie inside of the region's sides; negative outside."""
+    bounds = np.asarray(region.bounds, np.float64)
+    beyond = np.abs(np.asarray(points, np.float64) - bounds.mean(axis=0)) - (bounds[1] - bounds[0]) / 2  # (N, 3)
+    radius = min(float(region.corner_radius), float((bounds[1] - bounds[0])[:2].min()) / 2)
+    plan = beyond[:, :2] + radius
+    across = np.linalg.norm(np.maximum(plan, 0), axis=1) + np.minimum(plan.max(axis=1), 0) - radius
+    return np.asarray(-np.maximum(across, beyond[:, 2]))
+
+
+def inside_share(region: Region, points: np.ndarray) -> np.ndarray:
+    """(N,) how much of the density at points (N, 3) of the tree's frame belongs to the region's box: 1 inside of the band, 0 outside of its sides."""
+    distance = inside_distance(region, points)
+    if region.fade <= 0:
+        return (distance > 0).astype(np.float64)
+    share = np.clip(distance / region.fade, 0, 1)
+    return np.asarray(share * share * (3 - 2 * share))
+
+
+def voxel_centres(tree: NerfTree) -> np.ndarray:
+    """(N, 3) float64 centres of the stored voxels of all cascades, in the tree's frame."""
+    out = np.empty((len(tree.density_values), 3))
+    for cascade, (first, end) in zip(cascades_of(tree), brick_ranges(tree) if tree.outer else [(0, len(tree.voxel_index))], strict=True):
+        cells = np.flatnonzero(cascade.brick_index.reshape(-1) >= 0)
+        owner = np.zeros(end - first, np.int64)
+        owner[cascade.brick_index.reshape(-1)[cells] - first] = cells
+        rows = tree.voxel_index[first:end]
+        brick, local = np.nonzero(rows >= 0)
+        cell = np.stack(np.unravel_index(owner[brick], cascade.shape), axis=-1)
+        at = cell * tree.brick + np.stack(np.unravel_index(local, (tree.brick,) * 3), axis=-1)
+        out[rows[brick, local]] = cascade.bounds_min + (at + 0.5) * cascade.voxel
+    return out
+
+
+def foreground(tree: NerfTree) -> NerfTree:
+    """The tree with what lies in its region alone: no other voxels, densities faded in the region's band, no environment, no outer cascades that would be
+    empty. The result has no region: all of it is foreground. A tree without a region is returned as it is."""
+    region = tree.region
+    if region is None:
+        return tree
+    share = inside_share(region, voxel_centres(tree))
+    if region.bricks is not None:
+        brick, local = np.nonzero(tree.voxel_index >= 0)
+        share[tree.voxel_index[brick, local]] *= np.asarray(region.bricks, bool)[brick]
+    return _restricted(tree, share)
+
+
+def cropped(tree: NerfTree, corners: np.ndarray, world_from_capture: Similarity) -> NerfTree:
+    """The tree with the voxels alone whose centres lie in a box that is aligned with the axes of the capture's frame; no environment, no region.
+
+    corners  (2, 3) opposite corners in the capture's frame, in any order
+
+    Raises ValueError for a box without volume.
+    """
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    if np.shape(corners) != (2, 3) or not np.isfinite(corners).all() or not (high > low).all():
+        raise ValueError(f"box from {low.tolist()} to {high.tolist()}; expected two opposite corners of a box with some volume")
+    points = voxel_centres(tree)
+    points = points if tree.ndc is None else np.asarray(tree.ndc.world(points))
+    with np.errstate(invalid="ignore"):  # at infinity, in normalised device coordinates
+        at = world_from_capture.inverse().points(points)
+        inside = (at >= low).all(axis=1) & (at <= high).all(axis=1)
+    return _restricted(tree, inside.astype(np.float64))
+
+
+def _restricted(tree: NerfTree, share: np.ndarray) -> NerfTree:
+    """The tree with its densities times `share` (N,); voxels without a share are dropped."""
+    kept = subset(replace(tree, region=None, environment=None), share > 0)
+    occupied = [bool((cascade.brick_index >= 0).any()) for cascade in kept.outer]
+    outer = kept.outer[: max((n + 1 for n, any_there in enumerate(occupied) if any_there), default=0)]
+    density = (kept.density_values * share[share > 0]).astype(np.float32)
+    return replace(kept, outer=outer, density_values=density)

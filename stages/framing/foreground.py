@@ -1,0 +1,301 @@
+"""The foreground region of a trained scene: where its subject is, found from the points at which the rays of its photographs end.
+
+Sparse points are not enough: what is plain, thin or close has none. The trained field's depths cover every pixel. They are counted in the cells of a coarse
+grid; a cell is *trusted* where several views end in it and few see through it, which floaters fail. Where the view axes meet, the subject is what stands
+before the planes that support it (floor, table, wall), connected with what the middles of the photographs show; it may reach out of most pictures. The
+planes are clipped around it. Without such a subject (a street, a facade) the region is what is well observed.
+
+P points, M cells, C cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from efficientnerf.asset.region import Region, inside_distance
+from efficientnerf.geometry.cameras import Camera, project
+
+MIN_POINTS = 200
+MIN_OPACITY = 0.5
+MAX_CAMERAS = 64  # evenly spaced over the capture
+MAX_CELLS = 40_000
+CELLS_TO_FOCUS = 40  # along the distance from the cameras to what they look at
+NEIGHBOURS = 4  # samples of a view that a cell is compared with
+CENTRAL = 0.4  # of half the image: rays in its middle
+NEAR_QUANTILE = 0.35  # of a view's central distances: its subject, behind which there is always something
+OBSERVED, REACHED = 0.6, 0.2  # views of a cell over those of the cells with most: what is well observed; what the subject may still reach into
+FARTHEST, PATH_FARTHEST = 1.6, 3.0  # distance of a cell from its views over the usual distance
+MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
+SUPPORT_TRIES, MAX_SUPPORTS = 400, 3
+MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane holds; of the central rays that end before it, that end behind it: supports hide
+MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.25, 0.012  # of the longest side
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of the grid in which rays end.
+
+    side      of a cell
+    centres   (M, 3) mean of the points in each
+    agree     (M,) views whose rays end there
+    against   (M,) views that see through it
+    in_view   (M,) views that have it in view, hidden or not
+    distance  (M,) mean distance of the views that agree
+    nearest   (M,) least distance from a camera
+    central   (M,) weight of the central rays that end there
+    """
+
+    side: float
+    centres: np.ndarray
+    agree: np.ndarray
+    against: np.ndarray
+    in_view: np.ndarray
+    distance: np.ndarray
+    nearest: np.ndarray
+    central: np.ndarray
+
+    @property
+    def trusted(self) -> np.ndarray:
+        """(M,) bool."""
+        return (self.agree >= np.minimum(3, np.maximum(1, self.in_view))) & (self.agree >= self.against)
+
+
+def find_foreground(
+    points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], *, weights: np.ndarray | None = None
+) -> Region | None:
+    """The foreground region of a capture, in the training frame; None where the rays say too little.
+
+    points   (P, 3) where rays of the photographs end (their median depth), training frame; not finite where a ray ends nowhere
+    views    (P,) which camera each belongs to
+    pixels   (P, 2) x, y in its image, from -1 to 1
+    cameras  in the training frame, z up
+    weights  (P,) opacity of each ray; None: 1. Rays of less than half end nowhere
+
+    Deterministic. A few thousand rays of each photograph are enough.
+    """
+    views = np.asarray(views, np.int64)
+    chosen = np.arange(len(cameras))[:: -(-len(cameras) // MAX_CAMERAS)] if len(cameras) else np.arange(0)
+    number = np.full(len(cameras), -1)
+    number[chosen] = np.arange(len(chosen))
+    keep = number[views] >= 0 if len(cameras) else np.zeros(len(views), bool)
+    points, views, pixels = np.array(points, np.float64)[keep], number[views[keep]], np.asarray(pixels, np.float64)[keep]
+    cameras = [cameras[n] for n in chosen]
+    ends = np.isfinite(points).all(axis=1)
+    if weights is not None:
+        ends &= np.asarray(weights)[keep] >= MIN_OPACITY
+    points[~ends] = np.inf
+    if ends.sum() < MIN_POINTS:
+        return None
+    focus, reach, converging = find_focus(points, views, pixels, cameras)
+    cells = observed_cells(points, views, pixels, cameras, reach / CELLS_TO_FOCUS)
+    trusted = cells.trusted
+    if trusted.sum() < 10:
+        return None
+    if not converging:
+        return _region_of(cells, trusted & (cells.distance <= PATH_FARTHEST * reach), np.zeros(len(trusted), bool), False)
+    share = cells.in_view / max(1.0, float(np.quantile(cells.in_view[trusted], 0.95)))
+    centres = np.array([camera.centre for camera in cameras])
+    ring = np.linalg.norm(centres[:, :2] - focus[:2], axis=1)
+    inside = np.linalg.norm(cells.centres[:, :2] - focus[:2], axis=1) <= max(0.9 * float(np.median(ring)), 0.5 * reach)
+    close = trusted & (cells.distance <= FARTHEST * reach) & (cells.nearest >= 0.1 * reach) & (inside | (not _all_round(centres, focus)))
+    observed = close & (share >= OBSERVED)
+    if not observed.any():
+        return _region_of(cells, trusted, np.zeros(len(trusted), bool), False)
+    support, level, hidden = find_support(cells, observed, close, centres, reach)
+    subject = _subject(cells, close & ~support & ~hidden & (share >= REACHED), observed)
+    if cells.central[subject].sum() < MIN_SHARE * cells.central[close].sum():
+        return _region_of(cells, observed, np.zeros(len(trusted), bool), level)
+    return _region_of(cells, subject, support & close, level)
+
+
+def find_focus(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, float, bool]:
+    """What the middles of the photographs show: a point (3,), the usual distance from the cameras, and whether it is one place for all of them.
+
+    points that are not finite belong to rays that end nowhere.
+    """
+    distance = np.linalg.norm(points - np.array([camera.centre for camera in cameras])[views], axis=1)
+    middle = np.isfinite(distance) & (np.linalg.norm(pixels, axis=1) <= CENTRAL)
+    seen, reaches = [], []
+    for number in range(len(cameras)):
+        mine = np.flatnonzero(middle & (views == number))
+        if len(mine) >= 3:
+            reach = float(np.quantile(distance[mine], NEAR_QUANTILE))
+            seen.append(np.median(points[mine[distance[mine] <= 1.2 * reach]], axis=0))
+            reaches.append(reach)
+    if not seen:
+        finite = np.isfinite(distance)
+        return np.median(points[finite], axis=0), float(np.median(distance[finite])), False
+    reach = float(np.median(reaches))
+    # The points that are seen lie on the surface, towards their cameras. Where they go with the cameras there is no subject.
+    centres = np.array([camera.centre for camera in cameras])
+    focus, converging = _meeting_point(cameras)
+    off = np.median(np.linalg.norm(np.array(seen) - np.median(seen, axis=0), axis=1))
+    if not converging:
+        focus = np.median(seen, axis=0)
+        converging = bool(off <= 0.35 * reach and off <= 0.5 * max(float(np.median(np.linalg.norm(centres - focus, axis=1))), 1e-9))
+    return focus, reach, converging
+
+
+def _meeting_point(cameras: Sequence[Camera]) -> tuple[np.ndarray, bool]:
+    """The point nearest to all view axes, and whether they meet there, before the cameras and from different sides."""
+    centres, forward = np.array([camera.centre for camera in cameras]), np.array([camera.forward for camera in cameras])
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (C, 3, 3)
+    point = centres.mean(axis=0)
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < 0.03:  # about 10 degrees apart
+        return point, False
+    weight = np.ones(len(cameras))
+    for _ in range(20):
+        point = np.linalg.solve((weight[:, None, None] * across).sum(0), (weight[:, None, None] * across @ centres[:, :, None]).sum(0)[:, 0])
+        miss = np.linalg.norm((across @ (point - centres)[:, :, None])[..., 0], axis=1)
+        weight = 1 / (1 + (miss / max(float(np.median(miss)), 1e-12)) ** 2)
+    ahead = ((point - centres) * forward).sum(axis=1)
+    return point, bool((ahead > 0).mean() >= 0.8 and np.median(miss) < 0.5 * np.median(np.linalg.norm(point - centres, axis=1)))
+
+
+def _all_round(centres: np.ndarray, focus: np.ndarray) -> bool:
+    """Whether the cameras stand on all sides of a point: no gap of half a turn."""
+    azimuth = np.sort(np.arctan2(*(centres - focus)[:, 1::-1].T))
+    return bool(np.diff(np.append(azimuth, azimuth[0] + 2 * np.pi)).max() < np.pi)
+
+
+def observed_cells(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], side: float) -> Cells:
+    """The cells, of about this side or larger, in which rays end."""
+    from scipy.spatial import cKDTree
+
+    ends = np.flatnonzero(np.isfinite(points).all(axis=1))
+    while True:
+        index = np.floor(points[ends] / side)
+        index = index[(np.abs(index) < 2**20).all(axis=1)]
+        kept = ends[(np.abs(np.floor(points[ends] / side)) < 2**20).all(axis=1)]
+        _, cell, count = np.unique(index, axis=0, return_inverse=True, return_counts=True)
+        if len(count) <= MAX_CELLS:
+            break
+        side *= 1.4
+    cell = cell.reshape(-1)
+    centres = np.stack([np.bincount(cell, points[kept, axis], len(count)) for axis in range(3)], axis=1) / np.maximum(count, 1)[:, None]
+    central = np.bincount(cell, np.exp(-((pixels[kept] / CENTRAL) ** 2).sum(axis=1)), len(count))
+    agree, against, in_view = (np.zeros(len(count), np.int64) for _ in range(3))
+    total, nearest = np.zeros(len(count)), np.full(len(count), np.inf)
+    for number, camera in enumerate(cameras):
+        mine = np.flatnonzero(views == number)
+        place, depth = project(camera, centres)
+        place = 2 * place / (camera.width, camera.height) - 1
+        with np.errstate(invalid="ignore"):
+            seen = np.flatnonzero((depth > 0) & (np.abs(place) <= 1).all(axis=1))
+        distance = np.linalg.norm(centres - camera.centre, axis=1)
+        nearest = np.minimum(nearest, distance)
+        in_view[seen] += 1
+        if not len(mine) or not len(seen):
+            continue
+        found = cKDTree(pixels[mine]).query(place[seen], k=min(NEIGHBOURS, len(mine)))[1].reshape(len(seen), -1)
+        beyond = np.linalg.norm(points[mine] - camera.centre, axis=1)[found] - distance[seen, None]
+        tolerance = (1.5 * side + 0.02 * distance[seen])[:, None]
+        ends_there = (np.abs(beyond) <= tolerance).any(axis=1)
+        agree[seen] += ends_there
+        against[seen] += (beyond > tolerance).all(axis=1)
+        total[seen] += np.where(ends_there, distance[seen], 0)
+    return Cells(side, centres, agree, against, in_view, np.where(agree > 0, total / np.maximum(agree, 1), np.inf), nearest, central)
+
+
+def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras: np.ndarray, reach: float) -> tuple[np.ndarray, bool, np.ndarray]:
+    """Cells (M,) on the planes that support the subject, whether one of them is level, and the cells behind a plane.
+
+    A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of what the photographs' middles show beside it.
+    """
+    tolerance = max(1.5 * cells.side, 0.03 * reach)
+    support, hidden, level = np.zeros(len(observed), bool), np.zeros(len(observed), bool), False
+    left = observed.copy()
+    for _ in range(MAX_SUPPORTS):
+        found = _plane(cells.centres[left], tolerance)
+        if found is None:
+            break
+        normal, offset = found
+        if np.median(cameras @ normal - offset) < 0:
+            normal, offset = -normal, -offset
+        height = cells.centres @ normal - offset
+        on = left & (np.abs(height) <= tolerance)
+        if on.sum() < MIN_SUPPORT * observed.sum():
+            break
+        left &= ~on
+        before, behind = (float(cells.central[close & part].sum()) for part in (height > tolerance, height < -tolerance))
+        if (cameras @ normal > offset + tolerance).mean() < 0.8 or behind > MAX_BEHIND * before:
+            continue
+        support |= np.abs(height) <= tolerance
+        hidden |= height < -tolerance
+        level |= bool(normal[2] > 0.8)
+    return support, level, hidden & ~support
+
+
+def _plane(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, float] | None:
+    """Normal and offset of the plane with most of the points (N, 3) within a tolerance."""
+    if len(points) < 3:
+        return None
+    generator = np.random.default_rng(0)
+    triple = points[generator.integers(0, len(points), (SUPPORT_TRIES, 3))]
+    normals = np.cross(triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    good = length > 1e-12
+    if not good.any():
+        return None
+    normals = normals[good] / length[good, None]
+    offsets = (normals * triple[good, 0]).sum(axis=1)
+    counts = [(np.abs(points @ normal - offset) <= tolerance).sum() for normal, offset in zip(normals, offsets, strict=True)]
+    best = int(np.argmax(counts))
+    normal, offset = normals[best], float(offsets[best])
+    for _ in range(3):
+        near = points[np.abs(points @ normal - offset) <= tolerance]
+        if len(near) < 3:
+            break
+        middle = near.mean(axis=0)
+        normal = np.linalg.eigh((near - middle).T @ (near - middle))[1][:, 0]
+        offset = float(normal @ middle)
+    return normal, offset
+
+
+def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """(M,) bool: connected parts of the candidates that hold some of the central rays where they are well observed."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    at = np.flatnonzero(candidates)
+    out = np.zeros(len(candidates), bool)
+    if not len(at):
+        return out
+    pairs = cKDTree(cells.centres[at]).query_pairs(2.2 * cells.side, output_type="ndarray")
+    count, part = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(at), len(at))), directed=False)
+    held = np.bincount(part, np.where(observed[at], cells.central[at], 0.0), count)
+    out[at] = (held >= MIN_PART * held.sum())[part] & (held[part] > 0)
+    return out
+
+
+def _region_of(cells: Cells, subject: np.ndarray, support: np.ndarray, level: bool) -> Region:
+    """A region round the subject's cells and the support beside them."""
+    found = cells.centres[subject]
+    low, high = found.min(axis=0) - cells.side, found.max(axis=0) + cells.side
+    size = float((high - low).max())
+    room = SUPPORT_MARGIN * size
+    beside = cells.centres[support]
+    beside = beside[((beside >= low - room) & (beside <= high + room)).all(axis=1)]
+    margin = MARGIN * size + cells.side
+    if level:  # the floor is clipped to a disc, or to a rounded rectangle about a long subject
+        centre, half = (low + high)[:2] / 2, (high - low)[:2] / 2
+        round_one = float(np.linalg.norm(found[:, :2] - centre, axis=1).max()) + cells.side
+        half = np.full(2, round_one) if round_one <= 1.3 * half.min() else half
+        low, high = np.append(centre - half, low[2]), np.append(centre + half, high[2])
+    if len(beside):
+        # A support that lies across an axis ends the region there; along the other axes it is clipped.
+        thin = np.ptp(beside, axis=0) < 0.25 * max(np.ptp(beside, axis=0).max(), 1e-12)
+        low, high = np.where(thin, np.minimum(low, beside.min(axis=0)), low), np.where(thin, np.maximum(high, beside.max(axis=0)), high)
+    low, high = low - margin, high + margin
+    fade = FADE * float((high - low).max())
+    radius = float((high - low)[:2].min()) * (0.5 if level and abs((high - low)[0] - (high - low)[1]) < 1e-9 else 0.25 if level else 0.0)
+    region = Region(np.stack([low, high]), radius, fade)
+    while radius > 0 and inside_distance(region, found).min() < fade:  # corners of the subject
+        radius *= 0.8
+        region = Region(region.bounds, radius if radius > margin else 0.0, fade)
+        radius = region.corner_radius
+    return region
