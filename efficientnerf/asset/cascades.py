@@ -67,18 +67,24 @@ def cascades_of(tree: NerfTree) -> tuple[Cascade, ...]:
 def check_cascades(tree: NerfTree) -> None:
     """Raises ValueError unless the cascades nest as the module says."""
     cascades = cascades_of(tree)
-    if len(cascades) > MAX_CASCADES:
-        raise ValueError(f"{len(cascades)} cascades; expected at most {MAX_CASCADES}")
     if len(cascades) > 1 and tree.ndc is not None:
         raise ValueError("cascades around normalised device coordinates, which reach to infinity themselves")
-    for n in range(1, len(cascades)):
-        inner, outer = cascades[n - 1], cascades[n]
-        if outer.voxel != tree.voxel * 2.0**n:
-            raise ValueError(f"cascade {n} has voxels of {outer.voxel:g}; expected {tree.voxel * 2.0**n:g}")
-        cells = (inner.bounds(tree.brick) - outer.bounds_min) / (outer.voxel * tree.brick)  # (2, 3)
+    check_nesting([(cascade.shape, cascade.voxel, cascade.bounds_min) for cascade in cascades], tree.brick)
+
+
+def check_nesting(grids: Sequence[tuple[tuple[int, int, int], float, np.ndarray]], brick: int) -> None:
+    """Raises ValueError unless grids of these shapes, voxel sides and corners nest as the module says."""
+    if len(grids) > MAX_CASCADES:
+        raise ValueError(f"{len(grids)} cascades; expected at most {MAX_CASCADES}")
+    for n in range(1, len(grids)):
+        (inner_shape, inner_voxel, inner_low), (shape, voxel, low) = grids[n - 1], grids[n]
+        if voxel != grids[0][1] * 2.0**n:
+            raise ValueError(f"cascade {n} has voxels of {voxel:g}; expected {grids[0][1] * 2.0**n:g}")
+        bounds = np.stack([inner_low, inner_low + np.asarray(inner_shape) * brick * inner_voxel])
+        cells = (bounds - low) / (voxel * brick)  # (2, 3)
         if np.abs(cells - np.round(cells)).max() > 1e-3:
             raise ValueError(f"the box of cascade {n - 1} does not lie on faces of the coarse cells of cascade {n}")
-        if (np.round(cells[0]) < 0).any() or (np.round(cells[1]) > outer.shape).any():
+        if (np.round(cells[0]) < 0).any() or (np.round(cells[1]) > shape).any():
             raise ValueError(f"cascade {n} does not enclose cascade {n - 1}")
 
 

@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.cascades import Cascade, brick_ranges, cascades_of, check_cascades
+from efficientnerf.asset.file import whole_scene
 from efficientnerf.asset.file.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
 from efficientnerf.asset.file.layouts import LAYOUTS
 from efficientnerf.asset.file.memory import check_memory, needed
 from efficientnerf.asset.file.metadata import MAJOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of
-from efficientnerf.asset.file.serialisation import WRITERS, written_as
+from efficientnerf.asset.file.serialisation import WRITERS, bricks_of, written_as
 from efficientnerf.asset.tree import NerfTree
 
 __all__ = ["LAYOUTS", "WRITERS", "FormatError", "contents", "describe", "load", "save", "serialize"]
-
-OCCUPANCY = "coarse.occupancy"
 
 
 def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
@@ -33,13 +33,18 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
     """
     from safetensors.numpy import save as save_tensors
 
+    if tree.outer or tree.environment is not None:
+        _check_whole(tree)
     written = written_as(tree, layout)
-    tensors = {OCCUPANCY: np.packbits(tree.brick_index.reshape(-1) >= 0, bitorder="little"), **written.tensors}
-    name, minor = layout_name(written.layout, ndc=tree.ndc is not None, lookup=tree.lookup)
+    tensors = {whole_scene.occupancy_name(n): whole_scene.bits(cascade.brick_index >= 0) for n, cascade in enumerate(cascades_of(tree))} | written.tensors
+    whole, more = _whole_scene(tree)
+    tensors |= more
+    name, minor = layout_name(written.layout, ndc=tree.ndc is not None, nested="cascades" in whole, lookup=tree.lookup)
+    minor = max(minor or LAYOUTS[written.layout].minor, 0 if tree.region is None else whole_scene.MINOR)
     meta = {
         **{key: value for key, value in tree.metadata.items() if key not in STRUCTURE},
         "format": "nerftree",
-        "format_version": f"{MAJOR}.{minor or LAYOUTS[written.layout].minor}",
+        "format_version": f"{MAJOR}.{minor}",
         "layout": name,
         **({} if tree.lookup == "trilinear" else {"lookup": tree.lookup}),
         **({} if tree.ndc is None else {"ndc": tree.ndc.to_json()}),
@@ -52,21 +57,74 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
         "colour_space": "srgb-sigmoid",
         "background": None if tree.background is None else [float(x) for x in tree.background],
         **written.metadata,
+        **whole,
         "sha256": {name: hashlib.sha256(value.tobytes()).hexdigest() for name, value in tensors.items()},
     }
     try:
         text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError) as error:
         raise FormatError(f"metadata can't be written as JSON: {error}") from error
+    if whole:
+        whole_scene.check_whole_scene("the tree can't be saved", meta)
     data: bytes = save_tensors(tensors, metadata={METADATA_KEY: text})
     shapes, types = {name: value.shape for name, value in tensors.items()}, {name: value.dtype for name, value in tensors.items()}
     check_memory("the tree can't be saved", len(data), needed(written.layout, meta, shapes, types))
     return data
 
 
+def _check_whole(tree: NerfTree) -> None:
+    """Raises FormatError for cascades that no file holds."""
+    try:
+        check_cascades(tree)
+        brick_ranges(tree)
+    except ValueError as error:
+        raise FormatError(f"the tree can't be saved: {error}") from None
+    if tree.ndc is not None:
+        raise FormatError("the tree can't be saved: an environment map beyond normalised device coordinates, which reach to infinity themselves")
+
+
+def _whole_scene(tree: NerfTree) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Metadata and tensors of what a tree has beside one grid."""
+    meta: dict[str, Any] = {}
+    tensors: dict[str, np.ndarray] = {}
+    if tree.outer or tree.environment is not None:
+        meta["cascades"] = [{"shape": list(cascade.shape), "bounds_min": [float(x) for x in cascade.bounds_min]} for cascade in tree.outer]
+        meta["environment"] = None
+    if tree.environment is not None:
+        tensors[whole_scene.ENVIRONMENT] = whole_scene.environment_bytes(tree.environment)
+        meta["environment"] = len(tree.environment)
+    region = tree.region
+    if region is not None:
+        meta["region"] = {
+            "bounds": np.asarray(region.bounds, np.float64).tolist(),
+            "corner_radius": float(region.corner_radius),
+            "fade": float(region.fade),
+            "bricks": region.bricks is not None,
+        }
+        if region.bricks is not None:
+            tensors[whole_scene.REGION] = whole_scene.bits(np.asarray(region.bricks, bool)[bricks_of(tree)])
+    return meta, tensors
+
+
 def save(tree: NerfTree, path: str | Path, layout: str | None = None) -> None:
     """Write `tree` to `path`, whole or not at all; `layout` as in `serialize`."""
     write_whole(Path(path), serialize(tree, layout))
+
+
+def _tensors_of(meta: dict[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Tensors that a file of these metadata, which are checked, has, and the types that each may have."""
+    return {
+        **{whole_scene.occupancy_name(n): ("U8",) for n in range(len(whole_scene.grids_of(meta)))},
+        **LAYOUTS[layout_of(meta)].tensors,
+        **({whole_scene.ENVIRONMENT: ("U8",)} if whole_scene.environment_rows(meta) else {}),
+        **({whole_scene.REGION: ("U8",)} if whole_scene.names_bricks(meta) else {}),
+    }
+
+
+def _bricks(shapes: dict[str, tuple[int, ...]]) -> int:
+    """B, from the shapes of the tensors that say it."""
+    shape = next(shapes[tensor] for tensor in ("brick.mask", "brick.density") if tensor in shapes)
+    return shape[0] if shape else 0
 
 
 def _open(path: str | Path) -> Header:
@@ -75,7 +133,7 @@ def _open(path: str | Path) -> Header:
     name, meta = header.name, header.meta
     check_metadata(name, meta, tuple(LAYOUTS))
     layout = LAYOUTS[layout_of(meta)]
-    types = {OCCUPANCY: ("U8",), **layout.tensors}
+    types = _tensors_of(meta)
     for tensor in header.tensors:
         if tensor not in types and not tensor.startswith("x."):
             raise FormatError(f"{name}: unknown tensor '{tensor[:60]}'; only names that begin with 'x.' may be ignored")
@@ -85,10 +143,16 @@ def _open(path: str | Path) -> Header:
         if header.tensors[tensor][0] not in allowed:
             raise FormatError(f"{name}: tensor '{tensor}' is {header.tensors[tensor][0][:20]}; expected {' or '.join(allowed)}")
     shapes = {tensor: header.tensors[tensor][1] for tensor in types}
-    expected = {OCCUPANCY: (math.ceil(math.prod(meta["shape"]) / 8),), **layout.expected(name, meta, shapes)}
-    for tensor, want in expected.items():
-        if shapes[tensor] != want:
-            raise FormatError(f"{name}: tensor '{tensor}' has shape {shapes[tensor]}; expected {want}")
+    rows = whole_scene.environment_rows(meta)
+    expected = {
+        **{whole_scene.occupancy_name(n): (math.ceil(math.prod(grid.shape) / 8),) for n, grid in enumerate(whole_scene.grids_of(meta))},
+        **layout.expected(name, meta, shapes),
+        whole_scene.ENVIRONMENT: (rows, 2 * rows, 3),
+        whole_scene.REGION: (math.ceil(_bricks(shapes) / 8),),
+    }
+    for tensor, shape in shapes.items():
+        if shape != expected[tensor]:
+            raise FormatError(f"{name}: tensor '{tensor}' has shape {shape}; expected {expected[tensor]}")
     check_memory(name, header.size, needed(layout_of(meta), meta, shapes, {tensor: DTYPES[header.tensors[tensor][0]] for tensor in types}))
     return header
 
@@ -101,30 +165,28 @@ def load(path: str | Path) -> NerfTree:
     header = _open(path)
     name, meta = header.name, header.meta
     layout = LAYOUTS[layout_of(meta)]
-    raw = {tensor: header.read_verified(tensor) for tensor in (OCCUPANCY, *layout.tensors)}
-    shape = tuple(int(n) for n in meta["shape"])
-    cells = math.prod(shape)
-    if np.unpackbits(raw[OCCUPANCY][cells // 8 :], bitorder="little")[cells % 8 :].any():
-        raise FormatError(f"{name}: '{OCCUPANCY}' has bits set beyond its {cells} cells")
-    occupied = np.flatnonzero(np.unpackbits(raw[OCCUPANCY], count=cells, bitorder="little"))
-    bricks = next(len(raw[tensor]) for tensor in layout.tensors if tensor.startswith("brick."))
-    if len(occupied) != bricks:
-        raise FormatError(f"{name}: {len(occupied)} occupied cells but {bricks} brick{' masks' if 'brick.mask' in raw else 's'}")
-    bits = layout.stored(name, meta, raw)
-    count = int(np.count_nonzero(bits))
+    raw = {tensor: header.read_verified(tensor) for tensor in _tensors_of(meta)}
+    cascades, bricks = _cascades(name, meta, raw), len(raw["brick.mask" if "brick.mask" in raw else "brick.density"])
+    owned = sum(int(np.count_nonzero(cascade.brick_index >= 0)) for cascade in cascades)
+    if owned != bricks:
+        raise FormatError(f"{name}: {owned} occupied cells but {bricks} brick{' masks' if 'brick.mask' in raw else 's'}")
+    stored = layout.stored(name, meta, raw)
+    count = int(np.count_nonzero(stored))
     density, harmonics = layout.values(name, meta, raw, count)
+    environment = whole_scene.environment_colours(raw[whole_scene.ENVIRONMENT]) if whole_scene.environment_rows(meta) else None
+    region = whole_scene.region_of(
+        meta, whole_scene.booleans(name, whole_scene.REGION, raw[whole_scene.REGION], bricks, "bricks") if whole_scene.names_bricks(meta) else None
+    )
     del raw
-    brick_index = np.full(cells, -1, np.int32)
-    brick_index[occupied] = np.arange(len(occupied), dtype=np.int32)
-    voxel_index = np.full(bits.shape, -1, np.int32)
-    voxel_index[bits] = np.arange(count, dtype=np.int32)
+    voxel_index = np.full(stored.shape, -1, np.int32)
+    voxel_index[stored] = np.arange(count, dtype=np.int32)
     background = meta["background"]
     return NerfTree(
-        shape=shape,  # type: ignore[arg-type]
+        shape=cascades[0].shape,
         brick=int(meta["brick"]),
         voxel=float(meta["voxel"]),
-        bounds_min=np.asarray(meta["bounds_min"], np.float64),
-        brick_index=brick_index.reshape(shape),
+        bounds_min=cascades[0].bounds_min,
+        brick_index=cascades[0].brick_index,
         voxel_index=voxel_index,
         density_values=density,
         harmonics=harmonics,
@@ -132,7 +194,23 @@ def load(path: str | Path) -> NerfTree:
         metadata={key: value for key, value in meta.items() if key not in STRUCTURE},
         ndc=ndc_of(name, meta),
         lookup=lookup_of(name, meta),
+        outer=tuple(cascades[1:]),
+        environment=environment,
+        region=region,
     )
+
+
+def _cascades(name: str, meta: dict[str, Any], raw: dict[str, np.ndarray]) -> list[Cascade]:
+    """The grids with their bricks, which are numbered in the order of the file."""
+    cascades, first = [], 0
+    for n, grid in enumerate(whole_scene.grids_of(meta)):
+        cells = math.prod(grid.shape)
+        occupied = np.flatnonzero(whole_scene.booleans(name, whole_scene.occupancy_name(n), raw[whole_scene.occupancy_name(n)], cells, "cells"))
+        brick_index = np.full(cells, -1, np.int32)
+        brick_index[occupied] = np.arange(first, first + len(occupied), dtype=np.int32)
+        cascades.append(Cascade(grid.shape, grid.voxel, np.asarray(grid.bounds_min, np.float64), brick_index.reshape(grid.shape)))
+        first += len(occupied)
+    return cascades
 
 
 def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
@@ -140,8 +218,9 @@ def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]
     header = _open(path)
     digests = header.meta.get("sha256")
     digests = digests if isinstance(digests, dict) else {}
-    names = (OCCUPANCY, *LAYOUTS[layout_of(header.meta)].tensors)
-    tensors = {name: {"dtype": header.tensors[name][0], "shape": list(header.tensors[name][1]), "sha256": digests.get(name)} for name in names}
+    tensors = {
+        name: {"dtype": header.tensors[name][0], "shape": list(header.tensors[name][1]), "sha256": digests.get(name)} for name in _tensors_of(header.meta)
+    }
     return {key: value for key, value in header.meta.items() if key != "sha256"}, tensors
 
 
@@ -176,5 +255,23 @@ def describe(path: str | Path) -> dict[str, Any]:
         "background": meta["background"],
         "lookup": lookup_of(header.name, meta),
         **({} if ndc_of(header.name, meta) is None else {"ndc": meta["ndc"]}),
+        **_whole_scene_facts(meta),
     }
     return facts | {key: meta[key] for key in sorted(meta) if key not in STRUCTURE and key not in facts}
+
+
+def _whole_scene_facts(meta: dict[str, Any]) -> dict[str, Any]:
+    """What `describe` says beside one grid: all cascades, where there are more than one or an environment map; rows and columns of the map; the region."""
+    facts: dict[str, Any] = {}
+    if whole_scene.is_nested(meta):
+        cascades = [Cascade(grid.shape, grid.voxel, np.asarray(grid.bounds_min), np.empty(0)) for grid in whole_scene.grids_of(meta)]
+        boxes = [cascade.bounds(int(meta["brick"])).tolist() for cascade in cascades]
+        facts["cascades"] = [
+            {"coarse_cells": list(cascade.shape), "resolution": [n * int(meta["brick"]) for n in cascade.shape], "voxel_side": cascade.voxel,
+             "bounds": {"min": low, "max": high}}
+            for cascade, (low, high) in zip(cascades, boxes, strict=True)
+        ]  # fmt: skip
+        facts["environment"] = [whole_scene.environment_rows(meta), 2 * whole_scene.environment_rows(meta)] if whole_scene.environment_rows(meta) else None
+    if whole_scene.region_of(meta, None) is not None:
+        facts["region"] = meta["region"]
+    return facts

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.harmonics import C0
@@ -33,26 +34,33 @@ def compacted(tree: NerfTree, entries: int = ENTRIES, groups: tuple[int, ...] | 
     groups   harmonics above the base that share a code, in order; one each by default
     """
     groups = (1,) * (tree.harmonics_count - 1) if groups is None else groups
-    opacity = -np.expm1(-tree.density_values * np.float32(tree.voxel))
-    density = quantised_density(tree.density_values, tree.voxel)
+    side = voxel_sides(tree) if tree.outer else tree.voxel
+    opacity = -np.expm1(-tree.density_values * np.float32(side))
+    density = quantised_density(tree.density_values, side)
     return replace(tree, density_values=density, harmonics=quantised_harmonics(tree.sh, opacity, entries, groups))
 
 
-def quantised_density(density: np.ndarray, voxel: float) -> np.ndarray:
+def quantised_density(density: np.ndarray, voxel: float | np.ndarray) -> np.ndarray:
     """Densities (N,) rounded to at most 256 values: 0, and 255 whose logarithms are evenly spaced.
 
-    Up to 2.2 % away from what they were at an optical depth (density times side of the voxel) from 0.001 to 50, 0 below, 50 above.
+    voxel  side of the voxels, or of each, (N,)
+
+    Up to 2.2 % away from what they were at an optical depth (density times side of the voxel) from 0.001 to 50, 0 below, 50 above; with sides of several
+    lengths 0.14 % more for each doubling.
     """
     known = np.unique(density)
     if len(known) <= ENTRIES:
         return density
-    depth = density.astype(np.float64) * voxel
-    low, high = MIN_DEPTH, min(MAX_DEPTH, float(depth.max()))
+    side = np.asarray(voxel, np.float64)
+    unit, widest = float(side.min()), float(side.max())  # optical depths are of the smallest voxel
+    depth = density.astype(np.float64) * unit
+    most = MAX_DEPTH * (unit / side)
+    low, high = MIN_DEPTH * (unit / widest), float(np.minimum(depth, most).max())
     if high <= low:
         return np.zeros_like(density)
-    level = np.rint(np.log(np.maximum(depth, low) / low) / math.log(high / low) * (ENTRIES - 2)).clip(0, ENTRIES - 2)
-    table = (low * (high / low) ** (np.arange(ENTRIES - 1) / (ENTRIES - 2)) / voxel).astype(np.float32)
-    return np.where(depth < low / 2, np.float32(0), table[level.astype(np.int64)])
+    level = np.rint(np.log(np.maximum(np.minimum(depth, most), low) / low) / math.log(high / low) * (ENTRIES - 2)).clip(0, ENTRIES - 2)
+    table = (low * (high / low) ** (np.arange(ENTRIES - 1) / (ENTRIES - 2)) / unit).astype(np.float32)
+    return np.where(depth < MIN_DEPTH * (unit / side) / 2, np.float32(0), table[level.astype(np.int64)])
 
 
 def quantised_harmonics(sh: np.ndarray, opacity: np.ndarray, entries: int, groups: tuple[int, ...]) -> PaletteHarmonics:

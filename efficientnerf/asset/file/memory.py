@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset.file.container import FormatError
+from efficientnerf.asset.file.whole_scene import environment_rows, grids_of
 from efficientnerf.rendering.harmonics import harmonics_count
 
 TIMES, BESIDES = 8, 200_000_000  # of the file's size, and bytes
 CELL = 6  # its brick, how far a ray may leap from it, and whether it is full
 BRICK, SLOT = 72, 5  # where it lies, and which of its voxels are stored; for each of its voxels which of the stored ones it is
 VOXEL = 20  # its density, and its colour for a view
+ENVIRONMENT = 24  # a pair of texels of an environment map as floats
 PALETTE = 28  # a coefficient of a palette as a float, in two orders of the axes, one of them padded
 
 
@@ -29,7 +31,8 @@ def needed(layout: str, meta: dict[str, Any], shapes: dict[str, tuple[int, ...]]
     cube, coefficients = int(meta["brick"]) ** 3, 3 * harmonics_count(int(meta["sh_degree"]))
     bricks = shapes["brick.density" if layout == "full" else "brick.mask"][0]
     voxels = bricks * cube if layout == "full" else shapes["voxel.density"][0]
-    total = CELL * math.prod(meta["shape"]) + (BRICK + SLOT * cube) * bricks
+    cells = sum(math.prod(grid.shape) for grid in grids_of(meta))
+    total = CELL * cells + (BRICK + SLOT * cube) * bricks + ENVIRONMENT * environment_rows(meta) ** 2
     if layout != "compact":
         return total + (VOXEL + 4 * coefficients) * voxels
     each = VOXEL + 3 + shapes["voxel.sh"][1] * types["voxel.sh"].itemsize

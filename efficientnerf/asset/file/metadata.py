@@ -1,42 +1,26 @@
-"""The metadata of an asset, checked: the rules of FORMAT.md, section 2."""
+"""The metadata of an asset, checked: the rules of FORMAT.md, sections 2, 8 and 9; those of whole scenes are in `whole_scene.py`."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.file.checks import FARTHEST, coarse_shape, number, numbers
 from efficientnerf.asset.file.container import FormatError
+from efficientnerf.asset.file.whole_scene import MAX_CELLS, MINOR, NEAREST_PREFIX, NESTED_PREFIX, check_whole_scene
 from efficientnerf.geometry.ndc import NUMBERS, Ndc
 from efficientnerf.rendering.harmonics import MAX_DEGREE
 
 MAJOR = 1
-MAX_CELLS = 2**30
-FARTHEST = 2.0**40  # in units of the grid: 64-bit floats tell places to a thousandth of one there
 STEEPEST = 1e6  # of the reference camera's field of view, and of a spiral's
 NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not render it
 NDC_MINOR = 2  # the version that brought them
-NEAREST_PREFIX = "nearest-"  # of layouts whose voxels are not interpolated; before the other prefix where both hold
 NEAREST_MINOR = 3
 STRUCTURE = {
     "format", "format_version", "layout", "shape", "brick", "voxel", "bounds_min", "sh_degree", "sh_convention", "sh_groups", "colour_space",
-    "background", "sha256", "ndc", "lookup",
+    "background", "sha256", "ndc", "lookup", "cascades", "environment", "region",
 }  # fmt: skip
-
-
-def _number(name: str, meta: dict[str, Any], key: str, low: float, high: float, *, whole: bool) -> float:
-    value = meta.get(key)
-    if type(value) not in ((int,) if whole else (int, float)) or not low <= value <= high:  # type: ignore[operator]
-        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected a {'whole ' if whole else ''}number from {low:g} to {high:g}")
-    return value  # type: ignore[return-value]
-
-
-def _numbers(name: str, meta: dict[str, Any], key: str, count: int, low: float, high: float) -> list[float]:
-    value = meta.get(key)
-    if not (isinstance(value, list) and len(value) == count and all(type(x) in (int, float) and low <= x <= high for x in value)):
-        raise FormatError(f"{name}: metadata '{key}' is {str(value)[:60]}; expected {count} numbers from {low:g} to {high:g}")
-    return value
 
 
 def _check_frame(name: str, meta: dict[str, Any], unit: float) -> None:
@@ -48,33 +32,34 @@ def _check_frame(name: str, meta: dict[str, Any], unit: float) -> None:
         raise FormatError(f"{name}: metadata 'metric' is {str(meta['metric'])[:60]}; expected true or false")
     if "world_from_capture" in meta:
         similarity = meta["world_from_capture"]
-        _number(name, similarity, "scale", 1e-30, 1e30, whole=False)
-        _numbers(name, similarity, "translation", 3, -1e30, 1e30)
+        number(name, similarity, "scale", 1e-30, 1e30, whole=False)
+        numbers(name, similarity, "translation", 3, -1e30, 1e30)
         rows = similarity.get("rotation")
         if not (isinstance(rows, list) and len(rows) == 3):
             raise FormatError(f"{name}: metadata 'rotation' is {str(rows)[:60]}; expected three rows")
-        rotation = np.array([_numbers(name, {"rotation": row}, "rotation", 3, -2, 2) for row in rows], np.float64)
+        rotation = np.array([numbers(name, {"rotation": row}, "rotation", 3, -2, 2) for row in rows], np.float64)
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
             raise FormatError(f"{name}: metadata 'rotation' is not a rotation")
     if "orbit" in meta:
         orbit, far = meta["orbit"], FARTHEST * unit
-        _numbers(name, orbit, "centre", 3, -far, far)
-        _number(name, orbit, "radius", 1e-30, far, whole=False)
-        _number(name, orbit, "elevation", -90, 90, whole=False)
-        _number(name, orbit, "heading", -360, 360, whole=False)
+        numbers(name, orbit, "centre", 3, -far, far)
+        number(name, orbit, "radius", 1e-30, far, whole=False)
+        number(name, orbit, "elevation", -90, 90, whole=False)
+        number(name, orbit, "heading", -360, 360, whole=False)
         if type(orbit.get("forward_facing")) is not bool:
             raise FormatError(f"{name}: metadata 'forward_facing' is {str(orbit.get('forward_facing'))[:60]}; expected true or false")
 
 
 def layout_of(meta: dict[str, Any]) -> str:
     """The layout of the tensors, without the prefixes of frame and lookup."""
-    return str(meta.get("layout")).removeprefix(NEAREST_PREFIX).removeprefix(NDC_PREFIX)
+    name = str(meta.get("layout")).removeprefix(NEAREST_PREFIX)
+    return name.removeprefix(NDC_PREFIX) if name.startswith(NDC_PREFIX) else name.removeprefix(NESTED_PREFIX)
 
 
-def layout_name(layout: str, *, ndc: bool, lookup: str) -> tuple[str, int]:
+def layout_name(layout: str, *, ndc: bool, nested: bool, lookup: str) -> tuple[str, int]:
     """The layout's name with its prefixes, and the minor version that brought them; 0 without prefixes."""
-    name, minor = (NDC_PREFIX + layout, NDC_MINOR) if ndc else (layout, 0)
-    return (NEAREST_PREFIX + name, NEAREST_MINOR) if lookup == "nearest" else (name, minor)
+    name, minor = (NDC_PREFIX + layout, NDC_MINOR) if ndc else (NESTED_PREFIX + layout, MINOR) if nested else (layout, 0)
+    return (NEAREST_PREFIX + name, max(minor, NEAREST_MINOR)) if lookup == "nearest" else (name, minor)
 
 
 def lookup_of(name: str, meta: dict[str, Any]) -> str:
@@ -94,12 +79,12 @@ def ndc_of(name: str, meta: dict[str, Any]) -> Ndc | None:
     if not isinstance(found, dict):
         raise FormatError(f"{name}: metadata 'ndc' is {str(found)[:60]}; expected an object")
     for key in NUMBERS:
-        _number(name, found, key, 1e-30, 1e30, whole=False)
+        number(name, found, key, 1e-30, 1e30, whole=False)
     rows = found.get("world_from_camera")
     if not (isinstance(rows, list) and len(rows) == 4):
         raise FormatError(f"{name}: metadata 'world_from_camera' is {str(rows)[:60]}; expected four rows")
     for row in rows:
-        _numbers(name, {"world_from_camera": row}, "world_from_camera", 4, -1e30, 1e30)
+        numbers(name, {"world_from_camera": row}, "world_from_camera", 4, -1e30, 1e30)
     try:
         ndc = Ndc.from_json(found)
     except ValueError as error:
@@ -117,12 +102,12 @@ def _check_spiral(name: str, spiral: Any, unit: float) -> None:
         raise FormatError(f"{name}: metadata 'spiral' is {str(spiral)[:60]}; expected an object")
     far = FARTHEST * unit
     if "radii" in spiral:
-        _numbers(name, spiral, "radii", 3, 0, far)
+        numbers(name, spiral, "radii", 3, 0, far)
     for key in ("focus", "far"):
         if key in spiral:
-            _number(name, spiral, key, unit / FARTHEST, far, whole=False)
+            number(name, spiral, key, unit / FARTHEST, far, whole=False)
     if "tangents" in spiral:
-        _numbers(name, spiral, "tangents", 2, 1 / STEEPEST, STEEPEST)
+        numbers(name, spiral, "tangents", 2, 1 / STEEPEST, STEEPEST)
 
 
 def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) -> None:
@@ -142,18 +127,17 @@ def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) ->
     if meta.get("sh_convention") != "real-orthonormal-plenoctree" or meta.get("colour_space") != "srgb-sigmoid":
         found = f"harmonics {str(meta.get('sh_convention'))[:60]} in {str(meta.get('colour_space'))[:60]}"
         raise FormatError(f"{name}: {found}; expected real-orthonormal-plenoctree in srgb-sigmoid")
-    shape = _numbers(name, meta, "shape", 3, 1, 2**16)
-    if not all(type(n) is int for n in shape) or math.prod(shape) > MAX_CELLS:
-        raise FormatError(f"{name}: shape {shape}; expected whole numbers with a product of at most {MAX_CELLS}")
-    _number(name, meta, "brick", 1, 16, whole=True)
-    _number(name, meta, "sh_degree", 0, MAX_DEGREE, whole=True)
-    far = FARTHEST * _number(name, meta, "voxel", 1e-30, 1e30, whole=False)
-    _numbers(name, meta, "bounds_min", 3, -far, far)
+    coarse_shape(name, meta, MAX_CELLS)
+    number(name, meta, "brick", 1, 16, whole=True)
+    number(name, meta, "sh_degree", 0, MAX_DEGREE, whole=True)
+    far = FARTHEST * number(name, meta, "voxel", 1e-30, 1e30, whole=False)
+    numbers(name, meta, "bounds_min", 3, -far, far)
     if "background" not in meta:
         raise FormatError(f"{name}: metadata 'background' is missing; expected three numbers or null")
     if meta["background"] is not None:
-        _numbers(name, meta, "background", 3, 0, 1)
+        numbers(name, meta, "background", 3, 0, 1)
     lookup_of(name, meta)
+    check_whole_scene(name, meta)
     ndc = ndc_of(name, meta)
     unit = float(meta["voxel"]) if ndc is None else ndc.near
     _check_frame(name, meta, unit)

@@ -11,12 +11,13 @@ B bricks, N stored voxels, K harmonics.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascades_of, voxel_sides
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.layouts import LIMIT
 from efficientnerf.asset.palettes import PaletteHarmonics
@@ -51,24 +52,35 @@ def bytes_per_voxel(writer: str, degree: int) -> int:
     return {"compact": 4 + (harmonics - 1), "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
 
 
-def most_voxels(size: int, writer: str, degree: int, shape: tuple[int, int, int], brick: int) -> int:
-    """How many voxels a file of `size` bytes has room for, if a quarter of the voxels of its bricks are stored (usually more are)."""
+def most_voxels(
+    size: int, writer: str, degree: int, shape: tuple[int, int, int], brick: int, *, outer: Sequence[tuple[int, int, int]] = (), environment: int = 0
+) -> int:
+    """How many voxels, of all cascades together, a file of `size` bytes has room for, if a quarter of the voxels of its bricks are stored (usually more are).
+
+    shape        coarse cells of the grid; `outer` those of the cascades around it
+    environment  rows of the environment map, 0 without one
+    """
     palette = {"compact": 256, "small": SMALL_ENTRIES, "sparse": 0}[writer] * (harmonics_count(degree) - 1) * 6
-    fixed = 2**14 + math.prod(shape) // 8 + palette
+    fixed = 2**14 + sum(math.prod(cells) // 8 for cells in (shape, *outer)) + palette + 6 * environment**2
     mask = 8 * math.ceil(brick**3 / 64) / max(1.0, brick**3 / 4)
     return max(0, int((size - fixed) / (bytes_per_voxel(writer, degree) + mask)))
 
 
 def order_of(tree: NerfTree) -> np.ndarray:
-    """Stored voxels in the order of the file: brick by brick in the order of the cells, in a brick by number."""
+    """Stored voxels in the order of the file: brick by brick, in a brick by number."""
     order = _bricks(tree)
     return order[order >= 0]
 
 
+def bricks_of(tree: NerfTree) -> np.ndarray:
+    """(B,) numbers of the bricks in the order of the file: cascade by cascade, in each in the order of their cells."""
+    owner = np.concatenate([cascade.brick_index.reshape(-1) for cascade in cascades_of(tree)])
+    return owner[owner >= 0]
+
+
 def _bricks(tree: NerfTree) -> np.ndarray:
-    """(B, b^3) voxel numbers or -1, bricks in the order of their cells."""
-    owner = tree.brick_index.reshape(-1)
-    return tree.voxel_index[owner[owner >= 0]]
+    """(B, b^3) voxel numbers or -1, bricks in the order of the file."""
+    return tree.voxel_index[bricks_of(tree)]
 
 
 def _mask(tree: NerfTree) -> np.ndarray:
@@ -107,7 +119,7 @@ def _coded(tree: NerfTree) -> Written:
     assert isinstance(tree.harmonics, PaletteHarmonics)
     order = order_of(tree)
     codes = tree.harmonics.subset(order)
-    table, density = np.unique(quantised_density(_densities(tree, order), tree.voxel), return_inverse=True)
+    table, density = np.unique(quantised_density(_densities(tree, order), voxel_sides(tree)[order] if tree.outer else tree.voxel), return_inverse=True)
     tensors = {
         "brick.mask": _mask(tree),
         "voxel.density": density.reshape(-1).astype("<u1"),
