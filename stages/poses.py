@@ -28,6 +28,10 @@ from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.scene import SPLITS, Scene, View, save, save_points
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from stages.io.silhouettes import SmallPictures
+
     Format = str
 else:
     Format = Literal[importers.FORMATS]  # the names of the table of importers
@@ -55,8 +59,10 @@ class PosesSettings:
         "Space of the field: the box alone, with a background without depth beyond it (box); all of an unbounded scene (contracted); or normalised device"
         " coordinates, for forward-facing captures (ndc); auto: ndc for forward-facing LLFF folders, box for objects with alpha, else contracted.",
     )
-    alpha: Literal["auto", "composite", "mask"] = setting(
-        "auto", "What alpha means: an object to be composited on white (composite), or pixels to be left out where it is 0 (mask); auto: by the format."
+    masks: Literal["auto", "silhouette", "ignore"] = setting(
+        "auto",
+        "What masks and alpha channels mean: outside of them is background, and the object alone is trained, on random colours (silhouette), or pixels outside"
+        " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
     )
     test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
     llff_factor: PositiveInt | Auto = setting(
@@ -78,7 +84,7 @@ def run(job: Job) -> None:
     """Write scene.json, images/, masks/, points.safetensors, contact_sheet.png and report.json. Raises BadInput."""
     from stages.figures.contact_sheet import write_contact_sheet
     from stages.framing import training_frame
-    from stages.io import working_images
+    from stages.io.silhouettes import SmallPictures
     from stages.memory.poses import refuse_large_photographs
 
     settings: PosesSettings = job.settings
@@ -93,9 +99,12 @@ def run(job: Job) -> None:
     capture = read(job, settings, warn)
     job.say(f"{len(capture.photos)} images, {capture.kind}", kind=capture.kind, images=len(capture.photos))
     refuse_large_photographs(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos])
-    keep_alpha = working_images.alpha_is_coverage(capture.photos, settings.alpha, importers.IMPORTERS[_format_of(capture)].renders)
-    capture, written = _write_images(job, replace(capture, background=WHITE if keep_alpha else None), keep_alpha, warn)
-    framed = training_frame.find_training_frame(capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space)
+    small = SmallPictures()
+    capture, mask_facts = with_mask_use(job, capture, small, warn)
+    capture, written = _write_images(job, capture, warn)
+    framed = training_frame.find_training_frame(
+        capture, up=settings.up, box=given(settings.crop_box), margin=settings.box_margin, space=settings.space, small=small
+    )
     splits = assign_splits(capture.photos, settings.test_every, warn)
     world = framed.world_from_capture
     views = tuple(
@@ -125,12 +134,12 @@ def run(job: Job) -> None:
         forward=framed.forward,
     )
     save(scene, job.out)
-    _write_report(PosesOutputs(job.out).report, capture, scene, framed.facts, notes)
+    _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
 
-STAGE = Stage(name="poses", version=2, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
+STAGE = Stage(name="poses", version=3, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
@@ -193,12 +202,42 @@ def _format_of(capture: Capture) -> str:
     return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
 
 
-def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tuple[Capture, list[Any]]:
+def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -> tuple[Capture, dict[str, object]]:
+    """The capture with what its masks and alpha channels mean, without the images of which nothing says what is background; and facts for the report."""
+    import numpy as np
+
+    from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
+
+    renders = _may_be_renders(capture)
+    use = find_mask_use(capture, job.settings.masks, renders, small, job.safe_point)
+    for sentence in use.sentences:
+        job.say(sentence)
+    for sentence in doubts(use):
+        warn(sentence)
+    names = set(without_silhouette(capture.photos, use.silhouettes, renders))
+    if names:
+        warn(f"{len(names)} of {len(capture.photos)} images have no silhouette, and the others do: {abbreviated(sorted(names))}. They are left out.")
+    kept = [index for index, photo in enumerate(capture.photos) if photo.camera.name not in names]
+    capture = without(capture, kept, [(name, "has no silhouette, and the others do") for name in sorted(names)])
+    if not use.silhouettes:
+        return replace(capture, background=None), use.facts
+    capture = replace(capture, background=WHITE, silhouettes=use.silhouettes)
+    if capture.points is not None:
+        capture = replace(capture, points=only(capture.points, np.flatnonzero(points_of_object(capture, small))))
+    return capture, use.facts
+
+
+def _may_be_renders(capture: Capture) -> bool:
+    return importers.IMPORTERS[_format_of(capture)].renders
+
+
+def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[Any]]:
     """Write the working images. Returns the capture without the images that cannot be decoded, and what was written for the others."""
     from stages.io import working_images
     from stages.io.pictures import UnreadableImage
 
     relative = working_images.image_paths([photo.camera for photo in capture.photos])
+    how: dict[str, Any] = {"max_side": job.settings.max_image_size, "silhouettes": capture.silhouettes, "may_be_empty": _may_be_renders(capture)}
     kept: list[int] = []
     written = []
     failed: list[tuple[str, str]] = []
@@ -207,7 +246,7 @@ def _write_images(job: Job, capture: Capture, keep_alpha: bool, warn: Any) -> tu
         job.safe_point()
         job.progress(index, len(capture.photos), "preparing images")
         try:
-            written.append(working_images.write(photo, job.out, relative[index], max_side=job.settings.max_image_size, keep_alpha=keep_alpha))
+            written.append(working_images.write(photo, job.out, relative[index], **how))
             remarks += written[-1].warnings
             kept.append(index)
         except UnreadableImage as error:
@@ -238,6 +277,11 @@ def without(capture: Capture, kept: Sequence[int], failed: Sequence[tuple[str, s
     return replace(capture, photos=photos, points=points, rejected=(*capture.rejected, *failed), rejected_files=capture.rejected_files | files)
 
 
+def only(points: SparsePoints, kept: np.ndarray) -> SparsePoints:
+    """The points of these indices."""
+    return SparsePoints(points.xyz[kept], points.rgb[kept], points.error[kept], tuple(points.tracks[index] for index in kept.tolist()) if points.tracks else ())
+
+
 def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: None) -> list[str]:
     """The split of each photo: the source's where it states validation or test images, else every n-th in sorted order is a test image.
 
@@ -257,7 +301,7 @@ def assign_splits(photos: Sequence[Photo], every: int, warn: Any = lambda text: 
     return ["test" if index in test else "train" for index in range(len(photos))]
 
 
-def _write_report(path: Path, capture: Capture, scene: Scene, framing_facts: dict[str, object], notes: Sequence[str]) -> None:
+def _write_report(path: Path, capture: Capture, scene: Scene, facts: dict[str, dict[str, object]], notes: Sequence[str]) -> None:
     """Images used and rejected, splits, facts and warnings."""
     report = {
         "kind": capture.kind,
@@ -270,7 +314,7 @@ def _write_report(path: Path, capture: Capture, scene: Scene, framing_facts: dic
         "reprojection_error": capture.reprojection_error,
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "background": capture.background,
-        "framing": framing_facts,
+        **facts,
         "facts": capture.facts,
         "warnings": list(notes),
     }

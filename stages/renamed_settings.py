@@ -1,4 +1,4 @@
-"""Settings from before release 0.1: their present names and values.
+"""Settings of earlier releases: their present names and values.
 
 An old name on the command line or in a file is answered with `moved`; recorded settings are read with `updated`.
 """
@@ -14,6 +14,7 @@ import msgspec
 RENAMED: dict[str, dict[str, str]] = {
     "poses": {
         "max_side": "max_image_size", "box": "crop_box", "margin": "box_margin", "features": "max_features", "feature_side": "feature_image_size",
+        "alpha": "masks",
     },
     "train": {
         "budget": "time_budget", "samples": "sample_batch_size", "rays": "max_rays_per_batch", "degree": "sh_degree", "levels": "num_levels",
@@ -45,6 +46,9 @@ REMOVED: dict[str, dict[str, str]] = {
     },
 }
 
+# Values that have another name under the present name of their setting.
+VALUES: dict[str, dict[str, dict[str, str]]] = {"poses": {"alpha": {"composite": "silhouette", "mask": "ignore"}}}
+
 # Words that replace 0, none and empty texts.
 WORDS = ("auto", "off", "all")
 
@@ -52,7 +56,8 @@ WORDS = ("auto", "off", "all")
 def moved(stage: str, name: str) -> str | None:
     """The present name of an old setting, as a sentence; None where the name is none of the old ones."""
     if new := RENAMED.get(stage, {}).get(name):
-        return f"{stage}.{name} is now {stage}.{new}."
+        values = VALUES.get(stage, {}).get(name, {})
+        return f"{stage}.{name} is now {stage}.{new}{''.join(f', {before} is now {after}' for before, after in values.items())}."
     if why := REMOVED.get(stage, {}).get(name):
         return f"{stage}.{name} was removed: {why}. Leave it out."
     return None
@@ -75,6 +80,7 @@ def updated(stage: str, settings_type: type, recorded: Mapping[str, Any]) -> dic
         name = old if old in hints else RENAMED.get(stage, {}).get(old, old)
         if name not in hints and name in REMOVED.get(stage, {}):
             continue
+        value = VALUES.get(stage, {}).get(old, {}).get(value, value) if isinstance(value, str) else value
         out[name] = _word(hints[name], value) if name in hints else value
     return out
 

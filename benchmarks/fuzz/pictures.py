@@ -101,7 +101,7 @@ def open_mask(folder: Path) -> Opened:
             assert photo.read_mask_file(path, taken).shape == taken.rgb.shape[:2], "a mask of another size"
         except UnreadableImage as error:
             refused = error
-        working_images.write(Photo(captures.cameras(COUNT)[0], image, path), out, "a.png", max_side=16, keep_alpha=False)
+        working_images.write(Photo(captures.cameras(COUNT)[0], image, path), out, "a.png", max_side=16)
         if refused is not None:
             raise refused
 

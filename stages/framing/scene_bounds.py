@@ -9,30 +9,33 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, Similarity, project, resized
 from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.silhouettes import SmallPictures
 
 MIN_POINTS = 50  # sparse points
 MIN_VIEW_RATIO = 0.65  # views of a point over those of the points with most: below, it is background
 MAX_CAMERAS = 48  # evenly spaced over the capture
-SILHOUETTE_SIZE = 160  # px, longest side at which alpha is read
 GRID_SIZE = 32  # voxels along a side of the region searched
 
 
-def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool) -> tuple[np.ndarray, np.ndarray, str]:
+def find_scene_bounds(
+    capture: Capture, turned: Similarity, focus: np.ndarray, converging: bool, small: SmallPictures | None = None
+) -> tuple[np.ndarray, np.ndarray, str]:
     """Corners of an axis-aligned box in the turned frame, and how it was found, in words.
 
     turned      the rotation from the capture's frame to one with z up
     focus       what the cameras look at, in the turned frame
     converging  whether their axes meet there
+    small       what alpha channels and masks keep, as far as it was read
     """
-    photos = [photo for photo in capture.photos if photo.split in (None, "train")] or list(capture.photos)
-    photos = photos[:: -(-len(photos) // MAX_CAMERAS)]
+    photos = chosen_photos(capture.photos)
     cameras = [turned.camera(photo.camera) for photo in photos]
     ranges = [(photo.near, photo.far) for photo in photos]
     bounded = capture.background is not None  # silhouettes are more exact than points, in bounded scenes
     for way in ("silhouettes", "sparse points") if bounded else ("sparse points", "silhouettes"):
         if way == "silhouettes":
             # A wide region to start from: parts of the subject outside of close views are cut by the others.
-            found = bounds_of_visual_hull(photos, cameras, *bounds_of_frusta(cameras, ranges, focus, converging, least=0.5))
+            pictures = [(small or SmallPictures()).silhouette(photo, capture.silhouettes) for photo in photos]
+            found = bounds_of_visual_hull(pictures, cameras, *bounds_of_frusta(cameras, ranges, focus, converging, least=0.5))
         elif capture.points is not None and len(capture.points.xyz) >= MIN_POINTS:
             found = bounds_of_points(replace(capture.points, xyz=turned.points(capture.points.xyz)), cameras, converging)
         else:
@@ -40,6 +43,12 @@ def find_scene_bounds(capture: Capture, turned: Similarity, focus: np.ndarray, c
         if found is not None:
             return *found, way
     return *bounds_of_frusta(cameras, ranges, focus, converging), "camera frusta"
+
+
+def chosen_photos(photos: Sequence[Photo]) -> list[Photo]:
+    """At most `MAX_CAMERAS` of those that training may see, evenly spaced."""
+    usable = [photo for photo in photos if photo.split in (None, "train")] or list(photos)
+    return usable[:: -(-len(usable) // MAX_CAMERAS)]
 
 
 def bounds_of_points(points: SparsePoints, cameras: Sequence[Camera], converging: bool) -> tuple[np.ndarray, np.ndarray] | None:
@@ -151,15 +160,25 @@ def _depth_limits(near: float | None, far: float | None) -> tuple[float, float]:
     return 0.0, np.inf
 
 
-def bounds_of_visual_hull(photos: Sequence[Photo], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """A box round the visual hull; None unless half of the photos have an alpha channel with transparent pixels.
+def bounds_of_visual_hull(
+    pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """A box round the visual hull; None unless half of the photos have a silhouette, or where the hull is empty."""
+    found = visual_hull(pictures, cameras, low, high)
+    return None if found is None else (found[0].min(0) - found[1] / 2, found[0].max(0) + found[1] / 2)
 
-    A voxel is carved where its whole projection is transparent in more than one in fifty photographs (whose alpha channel may be damaged), or where
+
+def visual_hull(pictures: Sequence[np.ndarray | None], cameras: Sequence[Camera], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Centres (N, 3) of the voxels of the visual hull in a box, and the (3,) sides of a voxel; None unless half of the photos have a silhouette, or where
+    the hull is empty.
+
+    pictures  (h, w) bool of each photo: its silhouette, at any size; or None
+
+    A voxel is carved where its whole projection is transparent in more than one in fifty photographs (whose silhouette may be damaged), or where
     less than half of the photographs have it in view.
     """
-    masks = [(camera, silhouette(photo)) for camera, photo in zip(cameras, photos, strict=True)]
-    views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in masks if mask is not None]
-    if len(views) < max(3, len(photos) / 2):
+    views = [(resized(camera, mask.shape[1], mask.shape[0]), mask) for camera, mask in zip(cameras, pictures, strict=True) if mask is not None]
+    if len(views) < max(3, len(pictures) / 2):
         return None
     for _ in range(3):  # each pass refines the one before
         kept, step = voxel_centres(low, high)
@@ -173,7 +192,7 @@ def bounds_of_visual_hull(photos: Sequence[Photo], cameras: Sequence[Camera], lo
         if not len(kept):
             return None
         low, high = kept.min(0) - step / 2, kept.max(0) + step / 2
-    return low, high
+    return kept, step
 
 
 def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
@@ -190,26 +209,6 @@ def _transparent(camera: Camera, mask: np.ndarray, xyz: np.ndarray, radius: floa
     out = np.zeros(len(xyz), bool)
     out[inside] = distance[row[inside].astype(int), column[inside].astype(int)] > reach[inside]
     return inside, out
-
-
-def silhouette(photo: Photo) -> np.ndarray | None:
-    """(h, w) bool, upright, longest side at most SILHOUETTE: whether any pixel below is not wholly transparent; None without an alpha channel
-    or where nothing is transparent."""
-    from stages.io.photo import read_alpha
-    from stages.io.pictures import UnreadableImage
-
-    try:
-        alpha = read_alpha(photo.image)
-    except UnreadableImage:
-        return None
-    if alpha is None or not (alpha == 0).any():
-        return None
-    factor = -(-max(alpha.shape) // SILHOUETTE_SIZE)
-    height, width = -(-alpha.shape[0] // factor) * factor, -(-alpha.shape[1] // factor) * factor
-    if (height, width) != alpha.shape and factor > 1:
-        # Whole blocks only: the last ones are filled up with transparent pixels, which moves nothing by more than a pixel.
-        alpha = np.pad(alpha, ((0, height - alpha.shape[0]), (0, width - alpha.shape[1])))
-    return np.asarray(alpha.reshape(height // factor, factor, width // factor, factor).max((1, 3)) > 0)
 
 
 def voxel_centres(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

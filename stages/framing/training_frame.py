@@ -17,6 +17,7 @@ from stages.framing import scene_bounds
 from stages.framing.forward_facing import ForwardFacing, content_depths, detect_forward_facing
 from stages.io.capture import Capture
 from stages.io.scene import Orbit
+from stages.io.silhouettes import SmallPictures
 
 UP_CHOICES = ("auto", "x", "y", "z", "-x", "-y", "-z")
 MIN_CONVERGENCE = 0.03  # mean squared sine of the angles between view axes and their mean (10 degrees), below which they do not meet in a point
@@ -45,13 +46,16 @@ class TrainingFrame:
     facts: dict[str, object]
 
 
-def find_training_frame(capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto") -> TrainingFrame:
+def find_training_frame(
+    capture: Capture, *, up: str = "auto", box: Sequence[float] | None = None, margin: float = 0.05, space: str = "auto", small: SmallPictures | None = None
+) -> TrainingFrame:
     """Choose the training frame and the scene bounds.
 
     up      "auto", or an axis of the capture's frame ("z", "-y", ...) that points up
     box     six numbers in the capture's frame, x y z of one corner and of the opposite one; None: estimated
     margin  added on each side of the bounds of sparse points, as a fraction of their longest side; silhouettes already bound the subject from outside
     space   "auto", "box", "contracted" or "ndc"
+    small   what alpha channels and masks keep, as far as it was read
 
     Raises BadInput for an empty box or an unknown axis, and for ndc where the capture is not forward-facing.
     """
@@ -69,7 +73,7 @@ def find_training_frame(capture: Capture, *, up: str = "auto", box: Sequence[flo
         low, high, how = corners.min(0), corners.max(0), "given" if box is not None else "stated by the source"
     else:
         turned = Similarity(1.0, turn, np.zeros(3))
-        low, high, how = scene_bounds.find_scene_bounds(capture, turned, turned.points(focus), converging)
+        low, high, how = scene_bounds.find_scene_bounds(capture, turned, turned.points(focus), converging, small)
         padding = margin * (high - low).max() if how == "sparse points" else 0.0
         low, high = low - padding, high + padding
     centre, half = (low + high) / 2, (high - low) / 2

@@ -33,6 +33,21 @@ class Photo:
 
 
 @dataclass(frozen=True)
+class Silhouettes:
+    """Which of the two are silhouettes: what they leave out is background. Else what they leave out is ignored.
+
+    alpha  alpha channels of the photographs
+    masks  mask files
+    """
+
+    alpha: bool = False
+    masks: bool = False
+
+    def __bool__(self) -> bool:
+        return self.alpha or self.masks
+
+
+@dataclass(frozen=True)
 class SparsePoints:
     """Sparse points of structure from motion or a depth sensor.
 
@@ -55,6 +70,7 @@ class Capture:
     kind        "photographs", "blender", "nerfstudio", "instant-ngp", "llff" or "colmap"
     photos      in sorted order of name within each split; all registered
     background  the constant sRGB colour (0-1) that transparent pixels are composited on, of bounded scenes; None: unbounded
+    silhouettes whether alpha channels and masks are silhouettes
     up          unit up vector in the capture's frame where the format defines one (Blender: +z), else None
     points      or None
     bounds      (2, 3) box in the capture's frame where the source states one (instant-ngp's aabb), else None
@@ -68,6 +84,7 @@ class Capture:
     kind: str
     photos: tuple[Photo, ...]
     background: tuple[float, float, float] | None
+    silhouettes: Silhouettes = Silhouettes()
     up: np.ndarray | None = None
     points: SparsePoints | None = None
     bounds: np.ndarray | None = None

@@ -14,13 +14,16 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
-from stages.io.capture import Photo
+from stages.io.capture import Photo, Silhouettes
 from stages.io.photo import apply_exif_orientation, same_aspect, upright_mask, working_size
-from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, read_header, rgb_and_alpha
+from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
 MAX_PART = 200  # bytes of a part of the path of a working image
 OPAQUE = 128  # alpha from which a pixel counts where alpha is used as a mask
+TRANSPARENT = 8  # alpha and levels of masks up to which a pixel of a silhouette is background: what networks and filters leave of nothing
+LOSSY_NOISE = 16  # the same, in formats that keep pixels only about as they were
+NEITHER = Silhouettes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,43 +64,14 @@ def decode(path: Path) -> Decoded:
     return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, lossy)
 
 
-def has_transparency(path: Path) -> bool:
-    """Whether any pixel of an image is not opaque; raises UnreadableImage."""
-    pixels = decode(path).pixels
-    return pixels.shape[2] == 4 and bool((pixels[..., 3] < 255).any())
-
-
-def alpha_is_coverage(photos: tuple[Photo, ...], choice: str, may_be_renders: bool) -> bool:
-    """Whether alpha is coverage (the images are composited on a constant background) instead of a mask.
-
-    choice          the setting: "auto", "composite" or "mask"
-    may_be_renders  whether the capture's format may hold renders of an object, as transforms.json may
-
-    "auto" composites where every image of such a format holds an alpha channel and most have transparent pixels: renders of an object. Opaque
-    images, also in Blender's dialect, show real or rendered surroundings, and a few images with alpha among opaque ones are masked photographs.
-    Images that cannot be read have no say.
-    """
-    if choice != "auto":
-        return choice == "composite"
-    if not may_be_renders or not all(read_header(photo.image).alpha for photo in photos):
-        return False
-    transparent = opaque = 0
-    for photo in photos:
-        try:
-            transparent, opaque = (transparent + 1, opaque) if has_transparency(photo.image) else (transparent, opaque + 1)
-        except UnreadableImage:
-            continue
-        if 2 * max(transparent, opaque) > len(photos):
-            break
-    return transparent > opaque
-
-
-def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alpha: bool) -> Written:
+def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouettes: Silhouettes = NEITHER, may_be_empty: bool = True) -> Written:
     """Write the working image of a photo, and its mask if it has one.
 
-    relative    path of the image below folder/images, with its source's extension
-    max_side    longest side of the working image, pixels
-    keep_alpha  write RGBA as it is; else pixels with alpha below one half go into the mask
+    relative      path of the image below folder/images, with its source's extension
+    max_side      longest side of the working image, pixels
+    silhouettes   what becomes the alpha channel of the working image: the photo's own, the levels of its mask, or where both are silhouettes the lower of
+                  the two. Else pixels with alpha below one half, and those that the mask leaves out, go into the mask of the working image
+    may_be_empty  whether a silhouette may leave nothing
 
     A file that need not change is copied byte for byte, anything else becomes a PNG. Raises UnreadableImage; BadInput for a mask of another
     aspect than its image.
@@ -107,14 +81,22 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, keep_alph
     if (width, height) != (photo.camera.width, photo.camera.height):
         raise UnreadableImage(f"unreadable: {width}x{height} pixels, but {photo.camera.width}x{photo.camera.height} by its header, or it was changed")
     size = working_size(width, height, max_side)
-    usable, warnings = (None, []) if photo.mask is None else _usable(photo, size, found.orientation)
-    pixels = _resized(found.pixels, size)
-    has_alpha = pixels.shape[2] == 4
-    if has_alpha and not keep_alpha:
-        opaque = pixels[..., 3] >= OPAQUE
-        usable = opaque if usable is None else usable & opaque
-        pixels = pixels[..., :3]
-    verbatim = found.verbatim and size == (width, height) and (keep_alpha or not has_alpha)
+    usable: np.ndarray | None = None
+    warnings: list[str] = []
+    whole = found.pixels
+    if whole.shape[2] == 4 and not silhouettes.alpha:
+        reduced = _resized(whole, size)
+        whole, usable = reduced[..., :3], reduced[..., 3] >= OPAQUE
+    if photo.mask is not None and silhouettes.masks:
+        levels, warnings = mask_levels(photo, found.orientation)
+        whole = _with_alpha(whole, levels)
+    elif photo.mask is not None:
+        kept, warnings = _usable(photo, size, found.orientation)
+        usable = kept if usable is None else usable & kept
+    if silhouettes and not may_be_empty and whole.shape[2] == 4 and (whole[..., 3] <= TRANSPARENT).all():
+        raise UnreadableImage("has an empty silhouette")
+    pixels = _resized(whole, size)
+    verbatim = found.verbatim and pixels is found.pixels
     path = PosesOutputs(folder).images / relative
     path = path if verbatim else path.with_name(path.stem + ".png")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -176,8 +158,43 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.clip(np.rint(whole), 0, 255).astype(np.uint8)
 
 
+def _with_alpha(pixels: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """(H, W, 4) with the levels of a mask of any size as alpha, or the lower of these and the alpha that is there."""
+    import cv2
+
+    size = pixels.shape[1::-1]
+    if levels.shape[::-1] != size:
+        levels = cv2.resize(levels, size, interpolation=cv2.INTER_AREA if levels.shape[1] >= size[0] else cv2.INTER_LINEAR)
+    return np.dstack([pixels[..., :3], levels if pixels.shape[2] == 3 else np.minimum(levels, pixels[..., 3])])
+
+
+def mask_levels(photo: Photo, orientation: int) -> tuple[np.ndarray, list[str]]:
+    """(H, W) uint8, upright, at the mask file's size: how much of each pixel a silhouette covers; and warnings.
+
+    A mask of two levels, as of labels, covers all where it is not black, and so does a mask that is nowhere bright; others are soft. What is nearly black or
+    nearly white is noise of a network or of a lossy format.
+    """
+    levels, lossy, warnings = _read_mask(photo, orientation)
+    if not lossy and (levels.max(initial=0) < OPAQUE or len(np.flatnonzero(np.bincount(levels.ravel(), minlength=256))) <= 2):
+        levels = np.where(levels > 0, np.uint8(255), np.uint8(0))
+    else:
+        noise = LOSSY_NOISE if lossy else TRANSPARENT
+        levels = np.where(levels <= noise, np.uint8(0), np.where(levels >= 255 - noise, np.uint8(255), levels))
+    return levels if photo.mask_ignore == "black" else 255 - levels, warnings
+
+
 def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.ndarray, list[str]]:
     """(h, w) bool at working size from the photo's mask file, and warnings."""
+    mask, lossy, warnings = _read_mask(photo, orientation)
+    rows = ((np.arange(size[1]) + 0.5) * mask.shape[0] / size[1]).astype(int)
+    columns = ((np.arange(size[0]) + 0.5) * mask.shape[1] / size[0]).astype(int)
+    # Lossy files have no clean zero.
+    marked = mask[rows][:, columns] > (127 if lossy else 0)
+    return marked if photo.mask_ignore == "black" else ~marked, warnings
+
+
+def _read_mask(photo: Photo, orientation: int) -> tuple[np.ndarray, bool, list[str]]:
+    """The photo's mask file as it is meant to be seen, (H, W) uint8, whether its format is lossy, and warnings. Raises UnreadableImage, BadInput."""
     assert photo.mask is not None
     try:
         decoded = decode(photo.mask)
@@ -189,9 +206,4 @@ def _usable(photo: Photo, size: tuple[int, int], orientation: int) -> tuple[np.n
     sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
     if not same_aspect(found, expected):
         raise BadInput(f"{printable(photo.mask)}: {sizes}, of another aspect. Make the mask for this image.")
-    warnings = [] if found == expected else [f"{printable(photo.mask.name)}: {sizes}; it was resized."]
-    rows = ((np.arange(size[1]) + 0.5) * found[1] / size[1]).astype(int)
-    columns = ((np.arange(size[0]) + 0.5) * found[0] / size[0]).astype(int)
-    # Lossy files have no clean zero.
-    marked = mask[rows][:, columns] > (127 if decoded.lossy else 0)
-    return marked if photo.mask_ignore == "black" else ~marked, warnings
+    return mask, decoded.lossy, [] if found == expected else [f"{printable(photo.mask.name)}: {sizes}; it was resized."]

@@ -152,9 +152,9 @@ def test_alpha_of_renders_is_composited(tmp_path: Path) -> None:
     assert scene.read_image(tmp_path / "poses", made.views[1]).shape[2] == 4
 
 
-@pytest.mark.parametrize(("opaque", "without", "alpha"), [(6, 0, "auto"), (1, 1, "auto"), (0, 0, "mask"), (0, 6, "auto")])
+@pytest.mark.parametrize(("opaque", "without", "alpha"), [(6, 0, "auto"), (1, 1, "auto"), (0, 0, "ignore"), (0, 6, "auto")])
 def test_other_alpha_masks(tmp_path: Path, opaque: int, without: int, alpha: str) -> None:
-    made, _ = run(alpha_set(tmp_path / "source", opaque, without), tmp_path, alpha=alpha)
+    made, _ = run(alpha_set(tmp_path / "source", opaque, without), tmp_path, masks=alpha)
     assert made.background is None
     for index, view in enumerate(made.views):
         assert scene.read_image(tmp_path / "poses", view).shape[2] == 3
@@ -166,7 +166,7 @@ def test_other_alpha_masks(tmp_path: Path, opaque: int, without: int, alpha: str
 
 
 def test_composite_can_be_asked_for(tmp_path: Path) -> None:
-    made, _ = run(alpha_set(tmp_path / "source", without=1), tmp_path, alpha="composite")
+    made, _ = run(alpha_set(tmp_path / "source", without=1), tmp_path, masks="silhouette")
     assert made.background == (1.0, 1.0, 1.0)
 
 

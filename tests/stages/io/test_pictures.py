@@ -290,7 +290,7 @@ def test_sizes_are_bounded_before_anything_is_decoded(tmp_path: Path, size: tupl
             attempt(tmp_path / "bomb.png")
     masked = Photo(captures.cameras(1)[0], tmp_path / "a.png", tmp_path / "bomb.png")
     with pytest.raises(UnreadableImage, match=r"its mask bomb\.png is unreadable: .*million"):
-        working_images.write(masked, tmp_path / "out", "a.png", max_side=64, keep_alpha=False)
+        working_images.write(masked, tmp_path / "out", "a.png", max_side=64)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF", "WEBP", "BMP", "HEIF"])
@@ -341,7 +341,7 @@ def test_a_small_file_does_not_mean_a_large_picture(tmp_path: Path, kind: str) -
 def test_a_picture_of_another_size_than_its_header_states_is_left_out(tmp_path: Path) -> None:
     captures.write_picture(tmp_path / "a.png", captures.picture(width=16))
     with pytest.raises(UnreadableImage, match="16x24 pixels, but 32x24 by its header"):
-        working_images.write(Photo(captures.cameras(1)[0], tmp_path / "a.png"), tmp_path / "out", "a.png", max_side=64, keep_alpha=False)
+        working_images.write(Photo(captures.cameras(1)[0], tmp_path / "a.png"), tmp_path / "out", "a.png", max_side=64)
 
 
 class Failing(Exception):

@@ -136,7 +136,7 @@ def test_masks_are_turned_alike_for_features_and_for_working_images(tmp_path: Pa
     photo = reading.read_photo(tmp_path / "a.png", 100)
     for_features = reading.read_mask_file(tmp_path / "m.png", photo)
     camera = Camera("a.png", photo.width, photo.height, "SIMPLE_PINHOLE", (40.0, 20.0, 20.0), np.eye(4))
-    written = working_images.write(Photo(camera, tmp_path / "a.png", tmp_path / "m.png"), tmp_path / "out", "a.png", max_side=100, keep_alpha=False)
+    written = working_images.write(Photo(camera, tmp_path / "a.png", tmp_path / "m.png"), tmp_path / "out", "a.png", max_side=100)
     assert written.mask is not None
     with Image.open(tmp_path / "out" / written.mask) as mask:
         np.testing.assert_array_equal(np.asarray(mask) > 0, for_features)
