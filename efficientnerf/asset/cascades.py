@@ -114,6 +114,16 @@ def voxel_sides(tree: NerfTree) -> np.ndarray:
     return np.asarray([cascade.voxel for cascade in cascades_of(tree)], np.float32)[voxel_cascades(tree)]
 
 
+def point_cascades(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+    """(R,) int8: the cascade that points (R, 3) of the tree's frame belong to; -1 beyond all boxes."""
+    points = np.asarray(points, np.float64)
+    out = np.full(len(points), -1, np.int8)
+    for n, cascade in reversed(list(enumerate(cascades_of(tree)))):
+        low, high = cascade.bounds(tree.brick)
+        out[((points >= low) & (points < high)).all(axis=1)] = n
+    return out
+
+
 def cascade_tree(tree: NerfTree, number: int) -> NerfTree:
     """One cascade as a tree of its own, without the environment."""
     cascade, (first, end) = cascades_of(tree)[number], brick_ranges(tree)[number]

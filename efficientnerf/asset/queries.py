@@ -1,4 +1,4 @@
-"""What a NerfTree holds at points: density, normal, colour.
+"""What a NerfTree holds at points: density, normal, colour, of the cascade that each belongs to.
 
 N points.
 """
@@ -35,7 +35,7 @@ def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None 
 
 
 def density_block(tree: NerfTree, low: tuple[int, int, int], high: tuple[int, int, int]) -> np.ndarray:
-    """Density at the voxel centres low <= (i, j, k) < high: float32, zero outside of the grid and where nothing is stored."""
+    """Density at the voxel centres low <= (i, j, k) < high of cascade 0: float32, zero outside of the grid and where nothing is stored."""
     low_a, high_a = np.asarray(low), np.asarray(high)
     if (high_a < low_a).any():
         raise ValueError(f"density_block from {tuple(low)} to {tuple(high)}: the upper corner lies below the lower one")

@@ -31,8 +31,8 @@ MOST_PIXELS = 2**27  # 4 GiB of colours, opacities, depths and normals
 class Rendering:
     """The image of a scene that a camera takes, or the same along a bundle of rays.
 
-    colour   (..., 3) float32, sRGB, premultiplied by the opacity, or over the background that was given
-    opacity  (...)    float32, 0 to 1
+    colour   (..., 3) float32, sRGB, over the background that was given; else over the tree's environment, where it has one; else premultiplied by the opacity
+    opacity  (...)    float32, 0 to 1, of the voxels alone
     depth    (...)    float32, world units, along the view axis for cameras and along the ray for rays; where half of the light is
                       absorbed, infinity where less than half ever is
     normal   (..., 3) float32, unit, world frame, out of the surface; zero where nothing is hit
@@ -49,7 +49,7 @@ def render(
 ) -> Rendering:
     """The image that a camera in the training frame takes.
 
-    background     sRGB colour to composite over; None leaves the colour premultiplied
+    background     sRGB colour to composite over; None: the tree's environment, or nothing where it has none: then the colour is premultiplied
     supersample    rays along each side of a pixel
     rays_per_band  of supersampled images at once; changes memory alone
 
@@ -58,17 +58,25 @@ def render(
     from efficientnerf.backends.numba.tree.rendering import render_image
 
     _check_camera(camera, supersample)
-    behind = np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
-    if behind.shape != (3,):
-        raise ValueError(f"background {background}: expected three numbers, red, green and blue")
+    behind = _background(background)
     if tree.ndc is None and dispatch.tree_backend(tree) == "triton":
         from efficientnerf.backends.triton import tree as cuda_tree
 
         on_device = cuda_tree.render_image(cuda_tree.device_tree_of(tree), camera, background=background, supersample=supersample)
         return Rendering(*(part.cpu().numpy() for part in on_device))
     if tree.ndc is not None or tree.lookup == "nearest":
-        return _render_by_rays(tree, camera, behind, supersample, rays_per_band)
+        return _render_by_rays(tree, camera, background, supersample, rays_per_band)
     return Rendering(*render_image(tree, camera, supersample, behind, normals=True, rays_per_band=rays_per_band))
+
+
+def _background(background: tuple[float, float, float] | None) -> np.ndarray | None:
+    """As (3,) float32."""
+    if background is None:
+        return None
+    behind = np.asarray(background, np.float32)
+    if behind.shape != (3,):
+        raise ValueError(f"background {background}: expected three numbers, red, green and blue")
+    return behind
 
 
 def _check_camera(camera: Camera, supersample: int) -> None:
@@ -84,24 +92,36 @@ def _check_camera(camera: Camera, supersample: int) -> None:
         raise ValueError(f"{camera.name}: focal length {min(focal):g}; expected a positive one")
 
 
-def render_rays(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, *, eye: np.ndarray | None = None, columns: int | None = None) -> Rendering:
-    """The same along rays: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray.
+def render_rays(
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, *, eye: np.ndarray | None = None, columns: int | None = None,
+    background: tuple[float, float, float] | None = None,
+) -> Rendering:  # fmt: skip
+    """The same along rays: origins (R, 3), unit directions (R, 3), world frame; depth is the distance along the ray. `background` is as in `render`.
 
     What is known of all rays makes them faster on the CPU, and changes colours by less than 1e-3 (2e-3 in normalised device coordinates):
 
     eye      (3,) the point that all come from
     columns  how many make a row, where they are the rows of an image
     """
+    behind = _background(background)
     if tree.ndc is None:
-        return Rendering(*dispatch.tree_rays(tree, origins, directions, None, eye, columns))
-    from efficientnerf.backends.numba import rays as kernels
+        outputs = Rendering(*dispatch.tree_rays(tree, origins, directions, None, eye, columns))
+    else:
+        from efficientnerf.backends.numba import rays as kernels
 
-    warped = kernels.warp_rays(tree.ndc, origins, directions)
-    colour, opacity, along, normal = dispatch.tree_rays(tree, warped.origins, warped.directions, np.asarray(directions), eye, columns)
-    return Rendering(colour, opacity, *kernels.unwarp_hits(tree.ndc, warped, along, normal))
+        warped = kernels.warp_rays(tree.ndc, origins, directions)
+        colour, opacity, along, normal = dispatch.tree_rays(tree, warped.origins, warped.directions, np.asarray(directions), eye, columns)
+        outputs = Rendering(colour, opacity, *kernels.unwarp_hits(tree.ndc, warped, along, normal))
+    if behind is not None:
+        return replace(outputs, colour=outputs.colour + (1 - outputs.opacity[:, None]) * behind)
+    if tree.environment is not None:
+        from efficientnerf.backends.numba.tree.surroundings import over_environment
+
+        return replace(outputs, colour=over_environment(tree.environment, directions, outputs.opacity, outputs.colour))
+    return outputs
 
 
-def _render_single_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, rays_per_band: int) -> Rendering:
+def _render_single_rays(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None, rays_per_band: int) -> Rendering:
     """`_render_by_rays` of one ray to a pixel, where nothing has to be merged."""
     height, width = camera.height, camera.width
     colour, opacity = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
@@ -110,26 +130,26 @@ def _render_single_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, rays
     for top in range(0, height, step):
         y, x = np.mgrid[top : min(height, top + step), 0:width]
         origins, directions = rays(camera, np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5)
-        part = render_rays(tree, origins, directions, eye=camera.centre, columns=width)
+        part = render_rays(tree, origins, directions, eye=camera.centre, columns=width, background=background)
         to, hit = slice(top, top + len(y)), part.opacity >= 0.5
         depth[to] = np.where(hit, part.depth * (directions @ camera.forward), np.inf).reshape(y.shape)
         normal[to] = (part.normal * hit[:, None]).reshape(*y.shape, 3)
         opacity[to] = part.opacity.reshape(y.shape)
-        colour[to] = (part.colour + (1 - part.opacity[:, None]) * behind).reshape(*y.shape, 3)
+        colour[to] = part.colour.reshape(*y.shape, 3)
     return Rendering(colour, opacity, depth, normal)
 
 
-def _render_by_rays(tree: NerfTree, camera: Camera, behind: np.ndarray, supersample: int, rays_per_band: int) -> Rendering:
+def _render_by_rays(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None, supersample: int, rays_per_band: int) -> Rendering:
     """An image band by band of `render_rays`: of a tree whose frame is not the world, where rays of one camera diverge, or that is not interpolated."""
     height, width, n = camera.height, camera.width, supersample
     if n == 1:
-        return _render_single_rays(tree, camera, behind, rays_per_band)
-    bands = []
+        return _render_single_rays(tree, camera, background, rays_per_band)
+    bands, behind = [], np.zeros(3, np.float32) if background is None else np.asarray(background, np.float32)
     step = max(1, rays_per_band // 2 // (width * n**2))
     for top in range(0, height, step):
         y, x = np.mgrid[top * n : min(height, top + step) * n, 0 : width * n]
         origins, directions = rays(camera, (np.stack([x.ravel(), y.ravel()], axis=-1) + 0.5) / n)
-        part = render_rays(tree, origins, directions, eye=camera.centre, columns=width * n)
+        part = render_rays(tree, origins, directions, eye=camera.centre, columns=width * n, background=None if background is None else (0, 0, 0))
         along = (part.depth * (directions @ camera.forward)).astype(np.float32)
         values = np.concatenate([part.colour, part.opacity[:, None], along[:, None], part.normal], axis=1, dtype=np.float32)
         rows = len(y) // n
@@ -193,7 +213,8 @@ def ray_parts(tree: NerfTree, origins: Tensor, directions: Tensor) -> list[tuple
     met = []
     for low, high in bounds:
         one, other = (low - origins) / directions, (high - origins) / directions
-        met.append((torch.minimum(one, other).nan_to_num(-1e30).amax(dim=-1).clamp(min=0), torch.maximum(one, other).nan_to_num(1e30).amin(dim=-1)))
+        enter, leave = torch.minimum(one, other).nan_to_num(-1e30, 1e30, -1e30), torch.maximum(one, other).nan_to_num(1e30, 1e30, -1e30)
+        met.append((enter.amax(dim=-1).clamp(min=0), leave.amin(dim=-1)))
     front, back = [], []
     for n in range(1, len(met)):
         (enter, leave), (inner_enter, inner_leave) = met[n], met[n - 1]

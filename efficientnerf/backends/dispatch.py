@@ -173,7 +173,7 @@ def tree_backend(tree: NerfTree) -> Backend:
 def tree_rays(
     tree: NerfTree, origins: np.ndarray, directions: np.ndarray, views: np.ndarray | None = None, eye: np.ndarray | None = None, columns: int | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Colour (R, 3), opacity (R,), distance (R,) and normal (R, 3) of rays of a tree's frame.
+    """Colour (R, 3), premultiplied, of the voxels alone, opacity (R,), distance (R,) and normal (R, 3) of rays of a tree's frame.
 
     views    (R, 3) directions of the world that colours are looked up along; None: `directions`
     eye      the origin of all rays, columns: of the image that they are the pixels of; where known, for speed alone

@@ -104,6 +104,12 @@ def pointer(typing_context: Any, array: Any) -> Any:
 
 
 @intrinsic
+def advanced(typing_context: Any, address: Any, count: Any) -> Any:
+    """Pointer to the element that is `count` after the one that a pointer is to."""
+    return address(address, types.int64), lambda context, builder, signature, args: builder.gep(args[0], [args[1]])
+
+
+@intrinsic
 def popcount(typing_context: Any, bits: Any) -> Any:
     """Number of set bits of an int64."""
     return types.int64(types.int64), lambda context, builder, signature, args: builder.ctpop(args[0])

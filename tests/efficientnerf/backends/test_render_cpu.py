@@ -111,7 +111,7 @@ def laid_out(packed, colours, brick, direction, nearest, degree, owners, kind, v
         size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(colours), len(colours) - 1,
         pointer(voxels), pointer(waiting),
     )  # fmt: skip
-    grid, view = packed_pointers(packed, brick), View(pointer(direction), 1.0, nearest, np.float32(2), degree)
+    grid, view = packed_pointers(packed, brick, 0), View(pointer(direction), 1.0, nearest, np.float32(2), degree)
     for brick_number in owners:
         fill_block(brick_number, grid, view, pool)
     # They must outlive the pointers to them.
@@ -124,7 +124,7 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
     values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
     direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
     colours[-1, 1:] = np.nan
-    compute_view_colours(0, len(packed_of(tree).cells), packed_of(tree), tree.brick, direction, np.float32(2), tree.degree, colours)
+    compute_view_colours(0, len(packed_of(tree).cells), 0, packed_of(tree), tree.brick, direction, np.float32(2), tree.degree, colours)
     laid_out(packed_of(tree), colours, tree.brick, direction, nearest, tree.degree, owners, kind, values)
     back = np.argsort(owners)
     return values[back].reshape(-1, side, side, side, 4), kind[back]
@@ -194,7 +194,7 @@ def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> N
     for cell in np.argwhere(tree.brick_index >= 0):
         absorbs[tuple(cell)] = density_block(tree, tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
     assert 0 < absorbs.sum() < (tree.brick_index >= 0).sum()
-    leap = packed_of(tree).leap
+    leap = packed_of(tree).leap.reshape(tree.shape)
     assert not leap[absorbs].any()
     for at in np.argwhere(~absorbs):
         assert leap[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()

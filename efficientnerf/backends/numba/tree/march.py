@@ -113,7 +113,7 @@ class RayScratch(NamedTuple):
 
     x, y, z   (QUEUE,) float32: fractions of pending samples between voxels
     distance  (QUEUE,) float32: their distance along the ray, voxels
-    state     (10,) float32: see below
+    state     (12,) float32: see below
     basis     (K,) float32: harmonics of the ray's direction
     """
 
@@ -126,8 +126,10 @@ class RayScratch(NamedTuple):
 
 
 # State of a ray: four numbers of which the last three are its colour; transmittance; weight of samples without a colour yet; distance at which the
-# transmittance fell to one half; whether the harmonics are evaluated; and counts of interpolated samples and of colours looked up.
-COLOUR, TRANSMITTANCE, PENDING_WEIGHT, HALF_DISTANCE, HAS_BASIS, INTERPOLATED, LOOKUPS = 0, 4, 5, 6, 7, 8, 9
+# transmittance fell to one half; whether the harmonics are evaluated; and counts of interpolated samples, of colours looked up, of coarse cells visited and of
+# samples tested.
+COLOUR, TRANSMITTANCE, PENDING_WEIGHT, HALF_DISTANCE, HAS_BASIS, INTERPOLATED, LOOKUPS, VISITED, TESTED = 0, 4, 5, 6, 7, 8, 9, 10, 11
+STATE = 12
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
@@ -205,12 +207,18 @@ def _composite(kind, count, ray, grid, view, pool, scratch):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
-def march(ray, first, end, grid, view, pool, scratch, out):  # type: ignore[no-untyped-def]
-    """Renders the samples first <= k < end of a ray; both below 2^24.
+def begin_ray(scratch):  # type: ignore[no-untyped-def]
+    """A ray that has met nothing."""
+    for n in range(STATE):
+        scratch.state[n] = np.float32(0)
+    scratch.state[TRANSMITTANCE], scratch.state[HALF_DISTANCE] = _ONE, np.float32(np.inf)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+def march(ray, first, end, grid, view, pool, scratch):  # type: ignore[no-untyped-def]
+    """Adds the samples first <= k < end of a ray's part in a cascade to its state; both below 2^24. The half distance is one from the entry, voxels.
 
     view  see `View`; its density scale is STEP, in units of the frame, times log2(e)
-    out   (9,) float32: red, green, blue, opacity; distance from the entry at which the transmittance falls to one half, voxels, or infinity; and statistics:
-          coarse cells visited, samples tested, samples interpolated, colours looked up
     """
     ex, ey, ez, dx, dy, dz = ray.ex, ray.ey, ray.ez, ray.dx, ray.dy, ray.dz
     brick, state = grid.brick, scratch.state
@@ -226,9 +234,6 @@ def march(ray, first, end, grid, view, pool, scratch, out):  # type: ignore[no-u
     ahead_x, ahead_y, ahead_z = (_ONE if dx > 0 else -_ONE), (_ONE if dy > 0 else -_ONE), (_ONE if dz > 0 else -_ONE)
     beside_x, beside_y, beside_z = (none if dx > 0 else _ONE), (none if dy > 0 else _ONE), (none if dz > 0 else _ONE)
     most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)
-    for n in range(10):
-        state[n] = none
-    state[TRANSMITTANCE], state[HALF_DISTANCE] = _ONE, np.float32(np.inf)
     pending, kind = 0, np.int64(VIEW_COLOURS)
     visited, tested = 0, none
     # Integers are kept as float32: conversions would lengthen the dependency chain from step to step.
@@ -282,6 +287,4 @@ def march(ray, first, end, grid, view, pool, scratch, out):  # type: ignore[no-u
         tested += k
     if pending > 0:
         _composite(kind, pending, ray, grid, view, pool, scratch)
-    out[0], out[1], out[2] = state[COLOUR + 1], state[COLOUR + 2], state[COLOUR + 3]
-    out[3], out[4] = _ONE - state[TRANSMITTANCE], state[HALF_DISTANCE]
-    out[5], out[6], out[7], out[8] = visited, tested, state[INTERPOLATED], state[LOOKUPS]
+    state[VISITED], state[TESTED] = state[VISITED] + np.float32(visited), state[TESTED] + tested

@@ -19,10 +19,9 @@ def _density(u, v, w, grid, view, pool):  # type: ignore[no-untyped-def]
         return np.float32(0)
     per_brick = np.float32(1 / brick)
     a, e, c = min(int(u * per_brick), grid.nx - 1), min(int(v * per_brick), grid.ny - 1), min(int(w * per_brick), grid.nz - 1)
-    cell = (a * grid.ny + e) * grid.nz + c
-    if grid.leap[cell] > 0:
+    owner = np.int64(grid.brick_index[(a * grid.ny + e) * grid.nz + c])
+    if owner < 0:
         return np.float32(0)
-    owner = np.int64(grid.brick_index[cell])
     x, y, z = u - np.float32(a * brick) + _HALF, v - np.float32(e * brick) + _HALF, w - np.float32(c * brick) + _HALF
     i, j, k = int(x), int(y), int(z)
     side = brick + 2

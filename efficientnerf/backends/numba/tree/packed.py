@@ -3,7 +3,7 @@
 To the kernel a brick is empty if neither its voxels nor those around it have density. Blocks of the others are laid out while an image is rendered, see
 `efficientnerf.backends.numba.tree.blocks`.
 
-B bricks, N stored voxels, K harmonics, P entries of a palette; b = brick.
+L cascades, C coarse cells of all of them, B bricks, N stored voxels, K harmonics, P entries of a palette; b = brick.
 """
 
 from __future__ import annotations
@@ -26,21 +26,27 @@ VOXELS_PER_CALL = 2**23  # of bricks that one call of a kernel goes through, so 
 class Packed(NamedTuple):
     """See the module. The harmonics are either in `sh` or in the four arrays after it; the others are empty.
 
-    leap          (X, Y, Z) uint8: as `NerfTree.leap`, but bricks without density in or around them count as empty
+    grids         (L, 4) int64: coarse cells of a cascade along x, y, z, and which of all cells is its first
+    places        (L, 4) float64: side of its voxels and that of cascade 0's, divided; and what is added to voxel coordinates of cascade 0, so divided, to have
+                  those of the cascade
+    leap          (C,) uint8: as `NerfTree.leap`, but bricks without density in or around them count as empty, and so do those in the box of the cascade before
     has_density   (B, W) int64 bit masks: bit n % 64 of word n // 64 is set where any of the eight voxels has density that begin at voxel
                   (i - 1, j - 1, k - 1) of the brick; n = (i (b + 2) + j) (b + 2) + k
     stored_ranks  (B + 1, V, 2) int64: 64 voxels of a brick a word: which are stored, and the index of the first of them. A sixteenth of `voxel_index`, so that
                   it stays in a cache while blocks are filled. The last brick stores none
     cells         (B, 3) int32: the coarse cell of a brick
-    brick_index, voxel_index, density  the tree's own, with voxels in order; the harmonics likewise
+    brick_index   (C,) int32: those of the cascades
+    voxel_index, density  the tree's own, with voxels in order; the harmonics likewise
     sh            (N, K, 3) float32: the tree's own
     base, base_table, codes  as in PaletteHarmonics: the tree's own
     palette       (K - 1, P, 4) float32: the tree's, with a zero before red
     code_columns  (K - 1,) int64: which of a voxel's codes selects the entry of each harmonic above degree 0
-    colour_slope  view dependence: mean over voxels of the change of colour before the sigmoid, at most of the three channels, per radian of the direction, root
-                  mean square over directions
+    colour_slope  (L,) float64, view dependence: mean over voxels of the change of colour before the sigmoid, at most of the three channels, per radian of the
+                  direction, root mean square over directions
     """
 
+    grids: np.ndarray
+    places: np.ndarray
     leap: np.ndarray
     has_density: np.ndarray
     stored_ranks: np.ndarray
@@ -54,11 +60,11 @@ class Packed(NamedTuple):
     codes: np.ndarray
     palette: np.ndarray
     code_columns: np.ndarray
-    colour_slope: float
+    colour_slope: np.ndarray
 
     @property
     def nbytes(self) -> int:
-        """Of the arrays beside the tree's own."""
+        """Of the arrays beside the tree's own, but for the smallest."""
         return self.leap.nbytes + self.has_density.nbytes + self.stored_ranks.nbytes + self.cells.nbytes + self.palette.nbytes
 
 
@@ -107,10 +113,10 @@ def _has_density(first, end, cells, brick, brick_index, voxel_index, values, out
                         out[owner, n >> 6] |= np.int64(dense[i, j, k] | dense[i + 1, j, k]) << (n & 63)
 
 
-def brick_ranges(bricks: int, brick: int) -> Iterator[tuple[int, int]]:
-    """First brick and end of ranges of about VOXELS_PER_CALL voxels."""
+def brick_ranges(first: int, end: int, brick: int) -> Iterator[tuple[int, int]]:
+    """First brick and end of ranges of about VOXELS_PER_CALL voxels, of bricks `first` to `end`."""
     each = max(256, VOXELS_PER_CALL // brick**3)
-    return ((first, min(bricks, first + each)) for first in range(0, bricks, each))
+    return ((begin, min(end, begin + each)) for begin in range(first, end, each))
 
 
 def _stored_ranks(voxel_index: np.ndarray) -> np.ndarray:
@@ -126,14 +132,13 @@ def _stored_ranks(voxel_index: np.ndarray) -> np.ndarray:
     return out
 
 
-def _colour_slope(tree: NerfTree) -> float:
-    """`Packed.colour_slope`, from a regular subset of the voxels."""
+def _colour_slope(tree: NerfTree, first: int, end: int) -> float:
+    """`Packed.colour_slope` of voxels first <= N < end, from a regular subset of them."""
     from efficientnerf.rendering.harmonics import squared_slopes
 
-    count = len(tree.density_values)
-    if count == 0 or tree.degree == 0:
+    if end == first or tree.degree == 0:
         return 0.0
-    sample = tree.coefficients(np.arange(0, count, -(-count // SLOPE_VOXELS)))
+    sample = tree.coefficients(np.arange(first, end, -(-(end - first) // SLOPE_VOXELS)))
     return float(np.sqrt(np.einsum("nkc,nkc,k->nc", sample, sample, squared_slopes(tree.degree))).max(axis=1).mean())
 
 
@@ -158,23 +163,56 @@ def packed_of(tree: NerfTree) -> Packed:
     return tree.derived["packed"]
 
 
+def bricks_of(tree: NerfTree) -> list[tuple[int, int]]:
+    """First brick and end of each cascade."""
+    from efficientnerf.asset import cascades
+
+    return cascades.brick_ranges(tree) if tree.outer else [(0, len(tree.voxel_index))]
+
+
+def _places(tree: NerfTree) -> tuple[np.ndarray, np.ndarray]:
+    """`Packed.grids` and `Packed.places`."""
+    from efficientnerf.asset.cascades import cascades_of
+
+    cascades = cascades_of(tree)
+    count = [int(np.prod(cascade.shape)) for cascade in cascades]
+    grids = [[*cascade.shape, sum(count[:n])] for n, cascade in enumerate(cascades)]
+    places = [[cascade.voxel / tree.voxel, *(tree.bounds_min - cascade.bounds_min) / cascade.voxel] for cascade in cascades]
+    return np.array(grids, np.int64), np.array(places, np.float64)
+
+
+def _pack_cascade(tree: NerfTree, number: int, cells: np.ndarray, has_density: np.ndarray) -> np.ndarray:
+    """Fills in a cascade's rows of `Packed.cells` and `Packed.has_density`, the latter zero before; returns its part of `Packed.leap`, (X, Y, Z)."""
+    from efficientnerf.asset.cascades import cascades_of
+    from efficientnerf.asset.tree import leaps
+
+    cascades, (first, end) = cascades_of(tree), bricks_of(tree)[number]
+    cascade = cascades[number]
+    occupied = np.flatnonzero(cascade.brick_index.reshape(-1) >= 0)
+    cells[cascade.brick_index.reshape(-1)[occupied]] = np.stack(np.unravel_index(occupied, cascade.shape), axis=1)
+    for begin, stop in brick_ranges(first, end, tree.brick):
+        _has_density(begin, stop, cells, tree.brick, cascade.brick_index, tree.voxel_index, tree.density_values, has_density)
+    full = np.zeros(cascade.shape, bool)
+    full[tuple(cells[first:end][has_density[first:end].any(axis=1)].T)] = True
+    if number:  # no sample lies in the box of the cascade before
+        inner = np.round((cascades[number - 1].bounds(tree.brick) - cascade.bounds_min) / (cascade.voxel * tree.brick)).astype(int)
+        full[tuple(slice(*side) for side in inner.T)] = False
+    return leaps(full)
+
+
 def pack(tree: NerfTree) -> Packed:
     """The packed form of a tree; ValueError for nearest lookup, since the kernel that reads it interpolates."""
+    from efficientnerf.asset.cascades import cascades_of
     from efficientnerf.asset.palettes import PaletteHarmonics
-    from efficientnerf.asset.tree import leaps
 
     if tree.lookup != "trilinear":
         raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; render it by `backends.numba.tree.nearest`")
 
-    tree = _in_order(tree)
-    occupied = np.flatnonzero(tree.brick_index.reshape(-1) >= 0)
-    cells = np.empty((len(occupied), 3), np.int32)
-    cells[tree.brick_index.reshape(-1)[occupied]] = np.stack(np.unravel_index(occupied, tree.shape), axis=1)
+    tree, bricks = _in_order(tree), bricks_of(tree)
+    cells = np.empty((len(tree.voxel_index), 3), np.int32)
     has_density = np.zeros((len(cells), ((tree.brick + 2) ** 3 + 63) // 64), np.int64)
-    for first, end in brick_ranges(len(cells), tree.brick):
-        _has_density(first, end, cells, tree.brick, tree.brick_index, tree.voxel_index, tree.density_values, has_density)
-    full = np.zeros(tree.shape, bool)
-    full[tuple(cells[has_density.any(axis=1)].T)] = True
+    leap = [_pack_cascade(tree, n, cells, has_density).reshape(-1) for n in range(len(bricks))]
+    brick_index = [cascade.brick_index.reshape(-1) for cascade in cascades_of(tree)]
     harmonics = tree.harmonics
     if isinstance(harmonics, PaletteHarmonics):
         palette = np.zeros((harmonics.palette.shape[1], harmonics.palette.shape[0], 4), np.float32)
@@ -183,5 +221,8 @@ def pack(tree: NerfTree) -> Packed:
     else:
         none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
         coded = np.ascontiguousarray(harmonics, np.float32), *none
-    ranks, own = _stored_ranks(tree.voxel_index), (tree.brick_index, tree.voxel_index, tree.density_values)
-    return Packed(leaps(full), has_density, ranks, cells, *own, *coded, _colour_slope(tree))
+    ranks, stored = _stored_ranks(tree.voxel_index), (tree.voxel_index >= 0).sum(axis=1)
+    slopes = [_colour_slope(tree, int(stored[:first].sum()), int(stored[:end].sum())) for first, end in bricks]
+    joined = (leap[0], brick_index[0]) if len(leap) == 1 else (np.concatenate(leap), np.concatenate(brick_index))
+    own = np.ascontiguousarray(joined[1]), tree.voxel_index, tree.density_values
+    return Packed(*_places(tree), joined[0], has_density, ranks, cells, *own, *coded, np.array(slopes))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.cascades import Cascade, cascades_of, point_cascades
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.walk import TreeGrid, corner_voxels, walk_pointers
 from efficientnerf.rendering.harmonics import basis_numpy
@@ -117,28 +119,42 @@ def _colours(points, bases, grid, density, sh, out):  # type: ignore[no-untyped-
             _colour(index, weight, sh, bases[n], out[n])
 
 
-def _voxel_coordinates(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+def _voxel_coordinates(tree: NerfTree, cascade: Cascade, points: np.ndarray) -> np.ndarray:
     """Voxel coordinates of points of the tree's frame, float32; for nearest lookup those of voxel centres, where interpolation gives the voxel's own values."""
-    at = np.ascontiguousarray((np.asarray(points, np.float64) - tree.bounds_min) / tree.voxel, np.float32)
+    at = np.ascontiguousarray((points - cascade.bounds_min) / cascade.voxel, np.float32)
     return np.floor(at) + np.float32(0.5) if tree.lookup == "nearest" else at
 
 
-def _grid(tree: NerfTree) -> TreeGrid:
-    """The structure without its leaps, which points do not need."""
-    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, np.zeros((1, 1, 1), np.uint8), float(tree.voxel), tree.lookup == "nearest")
+def _grids(tree: NerfTree, points: np.ndarray) -> Iterator[tuple[np.ndarray | slice, np.ndarray, TreeGrid]]:
+    """Which points belong to a cascade, their voxel coordinates in it, and it without its leaps, which points do not need; those beyond all boxes are of the
+    first."""
+    points, cascades = np.asarray(points, np.float64), cascades_of(tree)
+    owner = point_cascades(tree, points).clip(0) if tree.outer else None
+    for n, cascade in enumerate(cascades):
+        chosen = slice(None) if owner is None else np.flatnonzero(owner == n)
+        grid = TreeGrid(
+            tree.brick, cascade.brick_index, tree.voxel_index, np.zeros((1, 1, 1), np.uint8), float(cascade.voxel), tree.lookup == "nearest"
+        )  # fmt: skip
+        yield chosen, _voxel_coordinates(tree, cascade, points[chosen]), grid
 
 
 def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     """(N,) float32 at points (N, 3) of the tree's frame."""
     out = np.empty(len(points), np.float32)
-    _densities(_voxel_coordinates(tree, points), _grid(tree), tree.density_values, out)
+    for chosen, at, grid in _grids(tree, points):
+        part = np.empty(len(at), np.float32)
+        _densities(at, grid, tree.density_values, part)
+        out[chosen] = part
     return out
 
 
 def normal_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 unit normals at points (N, 3) of the tree's frame; zero where the density is flat."""
+    """(N, 3) float32 unit normals at points (N, 3) of the tree's frame, from the cascade that a point belongs to; zero where the density is flat."""
     out = np.empty((len(points), 3), np.float32)
-    _normals(_voxel_coordinates(tree, points), _grid(tree), tree.density_values, out)
+    for chosen, at, grid in _grids(tree, points):
+        part = np.empty((len(at), 3), np.float32)
+        _normals(at, grid, tree.density_values, part)
+        out[chosen] = part
     return out
 
 
@@ -150,5 +166,8 @@ def colour_at(tree: NerfTree, points: np.ndarray, directions: np.ndarray | None)
     else:
         bases = basis_numpy(np.ascontiguousarray(directions, np.float32), tree.degree)
     out = np.empty((len(points), 3), np.float32)
-    _colours(_voxel_coordinates(tree, points), np.ascontiguousarray(bases), _grid(tree), tree.density_values, tree.sh, out)
+    for chosen, at, grid in _grids(tree, points):
+        part = np.empty((len(at), 3), np.float32)
+        _colours(at, np.ascontiguousarray(bases[chosen]), grid, tree.density_values, tree.sh, part)
+        out[chosen] = part
     return out

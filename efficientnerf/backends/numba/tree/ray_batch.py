@@ -25,10 +25,9 @@ class RayBatch(NamedTuple):
     pitch              distance of neighbouring rays, pixels; the first ray lies half of it from the left and upper border of the image
     first_row          row of the first ray
     rotation           (3, 3) world from camera
-    centre             (3,) of the camera, voxel coordinates
-    view_direction     (3, 4) direction along which points are seen, see `View`
+    centre             (3,) of the camera, voxel coordinates of cascade 0
     camera_directions  (H, W, 3) float32 unit directions in the camera's frame, or (0, 0, 3)
-    origins            (H, W, 3) voxel coordinates, or (0, 0, 3)
+    origins            (H, W, 3) voxel coordinates of cascade 0, or (0, 0, 3)
     directions         (H, W, 3) unit directions, with `origins`
     sh_directions      (H, W, 3) float32 directions that harmonics are evaluated along, or (0, 0, 3): those of the rays
     """
@@ -38,7 +37,6 @@ class RayBatch(NamedTuple):
     first_row: int
     rotation: np.ndarray
     centre: np.ndarray
-    view_direction: np.ndarray
     camera_directions: np.ndarray
     origins: np.ndarray
     directions: np.ndarray
@@ -107,6 +105,12 @@ def ray_at(row, column, rays):  # type: ignore[no-untyped-def]
     return rays.x, rays.y, rays.z, dx, dy, dz, cosine
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def in_cascade(x, y, z, grid):  # type: ignore[no-untyped-def]
+    """Voxel coordinates of a point, of those in cascade 0."""
+    return x / grid.ratio + grid.shift_x, y / grid.ratio + grid.shift_y, z / grid.ratio + grid.shift_z
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _empty_radius(x, y, z, grid):  # type: ignore[no-untyped-def]
     """Radius of a ball around a point, voxel coordinates, that touches no occupied cell."""
@@ -129,12 +133,13 @@ def _empty_radius(x, y, z, grid):  # type: ignore[no-untyped-def]
 def _clear_cone(origin, direction, radius, widening, t, grid):  # type: ignore[no-untyped-def]
     """Distance up to which all rays of a cone are clear; infinity where they never meet an occupied cell.
 
-    origin, direction  (x, y, z) of its axis, voxel coordinates
-    radius             distance of the rays' origins from `origin`, at most
+    origin, direction  (x, y, z) of its axis, voxel coordinates of cascade 0
+    radius             distance of the rays' origins from `origin`, at most, voxels of cascade 0
     widening           distance of their unit directions from `direction`, at most
-    t                  distance up to which they are known to be clear
+    t                  distance up to which they are known to be clear, voxels of the grid, as is what is returned
     """
-    ox, oy, oz = origin
+    ox, oy, oz = in_cascade(origin[0], origin[1], origin[2], grid)
+    radius /= grid.ratio
     dx, dy, dz = direction
     if not np.isfinite(ox + oy + oz + dx + dy + dz + radius + widening + t):  # NaN must not become an index
         return t
@@ -193,7 +198,7 @@ def _clear_rays(top, low, left, right, since, rays, grid):  # type: ignore[no-un
 
 @numba.njit(cache=True, error_model="numpy")
 def clear_distance(top, low, left, right, since, rays, grid):  # type: ignore[no-untyped-def]
-    """Distance up to which the rays of rows top to low and columns left to right are clear, at least `since`."""
+    """Distance, voxels of the grid, up to which the rays of rows top to low and columns left to right are clear in it, at least `since`."""
     if rays.kind == GIVEN_RAYS:
         return _clear_rays(top, low, left, right, since, rays, grid)
     if rays.kind == DIRECTION_TABLE:

@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.blocks import MIN_BLOCKS, POOL_BYTES
 from efficientnerf.backends.numba.tree.image import TILE, WORK, downsample, render_batch
 from efficientnerf.backends.numba.tree.march import LOG2E, STEP
-from efficientnerf.backends.numba.tree.packed import brick_ranges, packed_of
+from efficientnerf.backends.numba.tree.packed import brick_ranges, bricks_of, packed_of
 from efficientnerf.backends.numba.tree.ray_batch import RayBatch
-from efficientnerf.backends.numba.tree.view_colours import compute_view_colours
+from efficientnerf.backends.numba.tree.surroundings import add_environment
+from efficientnerf.backends.numba.tree.view_colours import Views, compute_view_colours
 from efficientnerf.geometry.cameras import Camera, rays
 
 if TYPE_CHECKING:
@@ -40,27 +42,35 @@ def _allocate(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np
 class ViewColours(NamedTuple):
     """Colours of a tree's voxels for a view, see `compute_view_colours`, and where they may be used, see `View`."""
 
-    direction_rate: float
-    min_distance: float
+    views: Views
     colours: np.ndarray
 
 
 def _view_colours(tree: NerfTree, view_direction: np.ndarray) -> ViewColours:
+    """Of all cascades; the direction is that of cascade 0."""
     colours, packed = np.empty((len(tree.density_values) + 1, 4), np.float32), packed_of(tree)
     colours[-1] = 0, np.nan, np.nan, np.nan
-    for first, end in brick_ranges(len(packed.cells), tree.brick):
-        compute_view_colours(first, end, packed, tree.brick, view_direction, _density_scale(tree), tree.degree, colours)
-    return ViewColours(float(np.linalg.norm(view_direction[:, :3], 2)), _min_distance(tree), colours)
+    views = _views(tree, view_direction, _min_distance(tree))
+    for cascade, bricks in enumerate(bricks_of(tree)):
+        for first, end in brick_ranges(*bricks, tree.brick):
+            direction, scale = views.direction[cascade], views.density_scale[cascade]
+            compute_view_colours(first, end, cascade, packed, tree.brick, direction, scale, tree.degree, colours)
+    return ViewColours(views, colours)
 
 
-def _min_distance(tree: NerfTree) -> float:
-    """`View.min_distance`, voxels."""
+def _views(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray) -> Views:
+    """The view of each cascade, from the direction of cascade 0."""
+    ratio, shift = packed_of(tree).places[:, 0], packed_of(tree).places[:, 1:]
+    matrix = np.broadcast_to(view_direction[:, :3], (len(ratio), 3, 3))  # directions may have any length: per voxel of each cascade
+    at_zero = view_direction[:, 3] / ratio[:, None] - np.einsum("ij,lj->li", view_direction[:, :3], shift)
+    scale = np.array([np.float32(STEP * cascade.voxel * LOG2E) for cascade in cascades_of(tree)], np.float32)
+    direction = np.concatenate([matrix, at_zero[..., None]], axis=2)
+    return Views(direction, float(np.linalg.norm(view_direction[:, :3], 2)), min_distance, scale, tree.degree)
+
+
+def _min_distance(tree: NerfTree) -> np.ndarray:
+    """`View.min_distance` of each cascade, voxels."""
     return (VOXELS_PER_SLOPE if tree.ndc is None else VOXELS_PER_SLOPE_NDC) * packed_of(tree).colour_slope
-
-
-def _density_scale(tree: NerfTree) -> np.float32:
-    """`View.density_scale`: optical thickness of a step, to base 2."""
-    return np.float32(STEP * tree.voxel * LOG2E)
 
 
 def _render(
@@ -72,8 +82,8 @@ def _render(
     progress = np.zeros((threads, 3), np.int64)
     # In pieces: signals are answered between calls.
     while not render_batch(
-        batch, background, packed_of(tree), tree.brick, colours.colours, colours.direction_rate, colours.min_distance, _density_scale(tree), tree.degree,
-        float(tree.voxel), tile, threads, _capacity(tree), WORK, progress, *out, statistics,
+        batch, background, packed_of(tree), tree.brick, colours.colours, colours.views, float(tree.voxel), tile, threads, _capacity(tree), WORK, progress,
+        *out, statistics,
     ):  # fmt: skip
         pass
 
@@ -112,11 +122,12 @@ def render_rays(
     directions = np.ascontiguousarray(directions, np.float64).reshape(shape)
     along = none if sh_directions is None else np.ascontiguousarray(sh_directions, np.float32).reshape(shape)
     view_direction = np.eye(3, 4) if eye is None else _view_direction(tree, eye)
-    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), view_direction, none, np.ascontiguousarray(starts), directions, along)
+    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), none, np.ascontiguousarray(starts), directions, along)
     out = _allocate(rows, columns, normals=True)
     if len(origins):
         shared = eye is not None and _any_far(tree, view_direction)
-        colours = _view_colours(tree, view_direction) if shared else ViewColours(1.0, np.inf, np.zeros((1, 4), np.float32))
+        never = np.full(len(packed_of(tree).grids), np.inf)
+        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((1, 4), np.float32))
         _render(tree, batch, colours, np.zeros(3, np.float32), (1, TILE * TILE) if rows == 1 else (TILE, TILE), out)
     colour, opacity, depth, normal = out
     return colour.reshape(-1, 3), opacity.reshape(-1), depth.reshape(-1), normal.reshape(-1, 3)
@@ -124,9 +135,14 @@ def render_rays(
 
 def _any_far(tree: NerfTree, view_direction: np.ndarray) -> bool:
     """Whether any voxel is at least `_min_distance` away."""
-    corners = np.stack(np.meshgrid(*((0, n) for n in tree.resolution), indexing="ij"), -1).reshape(-1, 3)
-    farthest = np.linalg.norm(corners @ view_direction[:, :3].T + view_direction[:, 3], axis=1).max()  # the length is convex: greatest at a corner
-    return bool(farthest > _min_distance(tree) * np.linalg.norm(view_direction[:, :3], 2))
+    grids, least = packed_of(tree).grids, _min_distance(tree)
+    views = _views(tree, view_direction, least)
+    for n, direction in enumerate(views.direction):
+        corners = np.stack(np.meshgrid(*((0, cells * tree.brick) for cells in grids[n, :3]), indexing="ij"), -1).reshape(-1, 3)
+        farthest = np.linalg.norm(corners @ direction[:, :3].T + direction[:, 3], axis=1).max()  # the length is convex: greatest at a corner
+        if farthest > least[n] * views.direction_rate:
+            return True
+    return False
 
 
 def _view_direction(tree: NerfTree, eye: np.ndarray) -> np.ndarray:
@@ -169,7 +185,6 @@ def _camera_batch(tree: NerfTree, camera: Camera, supersample: int, top: int, lo
         first_row=top * supersample,
         rotation=np.ascontiguousarray(camera.world_from_camera[:3, :3], np.float64),
         centre=centre,
-        view_direction=_direction_from(centre),
         camera_directions=table,
         origins=none.astype(np.float64),
         directions=none.astype(np.float64),
@@ -178,15 +193,17 @@ def _camera_batch(tree: NerfTree, camera: Camera, supersample: int, top: int, lo
 
 
 def render_image(
-    tree: NerfTree, camera: Camera, supersample: int, background: np.ndarray, *, normals: bool, rays_per_band: int
+    tree: NerfTree, camera: Camera, supersample: int, background: np.ndarray | None, *, normals: bool, rays_per_band: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Colour (H, W, 3) over `background`, opacity (H, W), depth (H, W) along the view axis, normal (H, W, 3) of a camera's pixels.
+    """Colour (H, W, 3), opacity (H, W), depth (H, W) along the view axis, normal (H, W, 3) of a camera's pixels.
 
+    background     (3,) that colours are composited over; None: the tree's environment, or nothing where it has none
     normals        whether they are wanted; else they are (0, 0, 3)
     rays_per_band  rays of a supersampled image that are rendered before they are averaged
     """
     height, width = camera.height, camera.width
-    background = np.ascontiguousarray(background, np.float32)
+    environment = tree.environment if background is None else None
+    behind = np.zeros(3, np.float32) if background is None else np.ascontiguousarray(background, np.float32)
     image = _allocate(height, width, normals=normals)
     most = rays_per_band if supersample > 1 else height * width
     if camera.model not in PINHOLES:
@@ -197,11 +214,11 @@ def render_image(
         low = min(top + step, height)
         part = tuple(whole[top:low] if len(whole) else whole for whole in image)
         batch = _camera_batch(tree, camera, supersample, top, low)
-        if supersample == 1:
-            _render(tree, batch, colours, background, (TILE, TILE), part)
-        else:
-            fine = _allocate((low - top) * supersample, width * supersample, normals=normals)
-            _render(tree, batch, colours, background, (TILE, TILE), fine)
+        fine = part if supersample == 1 else _allocate((low - top) * supersample, width * supersample, normals=normals)
+        _render(tree, batch, colours, behind, (TILE, TILE), fine)
+        if environment is not None:
+            add_environment(environment, batch, fine[1], fine[0])
+        if supersample > 1:
             downsample(supersample, *fine, *part)
     return image
 
@@ -211,5 +228,5 @@ def ray_statistics(tree: NerfTree, camera: Camera) -> np.ndarray:
     statistics = np.zeros((camera.height, camera.width, 4), np.int32)
     out = _allocate(camera.height, camera.width, normals=False)
     batch = _camera_batch(tree, camera, 1, 0, camera.height)
-    _render(tree, batch, _view_colours(tree, batch.view_direction), np.zeros(3, np.float32), (TILE, TILE), out, statistics)
+    _render(tree, batch, _view_colours(tree, _direction_from(batch.centre)), np.zeros(3, np.float32), (TILE, TILE), out, statistics)
     return statistics

@@ -16,6 +16,7 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import (
     add_scaled4,
     add_scaled_gathered16,
+    advanced,
     broadcast_like,
     load4,
     pack4,
@@ -62,15 +63,32 @@ class View(NamedTuple):
     degree: int
 
 
+class Views(NamedTuple):
+    """A View of each cascade: direction (L, 3, 4), min_distance (L,), density_scale (L,) float32; the rest is common to all."""
+
+    direction: np.ndarray
+    direction_rate: float
+    min_distance: np.ndarray
+    density_scale: np.ndarray
+    degree: int
+
+
 class PackedPointers(NamedTuple):
-    """A `Packed` with its arrays as pointers, and its sizes: cells along each axis, mask words of a block, rank words of a brick, bricks, harmonics, code
-    groups and palette entries; `coded` is whether there are codes.
+    """One cascade of a `Packed`, with its arrays as pointers, and its sizes: cells along each axis, mask words of a block, rank words of a brick, bricks of
+    all cascades, harmonics, code groups and palette entries; `coded` is whether there are codes.
+
+    ratio  of its voxels' side to that of cascade 0
+    shift  x, y, z: a point of cascade 0 is here at p / ratio + shift, voxel coordinates
     """
 
     brick: int
     nx: int
     ny: int
     nz: int
+    ratio: float
+    shift_x: float
+    shift_y: float
+    shift_z: float
     leap: Any
     has_density: Any
     mask_words: int
@@ -94,14 +112,16 @@ class PackedPointers(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def packed_pointers(packed, brick):  # type: ignore[no-untyped-def]
+def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
     """See `PackedPointers`."""
+    grids, places = packed.grids, packed.places
+    first = grids[cascade, 3]
     return PackedPointers(
-        brick, packed.leap.shape[0], packed.leap.shape[1], packed.leap.shape[2], pointer(packed.leap), pointer(packed.has_density), packed.has_density.shape[1],
-        pointer(packed.stored_ranks), packed.stored_ranks.shape[1], len(packed.cells), pointer(packed.cells), pointer(packed.brick_index),
-        pointer(packed.voxel_index), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh), pointer(packed.base),
-        pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1],
-        pointer(packed.code_columns),
+        brick, grids[cascade, 0], grids[cascade, 1], grids[cascade, 2], places[cascade, 0], places[cascade, 1], places[cascade, 2], places[cascade, 3],
+        advanced(pointer(packed.leap), first), pointer(packed.has_density), packed.has_density.shape[1], pointer(packed.stored_ranks),
+        packed.stored_ranks.shape[1], len(packed.cells), pointer(packed.cells), advanced(pointer(packed.brick_index), first), pointer(packed.voxel_index),
+        pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh), pointer(packed.base), pointer(packed.base_table),
+        pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1], pointer(packed.code_columns),
     )  # fmt: skip
 
 
@@ -251,15 +271,16 @@ def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def compute_view_colours(first, end, packed, brick, direction, density_scale, degree, out):  # type: ignore[no-untyped-def]
-    """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of the voxels of bricks first <= B < end into out (N + 1, 4).
+def compute_view_colours(first, end, cascade, packed, brick, direction, density_scale, degree, out):  # type: ignore[no-untyped-def]
+    """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of the voxels of bricks first <= B < end, all of one cascade,
+    into out (N + 1, 4).
 
     The last row, of voxels that are not stored, is for the caller to fill: density 0, colour NaN.
     """
     cube = brick * brick * brick
     for task in numba.prange((end - first + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
         steps, stored, basis = np.empty(3 * cube, np.float32), np.empty(cube + 3, np.int64), np.empty(128, np.float32)
-        grid, view = packed_pointers(packed, brick), View(pointer(direction), 0.0, 0.0, density_scale, degree)
+        grid, view = packed_pointers(packed, brick, cascade), View(pointer(direction), 0.0, 0.0, density_scale, degree)
         _voxel_steps(brick, view.direction, pointer(steps))
         for owner in range(first + BRICKS_PER_TASK * task, min(end, first + BRICKS_PER_TASK * task + BRICKS_PER_TASK)):
             _brick_colours(owner, grid, view, pointer(steps), pointer(stored), pointer(basis), pointer(out))

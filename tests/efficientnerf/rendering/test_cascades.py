@@ -1,0 +1,349 @@
+"""Renders of nested grids and environment maps on the CPU: against the reference, and what must not change them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.asset.cascades import cascade_grids, cascade_tree, cascades_of, nested, point_cascades
+from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.queries import colour_at, density_at, normal_at
+from efficientnerf.asset.rendering import Rendering, ray_parts, render, render_rays, render_reference, tree_density
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.backends.numba.tree import rendering
+from efficientnerf.backends.numba.tree.packed import packed_of
+from efficientnerf.geometry.cameras import Camera, rays, resized
+from efficientnerf.rendering import environment
+from tests.efficientnerf.balls import pose
+from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
+
+FIELDS = ("colour", "opacity", "depth", "normal")
+LENSES = {
+    "PINHOLE": (20.0, 18.0, 12.0, 10.0),
+    "OPENCV": (20.0, 18.0, 12.0, 10.0, -0.08, 0.01, 0.004, -0.003),
+    "OPENCV_FISHEYE": (12.0, 12.0, 12.0, 10.0, 0.02, 0.0, 0.001, 0.0),
+}
+CASES = [(1, 3, 1), (2, 2, 0), (3, 4, 2), (5, 1, 1), (3, 5, 3), (2, 3, 4)]  # cascades, brick, degree
+
+
+def camera_of(tree: NerfTree, model: str = "PINHOLE", distance: float = 1.0) -> Camera:
+    """A camera that many half diagonals of the innermost box away from its middle."""
+    at = pose(0.7, 0.4, distance * float(np.linalg.norm(tree.bounds_max - tree.bounds_min)) / 2)
+    at[:3, 3] += (tree.bounds_min + tree.bounds_max) / 2
+    return Camera("view", 24, 20, model, LENSES[model], at)
+
+
+def in_palettes(tree: NerfTree, entries: int = 200) -> NerfTree:
+    """The tree with random codes in place of its harmonics."""
+    rng, count, terms = np.random.default_rng(0), len(tree.density_values), tree.harmonics_count - 1
+    codes, palette = rng.integers(entries, size=(count, terms)).astype(np.uint8), rng.normal(size=(entries, terms, 3)).astype(np.float32)
+    base, table = rng.integers(256, size=(count, 3)).astype(np.uint8), rng.normal(size=(256, 3)).astype(np.float32)
+    return replace(tree, harmonics=PaletteHarmonics(base, table, codes, palette, (1,) * terms))
+
+
+def many_rays(tree: NerfTree, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Through and beside each cascade, a part of them from inside."""
+    parts = [rays_at(replace(tree, shape=c.shape, voxel=c.voxel, bounds_min=c.bounds_min, outer=()), count, seed + n) for n, c in enumerate(cascades_of(tree))]
+    origins, directions = zip(*parts, strict=True)
+    return np.concatenate(origins), np.concatenate(directions)
+
+
+def reference_depth(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Distances at which the transmittance falls to one half, by plain steps."""
+    o, d, density = torch.from_numpy(origins), torch.from_numpy(directions), torch.as_tensor(tree.density_values, dtype=torch.float64)
+    left, depth = torch.ones(len(o), dtype=torch.float64), torch.full((len(o),), np.inf, dtype=torch.float64)
+    for n, begin, end in ray_parts(tree, o, d):
+        cascade = cascades_of(tree)[n]
+        grid = replace(tree, shape=cascade.shape, voxel=cascade.voxel, bounds_min=cascade.bounds_min, brick_index=cascade.brick_index, outer=())
+        step = cascade.voxel / 2
+        for k in range(int(((end - begin).nan_to_num(0).clamp(0, 2 * sum(grid.resolution) * step).max() / step).ceil()) + 1):
+            t = begin + (k + 0.5) * step
+            sigma = tree_density(grid, (o + t[:, None] * d - torch.as_tensor(cascade.bounds_min)) / cascade.voxel, density)[0] * (t < end)
+            after = left * torch.exp(-sigma * step)
+            crossed = (left > 0.5) & (after <= 0.5)
+            depth = torch.where(crossed, t - step / 2 + torch.log(2 * left) / sigma.clamp(min=1e-30), depth)
+            left = after
+    return depth.numpy()
+
+
+def assert_as_the_reference(tree: NerfTree, outputs: Rendering, origins: np.ndarray, directions: np.ndarray) -> None:
+    colour, opacity = (part.numpy() for part in render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions)))
+    np.testing.assert_allclose(outputs.colour.reshape(-1, 3), colour, atol=1e-3)
+    np.testing.assert_allclose(outputs.opacity.reshape(-1), opacity, atol=1.01e-3)
+    assert opacity.max() > 0.5
+
+
+@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
+@pytest.mark.parametrize("layout", ["floats", "codes"])
+def test_rays_match_the_reference(count: int, brick: int, degree: int, layout: str) -> None:
+    tree = random_cascades(count + brick, count=count, brick=brick, degree=degree)
+    if layout == "codes":
+        tree = in_palettes(tree)
+    origins, directions = many_rays(tree, 80)
+    outputs = render_rays(tree, origins, directions)
+    assert_as_the_reference(tree, outputs, origins, directions)
+    expected = reference_depth(tree, origins, directions)
+    clear = np.abs(outputs.opacity - 0.5) > 1e-4
+    assert np.array_equal(np.isfinite(outputs.depth[clear]), np.isfinite(expected[clear]))
+    hit = np.isfinite(expected) & clear
+    assert hit.sum() > 10
+    np.testing.assert_allclose(outputs.depth[hit], expected[hit], rtol=2e-4, atol=2e-4)
+
+
+@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
+@pytest.mark.parametrize(("model", "distance"), [*((model, distance) for model in LENSES for distance in (0.02, 1.2, 2.7)), ("PINHOLE", 40.0)])
+def test_images_match_the_reference(count: int, brick: int, degree: int, model: str, distance: float) -> None:
+    tree = random_cascades(count, count=count, brick=brick, degree=degree, share=0.4)
+    camera = camera_of(tree, model, distance)
+    if distance > 3:
+        camera = replace(camera, params=(20.0 * distance, 18.0 * distance, *camera.params[2:]))
+    assert_as_the_reference(tree, render(tree, camera), *rays(camera))
+
+
+@pytest.mark.parametrize("layout", ["floats", "codes"])
+def test_view_colours_of_far_cascades_match_the_reference(layout: str) -> None:
+    """From so far away that colours are summed once for the view."""
+    tree = random_cascades(4, count=3, brick=4, degree=2, share=0.6)
+    if layout == "codes":
+        tree = in_palettes(tree)
+    camera = camera_of(tree, distance=400.0)
+    camera = replace(camera, params=(4000.0, 3600.0, 12.0, 10.0))
+    work = rendering.ray_statistics(tree, camera)
+    assert work[..., 3].sum() == work[..., 2].sum() > 0  # there every sample has its colour
+    assert_as_the_reference(tree, render(tree, camera), *rays(camera))
+
+
+def test_images_are_those_of_their_rays() -> None:
+    tree = random_cascades(2, count=4, brick=3, degree=2, share=0.4)
+    camera = camera_of(tree, distance=1.8)
+    origins, directions = rays(camera)
+    image = render(tree, camera)
+    for given in ({}, {"eye": camera.centre}, {"eye": camera.centre, "columns": camera.width}):
+        flat = render_rays(tree, origins, directions, **given)
+        np.testing.assert_allclose(flat.colour, image.colour.reshape(-1, 3), atol=2e-4)
+        np.testing.assert_allclose(flat.opacity, image.opacity.reshape(-1), atol=1e-4)
+        hit = np.abs(flat.opacity - 0.5) > 1e-3
+        along = flat.depth * (directions @ camera.forward)
+        np.testing.assert_allclose(along[hit], image.depth.reshape(-1)[hit], rtol=1e-3)
+        assert np.quantile(np.abs(flat.normal - image.normal.reshape(-1, 3))[hit], 0.97) < 1e-2
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_supersampled_images_are_means(model: str) -> None:
+    tree = random_cascades(6, count=3, brick=2, degree=1, share=0.4)
+    camera = camera_of(tree, model, 1.5)
+    fine, image = render(tree, resized(camera, 48, 40)), render(tree, camera, supersample=2)
+    np.testing.assert_allclose(image.colour, fine.colour.reshape(20, 2, 24, 2, 3).mean((1, 3)), atol=1e-4)
+    np.testing.assert_allclose(image.opacity, fine.opacity.reshape(20, 2, 24, 2).mean((1, 3)), atol=1e-4)
+
+
+def test_normals_are_those_of_the_cascade_that_is_hit() -> None:
+    tree = random_cascades(5, count=3, brick=4, share=0.5)
+    origins, directions = many_rays(tree, 200)
+    outputs = render_rays(tree, origins, directions)
+    hit = np.isfinite(outputs.depth)
+    at = origins[hit] + outputs.depth[hit, None] * directions[hit]
+    cascade = point_cascades(tree, at)
+    assert all((cascade == n).sum() > 20 for n in range(3))
+    assert np.quantile(np.abs(outputs.normal[hit] - normal_at(tree, at)), 0.97) < 1e-3
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.2, 0.5, 0.9)])
+def test_a_background_takes_the_place_of_the_environment(background: tuple[float, float, float]) -> None:
+    tree = random_cascades(1)
+    camera = camera_of(tree)
+    bare = replace(tree, environment=None)
+    for supersample in (1, 2):
+        one = render(tree, camera, background=background, supersample=supersample)
+        other = render(bare, camera, background=background, supersample=supersample)
+        for name in FIELDS:
+            assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    origins, directions = rays(camera)
+    alone = render_rays(bare, origins, directions)
+    over = render_rays(tree, origins, directions, background=background)
+    np.testing.assert_allclose(over.colour, alone.colour + (1 - alone.opacity[:, None]) * np.float32(background), atol=1e-6)
+    with pytest.raises(ValueError, match="expected three numbers"):
+        render_rays(tree, origins, directions, background=(1.0, 1.0))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
+def test_the_environment_is_seen_along_the_ray_through_what_is_not_opaque(lookup: str) -> None:
+    tree = random_tree(1, share=0.1, lookup=lookup)
+    rng = np.random.default_rng(0)
+    surroundings = rng.random((16, 32, 3)).astype(np.float32)
+    origins, directions = rays_at(tree, 400)
+    directions[:6] = [[0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -1e-12, 0], [1, 0, 0], [0, 1, 0]]
+    alone = render_rays(tree, origins, directions)
+    seen = render_rays(replace(tree, environment=surroundings), origins, directions)
+    expected = alone.colour + (1 - alone.opacity[:, None]) * environment.lookup(surroundings, directions)
+    through = alone.opacity < 0.999
+    np.testing.assert_allclose(seen.colour[through], expected[through], atol=1e-6)
+    np.testing.assert_allclose(seen.colour, expected, atol=1e-3)
+    assert np.array_equal(seen.opacity, alone.opacity)
+
+
+@pytest.mark.parametrize("height", [1, 2, 3])
+def test_environments_of_few_texels(height: int) -> None:
+    tree = replace(random_tree(0, share=0.0), environment=np.random.default_rng(0).random((height, 2 * height, 3)).astype(np.float32))
+    directions = np.random.default_rng(1).normal(size=(500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert tree.environment is not None
+    np.testing.assert_allclose(render_rays(tree, np.zeros((500, 3)), directions).colour, environment.lookup(tree.environment, directions), atol=1e-6)
+
+
+def without_voxels(tree: NerfTree) -> NerfTree:
+    """Its box alone."""
+    none = np.zeros((0, tree.harmonics_count, 3), np.float32)
+    return tree_from_voxels(tree.shape, tree.voxel, tree.bounds_min, np.zeros((0, 3), int), np.zeros(0, np.float32), none, brick=tree.brick)
+
+
+def test_outer_cascades_that_hold_nothing_change_nothing() -> None:
+    tree = random_tree(3, shape=(4, 4, 8), brick=4, degree=2, share=0.5)
+    grids = cascade_grids(np.stack([tree.bounds_min, tree.bounds_max]), tree.voxel, tree.brick, 4)
+    box = without_voxels(tree)
+    empty = [replace(box, shape=shape, voxel=voxel, bounds_min=low, brick_index=np.full(shape, -1, np.int32)) for shape, voxel, low in grids[1:]]
+    whole = nested([tree, *empty])
+    for distance in (0.1, 1.5, 6.0):
+        one, other = render(tree, camera_of(tree, distance=distance)), render(whole, camera_of(tree, distance=distance))
+        for name in FIELDS:
+            assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_an_inner_cascade_that_holds_nothing_is_a_hole() -> None:
+    """Voxels that the outer one stores inside of it are not seen, and let the rays that pass between see on."""
+    outer = replace(uniform_tree((4, 4, 4), brick=4, voxel=0.2, sigma=3.0), bounds_min=np.full(3, -1.6))
+    inner = replace(without_voxels(outer), voxel=0.1, bounds_min=np.full(3, -0.8), brick_index=np.full((4, 4, 4), -1, np.int32))
+    tree = nested([inner, outer])
+    origins = np.array([[-3.0, 0.1, 0.2], [0.0, 0.1, 0.2], [-3.0, 1.2, 0.2], [-1.2, 0.1, 0.2]])
+    directions = np.broadcast_to([1.0, 0, 0], (4, 3))
+    lengths = np.array([1.6, 0.8, 3.2, 1.2])
+    found = render_rays(tree, origins, directions)
+    np.testing.assert_allclose(found.opacity, 1 - np.exp(-3.0 * lengths), atol=6e-2)  # the outermost half voxels fade
+    np.testing.assert_allclose(found.opacity, render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions.copy()))[1], atol=1e-3)
+
+
+def test_a_uniform_medium_absorbs_by_the_length_of_the_path() -> None:
+    """Far from the faces of the last box it does not matter how many cascades hold it."""
+    count, sigma = 3, 0.7
+    grids = cascade_grids(np.array([[-0.8] * 3, [0.8] * 3]), 0.1, 4, count)
+    tree = nested([replace(uniform_tree(shape, brick=4, voxel=voxel, sigma=sigma), bounds_min=low) for shape, voxel, low in grids])
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(200, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = rng.uniform(-2, 2, (200, 3))
+    with np.errstate(divide="ignore"):
+        length = np.maximum((3.2 - origins) / directions, (-3.2 - origins) / directions).min(axis=1)
+    found = render_rays(tree, origins, directions)
+    # Sums of half steps on either side of a face, and the last half voxel, in which density falls to one half.
+    np.testing.assert_allclose(-np.log1p(-found.opacity.astype(np.float64)), sigma * length, atol=sigma * 0.6)
+    deep = np.isfinite(found.depth) & (np.log(2) / sigma < length - 0.6)
+    assert deep.sum() > 100
+    np.testing.assert_allclose(found.depth[deep], np.log(2) / sigma, atol=0.45)
+
+
+def test_images_depend_neither_on_threads_nor_on_pools_nor_on_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = random_cascades(5, count=4, brick=4, degree=2, share=0.5)
+    packed_of(tree)
+    camera, calls = camera_of(tree, distance=1.7), []
+    usual, far = render(tree, camera, supersample=2), render(tree, replace(camera, world_from_camera=camera_of(tree, distance=90.0).world_from_camera))
+    whole = rendering.render_batch
+
+    def in_small_pieces(*given: Any) -> bool:
+        calls.append(len(given))
+        return bool(whole(*given[:10], 500, *given[11:]))
+
+    monkeypatch.setattr(rendering, "render_batch", in_small_pieces)
+    monkeypatch.setattr(rendering, "POOL_BYTES", 1)
+    monkeypatch.setattr("numba.get_num_threads", lambda: 3)
+    for expected, found in (
+        (usual, render(tree, camera, supersample=2)),
+        (far, render(tree, replace(camera, world_from_camera=camera_of(tree, distance=90.0).world_from_camera))),
+    ):
+        for name in FIELDS:
+            assert np.array_equal(getattr(expected, name), getattr(found, name)), name
+    assert len(calls) > 20
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("share", [0.01, 0.1])
+@pytest.mark.parametrize("distance", [0.1, 1.5, 9.0])
+def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
+    tree = random_cascades(11, count=4, cells=6, brick=3, share=share)
+    timid = replace(tree)
+    timid.derived["packed"] = packed_of(tree)._replace(leap=np.minimum(packed_of(tree).leap, 1))
+    camera = camera_of(tree, model, distance)
+    usual, other = render(tree, camera), render(timid, camera)
+    for name in FIELDS:
+        assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("distance", [1e9, 1e15, 1e18, 1e25, 1e200])
+def test_rays_from_far_away_end(distance: float) -> None:
+    tree = random_cascades(0, count=4)
+    directions = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [-0.48, 0.6, 0.64], [np.sqrt(1 / 3)] * 3])
+    found = render_rays(tree, (tree.bounds_min + tree.bounds_max) / 2 - distance * directions, directions)
+    assert ((found.opacity >= 0) & (found.opacity <= 1)).all()
+    assert np.isfinite(found.colour).all()
+
+
+def test_rays_of_numbers_that_are_not_finite_see_nothing() -> None:
+    tree = random_cascades(0, count=3)
+    origins, directions = np.full((4, 3), 0.5), np.full((4, 3), 0.5)
+    origins[0, 1], origins[1, 2], directions[2, 0], directions[3] = np.nan, np.inf, np.nan, np.inf
+    found = render_rays(tree, origins, directions)
+    assert not found.opacity.any()
+    assert np.isfinite(found.colour).all()
+    with pytest.raises(ValueError, match="not finite"):
+        render(tree, replace(camera_of(tree), params=(20.0, np.nan, 10.0, 10.0)))
+
+
+@pytest.mark.parametrize("least", [-1e-42, 1e-42, -1e-320, 1e-31, 0.0])
+def test_rays_along_the_faces_of_boxes_and_cells(least: float) -> None:
+    """From outside, from the inner box's face and from its middle, along each axis; in the planes of a box's faces either side may be seen, or none."""
+    grids = cascade_grids(np.array([[-8.0] * 3, [8.0] * 3]), 1.0, 4, 3)
+    tree = nested([replace(uniform_tree(shape, brick=4, voxel=voxel, sigma=0.05), bounds_min=low) for shape, voxel, low in grids])
+    for axis in range(3):
+        for beside in (-32.0, -16.0, -8.0, 0.0, 4.0, 8.0, 16.0, 32.0):
+            origins, directions = np.full((3, 3), beside), np.full((3, 3), least)
+            origins[:, axis], directions[:, axis] = [-40.0, -8.0, 0.0], 1.0
+            found = render_rays(tree, origins, directions)
+            assert np.isfinite(found.opacity).all()
+            if abs(beside) < 8:
+                reference = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))[1]
+                np.testing.assert_allclose(found.opacity, reference, atol=1e-3)
+                assert found.opacity.min() > 0.7
+
+
+@pytest.mark.parametrize(("count", "brick", "degree"), CASES)
+def test_points_are_looked_up_in_the_cascade_that_they_belong_to(count: int, brick: int, degree: int) -> None:
+    tree = random_cascades(count, count=count, brick=brick, degree=degree, share=0.5)
+    rng = np.random.default_rng(0)
+    last = cascades_of(tree)[-1].bounds(brick)
+    points = np.concatenate([rng.uniform(*c.bounds(brick), (300, 3)) for c in cascades_of(tree)] + [last + np.array([[-0.1], [0.1]])])
+    directions = rng.normal(size=points.shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    owner = point_cascades(tree, points)
+    for n, cascade in enumerate(cascades_of(tree)):
+        low, high = cascade.bounds(brick)
+        inside = ((points >= low) & (points < high)).all(axis=1)
+        assert (owner[inside] <= n).all()
+        assert (owner[~inside] != n).all()
+        alone, mine = cascade_tree(tree, n), owner == n
+        assert np.array_equal(density_at(tree, points)[mine], density_at(alone, points[mine]))
+        assert np.array_equal(normal_at(tree, points)[mine], normal_at(alone, points[mine]))
+        assert np.array_equal(colour_at(tree, points, directions)[mine], colour_at(alone, points[mine], directions[mine]))
+        assert np.array_equal(colour_at(tree, points)[mine], colour_at(alone, points[mine]))
+        assert density_at(alone, points[mine]).max() > 0
+    assert (owner[-2:] == -1).all()
+    assert not density_at(tree, points[-2:]).any()
+    assert not density_at(tree, np.array([[np.nan, 0, 0], [np.inf, 0, 0]])).any()
+
+
+def test_memory_of_a_render_counts_all_cascades() -> None:
+    tree = random_cascades(2, count=3, brick=4)
+    alone = cascade_tree(tree, 0)
+    assert rendering.scratch_bytes(tree) - rendering.scratch_bytes(alone) >= 16 * (len(tree.density_values) - len(alone.density_values))
