@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -29,6 +29,9 @@ STEPS = 500  # of the progress of each
 class MeshSettings:
     """How the surface is meshed."""
 
+    region: Literal["foreground", "all"] = setting(
+        "foreground", "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all)."
+    )
     max_faces: Annotated[int, Meta(ge=100)] = setting(200_000, "Most faces of the mesh, which is decimated to this many.")
     density_threshold: float | Auto = setting("auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.")
     min_component: Fraction = setting(0.01, "Area below which connected components are dropped, as a fraction of the largest one's.", advanced=True)
@@ -37,29 +40,34 @@ class MeshSettings:
 
 def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:
     """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
-    from efficientnerf.surface.isosurface import NoSurface, surface
-    from efficientnerf.surface.volume import volume_of
+    from efficientnerf.surface.isosurface import NoSurface
+    from efficientnerf.surface.nested import scene_surface
 
     try:
-        return surface(
-            volume_of(tree),
+        return scene_surface(
+            tree,
             given(settings.density_threshold),
             faces=settings.max_faces,
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             viewpoints=orbit_points(tree.metadata),
-            progress=whole_progress(progress),
+            progress=whole_progress(progress, 1 + len(tree.outer)),
         )
     except NoSurface as error:
         raise StageFailed(f"mesh: {error}. {remedy('mesh', given(settings.density_threshold))}") from error
 
 
-def whole_progress(progress: Callable[[int, int, str], None]) -> Callable[[int, int, str], None]:
-    """Progress over the parts of a surface together: a bar that never goes back."""
+def whole_progress(progress: Callable[[int, int, str], None], grids: int = 1) -> Callable[[int, int, str], None]:
+    """Progress over the parts of the surfaces of so many grids together: a bar that never goes back."""
+    begun: list[str] = []
+    reached = 0
 
     def part(done: int, total: int, text: str) -> None:
-        before = PARTS.index(text)
-        progress(before * STEPS + (STEPS * done // total if total else STEPS), len(PARTS) * STEPS, text)
+        nonlocal reached
+        if not begun or (begun[-1] != text and len(begun) < grids * len(PARTS)):
+            begun.append(text)
+        reached = max(reached, (len(begun) - 1) * STEPS + (STEPS * done // total if total else STEPS))
+        progress(reached, grids * len(PARTS) * STEPS, text)
 
     return part
 
@@ -112,6 +120,7 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
     from stages.figures.shading import IN_FRONT, render_sides
+    from stages.framing.restriction import restricted
     from stages.io.exporters import MESH_EXPORTERS
     from stages.io.exporters.writing import source_frame
     from stages.io.png import write_png
@@ -119,7 +128,7 @@ def run(job: Job) -> None:
     from stages.memory.surface import surface_needed
 
     outputs = MeshOutputs(job.out)
-    tree = load(inputs_of(MeshInputs, job.inputs).bake.asset)
+    tree = restricted(load(inputs_of(MeshInputs, job.inputs).bake.asset), job.settings.region)
     frame = source_frame(tree.metadata)
     refuse_what_does_not_fit(job, surface_needed(tree), "Lower bake.max_mib or bake.resolution.")
     found = mesh_of(tree, job.settings, job.reached)
@@ -141,4 +150,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}", **facts)
 
 
-STAGE = Stage(name="mesh", version=1, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)
+STAGE = Stage(name="mesh", version=2, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

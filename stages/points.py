@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from msgspec import Meta
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 class PointsSettings:
     """How points are spread over the surface."""
 
+    region: Literal["foreground", "all"] = setting(
+        "foreground", "What gets points: the subject with what supports it, its edge clipped (foreground), or the whole scene (all)."
+    )
     num_points: PositiveInt = setting(200_000, "Number of points.")
     density_threshold: float | Auto = setting(
         "auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.", advanced=True
@@ -35,20 +38,20 @@ class PointsSettings:
 
 def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None]) -> PointCloud:
     """Points on the tree's surface in the capture's frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
-    from efficientnerf.surface.isosurface import NoSurface, points
+    from efficientnerf.surface.isosurface import NoSurface
     from efficientnerf.surface.mesh import PointCloud
-    from efficientnerf.surface.volume import volume_of
+    from efficientnerf.surface.nested import scene_points
 
     try:
-        cloud = points(
-            volume_of(tree),
+        cloud = scene_points(
+            tree,
             settings.num_points,
             given(settings.density_threshold),
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             seed=settings.seed,
             viewpoints=orbit_points(tree.metadata),
-            progress=whole_progress(progress),
+            progress=whole_progress(progress, 1 + len(tree.outer)),
         )
     except NoSurface as error:
         raise StageFailed(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
@@ -59,12 +62,13 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
+    from stages.framing.restriction import restricted
     from stages.io.exporters import POINT_EXPORTERS
     from stages.io.exporters.writing import source_frame
     from stages.memory.need import refuse_what_does_not_fit
     from stages.memory.surface import surface_needed
 
-    tree = load(inputs_of(PointsInputs, job.inputs).bake.asset)
+    tree = restricted(load(inputs_of(PointsInputs, job.inputs).bake.asset), job.settings.region)
     frame = source_frame(tree.metadata)
     remedy = f"Lower points.num_points ({job.settings.num_points}), bake.max_mib or bake.resolution."
     refuse_what_does_not_fit(job, surface_needed(tree, job.settings.num_points), remedy)
@@ -75,4 +79,4 @@ def run(job: Job) -> None:
     job.say(f"{len(cloud.positions)} points", points=len(cloud.positions))
 
 
-STAGE = Stage(name="points", version=1, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)
+STAGE = Stage(name="points", version=2, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)

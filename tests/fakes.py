@@ -31,6 +31,9 @@ class BallTree:
     similarity: Similarity = field(default_factory=Similarity.identity)
     forward_facing: bool = False
     ndc: None = None
+    outer: tuple[()] = ()
+    region: None = None
+    environment: None = None
 
     @property
     def bounds_min(self) -> np.ndarray:

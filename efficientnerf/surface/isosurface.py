@@ -306,9 +306,10 @@ def _view_directions(normal: np.ndarray) -> list[np.ndarray]:
     return [-normal, *slanted]
 
 
-def _cleaned_surface(
+def cleaned_surface(
     volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
 ) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
+    """Vertices, faces and facts of the surface before it is decimated; see `surface`."""
     level = automatic_threshold(volume) if threshold is None else float(threshold)
     if not (np.isfinite(level) and level > 0):
         raise NoSurface(f"threshold {level:g}: expected a density above zero")
@@ -349,7 +350,7 @@ def surface(
     """
     ndc = volume if isinstance(volume, NdcVolume) else None
     viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS  # the cameras are before the near plane, outside of the volume
-    vertices, triangles, facts = _cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
+    vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints)  # small components that decimation cut off
@@ -377,12 +378,18 @@ def points(
     """
     ndc = volume if isinstance(volume, NdcVolume) else None
     viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS
-    vertices, triangles, _ = _cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
+    vertices, triangles, _ = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
+    cloud = spread(volume, vertices, triangles, count, seed, progress)
+    return cloud if ndc is None else ndc.points(cloud)
+
+
+def spread(volume: Volume, vertices: np.ndarray, triangles: np.ndarray, count: int, seed: int, progress: Progress = _silent) -> PointCloud:
+    """`count` points spread evenly over a surface of the volume, in its frame."""
     face, weight = sample(vertices, triangles, count, seed)
     corners = triangles[face]  # (N, 3)
     normals = (vertex_normals(vertices, triangles)[corners] * weight[..., None]).sum(1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), vertex_normals(vertices, triangles)[corners[:, 0]])
     positions = (vertices[corners] * weight[..., None]).sum(1)
-    cloud = PointCloud(positions, normals, surface_colours(volume, positions, normals, progress, None if ndc is None else ndc.view_directions))
-    return cloud if ndc is None else ndc.points(cloud)
+    directions = volume.view_directions if isinstance(volume, NdcVolume) else None
+    return PointCloud(positions, normals, surface_colours(volume, positions, normals, progress, directions))

@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.stage import Job
 from stages.artifacts import BakeInputs, inputs_of
+from stages.framing.captured import captured_metadata
 
 if TYPE_CHECKING:
     from stages.bake import BakeSettings
@@ -45,6 +46,7 @@ def metadata_of(s: Scene, settings: BakeSettings, m: Any) -> dict[str, Any]:
             "forward_facing": bool(orbit.forward_facing),
             "heading": float(orbit.heading),
         },
+        "captured_path": captured_metadata([view.camera for view in s.views]),
         "metric": bool(s.metric),
         **({} if s.forward is None else {"spiral": spiral_of(s.forward)}),
         "licence": settings.licence,

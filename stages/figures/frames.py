@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 from stages.framing.camera_paths import similarity_of
@@ -21,14 +23,14 @@ if TYPE_CHECKING:
 class RenderOptions:
     """How a camera path is rendered.
 
-    background   white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white
+    background   white, black, transparent or #rrggbb; transparent: PNG with alpha, the video on white; auto: the asset's environment, white where it has none
     supersample  rays along each side of a pixel
     exr          "off", "first" or "all": which frames are written as EXR too
     video        name of the MP4 in the output folder, or None
     fps, crf     of the video
     """
 
-    background: str = "white"
+    background: str = "auto"
     supersample: int = 1
     exr: str = "first"
     video: str | None = "turntable.mp4"
@@ -59,10 +61,13 @@ def render_frames(
     """
     from efficientnerf.asset.rendering import render
     from stages.io.exporters.exr import write_exr
-    from stages.io.exporters.frames import background_from_text, frame_from_rendering
+    from stages.io.exporters.frames import frame_background, frame_from_rendering
     from stages.io.png import write_png
 
-    background, similarity = background_from_text(options.background), similarity_of(tree)
+    background, similarity = frame_background(options.background), similarity_of(tree)
+    surrounded = options.background == "auto" and tree.environment is not None
+    if tree.environment is not None and not surrounded:
+        tree = replace(tree, environment=None)
     draw, warn = draw or render, once(warn)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -74,9 +79,10 @@ def render_frames(
         outputs = [png, exr] if with_exr else [png]
         if not (reuse and noted(folder / f"frame_{k:04d}.json", list[str], warn, partial(_check, outputs, camera)) is not None):
             output = draw(tree, camera, supersample=options.supersample)
+            opacity = np.ones_like(output.opacity) if surrounded else output.opacity  # nothing shows through the environment
             if with_exr:
-                write_exr(exr, colour=output.colour, opacity=output.opacity, depth=output.depth, normal=output.normal, world_from_capture=similarity)
-            write_png(frame_from_rendering(output.colour, output.opacity, background), png, durable=not reuse)
+                write_exr(exr, colour=output.colour, opacity=opacity, depth=output.depth, normal=output.normal, world_from_capture=similarity)
+            write_png(frame_from_rendering(output.colour, opacity, background), png, durable=not reuse)
             if reuse:
                 note(folder / f"frame_{k:04d}.json", [path.name for path in outputs], outputs)
         written += outputs

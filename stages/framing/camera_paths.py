@@ -1,25 +1,38 @@
-"""Camera paths of a turntable: an orbit, part of one for captures from one side, and LLFF's spiral for forward-facing scenes."""
+"""Camera paths of a turntable: an orbit, a sway for captures from one side, the captured cameras', and LLFF's spiral for forward-facing scenes.
+
+Where an asset has a foreground region that is its subject: paths have all of it in view, in the middle. Where it keeps the captured cameras, paths stay in the
+part of the sphere that these cover, at their distance.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from efficientnerf.asset.cascades import Cascade, cascades_of
+from efficientnerf.asset.region import inside_share
 from efficientnerf.geometry.cameras import Camera, Similarity
 from pipeline.errors import BadInput
+from stages.framing.captured import captured_of, coverage
 from stages.io.scene import Orbit
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.ndc import Ndc
 
+PATHS = ("auto", "orbit", "sway", "captured")
 MAX_FITTED_FOV = 50.0  # degrees; with a larger one the camera would be too near, and moves back instead
+MAX_SURROUNDING_FOV = 75.0
+SWAY = 10.0  # degrees, where nothing says how far the captured cameras go
+COVERED = 0.85  # of the captured cameras' range, that a sway uses
 FIT_MARGIN = 1.1  # of the field of view
 OUTLIER_FRACTION = 0.005  # of the occupied cells, that may lie outside of the image: floaters at the border of the box
 MAX_FITTED_POINTS = 4000
+FEW_CELLS = 500  # of a region, of which corners are fitted in place of centres
 LARGEST, SMALLEST = 1e30, 1e-30  # numbers of an asset beyond these overflow when they are squared
 SPIRAL_TURNS = 2
 SPIRAL_FOV_RATIO = 0.95  # field of view of a spiral over that which all images share
@@ -77,11 +90,12 @@ def pose_on_sphere(centre: Sequence[float], radius: float, azimuth: float, eleva
     return pose
 
 
-def turntable_poses(orbit: Orbit, frames: int, *, sway: float) -> list[np.ndarray]:
-    """A full circle; or, for a capture from one side, an ellipse of `sway` by `sway` / 2 degrees about the mean camera. Both are closed."""
+def turntable_poses(orbit: Orbit, frames: int, *, sway: float, rise: float | None = None) -> list[np.ndarray]:
+    """A full circle; or, for a capture from one side, an ellipse of `sway` by `rise` degrees (None: half as much) about the mean camera. Both are closed."""
     turns = np.arange(frames) / frames
+    rise = 0.5 * sway if rise is None else rise
     if orbit.forward_facing:
-        angles = [(orbit.heading + sway * math.sin(2 * math.pi * t), orbit.elevation + 0.5 * sway * math.cos(2 * math.pi * t)) for t in turns]
+        angles = [(orbit.heading + sway * math.sin(2 * math.pi * t), orbit.elevation + rise * math.cos(2 * math.pi * t)) for t in turns]
     else:
         angles = [(orbit.heading + 360.0 * t, orbit.elevation) for t in turns]
     return [pose_on_sphere(orbit.centre, orbit.radius, azimuth, elevation) for azimuth, elevation in angles]
@@ -111,17 +125,44 @@ def spiral_poses(middle: np.ndarray, radii: Sequence[float], focus: float, frame
 
 
 def occupied_points(tree: NerfTree) -> np.ndarray:
-    """(N, 3) centres of occupied coarse cells, about MAX_FITTED_POINTS at most; of a forward-facing asset the nearer half of them, of an empty
-    asset the corners of its box."""
-    cells = np.argwhere(tree.brick_index >= 0)
-    if not len(cells) and tree.ndc is None:
+    """(N, 3) centres of occupied coarse cells of the subject, about MAX_FITTED_POINTS at most: those in the region, where there is one and it holds any; of a
+    forward-facing asset the nearer half of them, of an empty asset the corners of its box."""
+    points = cell_centres(tree)
+    if not len(points) and tree.ndc is None:
         return np.stack(np.meshgrid(*np.stack([tree.bounds_min, tree.bounds_max]).T, indexing="ij"), -1).reshape(-1, 3)
-    cells = cells[:: max(1, len(cells) // MAX_FITTED_POINTS)]
-    points = np.asarray(tree.bounds_min) + (cells + 0.5) * (tree.brick * tree.voxel)
+    points = points[:: max(1, len(points) // MAX_FITTED_POINTS)]
     if tree.ndc is None:
         return points
     near = points[points[:, 2] <= np.quantile(points[:, 2], 0.5)]  # the rest may lie at infinity
     return np.asarray(tree.ndc.world(near))
+
+
+def cell_centres(tree: NerfTree) -> np.ndarray:
+    """(N, 3) centres of the occupied coarse cells of a tree's region, in its frame; of the inmost cascade where it has none, or one that holds nothing."""
+
+    def centres(cascade: Cascade) -> np.ndarray:
+        return np.asarray(cascade.bounds_min) + (np.argwhere(cascade.brick_index >= 0) + 0.5) * (tree.brick * cascade.voxel)
+
+    cascades = cascades_of(tree)
+    if tree.region is not None:
+        found = []
+        for number, cascade in enumerate(cascades):
+            points = centres(cascade)
+            inside = inside_share(tree.region, points) > 0.5
+            if tree.region.bricks is not None:
+                inside &= np.asarray(tree.region.bricks, bool)[cascade.brick_index[cascade.brick_index >= 0]]
+            if number:  # the box before has its own
+                low, high = cascades[number - 1].bounds(tree.brick)
+                inside &= ((points < low) | (points > high)).any(axis=1)
+            found.append(points[inside])
+        if 0 < sum(map(len, found)) < FEW_CELLS:  # their size counts
+            corners = np.argwhere(np.ones((2, 2, 2))) - 0.5
+            sized = zip(cascades, found, strict=True)
+            spread = [(points[:, None] + corners * (tree.brick * cascade.voxel)).reshape(-1, 3) for cascade, points in sized]
+            return np.clip(np.concatenate(spread), *tree.region.bounds)
+        if sum(map(len, found)):
+            return np.concatenate(found)
+    return centres(cascades[0])
 
 
 def fitted_field_of_view(poses: Sequence[np.ndarray], points: np.ndarray, aspect: float) -> tuple[float, float]:
@@ -154,41 +195,93 @@ def turntable_cameras(
     elevation: float | None = None,
     radius: float | None = None,
     fov: float | None = None,
-    sway: float = 10.0,
+    sway: float | None = None,
+    path: str = "auto",
+    surroundings: bool = False,
 ) -> list[Camera]:
     """The cameras of a turntable, pinholes in the training frame.
 
     elevation  degrees; None: that of the capture's cameras
     radius     distance from the centre in the capture's units; None: that of the capture's cameras, or more where the asset would not fit
     fov        vertical, degrees; None: so that the asset fits from everywhere, vertically centred
-    sway       degrees; see turntable_poses
+    sway       degrees, see turntable_poses; None: as far as the captured cameras go, or SWAY where the asset keeps none
+    path       see PATHS; auto: a sway for a capture that does not go round, else an orbit; for a forward-facing asset a spiral among the capture's cameras,
+               unless an elevation or a radius is given
+    surroundings  whether they are shown: then the camera does not move back, where something may be in the way, and sees wider instead
 
-    For a forward-facing asset the path is a spiral among the capture's cameras, unless an elevation or a radius is given.
+    Raises BadInput for `captured` where the asset keeps no cameras, and for metadata that make no path.
     """
-    if tree.ndc is not None and elevation is None and radius is None:
+    if path == "captured":
+        return captured_cameras(tree, frames, width, height, fov)
+    if tree.ndc is not None and path == "auto" and elevation is None and radius is None:
         return _spiral_cameras(tree, tree.ndc, frames, width, height, fov)
-    orbit = orbit_of(tree)
-    distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
-    orbit = Orbit(orbit.centre, distance, orbit.elevation if elevation is None else elevation, orbit.forward_facing, orbit.heading)
     points = occupied_points(tree)
-    widest = math.tan(math.radians(MAX_FITTED_FOV / 2))
+    orbit, sway, rise = _framed_orbit(tree, points, path, sway)
+    distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
+    orbit = replace(orbit, radius=distance, elevation=orbit.elevation if elevation is None else elevation)
+    widest = math.tan(math.radians((MAX_SURROUNDING_FOV if surroundings else MAX_FITTED_FOV) / 2))
 
     def needed(poses: list[np.ndarray]) -> float:
         return FIT_MARGIN * fitted_field_of_view(poses, points, width / height)[0]
 
-    poses = turntable_poses(orbit, frames, sway=sway)
-    # Captures from one side have nothing beyond the borders of their images: there the camera keeps its distance, and the asset may be cropped.
-    if radius is None and fov is None and not orbit.forward_facing:
+    poses = turntable_poses(orbit, frames, sway=sway, rise=rise)
+    # Captures from one side have nothing beyond the borders of their images: without a region the camera keeps its distance, and the asset may be cropped.
+    if radius is None and fov is None and not surroundings and (tree.region is not None or not orbit.forward_facing):
         for _ in range(60):
             if needed(poses) <= widest:
                 break
-            orbit = Orbit(orbit.centre, 1.1 * orbit.radius, orbit.elevation, orbit.forward_facing, orbit.heading)
-            poses = turntable_poses(orbit, frames, sway=sway)
+            orbit = replace(orbit, radius=1.1 * orbit.radius)
+            poses = turntable_poses(orbit, frames, sway=sway, rise=rise)
     half, drop = fitted_field_of_view(poses, points, width / height)
     half, drop = (min(widest, FIT_MARGIN * half), drop) if fov is None else (math.tan(math.radians(fov / 2)), 0.0)
     focal = 0.5 * height / half
     lens = (focal, width / 2, height / 2 - focal * drop)
     return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", lens, pose) for k, pose in enumerate(poses)]
+
+
+def _framed_orbit(tree: NerfTree, points: np.ndarray, path: str, sway: float | None) -> tuple[Orbit, float, float | None]:
+    """The orbit round the subject's points (N, 3), and the amplitudes of its sway.
+
+    A region's middle is the centre; without one it is what the cameras look at.
+    """
+    orbit, rise = orbit_of(tree), None
+    captured = captured_of(tree.metadata)
+    if tree.region is not None:
+        low, high = np.quantile(points, [OUTLIER_FRACTION, 1 - OUTLIER_FRACTION], axis=0)
+        x, y, z = (float(c) for c in (low + high) / 2)
+        if captured is None:  # the distance to the nearest part of the orbit's centre stays
+            away = float(np.linalg.norm(np.array([x, y, z]) - orbit.centre))
+            orbit = replace(orbit, radius=max(orbit.radius, away))
+        orbit = replace(orbit, centre=(x, y, z))
+    if captured is not None:
+        found = coverage(captured.centres, np.asarray(orbit.centre))
+        if tree.region is not None and found.distance > SMALLEST:
+            orbit = replace(orbit, radius=found.distance, elevation=found.elevation)
+        if found.arc < 360:
+            orbit = replace(orbit, forward_facing=True, heading=found.heading)
+            if sway is None:
+                sway, rise = COVERED * found.arc / 2, min(COVERED * found.heights, 0.25 * found.arc)
+        else:
+            orbit = replace(orbit, forward_facing=False)
+    if path != "auto":
+        orbit = replace(orbit, forward_facing=path == "sway")
+    return orbit, SWAY if sway is None else sway, rise
+
+
+def captured_cameras(tree: NerfTree, frames: int, width: int, height: int, fov: float | None = None) -> list[Camera]:
+    """Cameras on the way of the captured ones, with about their field of view along the diagonal. Raises BadInput where the asset keeps none."""
+    from stages.framing.captured_path import captured_path
+
+    captured = captured_of(tree.metadata)
+    if captured is None:
+        raise BadInput(
+            "asset: it keeps no captured cameras, which the path `captured` follows. Bake it again, or choose another path."
+        )
+    focal = captured.focal * math.hypot(width, height) / math.hypot(captured.width, captured.height)
+    if fov is not None:
+        focal = 0.5 * height / math.tan(math.radians(fov / 2))
+    poses = captured_path(list(captured.poses), frames)
+    return [Camera(f"frame_{k:04d}", width, height, "SIMPLE_PINHOLE", (focal, width / 2, height / 2), pose) for k, pose in enumerate(poses)]
 
 
 def _checked(poses: list[np.ndarray]) -> list[np.ndarray]:

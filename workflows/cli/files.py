@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from workflows.cli.options import common_options, folder_type, force_option, json_option, memory_limit, memory_option, quiet_option, set_option
+from workflows.cli.options import common_options, crop_option, folder_type, force_option, json_option, memory_limit, memory_option, quiet_option, set_option
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Camera
     from pipeline.executors.memory import Limit
+    from stages.turntable import TurntableSettings
     from workflows.cli.resolve import Settings
 
 CAMERAS = ".json"
+REGIONS = ("foreground", "all")  # efficientnerf.asset.region.REGIONS, which a test compares; that import is heavy
+Crop = tuple[float, float, float, float, float, float] | None
 
 
 @click.command(short_help="Write meshes, points or cameras in other formats.")
@@ -22,6 +27,10 @@ CAMERAS = ".json"
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", required=True, metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
 @click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
+@click.option(
+    "--region", type=click.Choice(REGIONS), help="The subject (foreground) or the whole scene (all); by default mesh.region or points.region: foreground."
+)
+@crop_option
 @force_option
 @memory_option
 @set_option
@@ -29,7 +38,17 @@ CAMERAS = ".json"
 @quiet_option
 @common_options
 def export(
-    what: Path, first: Path, more: tuple[Path, ...], as_points: bool, force: bool, memory: str | None, sets: tuple[str, ...], as_json: bool, quiet: bool
+    what: Path,
+    first: Path,
+    more: tuple[Path, ...],
+    as_points: bool,
+    region: str | None,
+    crop: Crop,
+    force: bool,
+    memory: str | None,
+    sets: tuple[str, ...],
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     """Write the surface of RUN or ASSET as .ply, .glb or .obj, with --points as .ply or .xyz; or the cameras of RUN as .json (nerfstudio).
 
@@ -55,7 +74,7 @@ def export(
         for path in cameras:
             written.append({"path": str(path.absolute()), "cameras": _export_cameras(what, path, force)})
         if surfaces:
-            written += _export_surface(what, surfaces, as_points, force, limit, sets, show)
+            written += _export_surface(what, surfaces, as_points, (region, crop), force, limit, sets, show)
     if as_json:
         write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
     elif not quiet:
@@ -82,9 +101,17 @@ def _export_cameras(what: Path, path: Path, force: bool) -> int:
 
 
 def _export_surface(
-    what: Path, files: list[Path], as_points: bool, force: bool, limit: Limit | None, sets: tuple[str, ...], show: Callable[[dict[str, Any]], None]
+    what: Path,
+    files: list[Path],
+    as_points: bool,
+    part: tuple[str | None, Crop],
+    force: bool,
+    limit: Limit | None,
+    sets: tuple[str, ...],
+    show: Callable[[dict[str, Any]], None],
 ) -> list[dict[str, Any]]:
     from stages import mesh, points
+    from stages.framing.restriction import restricted
     from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
     from stages.io.exporters.writing import source_frame
     from stages.memory.need import refuse_more_than
@@ -94,7 +121,9 @@ def _export_surface(
 
     settings = _settings_for(what, sets, {"mesh": mesh.MeshSettings, "points": points.PointsSettings}).resolved()
     progress = _progress("export", show)
-    tree = load_asset(what)
+    region, crop = part
+    usual = settings["points" if as_points else "mesh"].region if crop is None else "all"
+    tree = restricted(load_asset(what), region or usual, crop)
     frame = source_frame(tree.metadata)
     number = settings["points"].num_points if as_points else 0
     remedy = f"Lower points.num_points ({number})." if as_points else "Take an asset of fewer voxels: enerf convert --resolution."
@@ -132,11 +161,19 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @click.command(short_help="Render a turntable, or the cameras of a JSON path.")
 @click.argument("what", metavar="RUN|ASSET", type=folder_type)
 @click.option("--out", required=True, type=folder_type, metavar="DIR", help="Folder for frame_0000.png and so on; created if missing.")
-@click.option("--path", "camera_path", type=folder_type, metavar="JSON", help="A camera path as nerfstudio exports it, in the frame of the capture.")
+@click.option(
+    "--path",
+    "way",
+    type=folder_type,
+    metavar="orbit|sway|captured|JSON",
+    help="A circle, to and fro, past the captured cameras, or a camera path as nerfstudio exports it, in the frame of the capture.",
+)
+@click.option("--region", type=click.Choice(REGIONS), help="The whole scene (all, the default) or the subject alone (foreground).")
+@crop_option
 @click.option("--frames", type=click.IntRange(1, 9999), help="Frames of the turntable.")
 @click.option("--width", type=click.IntRange(16, 8192), help="Pixels; with --path in place of the file's.")
 @click.option("--height", type=click.IntRange(16, 8192), help="Pixels.")
-@click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb.")
+@click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb; by default the scene's environment, or white.")
 @click.option("--video", metavar="FILE", type=folder_type, help="Also write the frames as an MP4 (H.264).")
 @force_option
 @memory_option
@@ -145,10 +182,11 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @quiet_option
 @common_options
 def render(
-    what: Path, out: Path, camera_path: Path | None, video: Path | None, force: bool, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any
+    what: Path, out: Path, way: Path | None, crop: Crop, video: Path | None, force: bool, sets: tuple[str, ...], as_json: bool, quiet: bool, **given: Any
 ) -> None:
     """Render the asset of RUN, or ASSET, on a turntable or along a camera path, into DIR.
 
+    With all of a scene its surroundings are the background, unless one is given.
     Settings of the stage turntable apply: '--set turntable.elevation=30'. Existing frames are replaced with --force only;
     DIR cannot lie in a run.
     """
@@ -156,12 +194,11 @@ def render(
 
     from pipeline.errors import UsageError
     from stages.figures.frames import RenderOptions, encode_frames, render_frames
-    from stages.framing.camera_paths import similarity_of
-    from stages.io.camera_path import read_camera_path
-    from stages.io.exporters.frames import background_from_text
+    from stages.framing.camera_paths import PATHS
+    from stages.io.exporters.frames import frame_background
     from stages.memory.need import refuse_more_than
     from stages.memory.rendering import frames_needed
-    from stages.turntable import TurntableSettings, cameras_of
+    from stages.turntable import TurntableSettings
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import load_asset
     from workflows.destination import check_files, check_folder, check_free, writing
@@ -169,20 +206,18 @@ def render(
     if video is not None and video.suffix.lower() != ".mp4":
         raise UsageError(f"--video {video}: the extension {video.suffix!r} is not known; expected .mp4.")
     check_folder(out)
+    camera_path = None if way is None or str(way) in PATHS else way
     read = [what, *([] if camera_path is None else [camera_path])]
     check_files([] if video is None else [video], force=force, inputs=read)
     if camera_path is not None and given["frames"] is not None:
         raise UsageError("--frames: the path says how many there are; give either --path or --frames.")
     limit = memory_limit(given.pop("memory"))
     settings = _settings_for(what, sets, {"turntable": TurntableSettings}).resolved()["turntable"]
+    given["region"] = given["region"] or (None if any(text.startswith("turntable.region=") for text in sets) else "all")
+    given["path"] = str(way) if way is not None and camera_path is None else None
     settings = replace(settings, **{name: value for name, value in given.items() if value is not None})
-    background_from_text(settings.background)
-    tree = load_asset(what)
-    if camera_path is not None:
-        path = read_camera_path(camera_path, similarity_of(tree), width=given["width"], height=given["height"])
-        cameras, fps = list(path.cameras), path.fps or settings.fps
-    else:
-        cameras, fps = cameras_of(tree, settings), settings.fps
+    frame_background(settings.background)
+    tree, cameras, fps = _restricted_with_cameras(load_asset(what), settings, crop, camera_path, given["width"], given["height"])
     most = max((camera.width * camera.height for camera in cameras), default=0)
     refuse_more_than(limit, str(what), frames_needed(tree, most), "Render smaller frames (--width, --height).")
     for k in range(len(cameras)):
@@ -201,6 +236,22 @@ def render(
         write_json({"event": "summary", "ok": True, "written": [str(each.absolute()) for each in written], "exit_code": 0})
     elif not quiet:
         closing(f"{len(cameras)} frames in {out}" + (f", {video}" if video is not None else ""))
+
+
+def _restricted_with_cameras(
+    whole: NerfTree, settings: TurntableSettings, crop: Crop, camera_path: Path | None, width: int | None, height: int | None
+) -> tuple[NerfTree, list[Camera], int]:
+    """What of an asset is rendered, the cameras, and the frames per second."""
+    from stages.framing.camera_paths import similarity_of
+    from stages.framing.restriction import restricted, with_region
+    from stages.io.camera_path import read_camera_path
+    from stages.turntable import cameras_of
+
+    tree = restricted(whole, settings.region, crop)
+    if camera_path is None:
+        return tree, cameras_of(whole if crop is None else with_region(tree), settings), settings.fps
+    path = read_camera_path(camera_path, similarity_of(whole), width=width, height=height)
+    return tree, list(path.cameras), path.fps or settings.fps
 
 
 @click.command(short_help="Describe an asset, a run, a data set, a mesh or points.")

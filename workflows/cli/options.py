@@ -23,6 +23,10 @@ memory_option = click.option(
     "--memory", metavar="SIZE", help="Memory that may be taken, as 512m, 8g or 1.5GiB; auto: what the machine or its control group has. Changes no result."
 )
 
+crop_option = click.option(
+    "--crop", nargs=6, type=float, metavar="X Y Z X Y Z", help="Only what lies in this box, two opposite corners in the capture's frame; in place of a region."
+)
+
 
 class PathOfAnything(click.Path):
     """A path as it was given; what is at it is looked at later."""

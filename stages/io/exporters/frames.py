@@ -22,6 +22,11 @@ def background_from_text(text: str) -> tuple[float, float, float] | None:
     raise UsageError(f"background: found {text!r}, expected white, black, transparent or #rrggbb")
 
 
+def frame_background(text: str) -> tuple[float, float, float] | None:
+    """The same of the setting, which may be "auto" too: white, unless the asset's environment takes its place."""
+    return NAMED["white"] if text == "auto" else background_from_text(text)
+
+
 def frame_from_rendering(colour: np.ndarray, opacity: np.ndarray, background: tuple[float, float, float] | None) -> np.ndarray:
     """The 8-bit frame of a rendering.
 

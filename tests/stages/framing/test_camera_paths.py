@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,17 @@ import av
 import numpy as np
 import pytest
 
-from efficientnerf.asset.rendering import MOST_PIXELS
-from efficientnerf.geometry.cameras import Similarity, opengl_from_pose, project
+from efficientnerf.asset.region import Region
+from efficientnerf.asset.rendering import MOST_PIXELS, Rendering
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError
 from stages.figures.frames import RenderOptions, render_path
 from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
+from stages.framing.captured import captured_metadata, captured_of, coverage
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
-from tests.efficientnerf.trees import random_tree
+from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree
 
@@ -260,3 +264,147 @@ def test_an_odd_orbit_gives_cameras_or_is_refused(name: str) -> None:
         except BadInput:
             continue
         assert np.isfinite([camera.world_from_camera for camera in cameras]).all()
+
+
+def test_an_environment_is_behind_frames_unless_a_background_is_asked_for(tmp_path: Path) -> None:
+    tree = replace(random_tree(), environment=np.ones((4, 8, 3), np.float32))
+    camera = turntable_cameras(tree, frames=1, width=16, height=12)[0]
+
+    def draw(shown: NerfTree, camera: Any, **more: Any) -> Rendering:
+        shape = (camera.height, camera.width)
+        blue = np.zeros((*shape, 3), np.float32)
+        blue[..., 2] = 0.0 if shown.environment is None else 1.0
+        return Rendering(blue, np.zeros(shape, np.float32), np.full(shape, np.inf, np.float32), np.zeros((*shape, 3), np.float32))
+
+    for background, expected in (("auto", [0, 0, 255]), ("white", [255, 255, 255]), ("#ff0000", [255, 0, 0]), ("transparent", [0, 0, 0, 0])):
+        render_path(tree, [camera], tmp_path / background, RenderOptions(background=background, video=None, exr="off"), draw=draw)
+        assert read_png(tmp_path / background / "frame_0000.png")[0, 0].tolist() == expected
+    render_path(replace(tree, environment=None), [camera], tmp_path / "none", RenderOptions(video=None, exr="off"), draw=draw)
+    assert read_png(tmp_path / "none" / "frame_0000.png")[0, 0].tolist() == [255, 255, 255]
+
+
+def arc(degrees: float, *, count: int = 20, distance: float = 3.0, target: tuple[float, float, float] = (0.0, 0.0, 0.0), rise: float = 10.0) -> list[Camera]:
+    angles = np.linspace(-90 - degrees / 2, -90 + degrees / 2, count, endpoint=degrees < 360)
+    heights = 20 + rise * np.sin(np.arange(count) * 2.1)
+    poses = [pose_on_sphere(target, distance, a, e) for a, e in zip(angles, heights, strict=True)]
+    return [Camera("", 120, 90, "SIMPLE_PINHOLE", (110.0, 60, 45), pose) for pose in poses]
+
+
+def captured_tree(degrees: float, **more: Any) -> NerfTree:
+    """Voxels throughout two nested grids, whose subject is aside."""
+    tree = random_cascades(5, share=0.9)
+    low, high = tree.bounds_min, tree.bounds_max
+    around = Region(np.stack([low + 0.5 * (high - low), high]))
+    metadata = {"captured_path": captured_metadata(arc(degrees, target=tuple(around.bounds.mean(axis=0)), **more))}
+    return replace(tree, region=around, metadata=metadata)
+
+
+@pytest.mark.parametrize("degrees", [360.0, 120.0, 40.0])
+@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
+def test_the_whole_region_is_in_the_middle_of_every_picture(degrees: float, size: tuple[int, int]) -> None:
+    tree = captured_tree(degrees)
+    assert tree.region is not None
+    cameras = turntable_cameras(tree, frames=16, width=size[0], height=size[1])
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    points = tree.region.bounds[0] + (0.1 + 0.8 * corners) * (tree.region.bounds[1] - tree.region.bounds[0])
+    seen = np.stack([project(camera, points)[0] for camera in cameras]) / size
+    assert seen.min() > 0
+    assert seen.max() < 1
+    middle = np.stack([project(camera, tree.region.bounds.mean(axis=0)[None])[0][0] for camera in cameras]) / size
+    assert np.abs(middle - 0.5).max() < 0.1
+    assert all(abs(camera.world_from_camera[2, 0]) < 1e-9 for camera in cameras), "upright"
+    distances = [np.linalg.norm(camera.centre - tree.region.bounds.mean(axis=0)) for camera in cameras]
+    assert min(distances) >= 0.97 * 3.0, "not closer than the photographs"
+
+
+@pytest.mark.parametrize("degrees", [300.0, 200.0, 120.0, 40.0])
+def test_the_path_stays_where_photographs_were_taken(degrees: float) -> None:
+    """On an arc of less than a full circle the camera goes to and fro, nearly to its ends."""
+    if degrees > 285:  # a gap of 60 degrees is no gap
+        cameras = turntable_cameras(captured_tree(degrees), frames=40, width=64, height=48)
+        azimuths = np.unwrap(np.radians([azimuth_of(camera) for camera in cameras]))
+        assert np.degrees(np.ptp(azimuths)) == pytest.approx(360 * 39 / 40, abs=1)
+        return
+    cameras = turntable_cameras(captured_tree(degrees), frames=40, width=64, height=48)
+    off = np.array([(azimuth_of(camera) + 90 + 180) % 360 - 180 for camera in cameras])
+    assert np.abs(off).max() <= degrees / 2
+    assert np.abs(off).max() >= 0.7 * degrees / 2
+    elevations = np.array([math.degrees(math.asin(-camera.forward[2])) for camera in cameras])
+    assert elevations.min() > 9
+    assert elevations.max() < 31
+    steps = np.abs(np.diff([*off, off[0]]))
+    assert steps.max() < 0.2 * degrees, "without a jump"
+
+
+def azimuth_of(camera: Camera) -> float:
+    return math.degrees(math.atan2(-camera.forward[1], -camera.forward[0]))
+
+
+def test_paths_by_name_and_by_hand() -> None:
+    tree = captured_tree(100.0)
+    around = [azimuth_of(camera) for camera in turntable_cameras(tree, frames=12, width=64, height=48, path="orbit")]
+    assert np.ptp(np.degrees(np.unwrap(np.radians(around)))) == pytest.approx(330, abs=1)
+    swayed = [(azimuth_of(camera) + 90) % 360 for camera in turntable_cameras(tree, frames=40, width=64, height=48, sway=7.0)]
+    assert max(min(a, 360 - a) for a in swayed) == pytest.approx(7, abs=0.1)
+    captured = turntable_cameras(tree, frames=30, width=64, height=48, path="captured")
+    places = np.array([camera.centre for camera in captured])
+    assert tree.region is not None
+    assert np.linalg.norm(places - tree.region.bounds.mean(axis=0), axis=1) == pytest.approx(3.0, rel=0.05)
+    assert captured[0].params[0] == pytest.approx(110.0 * 80 / 150, rel=1e-3)  # by the diagonal
+    assert turntable_cameras(tree, frames=1, width=64, height=48, path="captured", fov=90.0)[0].params[0] == pytest.approx(24)
+
+
+def test_with_its_surroundings_the_camera_keeps_its_distance() -> None:
+    tree = replace(captured_tree(360.0), region=Region(np.array([[-9.0] * 3, [9.0] * 3])))
+    back, stays = (turntable_cameras(tree, frames=4, width=64, height=48, surroundings=shown) for shown in (False, True))
+    middle = np.median([camera.centre for camera in stays], axis=0)
+    assert np.linalg.norm(back[0].centre - middle) > 1.3 * np.linalg.norm(stays[0].centre - middle)
+    assert 2 * math.degrees(math.atan(24 / stays[0].params[0])) <= 75.001
+
+
+def test_captured_cameras_survive_the_metadata() -> None:
+    cameras = arc(360.0, count=150)
+    stated = captured_metadata(cameras)
+    found = captured_of({"captured_path": json.loads(json.dumps(stated))})
+    assert found is not None
+    assert len(found.poses) == 64
+    assert (found.width, found.height, found.focal) == (120, 90, 110)
+    given = np.array([camera.world_from_camera for camera in cameras])
+    assert all(np.abs(given - pose).max(axis=(1, 2)).min() < 1e-4 for pose in found.poses)
+    assert len(json.dumps(stated)) < 12_000
+    assert captured_of({}) is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"poses": []},
+        {"poses": [[0.0] * 12]},
+        {"poses": [[1.0] * 11]},
+        {"poses": [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, float("nan")]]},
+        {"poses": [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0]]},
+        {"poses": [[1, 0, 0, 1e300, 0, 1, 0, 0, 0, 0, 1, 0]]},
+        {"poses": "x"},
+        {"poses": [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]] * 65},
+        {"focal": 0},
+        {"width": -3},
+        {"height": None},
+        {"focal": float("inf")},
+    ],
+)
+def test_captured_cameras_that_cannot_be_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(BadInput, match="captured_path"):
+        captured_of({"captured_path": captured_metadata(arc(90.0)) | change})
+    with pytest.raises(BadInput, match="captured_path"):
+        captured_of({"captured_path": 7})
+
+
+def test_coverage_of_cameras_round_a_point() -> None:
+    found = coverage(np.array([camera.centre for camera in arc(140.0, target=(1.0, 2.0, 3.0))]), np.array([1.0, 2.0, 3.0]))
+    assert found.arc == pytest.approx(140)
+    assert found.heading == pytest.approx(-90)
+    assert found.distance == pytest.approx(3)
+    assert found.elevation == pytest.approx(20, abs=4)
+    assert 5 < found.heights < 10
+    assert coverage(np.array([camera.centre for camera in arc(360.0, count=4)]), np.zeros(3)).arc == 360  # four on all sides
+    assert coverage(np.zeros((1, 3)), np.ones(3)).arc == pytest.approx(0)

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from efficientnerf.asset import format
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset import format, region
+from efficientnerf.asset.cascades import cascade_grids, nested
+from efficientnerf.asset.region import Region
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.cameras import Camera
+from stages.framing.camera_paths import pose_on_sphere
+from stages.framing.captured import captured_metadata
 from tests.workflows.command import Result
+from workflows.cli.files import REGIONS
 
 Enerf = Callable[..., Result]
 SCALE = 0.5
@@ -146,3 +153,79 @@ def test_broken_assets(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     assert enerf("inspect", ball.parent / "nothing.nerftree").code == 2
     (tmp_path / "mesh.ply").write_text("ply\nbroken", encoding="utf-8")
     assert enerf("inspect", tmp_path / "mesh.ply").code == 2
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two nested grids: a red ball about the origin and its foreground region, a blue ball outside of it, green surroundings, captured cameras on an arc."""
+    trees = []
+    for number, (shape, voxel, low) in enumerate(cascade_grids(np.array([[-1.0] * 3, [1.0] * 3]), 2 / 24, 3, 2)):
+        at = low + (np.argwhere(np.ones(np.array(shape) * 3, bool)) + 0.5) * voxel
+        inside = np.linalg.norm(at - ((0, 0, 0), (1.6, 0, 0))[number], axis=1) < (0.6, 0.3)[number]
+        sh = np.tile(np.array([[[8.0, -8, -8]], [[-8.0, -8, 8]]], np.float32)[number], (int(inside.sum()), 1, 1))
+        trees.append(tree_from_voxels(shape, voxel, low, np.argwhere(np.ones(np.array(shape) * 3, bool))[inside], np.full(inside.sum(), 150.0), sh, brick=3))
+    cameras = [Camera("", 80, 60, "SIMPLE_PINHOLE", (80.0, 40, 30), pose_on_sphere((0, 0, 0), 4.0, azimuth, 20.0)) for azimuth in range(-120, -59, 6)]
+    metadata = {"world_from_capture": {"scale": SCALE, "rotation": np.eye(3).tolist(), "translation": [0.0, 0.0, 0.0]}}
+    metadata["captured_path"] = captured_metadata(cameras)
+    around = Region(np.array([[-0.8] * 3, [0.8] * 3]), 0.2, 0.05)
+    path = tmp_path_factory.mktemp("scene") / "scene.nerftree"
+    format.save(replace(nested(trees, np.tile(np.float32([0, 1, 0]), (8, 16, 1))), region=around, metadata=metadata), path, "sparse")
+    return path
+
+
+def test_regions_that_can_be_asked_for_are_those_that_there_are() -> None:
+    assert REGIONS == region.REGIONS
+
+
+def test_exports_take_the_foreground_unless_all_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    """The blue ball is at 3.2 along x in the capture's frame, the red one's radius is 1.2."""
+    both = ["--set", "mesh.region=all", "--region", "foreground"]
+    for name, more, reach in (("a", [], 1.3), ("b", ["--region", "all"], 3.9), ("c", both[:2], 3.9), ("d", both, 1.3)):
+        assert enerf("export", scene, "--to", tmp_path / f"{name}.ply", *more, "--set", "mesh.max_faces=3000").code == 0
+        assert enerf("inspect", tmp_path / f"{name}.ply", "--json").object["bounds"][1][0] == pytest.approx(reach, abs=0.25)
+    assert enerf("export", scene, "--points", "--to", tmp_path / "points.ply", "--region", "all", "--set", "points.num_points=500").code == 0
+    assert enerf("inspect", tmp_path / "points.ply", "--json").object["bounds"][1][0] == pytest.approx(3.9, abs=0.45)
+
+
+def test_a_crop_is_in_the_frame_of_the_capture_and_replaces_the_region(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    found = enerf("export", scene, "--to", tmp_path / "a.ply", "--crop", 4, 1, 1, 2, -1, -1, "--set", "mesh.max_faces=3000")
+    assert found.code == 0, found.err
+    low, high = enerf("inspect", tmp_path / "a.ply", "--json").object["bounds"]
+    assert low[0] == pytest.approx(2.6, abs=0.25)
+    assert high[0] == pytest.approx(3.9, abs=0.25)
+    assert enerf("export", scene, "--to", tmp_path / "b.ply", "--crop", 4, 1, 1, 2, -1, -1, "--region", "foreground").code == 2
+    for numbers, words in (((0, 0, 0, 1, 1, 0), "some volume"), ((50, 50, 50, 51, 51, 51), "nothing of the asset"), ((0, 0, 0, 1, 1, "nan"), "some volume")):
+        refused = enerf("export", scene, "--to", tmp_path / "c.ply", "--crop", *numbers)
+        assert refused.code == 2
+        assert words in refused.err
+    assert not (tmp_path / "c.ply").exists()
+
+
+def frame(enerf: Enerf, scene: Path, folder: Path, *more: object) -> np.ndarray:
+    result = enerf("render", scene, "--out", folder, "--frames", 4, "--width", 48, "--height", 36, *more)
+    assert result.code == 0, result.err
+    return np.asarray(Image.open(folder / "frame_0000.png")).astype(int)
+
+
+def test_renders_of_the_foreground_show_nothing_else(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    subject = frame(enerf, scene, tmp_path / "subject", "--region", "foreground")
+    assert subject[0, 0].tolist() == [255, 255, 255]
+    assert subject[18, 24, 0] > 200
+    assert not ((subject[..., 2] > 200) & (subject[..., 0] < 100)).any(), "the blue ball"
+    assert np.array_equal(frame(enerf, scene, tmp_path / "set", "--set", "turntable.region=foreground"), subject)
+    on_black = frame(enerf, scene, tmp_path / "black", "--region", "foreground", "--background", "black")
+    assert on_black[0, 0].tolist() == [0, 0, 0]
+
+
+def test_paths_by_name(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    ways = ("auto", "orbit", "sway", "captured")
+    pictures = {way: frame(enerf, scene, tmp_path / way, "--region", "foreground", "--path", way) for way in ways}
+    assert np.array_equal(pictures["auto"], pictures["sway"]), "cameras on an arc sway"
+    assert not np.array_equal(pictures["auto"], pictures["orbit"])
+    assert not np.array_equal(pictures["captured"], pictures["orbit"])
+
+
+def test_an_asset_without_cameras_has_no_captured_path(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    result = enerf("render", ball, "--out", tmp_path / "frames", "--path", "captured")
+    assert result.code == 2
+    assert "keeps no captured cameras" in result.err

@@ -1,0 +1,144 @@
+"""The surface of a whole scene: that of each cascade in its own grid, joined.
+
+A cascade's surface is cut where the one before begins and where its own box ends, and open there. The parts are not sewn together: between cascades, whose
+voxels differ by a factor of two, there may be cracks of about a voxel.
+
+F faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from efficientnerf.asset.cascades import Cascade, cascade_tree, cascades_of, voxel_cascades
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.surface.isosurface import NoSurface, Progress, cleaned_surface, points, spread, surface
+from efficientnerf.surface.mesh import Mesh, PointCloud, compact, face_areas
+from efficientnerf.surface.volume import volume_of
+
+MIN_FACES = 20
+BORDER = 0.6  # voxels of a cascade from the borders of its box, and of the one before, in which its surface has lids
+ALONG = 0.7  # cosine of a lid's normal to that of the border
+
+
+def scene_surface(
+    tree: NerfTree, threshold: float | None, *, faces: int, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
+) -> Mesh:
+    """The surface of all cascades as one mesh; of a tree with one grid the same as `surface`. Arguments as there.
+
+    threshold  density per world unit of the inmost cascade; each one after it has half of that, for its voxels are twice as large
+    faces      budget of all together, shared by the numbers of voxels; a cascade whose share is under MIN_FACES is left out, but for the greatest
+
+    Raises NoSurface where no cascade has any.
+    """
+    if not tree.outer:
+        return surface(
+            volume_of(tree), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, progress=progress
+        )  # fmt: skip
+    found = []
+    sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
+    for number, part in _parts(tree):
+        share = faces * len(part.density_values) // len(tree.density_values)
+        if share < MIN_FACES and number != int(sizes.argmax()):
+            continue
+        try:
+            mesh = surface(
+                volume_of(part), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints, progress=progress
+            )
+        except NoSurface:
+            continue
+        found.append((mesh, _visible(tree, number, mesh.vertices, mesh.faces)))
+    if not any(kept.any() for _, kept in found):
+        raise NoSurface("the density of no cascade reaches the threshold" + ("" if threshold is None else f" {threshold:.4g}"))
+    return _joined([(mesh, kept) for mesh, kept in found if kept.any()])
+
+
+def scene_points(
+    tree: NerfTree, count: int, threshold: float | None, *, min_component: float, rounds: int, viewpoints: np.ndarray, seed: int, progress: Progress
+) -> PointCloud:
+    """Points on the surfaces of all cascades; of a tree with one grid the same as `points`. Arguments as there and for `scene_surface`.
+
+    They are spread evenly in each cascade, and as many to a voxel's face in all of them: sparser where voxels are larger.
+    """
+    if not tree.outer:
+        return points(
+            volume_of(tree), count, threshold, min_component=min_component, rounds=rounds, viewpoints=viewpoints, seed=seed, progress=progress
+        )  # fmt: skip
+    found = []
+    for number, part in _parts(tree):
+        try:
+            vertices, triangles, _ = cleaned_surface(volume_of(part), _level(threshold, number), min_component, rounds, viewpoints, progress)
+        except NoSurface:
+            continue
+        kept = triangles[_visible(tree, number, vertices, triangles)]
+        if len(kept):
+            found.append((volume_of(part), *compact(vertices, kept)))
+    if not found:
+        raise NoSurface("the density of no cascade reaches the threshold" + ("" if threshold is None else f" {threshold:.4g}"))
+    size = np.array([face_areas(vertices, triangles).sum() / volume.voxel**2 for volume, vertices, triangles in found])
+    ends = np.round(np.cumsum(size) / size.sum() * count).astype(int)
+    clouds = [spread(*part, number, seed, progress) for part, number in zip(found, np.diff(ends, prepend=0).tolist(), strict=True) if number]
+    return PointCloud(*(np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in ("positions", "normals", "colours")))
+
+
+def _parts(tree: NerfTree) -> Iterator[tuple[int, NerfTree]]:
+    """The cascades that hold anything, with their numbers."""
+    for number in range(len(cascades_of(tree))):
+        part = cascade_tree(tree, number)
+        if len(part.density_values):
+            yield number, part
+
+
+def _level(threshold: float | None, number: int) -> float | None:
+    return None if threshold is None else threshold / 2.0**number
+
+
+def _visible(tree: NerfTree, number: int, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool: faces of a cascade's surface that lie in its box, not in the one before, and do not close it where it merely ends at a border."""
+    cascades = cascades_of(tree)
+    corners = vertices[faces]  # (F, 3, 3)
+    middle = corners.mean(axis=1)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    out = np.ones(len(faces), bool)
+    if number:
+        out &= (_depth(cascades[number - 1], tree.brick, middle) <= 0).any(axis=1)
+        out &= ~_lids(cascades[number - 1], tree.brick, middle, -normal, cascades[number].voxel)
+    if number + 1 < len(cascades):
+        out &= (_depth(cascades[number], tree.brick, middle) >= 0).all(axis=1)
+        out &= ~_lids(cascades[number], tree.brick, middle, normal, cascades[number].voxel)
+    return out
+
+
+def _depth(cascade: Cascade, brick: int, at: np.ndarray) -> np.ndarray:
+    """(F, 3) how far points lie inside of the nearer side of a box along each axis."""
+    low, high = cascade.bounds(brick)
+    return np.asarray(np.minimum(at - low, high - at))
+
+
+def _lids(cascade: Cascade, brick: int, at: np.ndarray, normal: np.ndarray, voxel: float) -> np.ndarray:
+    """(F,) bool: faces about at a side of a box, and along it, with normals out of it."""
+    low, high = cascade.bounds(brick)
+    outward = np.maximum(np.sign(at - (low + high) / 2) * normal, 0)
+    near = np.abs(_depth(cascade, brick, at)) < BORDER * voxel  # of several sides at edges and corners, which are bevelled
+    return np.asarray(np.linalg.norm(np.where(near, outward, 0), axis=1) > ALONG)
+
+
+def _joined(parts: list[tuple[Mesh, np.ndarray]]) -> Mesh:
+    """One mesh of the chosen faces (F,) of several; the facts are those of the first, with the numbers of faces and components summed."""
+    vertices, faces, normals, colours, first = [], [], [], [], 0
+    for mesh, kept in parts:
+        used, index = np.unique(mesh.faces[kept], return_inverse=True)
+        vertices.append(mesh.vertices[used])
+        normals.append(mesh.normals[used])
+        colours.append(mesh.colours[used])
+        faces.append(index.reshape(-1, 3) + first)
+        first += len(used)
+    facts: dict[str, object] = dict(parts[0][0].facts) | {"cascades": len(parts)}
+    for name, value in facts.items():
+        others = [mesh.facts.get(name) for mesh, _ in parts]
+        if name != "cascades" and all(type(other) is int for other in [value, *others]):
+            facts[name] = sum(other for other in others if isinstance(other, int))
+    return Mesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int64), np.concatenate(normals), np.concatenate(colours), facts)

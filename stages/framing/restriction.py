@@ -1,0 +1,48 @@
+"""What of an asset is shown or exported: its foreground or all of it, or what lies in a box of the capture's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.asset.region import Region, cropped, foreground, voxel_centres
+from pipeline.errors import UsageError
+from stages.framing.camera_paths import similarity_of
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+
+def restricted(tree: NerfTree, region: str, crop: Sequence[float] | None = None) -> NerfTree:
+    """The tree with its foreground alone, or with all, and of that what lies in a box.
+
+    region  "foreground" or "all"; a tree without a region is foreground throughout
+    crop    six numbers in the capture's frame, x y z of one corner and of the opposite one
+
+    Raises UsageError for a box without volume, and where the box or the region leaves nothing of an asset that holds something.
+    """
+    out = foreground(tree) if region == "foreground" else tree
+    if not len(out.density_values) and len(tree.density_values):
+        raise UsageError("nothing of the asset lies in its foreground region. Choose the region all.")
+    if crop is None:
+        return out
+    before = len(out.density_values)
+    try:
+        out = cropped(out, np.array(crop, np.float64).reshape(2, 3), similarity_of(tree))
+    except ValueError as error:
+        raise UsageError(f"--crop: {error}") from error
+    if before and not len(out.density_values):
+        numbers = " ".join(f"{x:g}" for x in crop)
+        raise UsageError(f"--crop {numbers}: nothing of the asset lies in this box of the capture's frame. enerf inspect shows the asset's bounds.")
+    return out
+
+
+def with_region(tree: NerfTree) -> NerfTree:
+    """The tree with a region round all that it holds, so that camera paths frame that."""
+    if tree.ndc is not None or not len(tree.density_values):
+        return tree
+    places, side = voxel_centres(tree), tree.voxel
+    return replace(tree, region=Region(np.stack([places.min(axis=0) - side, places.max(axis=0) + side])))

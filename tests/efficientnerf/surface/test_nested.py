@@ -1,0 +1,128 @@
+"""The surface of nested grids: a ball that reaches through several of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.surface.isosurface import NoSurface, points, surface
+from efficientnerf.surface.mesh import Mesh, PointCloud
+from efficientnerf.surface.nested import scene_points, scene_surface
+from efficientnerf.surface.volume import volume_of
+
+NO_VIEWPOINTS = np.zeros((0, 3))
+VOXEL, SIGMA = 0.1, 60.0
+
+
+def silent(done: int, total: int, text: str) -> None:
+    pass
+
+
+def balls(*each: tuple[tuple[float, float, float], float], count: int = 3, half: float = 0.8) -> NerfTree:
+    """Balls in nested grids, the inmost from -half to half."""
+    bounds = np.array([[-half] * 3, [half] * 3])
+    trees = []
+    for number, (shape, voxel, low) in enumerate(cascade_grids(bounds, VOXEL, 4, count)):
+        at = low + (np.argwhere(np.ones(np.array(shape) * 4, bool)) + 0.5) * voxel
+        inside = np.zeros(len(at), bool)
+        for centre, radius in each:
+            inside |= np.linalg.norm(at - centre, axis=1) < radius
+        if number:
+            inside &= (np.abs(at) > half * 2 ** (number - 1) - 1.5 * voxel).any(axis=1)  # some voxels within the box before
+        indices = np.argwhere(np.ones(np.array(shape) * 4, bool))[inside]
+        sh = np.zeros((len(indices), 1, 3), np.float32)
+        trees.append(tree_from_voxels(shape, voxel, low, indices, np.full(len(indices), SIGMA / 2**number, np.float32), sh, brick=4))
+    return nested(trees)
+
+
+def mesh_of(tree: NerfTree, threshold: float | None = None, faces: int = 20_000) -> Mesh:
+    return scene_surface(tree, threshold, faces=faces, min_component=0.01, rounds=2, viewpoints=NO_VIEWPOINTS, progress=silent)
+
+
+def points_of(tree: NerfTree, count: int = 4000) -> PointCloud:
+    return scene_points(tree, count, None, min_component=0.01, rounds=2, viewpoints=NO_VIEWPOINTS, seed=0, progress=silent)
+
+
+def test_of_one_grid_it_is_the_surface_as_before() -> None:
+    tree = balls(((0, 0, 0), 0.5), count=1)
+    ours, before = mesh_of(tree), surface(volume_of(tree), None, faces=20_000, min_component=0.01, rounds=2)
+    assert np.array_equal(ours.vertices, before.vertices)
+    assert np.array_equal(ours.faces, before.faces)
+    assert ours.facts == before.facts
+    assert np.array_equal(points_of(tree, 50).positions, points(volume_of(tree), 50, min_component=0.01, rounds=2).positions)
+
+
+@pytest.mark.parametrize("threshold", [None, 25.0])
+def test_a_ball_through_all_grids_has_one_surface_and_none_within(threshold: float | None) -> None:
+    """Its middle fills the inmost grid; its surface lies in the last."""
+    radius = 2.2
+    mesh = mesh_of(balls(((0, 0, 0), radius)), threshold)
+    away = np.linalg.norm(mesh.vertices, axis=1)
+    side = 4 * VOXEL
+    assert (np.abs(away - radius) < side).all()
+    area = 0.5 * np.linalg.norm(np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2))), axis=1).sum()
+    assert 0.78 < area / (4 * np.pi * radius**2) < 1.05  # of voxels of 0.4 it is smaller, and there are cracks; lids would make it larger
+    outward = (mesh.vertices * mesh.normals).sum(1) / away
+    assert np.median(outward) > 0.95
+
+
+def test_a_ball_across_the_border_of_two_grids_is_whole_but_for_a_crack() -> None:
+    centre, radius = np.array([0.8, 0.0, 0.0]), 0.5
+    tree = balls(((0.8, 0.0, 0.0), radius), count=2)
+    mesh = mesh_of(tree, 20.0)
+    assert (np.abs(np.linalg.norm(mesh.vertices - centre, axis=1) - radius) < 2.1 * VOXEL).all()
+    middle = mesh.vertices[mesh.faces].mean(1)
+    assert (middle[:, 0] < 0.8).any()
+    assert (middle[:, 0] > 0.8).any()
+    directions = np.random.default_rng(0).normal(size=(3000, 3))
+    on_ball = centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    from scipy.spatial import cKDTree
+
+    distance = cKDTree(middle).query(on_ball)[0]
+    crack = np.abs(on_ball[:, 0] - 0.8) < 2 * 2 * VOXEL
+    assert distance[~crack].max() < 2.5 * VOXEL
+
+
+def test_what_is_in_outer_grids_alone_is_there() -> None:
+    tree = balls(((1.9, 0, 0), 0.6))
+    for found in (mesh_of(tree).vertices, points_of(tree).positions):
+        assert found.min(axis=0) == pytest.approx([1.3, -0.6, -0.6], abs=4 * VOXEL)
+        assert found.max(axis=0) == pytest.approx([2.5, 0.6, 0.6], abs=4 * VOXEL)
+
+
+def test_the_budget_of_faces_holds_for_all_together() -> None:
+    tree = balls(((0, 0, 0), 0.5), ((1.3, 0, 0), 0.25), ((0, 2.4, 0), 0.6))
+    full, small = mesh_of(tree), mesh_of(tree, faces=600)
+    assert len(full.faces) > 1000
+    assert 100 < len(small.faces) <= 600
+    assert full.facts["cascades"] == 3
+
+
+def test_points_number_as_asked_and_thin_out_outwards() -> None:
+    tree = balls(((0, 0, 0), 0.5), ((0, 2.3, 0), 0.6))
+    cloud = points_of(tree, 3001)
+    assert cloud.positions.shape == cloud.normals.shape == cloud.colours.shape == (3001, 3)
+    near = np.linalg.norm(cloud.positions, axis=1) < 1
+    per_area = near.mean() / 0.5**2, (~near).mean() / 0.6**2
+    assert 10 < per_area[0] / per_area[1] < 28  # voxels of four times the side: 16, and the coarse ball is smaller than it should be
+    assert np.array_equal(cloud.positions, points_of(tree, 3001).positions)
+
+
+def test_nothing_anywhere_is_said() -> None:
+    tree = balls(((0, 0, 0), 0.5))
+    with pytest.raises(NoSurface, match="no cascade reaches the threshold 1e"):
+        mesh_of(tree, 1e9)
+    with pytest.raises(NoSurface):
+        points_of(replace(tree, density_values=np.zeros_like(tree.density_values)))
+
+
+def test_nothing_is_found_twice_where_grids_overlap() -> None:
+    tree = balls(((0.45, 0.3, 0.2), 0.2))
+    mesh = mesh_of(tree)
+    low, high = cascades_of(tree)[0].bounds(tree.brick)
+    assert ((mesh.vertices > low) & (mesh.vertices < high)).all()
+    assert mesh.facts["cascades"] == 1
