@@ -101,7 +101,7 @@ def contender(preset: str, poses: Path, seconds: float, whole: bool) -> Contende
 
 def test_views(poses: Path, count: int, side: int) -> list[tuple[Any, Any, int]]:
     """Cameras, their images, and by how much both are subsampled."""
-    from stages.evaluate import ground_truth, subsample, subsample_camera
+    from stages.evaluation.views import ground_truth, subsample, subsample_camera
     from stages.io import scene
 
     s = scene.load(poses)

@@ -80,8 +80,16 @@ class EvaluateOutputs(Outputs):
     """The metrics."""
 
     stage = "evaluate"
-    metrics = Name("metrics.json")  # PSNR, SSIM, LPIPS: means, and of each view
+    metrics = Name("metrics.json")  # PSNR, SSIM, gap, holes, floaters, LPIPS: means, and of each view
     contact_sheet = Name("contact_sheet.png")
+    strip_worst = Name("strip_worst.png")  # photograph, network, asset; as many of the three as there are views
+    strip_median = Name("strip_median.png")
+    strip_best = Name("strip_best.png")
+    captured_path = Name("captured_path.mp4")
+
+    def strip(self, which: str) -> Path:
+        """That of the worst, the median or the best view."""
+        return {"worst": self.strip_worst, "median": self.strip_median, "best": self.strip_best}[which]
 
 
 class TurntableOutputs(Outputs):

@@ -159,7 +159,7 @@ def _baked_tree(job: Job, m: Any, s: Scene, space: Space, resolution: int, indic
 def _targets(s: Scene, pixels: Pixels, visibility: Visibility) -> Targets:
     """What the tree is fitted to."""
     from efficientnerf.asset.refinement.targets import Targets
-    from stages.evaluate import constant_background
+    from stages.evaluation.views import constant_background
 
     background = constant_background(s)
     if background is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from efficientnerf.asset.rendering import Rendering
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
-from efficientnerf.rendering.field_renderer import FieldRendering
+from efficientnerf.rendering.field_renderer import FieldRendering, SampleCounts
+from stages.evaluation.asset import EvaluatedAsset
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -99,6 +101,18 @@ class BallTree:
         normal = np.where(opacity[:, None] > 0, self.normal(hit), 0.0)
         return Rendering(colour.astype(np.float32), opacity.astype(np.float32), depth.astype(np.float32), normal.astype(np.float32))
 
+    def opacity_nearer(self, origins: np.ndarray, directions: np.ndarray, limits: np.ndarray) -> np.ndarray:
+        """Closed form, as above."""
+        to_centre = np.asarray(self.centre) - origins
+        middle = (to_centre * directions).sum(-1)
+        half = np.sqrt(np.maximum(self.radius**2 - ((to_centre**2).sum(-1) - middle**2), 0.0))
+        near, far = np.maximum(middle - half, 0.0), np.maximum(middle + half, 0.0)
+        return 1.0 - np.exp(-self.sigma * np.maximum(np.minimum(far, limits) - near, 0.0))
+
+    def evaluated(self, **more: Any) -> EvaluatedAsset:
+        """As the evaluate stage sees it; margins of 2 % of the distance."""
+        return EvaluatedAsset(self.render, limits=lambda origins, directions, distance: 0.98 * distance, nearer=self.opacity_nearer, **more)
+
     def render(self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
         origins, directions = rays(camera)
         flat = self.render_rays(origins, directions)
@@ -122,12 +136,21 @@ class BallField:
     noise: float = 0.0
     calls: list[tuple[str, int, int]] = field(default_factory=list)
 
-    def render(self, camera: Camera, progress: Any = None) -> FieldRendering:
+    def render(
+        self,
+        camera: Camera,
+        progress: Any = None,
+        *,
+        box: np.ndarray | None = None,
+        reach: np.ndarray | None = None,
+        limits: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
+    ) -> FieldRendering:
+        """The ball lies in any box that is asked for."""
         self.calls.append((camera.name, camera.width, camera.height))
         inner = self.tree.render(camera)
         size = (camera.height, camera.width)
+        origins, directions = rays(camera)
         if self.background is None:
-            _, directions = rays(camera)
             behind = (0.5 + 0.3 * np.sin(2.0 * directions)).reshape(*size, 3).astype(np.float32)
         else:
             behind = np.broadcast_to(np.asarray(self.background, np.float32), (*size, 3)).copy()
@@ -137,4 +160,9 @@ class BallField:
             colour = colour + (self.noise * pattern[..., None]).astype(np.float32)
         if progress is not None:
             progress(camera.width * camera.height, camera.width * camera.height)
-        return FieldRendering(colour, inner.opacity, inner.depth, np.zeros((*size, 4), np.float32), behind, inner.opacity)
+        nearer = None
+        if limits is not None:
+            distance = self.tree.render_rays(origins, directions).depth
+            nearer = self.tree.opacity_nearer(origins, directions, limits(origins, directions, distance)).reshape(size)
+        before = np.zeros((*size, 4), np.float32)
+        return FieldRendering(colour, inner.opacity, inner.depth, before, behind, inner.opacity, SampleCounts(), inner.opacity, nearer)

@@ -31,6 +31,19 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
     return math.inf if error == 0.0 else -10.0 * math.log10(error)
 
 
+def colour_fitted(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """The image with the affine change of its colours, c -> A c + b with A (3, 3), that brings it nearest to the ground truth by least squares over the pixels
+    that count: what photographs differ by in exposure and white balance is taken out of a figure. Clipped to 0-1.
+
+    Arguments as for mean_squared_error, with three channels. Returns (H, W, 3) float64.
+    """
+    image, truth, mask = _checked(image, truth, mask)
+    used = (slice(None), slice(None)) if mask is None else mask
+    rows = np.concatenate([image, np.ones((*image.shape[:2], 1))], axis=-1)  # (H, W, 4)
+    change = np.linalg.lstsq(rows[used].reshape(-1, 4), truth[used].reshape(-1, 3), rcond=None)[0]
+    return np.clip(rows @ change, 0.0, 1.0)
+
+
 def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Structural similarity, 1 where the images are equal: the mean of ssim_map over channels and over the windows that lie inside the image.
 

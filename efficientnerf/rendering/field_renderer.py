@@ -14,10 +14,12 @@ import torch
 from torch import Tensor
 
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.geometry.spaces import Box
 from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.rendering.compositing import activate, ray_of_sample
 
 RAYS_PER_BLOCK = 8192
+Limits = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (R, 3), directions (R, 3), distances (R,) -> distances (R,)
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,10 @@ class FieldRendering:
     depth           (H, W) along the view axis, world units; infinity where the opacity stays below one half
     before          (H, W, 4) premultiplied colour and opacity of what lies between the camera and the box
     behind          (H, W, 3) colour of what lies beyond the box, as if the box were empty
-    inside_opacity  (H, W) of what lies in the box
+    inside_opacity  (H, W) of what lies in the box, of the light that reaches it
     counts          of the samples that it took
+    within          (H, W) opacity of all that lies before the ray leaves the box `reach` of the render; 0 where it misses that
+    nearer          (H, W) opacity of what lies nearer than the limits that the render was given; None without
     """
 
     colour: np.ndarray
@@ -63,7 +67,9 @@ class FieldRendering:
     before: np.ndarray
     behind: np.ndarray
     inside_opacity: np.ndarray
-    counts: SampleCounts = SampleCounts()
+    counts: SampleCounts
+    within: np.ndarray
+    nearer: np.ndarray | None = None
 
 
 def valid_count(m: Model, outputs: RayOutputs) -> int:
@@ -87,8 +93,21 @@ class FieldRenderer:
     rays_per_block: int = RAYS_PER_BLOCK
 
     @torch.no_grad()
-    def render(self, camera: Camera, progress: Callable[..., Any] | None = None) -> FieldRendering:
-        """The image that a camera in the training frame takes of the field."""
+    def render(
+        self,
+        camera: Camera,
+        progress: Callable[..., Any] | None = None,
+        *,
+        box: np.ndarray | None = None,
+        reach: np.ndarray | None = None,
+        limits: Limits | None = None,
+    ) -> FieldRendering:
+        """The image that a camera in the training frame takes of the field.
+
+        box     (2, 3) by which it is split; None: that of the field's space. The space's frame has to be the world, here and below
+        reach   (2, 3) a box around it, for `within`; None: the same
+        limits  for `nearer`: from where the light is half gone (infinity: nowhere) on rays to where on them to look; distances of the world
+        """
         m = self.model
         count = camera.width * camera.height
         parts, counts = [], SampleCounts()
@@ -103,22 +122,49 @@ class FieldRenderer:
             outputs = render_rays(m, origins, directions, self.near / slant, self.far / slant, torch.full_like(slant, 0.5), beyond)
             intervals = outputs.coarse.tried if m.space.contracted else len(index) * (self.far - self.near) / m.step
             counts += SampleCounts(len(index), intervals, valid_count(m, outputs), int(outputs.pivotal.sum()), len(outputs.fine.start))
-            parts.append([part.cpu().numpy() for part in split_by_box(m, origins, directions, slant, outputs, beyond)])
+            split = split_by_box(m, origins, directions, slant, outputs, beyond, box)
+            found = [*split, opacity_within(m, outputs, box if reach is None else reach)]
+            if limits is not None:
+                stated = limits(*(a.double().cpu().numpy() for a in (origins, directions, split[2] / slant)))
+                found.append(opacity_nearer(outputs, torch.as_tensor(stated, dtype=torch.float32, device=m.device)))
+            parts.append([part.cpu().numpy() for part in found])
             if progress is not None:
                 progress(begin + len(index), count)
         shape = (camera.height, camera.width)
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        colour, opacity, depth, before, behind, inside = (column.reshape(*shape, *column.shape[1:]) for column in columns)
-        return FieldRendering(colour, opacity, depth, before, behind, inside, counts)
+        colour, opacity, depth, before, behind, inside, within, *nearer = (column.reshape(*shape, *column.shape[1:]) for column in columns)
+        return FieldRendering(colour, opacity, depth, before, behind, inside, counts, within, nearer[0] if nearer else None)
 
 
-def split_by_box(m: Model, origins: Tensor, directions: Tensor, slant: Tensor, outputs: RayOutputs, behind: Tensor) -> tuple[Tensor, ...]:
-    """The fields of a FieldRendering for rays (R, ...): each fine sample belongs in front of the box, in it or beyond it."""
+def opacity_within(m: Model, outputs: RayOutputs, box: np.ndarray | None) -> Tensor:
+    """Opacity (R,) of all that lies before a ray leaves a box (2, 3), None: that of the space; 0 where it misses it."""
+    enter, leave = (m.space if box is None else Box(box)).intersect(outputs.rays.origins, outputs.rays.directions)
+    leave = torch.where(leave <= torch.clamp(enter, min=0), -torch.inf, leave)
+    ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
+    chosen = outputs.fine.start + outputs.fine.extent / 2 <= leave[ray]
+    return torch.zeros_like(leave).index_add(0, ray, outputs.fine_weight * chosen)
+
+
+def opacity_nearer(outputs: RayOutputs, limits: Tensor) -> Tensor:
+    """Opacity (R,) of the samples whose middle is nearer than the limits (R,), distances of the world."""
+    ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
+    chosen = outputs.rays.world_distance(outputs.fine.start + outputs.fine.extent / 2, ray) < limits[ray]
+    return torch.zeros_like(limits).index_add(0, ray, outputs.fine_weight * chosen)
+
+
+def split_by_box(
+    m: Model, origins: Tensor, directions: Tensor, slant: Tensor, outputs: RayOutputs, behind: Tensor, box: np.ndarray | None = None
+) -> tuple[Tensor, ...]:
+    """Colour, opacity, depth, before, behind and inside_opacity of a FieldRendering for rays (R, ...): each fine sample belongs in front of the box, in it or
+    beyond it.
+
+    box  (2, 3) in the world, where that is the space's frame; None: that of the space
+    """
     count = len(origins)
     ray = ray_of_sample(outputs.fine.first, len(outputs.fine.start))
     middle = outputs.fine.start + outputs.fine.extent / 2
     origins, directions = outputs.rays.origins, outputs.rays.directions
-    enter, leave = m.space.intersect(origins, directions)
+    enter, leave = (m.space if box is None else Box(box)).intersect(origins, directions)
     misses = leave <= torch.clamp(enter, min=0)  # such a ray sees nothing but what lies beyond
     enter = torch.where(misses, -torch.inf, enter)
     leave = torch.where(misses, -torch.inf, leave)

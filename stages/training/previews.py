@@ -40,7 +40,7 @@ class Previews:
         if self.view is None or self.every is None or step == 0 or step % self.every:
             return None
         from efficientnerf.evaluation.metrics import psnr
-        from stages.evaluate import ground_truth, subsample, subsample_camera
+        from stages.evaluation.views import ground_truth, subsample, subsample_camera
         from stages.figures.plots import to_uint8
         from stages.io.png import write_png
 

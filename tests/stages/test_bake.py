@@ -27,7 +27,7 @@ from stages import bake, train
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
 from stages.baking import memory, refinement, resolution
-from stages.evaluate import ground_truth
+from stages.evaluation.views import ground_truth
 from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from tests.efficientnerf.balls import settings

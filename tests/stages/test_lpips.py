@@ -10,7 +10,9 @@ import torch
 
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
-from stages.evaluate import GroundTruth, lpips_metrics, summary
+from stages.evaluation.comparison import GAP, lpips_metrics
+from stages.evaluation.summary import summary
+from stages.evaluation.views import GroundTruth
 from stages.lpips_weights import BACKBONES, load_lpips
 
 
@@ -110,8 +112,10 @@ def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
     assert figures["lpips_alex"] is not None
     assert figures["lpips_alex"] > 0
     assert lpips_metrics(metrics, image[:50], GroundTruth(truth[:50], None, None)) == {"lpips_alex": None}
-    some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, **figures}
-    views = [{"name": "a", "network": {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0}, "asset": {**some, "lpips_alex": None}}]
+    some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, "psnr_colour_fitted": 21.0, **figures}
+    network = {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0, "floaters": None}
+    against = {"asset_with_network_background": None, "gap": dict.fromkeys(GAP), "holes": 0.0, "floaters": None}
+    views = [{"name": "a", "network": network, "asset": {**some, "lpips_alex": None}, **against}]
     found = summary(views, split="test", stride=1, background=None, perceptual=("lpips_alex",))
     assert found["network"]["lpips_alex"] == figures["lpips_alex"]
     assert found["asset"]["lpips_alex"] is None

@@ -9,7 +9,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio
 
 from efficientnerf.evaluation import metrics
-from efficientnerf.evaluation.metrics import mean_squared_error, psnr, ssim, ssim_map
+from efficientnerf.evaluation.metrics import colour_fitted, mean_squared_error, psnr, ssim, ssim_map
 from tests import reference
 
 
@@ -96,3 +96,26 @@ def test_ssim_is_the_same_to_the_bit_in_bands(monkeypatch: pytest.MonkeyPatch, s
     monkeypatch.setattr(metrics, "BAND", band)
     assert (metrics.ssim(image, truth), metrics.ssim(image, truth, mask)) == (whole, masked)
     assert np.array_equal(metrics.ssim_map(image, truth), similarity)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_change_of_exposure_and_white_balance_is_fitted_away(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    _, truth = pair(seed)
+    mix, shift = np.eye(3) + random.normal(0, 0.1, (3, 3)), random.normal(0, 0.05, 3)
+    changed = (truth - shift) @ np.linalg.inv(mix).T
+    np.testing.assert_allclose(colour_fitted(changed, truth), truth, atol=1e-6)
+    noisy, truth = pair(seed)
+    assert psnr(colour_fitted(noisy, truth), truth) >= psnr(noisy, truth)
+    assert colour_fitted(noisy, truth).min() >= 0
+
+
+def test_only_pixels_that_count_are_fitted() -> None:
+    image, truth = pair()
+    mask = np.zeros(truth.shape[:2], bool)
+    mask[:20] = True
+    spoilt = image * 0.7 + 0.1
+    spoilt[20:] = 0.5
+    np.testing.assert_allclose(colour_fitted(spoilt, truth, mask)[mask], colour_fitted(image[:20], truth[:20]).reshape(-1, 3), atol=1e-5)
+    flat = colour_fitted(np.full((4, 5, 3), 0.3), np.full((4, 5, 3), 0.6))
+    np.testing.assert_allclose(flat, 0.6, err_msg="an image of one colour leaves the fit open; any will do")

@@ -1,0 +1,76 @@
+"""metrics.json: means over the views, and what they say in words.
+
+network, asset  means over their views of PSNR (in decibels, as published), SSIM and the rest; `scale`: of the pixel grid
+asset.on_network_views         those of the views that the network was rendered for
+asset_with_network_background  cascade 0 of a whole scene's asset between what the field shows before and behind its box; null for other assets
+gap, holes, floaters           means over the views that the network was rendered for (`stages.evaluation.comparison`)
+strips          the views whose pictures stand beside, with the figures of these
+views           the metrics of each view
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES
+
+FORMAT = 1
+
+
+def summary(
+    figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, perceptual: Sequence[str] = (), strips: Sequence[dict[str, Any]] = ()
+) -> dict[str, Any]:
+    """The document of metrics.json.
+
+    figures     the metrics of each view
+    stride      of the network's renders
+    background  stride of the surroundings that the field renders for the other views; None: no view has such
+    perceptual  names of LPIPS metrics
+    """
+    drawn = [view for view in figures if view["network"] is not None]
+    networks, assets = [view["network"] for view in drawn], [view["asset"] for view in figures]
+    network: dict[str, Any] = {**means(networks), **means(networks, (*perceptual, *SAMPLE_SHARES, "floaters")), "views": len(drawn), "scale": 1.0 / stride}
+    asset: dict[str, Any] = {**means(assets), **means(assets, perceptual), "views": len(assets), "scale": 1.0}
+    asset["on_network_views"] = means([view["asset"] for view in drawn])
+    if background is not None:
+        asset["background_scale"] = {"network_views": 1.0 / stride, "other_views": 1.0 / background}
+    composited = [view["asset_with_network_background"] for view in drawn if view["asset_with_network_background"] is not None]
+    return {
+        "format": FORMAT,
+        "split": split,
+        "network": network,
+        "asset": asset,
+        "asset_with_network_background": {**means(composited), "views": len(composited), "background_scale": 1.0 / stride} if composited else None,
+        "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
+        **means(drawn, ("holes", "floaters")),
+        "strips": list(strips),
+        "views": list(figures),
+    }
+
+
+def means(figures: Sequence[Mapping[str, Any]], names: Sequence[str] = QUALITY) -> dict[str, float | None]:
+    """Means by name over those that have the figure; None where none has."""
+    found: dict[str, float | None] = {}
+    for name in names:
+        values = [view[name] for view in figures if view[name] is not None]
+        found[name] = math.fsum(values) / len(values) if values else None
+    return found
+
+
+def quality(found: Mapping[str, Any]) -> str:
+    """`28.87 dB, SSIM 0.894`."""
+    psnr = "no PSNR" if found["psnr"] is None else f"{found['psnr']:.2f} dB"
+    return psnr if found["ssim"] is None else f"{psnr}, SSIM {found['ssim']:.3f}"
+
+
+def in_words(metrics: Mapping[str, Any]) -> str:
+    """The means in one line."""
+    parts = [f"network {quality(metrics['network'])}", f"asset {quality(metrics['asset'])}"]
+    if metrics["gap"]["psnr"] is not None:
+        parts.append(f"gap {metrics['gap']['psnr']:+.2f} dB")
+    for name in ("holes", "floaters"):
+        if metrics[name] is not None:
+            parts.append(f"{name} {100 * metrics[name]:.2f} %")
+    return "; ".join(parts)

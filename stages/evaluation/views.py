@@ -1,0 +1,113 @@
+"""The views that are measured: which, at which pixels, and the images that renders are compared with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import MODELS, Camera
+from stages.io.scene import Scene, View
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """The image that a render is compared with.
+
+    colour  (H, W, 3) float32, on the scene's background
+    mask    (H, W) bool, pixels that are compared; None: all
+    inside  (H, W) bool, pixels that the image's alpha covers; None without alpha
+    """
+
+    colour: np.ndarray
+    mask: np.ndarray | None
+    inside: np.ndarray | None
+
+    def subsampled(self, stride: int) -> GroundTruth:
+        """That of the pixels that `subsample` keeps."""
+        return GroundTruth(subsample(self.colour, stride), *(None if part is None else subsample(part, stride) for part in (self.mask, self.inside)))
+
+
+def evaluation_views(scene: Scene) -> tuple[tuple[View, ...], str]:
+    """The views to report on and their split: test, else val, else train. Raises ValueError where the scene has no views."""
+    from stages.io.scene import views_of
+
+    for split in ("test", "val", "train"):
+        views = views_of(scene, split)
+        if views:
+            return views, split
+    raise ValueError("the scene holds no views")
+
+
+def evenly_spaced(count: int, wanted: int | None) -> list[int]:
+    """`wanted` of the indices below `count`; None: all."""
+    if wanted is None or wanted >= count:
+        return list(range(count))
+    return [int((k + 0.5) * count / wanted) for k in range(wanted)]
+
+
+def stride_for(views: Sequence[View], rays: int) -> int:
+    """The stride at which the views together have at most about this many rays."""
+    total = sum(view.camera.width * view.camera.height for view in views)
+    return max(1, math.ceil(math.sqrt(total / rays)))
+
+
+def ground_truth(folder: Path, view: View, background: tuple[float, float, float] | None) -> GroundTruth:
+    """The image of a view at working size.
+
+    background  what images with alpha are composited on; None: alpha below one half masks
+    """
+    from stages.io.scene import read_image, read_mask
+
+    pixels = read_image(folder, view).astype(np.float32) / 255.0
+    mask = read_mask(folder, view)
+    if pixels.shape[2] == 3:
+        return GroundTruth(pixels, mask, None)
+    alpha = pixels[..., 3]
+    if background is None:
+        covered = alpha >= 0.5
+        return GroundTruth(pixels[..., :3], covered if mask is None else mask & covered, None)
+    colour = pixels[..., :3] * alpha[..., None] + (1.0 - alpha[..., None]) * np.asarray(background, np.float32)
+    return GroundTruth(colour, mask, alpha > 0)
+
+
+def subsample_camera(camera: Camera, stride: int) -> Camera:
+    """The camera whose pixel centres are those of the pixels that `subsample` keeps."""
+    first = (stride - 1) // 2
+    params = []
+    for name, value in zip(MODELS[camera.model], camera.params, strict=True):
+        if name in ("cx", "cy"):
+            value = (value - first - 0.5) / stride + 0.5
+        elif name in ("f", "fx", "fy"):
+            value = value / stride
+        params.append(value)
+    width, height = (len(range(first, size, stride)) for size in (camera.width, camera.height))
+    return replace(camera, width=width, height=height, params=tuple(params))
+
+
+def subsample(values: np.ndarray, stride: int) -> np.ndarray:
+    """Every stride-th row and column, beginning in the middle of the first stride; (H, W, ...) -> (H', W', ...)."""
+    first = (stride - 1) // 2
+    return values[first::stride, first::stride]
+
+
+def upsample(values: np.ndarray, stride: int, width: int, height: int) -> np.ndarray:
+    """The inverse of `subsample`: bilinear, clamped at the border; (H', W', ...) -> (height, width, ...)."""
+    import cv2
+
+    values = np.ascontiguousarray(values, np.float32)
+    if stride == 1:
+        return values
+    first = (stride - 1) // 2
+    x, y = np.meshgrid((np.arange(width, dtype=np.float32) - first) / stride, (np.arange(height, dtype=np.float32) - first) / stride)
+    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+
+def constant_background(scene: Scene) -> tuple[float, float, float] | None:
+    """The colour behind the asset in bounded and forward-facing scenes; None in unbounded ones."""
+    from efficientnerf.model import UNSEEN
+
+    return scene.background if scene.background is not None or scene.forward is None else (UNSEEN, UNSEEN, UNSEEN)

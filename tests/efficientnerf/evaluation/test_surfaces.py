@@ -1,0 +1,72 @@
+"""Where density lies against surfaces: closed forms in uniform trees, the reference render, cascades and normalised device coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.asset.rendering import render_reference
+from efficientnerf.evaluation.surfaces import MARGIN_DEPTH, MARGIN_VOXELS, opacity_nearer, surface_limits
+from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
+from tests.efficientnerf.walls import DEPTH, NEAR, looking_along_y, wall
+
+
+def test_the_opacity_up_to_a_limit_in_a_uniform_box_is_the_closed_form() -> None:
+    tree = uniform_tree(sigma=2.0)
+    centre = (tree.bounds_min + tree.bounds_max) / 2
+    directions = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, 1]])
+    half = (tree.bounds_max - tree.bounds_min)[0] / 2
+    limits = np.array([0.7, 0.2, 0.45])
+    found = opacity_nearer(tree, np.tile(centre, (3, 1)), directions, limits)
+    np.testing.assert_allclose(found, 1 - np.exp(-2.0 * limits), atol=0.02)  # trilinear: half a voxel at the border is less dense
+    beyond = opacity_nearer(tree, np.tile(centre, (3, 1)), directions, np.full(3, np.inf))
+    np.testing.assert_allclose(beyond, 1 - np.exp(-2.0 * half), atol=0.04)
+    assert (opacity_nearer(tree, np.tile(centre, (3, 1)), directions, np.zeros(3)) == 0).all()
+    assert (opacity_nearer(tree, np.tile(centre + 100, (3, 1)), directions, np.full(3, np.inf)) == 0).all()
+
+
+@pytest.mark.parametrize("make", [random_cascades, random_tree], ids=["cascades", "one box"])
+def test_without_a_limit_it_is_the_opacity_of_the_reference(make) -> None:  # type: ignore[no-untyped-def]
+    tree = make(4)
+    origins, directions = rays_at(tree, 80)
+    wanted = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))[1].numpy()
+    found = opacity_nearer(tree, origins, directions, np.full(80, np.inf))
+    assert np.abs(found - wanted).mean() < 0.03, "steps of a voxel in place of half of one"
+    assert np.corrcoef(found, wanted)[0, 1] > 0.99
+
+
+def test_a_nearer_limit_never_sees_more_and_pieces_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = random_cascades(1)
+    origins, directions = rays_at(tree, 40)
+    along = np.linspace(0, 12, 9)
+    found = np.stack([opacity_nearer(tree, origins, directions, np.full(40, t)) for t in along])
+    assert (np.diff(found, axis=0) > -0.02).all()  # steps differ a little
+    assert found[-1].max() > 0.5
+    monkeypatch.setattr("efficientnerf.evaluation.surfaces.POINTS_AT_ONCE", 7)
+    np.testing.assert_array_equal(opacity_nearer(tree, origins, directions, np.full(40, along[4])), found[4])
+
+
+def test_the_margin_is_the_wider_of_the_two_in_the_cascade_of_the_surface() -> None:
+    tree = random_cascades(0)
+    eye = (tree.bounds_min + tree.bounds_max) / 2
+    inner, outer = 0.05, 0.6 + 0.3  # in cascade 0, whose half side is 0.6, and in cascade 1
+    origins, directions = np.tile(eye, (4, 1)), np.tile([1.0, 0, 0], (4, 1))
+    distance = np.array([inner, outer, 1000.0, np.inf])
+    found = surface_limits(tree, origins, directions, distance)
+    voxels = [tree.voxel, 2 * tree.voxel, 4 * tree.voxel]
+    wanted = [max(0.0, inner - MARGIN_VOXELS * voxels[0]), outer - MARGIN_VOXELS * voxels[1], 1000 * (1 - MARGIN_DEPTH), np.inf]
+    np.testing.assert_allclose(found, wanted)
+
+
+def test_in_normalised_device_coordinates_limits_are_of_the_world() -> None:
+    tree = wall()
+    eye = looking_along_y()
+    origins, directions = eye[:3, 3][None], eye[:3, 2][None]
+    nearer = [opacity_nearer(tree, origins, directions, np.array([limit]))[0] for limit in (DEPTH - 0.3, DEPTH + 1.5, np.inf)]
+    assert nearer[0] == 0
+    assert nearer[1] > 0.99
+    assert nearer[2] >= nearer[1]
+    limit = surface_limits(tree, origins, directions, np.array([DEPTH]))
+    # z' = 1 - 2 n / z: so many voxels of z' before the wall
+    np.testing.assert_allclose(limit, 2 * NEAR / (2 * NEAR / DEPTH + MARGIN_VOXELS * tree.voxel))
