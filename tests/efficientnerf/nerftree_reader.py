@@ -1,4 +1,4 @@
-"""A reader of NerfTree files, all layouts, written from efficientnerf/asset/FORMAT.md alone in 100 lines: plain numpy, checks no more than it needs."""
+"""A reader of NerfTree files, all layouts, written from efficientnerf/asset/FORMAT.md alone in 150 lines: plain numpy, checks no more than it needs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,22 @@ import numpy as np
 KINDS = {"U8": "<u1", "U16": "<u2", "U64": "<u8", "F16": "<f2", "F32": "<f4"}
 
 
+class Grid:
+    """One cascade: the set of occupied cells, and the stored voxels by coordinate, numbered in the order of the file."""
+
+    def __init__(self, shape: list[int], voxel: float, low: list[float], occupancy: np.ndarray) -> None:
+        self.shape, self.voxel, self.low = shape, voxel, np.array(low)
+        self.occupied = [cell for c, cell in enumerate(np.ndindex(*shape)) if int(occupancy[c // 8]) >> c % 8 & 1]
+        self.stored: dict[tuple[int, ...], int] = {}
+
+    def crossed(self, origin: np.ndarray, direction: np.ndarray, brick: int) -> tuple[float, float]:
+        with np.errstate(divide="ignore"):
+            crossings = np.sort([(self.low - origin) / direction, (self.low + np.array(self.shape) * brick * self.voxel - origin) / direction], axis=0)
+        return max(0.0, crossings[0].max()), crossings[1].min()
+
+
 class Tree:
-    """Stored voxels by coordinate, in the order of the file, with their densities and coefficients; and the set of occupied cells."""
+    """The cascades, the innermost first; densities and coefficients of the stored voxels of all of them; the environment map and the region's bricks."""
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
@@ -27,65 +41,94 @@ class Tree:
             raw = data[8 + length + begin : 8 + length + end]
             assert hashlib.sha256(raw).hexdigest() == digest
             tensors[name] = np.frombuffer(raw, KINDS[header[name]["dtype"]]).reshape(header[name]["shape"])
-        self.meta, self.brick, self.voxel, layout = meta, meta["brick"], meta["voxel"], meta["layout"].removeprefix("nearest-").removeprefix("ndc-")
-        self.low, self.shape = np.array(meta["bounds_min"]), meta["shape"]
-        occupancy = [int(byte) for byte in tensors["coarse.occupancy"]]
-        self.occupied = [cell for c, cell in enumerate(np.ndindex(*self.shape)) if occupancy[c // 8] >> c % 8 & 1]
-        self.stored: dict[tuple[int, ...], int] = {}
-        for row, (x, y, z) in enumerate(self.occupied):
+        name = meta["layout"].removeprefix("nearest-")
+        nested, layout = name.startswith("nested-"), name.removeprefix("ndc-").removeprefix("nested-")
+        self.meta, self.brick = meta, meta["brick"]
+        self.grids = [Grid(meta["shape"], meta["voxel"], meta["bounds_min"], tensors["coarse.occupancy"])]
+        for n, cascade in enumerate(meta["cascades"] if nested else [], 1):
+            self.grids.append(Grid(cascade["shape"], 2**n * meta["voxel"], cascade["bounds_min"], tensors[f"coarse.occupancy.{n}"]))
+        count = 0
+        for row, (owner, (x, y, z)) in enumerate((grid, cell) for grid in self.grids for cell in grid.occupied):
             for v, (p, q, r) in enumerate(np.ndindex(self.brick, self.brick, self.brick)):
                 if layout == "full" or int(tensors["brick.mask"][row, v // 64]) >> (v % 64) & 1:
-                    self.stored[x * self.brick + p, y * self.brick + q, z * self.brick + r] = len(self.stored)
+                    owner.stored[x * self.brick + p, y * self.brick + q, z * self.brick + r] = count
+                    count += 1
         if layout == "compact":
-            densities, sh = tensors["density.table"][tensors["voxel.density"]], np.empty((len(self.stored), (meta["sh_degree"] + 1) ** 2, 3))
+            densities, sh = tensors["density.table"][tensors["voxel.density"]], np.empty((count, (meta["sh_degree"] + 1) ** 2, 3))
             groups = [g for g, size in enumerate(meta["sh_groups"]) for _ in range(size)]
             for c in range(3):
                 sh[:, 0, c] = tensors["base.table"][tensors["voxel.base"][:, c], c]
                 for k in range(1, sh.shape[1]):
                     sh[:, k, c] = tensors["sh.palette"][tensors["voxel.sh"][:, groups[k - 1]], k - 1, c]
         elif layout == "full":
-            densities, sh = tensors["brick.density"].reshape(-1), tensors["brick.sh"].reshape(len(self.stored), -1, 3)
+            densities, sh = tensors["brick.density"].reshape(-1), tensors["brick.sh"].reshape(count, -1, 3)
         else:
             densities, sh = tensors["voxel.density"], tensors["voxel.sh"]
         self.densities, self.sh = densities.astype(np.float64), sh.astype(np.float64)
-        assert len(self.stored) == len(self.densities) == len(self.sh)
+        assert count == len(self.densities) == len(self.sh)
+        self.environment = tensors["environment"] / 255 if nested and meta["environment"] else None
+        self.region, bricks = None, sum(len(grid.occupied) for grid in self.grids)
+        if meta.get("region", {}).get("bricks"):
+            self.region = [bool(int(tensors["x.region.bricks"][n // 8]) >> n % 8 & 1) for n in range(bricks)]
 
-    def around(self, u: np.ndarray) -> list[tuple[int, float]]:
+    def around(self, grid: Grid, point: np.ndarray) -> list[tuple[int, float]]:
+        u = (point - grid.low) / grid.voxel
         u = np.floor(u) + 0.5 if self.meta.get("lookup") == "nearest" else u
         low = np.floor(u - 0.5).astype(int)
         f = u - 0.5 - low
         found = []
         for offset in np.ndindex(2, 2, 2):
-            if (voxel := self.stored.get(tuple(int(n) for n in low + offset))) is not None:
+            if (voxel := grid.stored.get(tuple(int(n) for n in low + offset))) is not None:
                 found.append((voxel, math.prod(a if o else 1 - a for a, o in zip(f, offset, strict=True))))
         return found
 
-    def density(self, point: np.ndarray) -> float:
-        u = (point - self.low) / self.voxel
-        if tuple(int(n) for n in np.floor(u / self.brick)) not in self.occupied:
-            return 0.0
-        return sum(weight * self.densities[voxel] for voxel, weight in self.around(u))
+    def grid_of(self, point: np.ndarray) -> Grid | None:
+        return next((g for g in self.grids if all(0 <= u < n for u, n in zip((point - g.low) / (g.voxel * self.brick), g.shape, strict=True))), None)
 
-    def colour(self, point: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        found = self.around((point - self.low) / self.voxel)
+    def density(self, point: np.ndarray, grid: Grid | None = None) -> float:
+        grid = grid or self.grid_of(point)
+        if grid is None or tuple(int(n) for n in np.floor((point - grid.low) / grid.voxel / self.brick)) not in grid.occupied:
+            return 0.0
+        return sum(weight * self.densities[voxel] for voxel, weight in self.around(grid, point))
+
+    def colour(self, point: np.ndarray, direction: np.ndarray, grid: Grid | None = None) -> np.ndarray:
+        found = self.around(grid or self.grid_of(point) or self.grids[-1], point)
         total = sum(weight for _, weight in found)
         if total == 0:
             return np.full(3, 0.5)
         coefficients = sum(weight * self.sh[voxel] for voxel, weight in found) / total  # (K, 3)
         return 1 / (1 + np.exp(-(harmonics(direction, self.meta["sh_degree"]) @ coefficients)))
 
+    def parts(self, origin: np.ndarray, direction: np.ndarray) -> list[tuple[Grid, float, float]]:
+        met = [grid.crossed(origin, direction, self.brick) for grid in self.grids]
+        front, back = [], []
+        for grid, (enter, leave), (inner_enter, inner_leave) in zip(self.grids[1:], met[1:], met, strict=False):
+            meets = inner_leave > inner_enter
+            front.append((grid, enter, inner_enter if meets else leave))
+            back.append((grid, inner_leave if meets else leave, leave))
+        return [*reversed(front), (self.grids[0], *met[0]), *back]
+
     def ray(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, float]:
-        with np.errstate(divide="ignore"):
-            crossings = np.sort([(self.low - origin) / direction, (self.low + np.array(self.shape) * self.brick * self.voxel - origin) / direction], axis=0)
-        enter, leave = max(0.0, crossings[0].max()), crossings[1].min()
-        light, colour, n = 1.0, np.zeros(3), 0
-        while (t := enter + (n + 0.5) * self.voxel / 2) < leave:
-            alpha = 1 - math.exp(-self.density(origin + t * direction) * self.voxel / 2)
-            if alpha > 0:
-                colour = colour + light * alpha * self.colour(origin + t * direction, direction)
-            light *= 1 - alpha
-            n += 1
-        return colour, 1 - light
+        light, colour = 1.0, np.zeros(3)
+        for grid, enter, leave in self.parts(origin, direction):
+            n = 0
+            while (t := enter + (n + 0.5) * grid.voxel / 2) < leave:
+                alpha = 1 - math.exp(-self.density(origin + t * direction, grid) * grid.voxel / 2)
+                if alpha > 0:
+                    colour = colour + light * alpha * self.colour(origin + t * direction, direction, grid)
+                light *= 1 - alpha
+                n += 1
+        return (colour if self.environment is None else colour + light * self.behind(direction)), 1 - light
+
+    def behind(self, direction: np.ndarray) -> np.ndarray:
+        assert self.environment is not None
+        rows, columns, _ = self.environment.shape
+        column = (math.atan2(direction[1], direction[0]) / (2 * math.pi) + 0.5) * columns - 0.5
+        row = min(max(math.acos(direction[2]) / math.pi * rows - 0.5, 0), rows - 1)
+        i, j = math.floor(row), math.floor(column)
+        upper, lower = (self.environment[min(n, rows - 1)] for n in (i, i + 1))
+        first, second = (line[j % columns] * (1 - column + j) + line[(j + 1) % columns] * (column - j) for line in (upper, lower))
+        return first * (1 - row + i) + second * (row - i)
 
 
 def harmonics(direction: np.ndarray, degree: int) -> np.ndarray:

@@ -18,17 +18,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from efficientnerf.asset import format
+from efficientnerf.asset.cascades import cascade_tree, cascades_of
 from efficientnerf.asset.file import container
 from efficientnerf.asset.file.container import HEADER_LIMIT
 from efficientnerf.asset.file.metadata import MAJOR, STRUCTURE
 from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, save, serialize
 from efficientnerf.asset.queries import colour_at, density_at
-from efficientnerf.asset.rendering import render_rays
+from efficientnerf.asset.rendering import render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests.efficientnerf import nerftree_reader
 from tests.efficientnerf.hostile import HOSTILE, METADATA, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
 from tests.efficientnerf.nerftree_reader import Tree
-from tests.efficientnerf.trees import random_tree, rays_at
+from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, tensors
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
 
@@ -149,14 +150,55 @@ def test_a_reader_written_from_the_text_alone_sees_the_same(tmp_path: Path, bric
         assert float(seen.opacity[r]) == pytest.approx(opacity, abs=1.5e-3)
 
 
+@pytest.mark.parametrize("lookup", ["trilinear", "nearest"])
+def test_a_reader_written_from_the_text_alone_sees_the_same_whole_scene(tmp_path: Path, lookup: str) -> None:
+    save(random_cascades(3, brick=2, degree=2, lookup=lookup), tmp_path / "a.nerftree")
+    ours, theirs = load(tmp_path / "a.nerftree"), Tree(tmp_path / "a.nerftree")
+    low, high = ours.outer[-1].bounds(ours.brick)
+    points, directions = np.random.default_rng(0).uniform(low - 0.2, high + 0.2, (150, 3)), rays_at(ours, 150)[1]
+    points[:40] = np.random.default_rng(1).uniform(ours.bounds_min, ours.bounds_max, (40, 3))
+    density, colour = of_cascades(ours, points, directions)
+    np.testing.assert_allclose(density, [theirs.density(p) for p in points], atol=2e-3)
+    np.testing.assert_allclose(colour, [theirs.colour(p, d) for p, d in zip(points, directions, strict=True)], atol=1e-3)
+    origins, directions = rays_at(ours, 30)
+    for r, (seen, opacity) in enumerate(zip(*render_reference(ours, *tensors(origins, directions)), strict=True)):
+        expected, full = theirs.ray(origins[r], directions[r])
+        np.testing.assert_allclose(seen, expected, atol=1e-5)
+        assert float(opacity) == pytest.approx(full, abs=1e-5)
+
+
 def test_the_text_names_all_that_the_reader_knows() -> None:
     text = (Path(format.__file__).parent / "FORMAT.md").read_text(encoding="utf-8")
-    tensors = [name for layout in LAYOUTS.values() for name in layout.tensors]
-    for word in [*tensors, *LAYOUTS, *STRUCTURE, "world_from_capture", "orbit", "metric", f"{MAJOR}.1", f"{HEADER_LIMIT:,}"]:
+    names = [name for layout in LAYOUTS.values() for name in layout.tensors]
+    for word in [
+        *names,
+        "coarse.occupancy.1",
+        "environment",
+        "x.region.bricks",
+        *LAYOUTS,
+        *STRUCTURE,
+        "world_from_capture",
+        "orbit",
+        "metric",
+        f"{MAJOR}.1",
+        f"{HEADER_LIMIT:,}",
+    ]:
         assert word in text, word
 
 
 # Golden files: made once, readable for ever.
+
+
+def of_cascades(tree: NerfTree, points: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Density and colour at points, each from the first cascade whose box holds it."""
+    density, colour = np.zeros(len(points), np.float32), np.full((len(points), 3), 0.5, np.float32)
+    left = np.ones(len(points), bool)
+    for n in range(1 + len(tree.outer)):
+        grid, last = cascade_tree(tree, n) if tree.outer else tree, n == len(tree.outer)
+        here = left & (last | ((points >= grid.bounds_min) & (points < grid.bounds_max)).all(axis=1))
+        density[here], colour[here] = density_at(grid, points[here]), colour_at(grid, points[here], directions[here])
+        left &= ~here
+    return density, colour
 
 
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.nerftree")), ids=lambda path: path.stem)
@@ -166,9 +208,15 @@ def test_golden_files_stay_readable(path: Path, tmp_path: Path) -> None:
     assert hashlib.sha256(path.read_bytes()).hexdigest() == known["sha256"]
     tree = load(path)
     points, directions = np.array(known["points"]), np.array(known["directions"])
-    np.testing.assert_allclose(density_at(tree, points), known["density"], atol=1e-3)
-    np.testing.assert_allclose(colour_at(tree, points, directions), known["colour"], atol=1e-4)
-    np.testing.assert_allclose(render_rays(tree, points - 3 * directions, directions).opacity, known["opacity"], atol=1.5e-3)
+    density, colour = of_cascades(tree, points, directions)
+    np.testing.assert_allclose(density, known["density"], atol=1e-3)
+    np.testing.assert_allclose(colour, known["colour"], atol=1e-4)
+    rendered, opacity = render_reference(tree, *tensors(points - 3 * directions, directions))
+    np.testing.assert_allclose(opacity, known["opacity"], atol=1.5e-3)
+    if "rendered" in known:
+        np.testing.assert_allclose(rendered, known["rendered"], atol=1.5e-3)
+    if not tree.outer:
+        np.testing.assert_allclose(render_rays(tree, points - 3 * directions, directions).opacity, known["opacity"], atol=1.5e-3)
     assert max(known["opacity"]) > 0.5
     about = describe(path)
     assert {key: about[key] for key in known["describe"]} == known["describe"]
@@ -182,24 +230,30 @@ def test_golden_files_stay_readable(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.nerftree")), ids=lambda path: path.stem)
 def test_a_reader_written_from_the_text_alone_decodes_golden_files_to_the_same_voxels(path: Path) -> None:
     ours, theirs = load(path), Tree(path)
-    assert len(Path(nerftree_reader.__file__).read_text().splitlines()) <= 100
+    assert len(Path(nerftree_reader.__file__).read_text().splitlines()) <= 150
     assert "efficientnerf" not in re.sub('""".*?"""', "", Path(nerftree_reader.__file__).read_text(), flags=re.S)
-    assert [tuple(cell) for cell in np.argwhere(ours.brick_index >= 0)] == theirs.occupied
-    number = {}
-    for at in np.ndindex(*ours.resolution):
-        cell, local = np.divmod(at, ours.brick)
-        owner = ours.brick_index[tuple(cell)]
-        if owner >= 0 and (voxel := ours.voxel_index[owner, (local[0] * ours.brick + local[1]) * ours.brick + local[2]]) >= 0:
-            number[at] = voxel
-    assert number == theirs.stored
+    for cascade, grid in zip(cascades_of(ours), theirs.grids, strict=True):
+        assert [tuple(cell) for cell in np.argwhere(cascade.brick_index >= 0)] == grid.occupied
+        assert (cascade.voxel, cascade.bounds_min.tolist()) == (grid.voxel, grid.low.tolist())
+        number = {}
+        for cell in grid.occupied:
+            for v, local in enumerate(np.ndindex(*(ours.brick,) * 3)):
+                if (voxel := ours.voxel_index[cascade.brick_index[cell], v]) >= 0:
+                    number[tuple(c * ours.brick + p for c, p in zip(cell, local, strict=True))] = voxel
+        assert number == grid.stored
     assert np.array_equal(ours.density_values, theirs.densities.astype(np.float32))
     assert np.array_equal(ours.sh, theirs.sh.astype(np.float32))
+    assert (ours.environment is None) == (theirs.environment is None)
+    assert ours.environment is None or np.array_equal(ours.environment, theirs.environment.astype(np.float32))
+    bricks = None if ours.region is None or ours.region.bricks is None else ours.region.bricks.tolist()
+    assert bricks == theirs.region
 
 
 def test_there_is_a_golden_file_for_each_layout_and_released_version() -> None:
     found = {(about["layout"], about["format_version"]) for about in map(describe, GOLDEN.glob("*.nerftree"))}
-    assert found == {("sparse", "1.0"), ("compact", "1.1"), ("full", "1.1"), ("ndc-compact", "1.2"), ("nearest-compact", "1.3")}
-    assert {layout.removeprefix("nearest-").removeprefix("ndc-") for layout, _ in found} == set(LAYOUTS)
+    released = {("sparse", "1.0"), ("compact", "1.1"), ("full", "1.1"), ("ndc-compact", "1.2"), ("nearest-compact", "1.3")}
+    assert found == {*released, ("nested-compact", "1.4"), ("sparse", "1.4")}
+    assert {layout.removeprefix("nearest-").removeprefix("ndc-").removeprefix("nested-") for layout, _ in found} == set(LAYOUTS)
 
 
 @pytest.mark.parametrize(
@@ -211,6 +265,9 @@ def test_there_is_a_golden_file_for_each_layout_and_released_version() -> None:
         ("groups-1.1", None),
         ("ndc-1.2", None),
         ("nearest-1.3", None),
+        ("nested-1.4", None),
+        ("nested-1.4", "compact"),
+        ("region-1.4", None),
         ("full-1.1", "full"),
         ("floats-1.1", "full32"),
     ],
