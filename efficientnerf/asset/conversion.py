@@ -10,7 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, nested, subset, voxel_cascades
 from efficientnerf.asset.palettes import PaletteHarmonics
+from efficientnerf.asset.region import Region
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from efficientnerf.rendering.harmonics import harmonics_count
 
@@ -36,31 +38,60 @@ def with_degree(tree: NerfTree, degree: int) -> NerfTree:
 
 
 def with_resolution(tree: NerfTree, resolution: int) -> NerfTree:
-    """The same grid box in larger voxels, `resolution` of them where the longest side has more now.
+    """The same grid box in larger voxels, `resolution` of them where the longest side has more now; that of cascade 0, where there are several.
 
+    Cascades keep their coarse cells, whose faces each other's boxes lie on, so that their voxels get larger by the divisors of the brick alone, all alike.
     A new voxel gets the density with the mean transmittance of the ones in its place, over the rays along the three axes that
     cross it; an average of densities would make a thin wall opaque all over its new voxel. Harmonics are averaged by opacity.
     """
     most = max(tree.resolution)
     if not 1 <= resolution <= most:
         raise ValueError(f"resolution {resolution} from an asset of {most} voxels along its longest side; expected 1 to {most}. Bake a finer one from its run.")
-    ratio = most / resolution
+    if not tree.outer:
+        made = _enlarged(tree, most / resolution, tree.brick)
+        return replace(made, region=_region_of(tree, made, most / resolution))
+    divisor = most // resolution
+    if most % resolution or tree.brick % divisor:
+        possible = ", ".join(str(most // n) for n in range(1, tree.brick + 1) if tree.brick % n == 0)
+        raise ValueError(f"resolution {resolution} from cascades of {most} voxels in bricks of {tree.brick}; expected one of {possible}")
+    made = nested([_enlarged(cascade_tree(tree, n), divisor, tree.brick // divisor) for n in range(1 + len(tree.outer))], tree.environment)
+    return replace(made, region=_region_of(tree, made, 1))
+
+
+def _region_of(tree: NerfTree, made: NerfTree, ratio: float) -> Region | None:
+    """The region of a tree for one whose coarse cells are `ratio` times as large: a brick belongs to it where one in its place did."""
+    if tree.region is None or tree.region.bricks is None:
+        return tree.region
+    bricks = np.zeros(len(made.voxel_index), bool)
+    for old, new in zip(cascades_of(tree), cascades_of(made), strict=True):
+        owner = old.brick_index.reshape(-1)
+        cells = np.flatnonzero(np.where(owner >= 0, tree.region.bricks[owner], False) if len(tree.region.bricks) else owner >= 0)
+        at = np.stack(np.unravel_index(cells, old.shape), axis=-1)
+        low, high = np.floor(at / ratio + 1e-9).astype(np.int64), np.ceil((at + 1) / ratio - 1e-9).astype(np.int64) - 1
+        for corner in np.argwhere(np.ones((2, 2, 2), bool)):
+            held = new.brick_index[tuple(np.minimum(np.where(corner, high, low), np.asarray(new.shape) - 1).T)]
+            bricks[held[held >= 0]] = True
+    return replace(tree.region, bricks=bricks)
+
+
+def _enlarged(tree: NerfTree, ratio: float, brick: int) -> NerfTree:
+    """One grid in voxels `ratio` times as large, in bricks of `brick`."""
     side = tree.voxel * ratio
     size = [max(1, math.ceil(round(n / ratio, 6))) for n in tree.resolution]
-    x, y, z = (math.ceil(n / tree.brick) for n in size)
+    x, y, z = (math.ceil(n / brick) for n in size)
     at = voxel_coordinates(tree).astype(np.int64)
     # Every new voxel that a stored one reaches into.
     low = np.floor(at / ratio + 1e-9).astype(np.int64)
     high = np.ceil((at + 1) / ratio - 1e-9).astype(np.int64) - 1
-    limit = np.array([x, y, z]) * tree.brick
+    limit = np.array([x, y, z]) * brick
     reached = np.concatenate([np.where(corner, high, low) for corner in np.argwhere(np.ones((2, 2, 2), bool))]) if len(at) else low
     flat = np.unique(np.ravel_multi_index(tuple(np.minimum(reached, limit - 1).T), tuple(limit))) if len(at) else np.zeros(0, np.int64)
     indices = np.stack(np.unravel_index(flat, tuple(limit)), axis=1).astype(np.int64)
     count = min(MOST_SAMPLES, int(ratio) if float(ratio).is_integer() else 2 * math.ceil(ratio))
     parts = [_merged(tree, block, ratio, count) for block in np.array_split(indices, 1 + len(indices) * count**3 // SAMPLES_AT_ONCE)]
     density, sh, known = (np.concatenate(values) for values in zip(*parts, strict=True))
-    made = tree_from_voxels((x, y, z), side, tree.bounds_min, indices[known], density[known], sh[known], brick=tree.brick)
-    changed = {name: getattr(made, name) for name in ("shape", "voxel", "brick_index", "voxel_index", "density_values", "harmonics")}
+    made = tree_from_voxels((x, y, z), side, tree.bounds_min, indices[known], density[known], sh[known], brick=brick)
+    changed = {name: getattr(made, name) for name in ("shape", "brick", "voxel", "brick_index", "voxel_index", "density_values", "harmonics")}
     return replace(tree, **changed)
 
 
@@ -87,26 +118,21 @@ def _merged(tree: NerfTree, indices: np.ndarray, ratio: float, count: int) -> tu
 
 
 def pruned(tree: NerfTree) -> NerfTree:
-    """Without the voxels that cannot be seen: those of density 0 among neighbours of density 0. Renders stay as they are."""
-    at = voxel_coordinates(tree).astype(np.int64)
+    """Without the voxels that cannot be seen: those of density 0 among neighbours of density 0 in their cascade. Renders stay as they are."""
     lit: np.ndarray = np.greater(tree.density_values, 0)
-    for offset in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
-        beside = lookup(tree, at + offset)
-        lit = np.logical_or(lit, (beside >= 0) & (tree.density_values[np.maximum(beside, 0)] > 0))
-    if lit.all():
-        return tree
-    left = tree_from_voxels(
-        tree.shape, tree.voxel, tree.bounds_min, at[lit], tree.density_values[lit], np.zeros((int(lit.sum()), 1, 3), np.float32), brick=tree.brick
-    )
-    # tree_from_voxels sorts: the numbers of the voxels left, in its order.
-    order = lookup(tree, voxel_coordinates(left).astype(np.int64))
-    held = tree.harmonics
-    harmonics = held.subset(order) if isinstance(held, PaletteHarmonics) else held[order]
-    return replace(tree, brick_index=left.brick_index, voxel_index=left.voxel_index, density_values=left.density_values, harmonics=harmonics)
+    at = voxel_coordinates(tree).astype(np.int64)
+    member = voxel_cascades(tree) if tree.outer else np.zeros(len(lit), np.uint8)
+    for n, cascade in enumerate(cascades_of(tree)):
+        here = np.flatnonzero(member == n)
+        grid = replace(tree, shape=cascade.shape, brick_index=cascade.brick_index, outer=())
+        for offset in np.argwhere(np.ones((3, 3, 3), bool)) - 1:
+            beside = lookup(grid, at[here] + offset)
+            lit[here] |= (beside >= 0) & (tree.density_values[np.maximum(beside, 0)] > 0)
+    return tree if lit.all() else subset(tree, lit)
 
 
 def lookup(tree: NerfTree, at: np.ndarray) -> np.ndarray:
-    """Numbers (n,) of the stored voxels at coordinates (n, 3), -1 where none is."""
+    """Numbers (n,) of the stored voxels of cascade 0 at coordinates (n, 3), -1 where none is."""
     inside: np.ndarray = ((at >= 0) & (at < np.asarray(tree.resolution))).all(axis=1)  # type: ignore[assignment]
     cell, local = np.divmod(np.where(inside[:, None], at, 0), tree.brick)
     owner = np.where(inside, tree.brick_index[tuple(cell.T)], -1)

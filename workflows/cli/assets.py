@@ -42,7 +42,7 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 @click.argument("out", metavar="OUT", type=folder_type)
 @click.option("--layout", type=click.Choice(LAYOUTS), help="Layout of the voxels in OUT; by default that of ASSET.")
 @click.option("--sh-degree", "degree", type=click.IntRange(0, 4), help="Keep the spherical harmonics up to this degree.")
-@click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side; fewer than there are.")
+@click.option("--resolution", type=click.IntRange(1, 65536), help="Voxels along the longest side, of the innermost cascade; fewer than there are.")
 @force_option
 @json_option
 @quiet_option

@@ -46,7 +46,7 @@ def _psnr_of_renders(a: NerfTree, b: NerfTree, views: int, size: int) -> list[fl
     from efficientnerf.evaluation.metrics import psnr
     from stages.framing.camera_paths import turntable_cameras
 
-    background = a.background or (1.0, 1.0, 1.0)
+    background = None if a.environment is not None or b.environment is not None else a.background or (1.0, 1.0, 1.0)  # what lies beyond is compared too
     cameras = turntable_cameras(a, frames=views, width=size, height=size)
     return [min(PSNR_CAP, psnr(*(render(tree, camera, background=background).colour.clip(0, 1) for tree in (a, b)))) for camera in cameras]
 

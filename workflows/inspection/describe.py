@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -120,11 +121,39 @@ def _lines(found: dict[str, Any], indent: str) -> list[str]:
                 lines.append(f"{label:<24} {len(value)}, listed with --json; the first: {first['name']}, {first['model']} {_shown(first['params'])}")
         elif name == "warnings" and isinstance(value, list):
             lines += [f"{label:<24} {sentence}" for sentence in value] or [f"{label:<24} nothing"]
+        elif name in SCENE_PARTS and value and not isinstance(value, int):  # "environment" is the bytes of a tensor too
+            lines += [f"{label:<24} {sentence}" for sentence in SCENE_PARTS[name](value)]
         elif isinstance(value, dict):
             lines += [label, *_lines(value, indent + "  ")]
         elif value not in (None, [], ""):
             lines.append(f"{label:<24} {size(value) if name == 'bytes' and isinstance(value, int) else _shown(value)}")
     return lines
+
+
+def _cascades(found: list[dict[str, Any]]) -> list[str]:
+    """The grids of a whole scene, a line for each."""
+    first = f"{len(found)}, each with voxels twice as large as the one before" if len(found) > 1 else "1"
+    rows = [f"voxels of {_shown(one['voxel_side'])}, {_shown(one['resolution'])} of them, {_box(one['bounds']['min'], one['bounds']['max'])}" for one in found]
+    return [first, *(f"{n}: {row}" for n, row in enumerate(rows))]
+
+
+def _environment(found: list[int]) -> list[str]:
+    return [f"a map of {found[1]} x {found[0]} colours, beyond all voxels"]
+
+
+def _region(found: dict[str, Any]) -> list[str]:
+    """The foreground region."""
+    about = [f"radius of its upright edges {_shown(float(found['corner_radius']))}"] if found["corner_radius"] else []
+    about += [f"fading over {_shown(float(found['fade']))}"] if found["fade"] else []
+    about += ["some of the bricks in it"] if found["bricks"] else []
+    return [", ".join([_box(*found["bounds"]), *about])]
+
+
+def _box(low: list[float], high: list[float]) -> str:
+    return f"from {_shown(low)} to {_shown(high)}"
+
+
+SCENE_PARTS: dict[str, Callable[[Any], list[str]]] = {"cascades": _cascades, "environment": _environment, "region": _region}
 
 
 def _shown(value: Any) -> str:

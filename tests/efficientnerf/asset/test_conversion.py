@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from efficientnerf.asset.cascades import cascade_tree, cascades_of, check_cascades, nested
 from efficientnerf.asset.conversion import lookup, pruned, with_degree, with_resolution
 from efficientnerf.asset.quantisation import compacted
-from efficientnerf.asset.rendering import render_rays
+from efficientnerf.asset.region import Region
+from efficientnerf.asset.rendering import render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
-from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, tensors, uniform_tree
 
 
 def same_pictures(a: NerfTree, b: NerfTree, tolerance: float = 1e-5) -> None:
@@ -103,3 +106,93 @@ def test_trees_of_nothing_stay_so() -> None:
     assert not len(with_resolution(empty, 5).density_values)
     assert pruned(empty) is empty
     assert with_degree(empty, 0).degree == 0
+
+
+# Whole scenes.
+
+
+def whole(seed: int = 5, **more: Any) -> NerfTree:
+    tree = random_cascades(seed, brick=4, degree=1, share=0.5, **more)
+    bounds = np.stack([tree.bounds_min, tree.bounds_max])
+    return replace(tree, region=Region(bounds, 0.1, 0.0, np.random.default_rng(seed).random(len(tree.voxel_index)) < 0.5))
+
+
+def reference_images(tree: NerfTree, like: NerfTree) -> tuple[np.ndarray, np.ndarray]:
+    colour, opacity = render_reference(tree, *tensors(*rays_at(like, 60)))
+    return colour.numpy(), opacity.numpy()
+
+
+def test_cascades_get_larger_voxels_in_smaller_bricks_and_keep_their_boxes() -> None:
+    tree = whole()
+    for divisor in (1, 2, 4):
+        fewer = with_resolution(tree, 16 // divisor)
+        check_cascades(fewer)
+        assert (fewer.brick, fewer.voxel) == (4 // divisor, pytest.approx(tree.voxel * divisor))
+        for old, new in zip(cascades_of(tree), cascades_of(fewer), strict=True):
+            assert old.shape == new.shape
+            np.testing.assert_allclose(old.bounds(tree.brick), new.bounds(fewer.brick))
+            assert np.array_equal(old.brick_index >= 0, new.brick_index >= 0)
+        assert fewer.region is not None
+        assert tree.region is not None
+        assert np.array_equal(fewer.region.bricks, tree.region.bricks)  # type: ignore[arg-type]
+        assert np.array_equal(fewer.environment, tree.environment)  # type: ignore[arg-type]
+    for name, found in zip(("colour", "opacity"), reference_images(with_resolution(tree, 16), tree), strict=True):
+        np.testing.assert_allclose(found, dict(zip(("colour", "opacity"), reference_images(tree, tree), strict=True))[name], atol=1e-5)
+
+
+def test_an_even_scene_stays_what_it_is_in_larger_voxels() -> None:
+    """Cascades filled alike, which absorb as much in any resolution."""
+    tree = random_cascades(0, brick=4, degree=0, share=1.1)
+    even = []
+    for n in range(1 + len(tree.outer)):
+        grid = cascade_tree(tree, n)
+        at = np.argwhere(np.ones(grid.resolution, bool))
+        even.append(tree_from_voxels(grid.shape, grid.voxel, grid.bounds_min, at, np.full(len(at), 0.7), np.ones((len(at), 1, 3)), brick=4))
+    made = nested(even, tree.environment)
+    # Half a voxel within each face less is stored beyond it, so that the sums differ there.
+    for divisor in (2, 4):
+        _, opacity = reference_images(with_resolution(made, 16 // divisor), made)
+        np.testing.assert_allclose(opacity, reference_images(made, made)[1], atol=0.25)
+        assert abs(opacity - reference_images(made, made)[1]).mean() < 0.03
+        np.testing.assert_allclose(with_resolution(made, 16 // divisor).density_values, 0.7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("resolution", [15, 5, 3, 2, 1])
+def test_cascades_have_no_resolutions_between(resolution: int) -> None:
+    with pytest.raises(ValueError, match=rf"resolution {resolution} from cascades of 16 voxels in bricks of 4; expected one of 16, 8, 4"):
+        with_resolution(whole(), resolution)
+
+
+def test_pruning_cascades_changes_no_picture() -> None:
+    tree = whole(6)
+    values = np.where(np.random.default_rng(0).random(len(tree.density_values)) < 0.93, 0, tree.density_values).astype(np.float32)
+    tree = replace(tree, density_values=values)
+    fewer = pruned(tree)
+    assert 0 < len(fewer.density_values) < len(values)
+    for n in range(3):
+        assert len(pruned(cascade_tree(tree, n)).density_values) == len(cascade_tree(fewer, n).density_values)
+    for found, expected in zip(reference_images(fewer, tree), reference_images(tree, tree), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert np.array_equal(fewer.environment, tree.environment)  # type: ignore[arg-type]
+
+
+def test_the_bricks_of_a_region_follow_their_place() -> None:
+    """Of one grid in larger voxels: a point of a brick of the region is in one still."""
+    plain = random_tree(3, shape=(4, 3, 5), brick=2, share=0.6)
+    tree = replace(plain, region=Region(np.stack([plain.bounds_min, plain.bounds_max]), bricks=np.arange(len(plain.voxel_index)) % 3 == 0))
+    assert tree.region is not None
+    for resolution in (10, 7, 5, 3):
+        fewer = with_resolution(tree, resolution)
+        assert fewer.region is not None
+        assert fewer.region.bricks is not None
+        assert len(fewer.region.bricks) == len(fewer.voxel_index)
+        # A voxel's centre, and the brick of the new tree that holds it.
+        at = voxel_coordinates(tree)
+        owner = np.zeros(len(at), np.int64)
+        for brick, row in enumerate(tree.voxel_index):
+            owner[row[row >= 0]] = brick
+        cell = np.floor((at + 0.5) * tree.voxel / (fewer.voxel * fewer.brick)).astype(int)
+        new = fewer.brick_index[tuple(cell.T)]
+        assert (new >= 0).all()
+        assert fewer.region.bricks[new[tree.region.bricks[owner]]].all()  # type: ignore[index]
+    assert with_resolution(replace(tree, region=Region(np.zeros((2, 3)))), 3).region is not None

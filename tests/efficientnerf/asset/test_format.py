@@ -27,7 +27,7 @@ from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.rendering import render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests.efficientnerf import nerftree_reader
-from tests.efficientnerf.hostile import HOSTILE, METADATA, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
+from tests.efficientnerf.hostile import HOSTILE, METADATA, NESTED, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, tensors
 
@@ -313,14 +313,14 @@ def test_what_may_be_there_may_be_there(tmp_path: Path) -> None:
         assert np.array_equal(load(path).density_values, tiny().density_values)
 
 
-@pytest.mark.parametrize("of", LAYOUTS)
+@pytest.mark.parametrize("of", [*LAYOUTS, *NESTED])
 def test_a_file_cut_short_anywhere_is_refused(tmp_path: Path, of: str) -> None:
     data = blob(of)
     for length in range(len(data)):
         refusal(data[:length], tmp_path)
 
 
-@pytest.mark.parametrize("of", LAYOUTS)
+@pytest.mark.parametrize("of", [*LAYOUTS, *NESTED])
 def test_any_flipped_bit_of_the_data_is_noticed(tmp_path: Path, of: str) -> None:
     data = blob(of)
     for at in range(8 + int.from_bytes(data[:8], "little"), len(data)):
@@ -367,7 +367,7 @@ def outcome(path: Path, data: bytes) -> NerfTree | None:
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
 @given(
-    of=st.sampled_from(sorted(LAYOUTS)),
+    of=st.sampled_from(sorted([*LAYOUTS, *NESTED])),
     changes=st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4),
 )
 def test_a_header_of_noise_raises_nothing_else(tmp_path: Path, of: str, changes: list[tuple[float, bytes]]) -> None:
@@ -387,13 +387,13 @@ JSON = st.recursive(
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(of=st.sampled_from(sorted(LAYOUTS)), key=st.sampled_from([*sorted(STRUCTURE), "world_from_capture", "orbit", "metric"]), value=JSON)
+@given(of=st.sampled_from(sorted([*LAYOUTS, *NESTED])), key=st.sampled_from([*sorted(STRUCTURE), "world_from_capture", "orbit", "metric"]), value=JSON)
 def test_any_value_of_any_key_raises_nothing_else(tmp_path: Path, of: str, key: str, value: Any) -> None:
     outcome(tmp_path / "a.nerftree", meta_with(of, **{key: value}))
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(of=st.sampled_from(sorted(LAYOUTS)), which=st.integers(0, 7), key=st.sampled_from(["dtype", "shape", "data_offsets"]), value=JSON)
+@given(of=st.sampled_from(sorted([*LAYOUTS, *NESTED])), which=st.integers(0, 11), key=st.sampled_from(["dtype", "shape", "data_offsets"]), value=JSON)
 def test_any_value_of_any_entry_raises_nothing_else(tmp_path: Path, of: str, which: int, key: str, value: Any) -> None:
-    names = ["coarse.occupancy", *LAYOUTS[of].tensors]
+    names = list(parts(blob(of))[0])
     outcome(tmp_path / "a.nerftree", header_with(names[which % len(names)], of, **{key: value}))

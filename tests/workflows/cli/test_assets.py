@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -138,3 +139,40 @@ def test_inspect_tells_what_a_coded_asset_holds(enerf: Enerf, asset: Path, tmp_p
     assert words.code == 0
     assert "sh degree" in words.out
     assert json.loads(enerf("inspect", out, "--json").out)["voxels"] == found["voxels"]
+
+
+GOLDEN = Path(__file__).parents[2] / "data" / "golden"
+
+
+def test_a_whole_scene_is_inspected_verified_compared_and_converted(enerf: Enerf, tmp_path: Path) -> None:
+    scene = tmp_path / "scene.nerftree"
+    scene.write_bytes((GOLDEN / "nested-1.4.nerftree").read_bytes())
+    words = enerf("inspect", scene).out
+    assert "3, each with voxels twice as large as the one before" in words
+    assert "1: voxels of 0.2, [12, 12, 12] of them, from [-1.3, -0.4, -1.7] to [1.1, 2, 0.7]" in words
+    assert "a map of 12 x 6 colours, beyond all voxels" in words
+    assert "from [-0.7, 0.2, -1.1] to [0.2, 1.1, -0.2], radius of its upright edges 0.2, fading over 0.1, some of the bricks in it" in words
+    found = enerf("inspect", scene, "--json").object
+    assert [cascade["voxel_side"] for cascade in found["cascades"]] == [0.1, 0.2, 0.4]
+    assert found["environment"] == [6, 12]
+    assert "format 1.4, nested-compact" in enerf("verify", scene).out
+    # Without its map, which is all that differs.
+    tree = load(scene)
+    save(replace(tree, environment=tree.environment * 0), tmp_path / "dark.nerftree")  # type: ignore[operator]
+    compared = enerf("diff", scene, tmp_path / "dark.nerftree", "--views", 0, "--json").object
+    assert not compared["equal"]
+    assert {name for name, said in compared["tensors"].items() if said != "same"} == {"environment"}
+    for layout in LAYOUTS:
+        out = tmp_path / f"{layout}.nerftree"
+        made = enerf("convert", scene, out, "--layout", layout)
+        assert made.code == 0, made.err
+        about = describe(out)
+        assert about["layout"] == "nested-" + {"small": "compact", "full32": "full"}.get(layout, layout)
+        assert {key: about[key] for key in ("cascades", "environment", "region")} == {key: found[key] for key in ("cascades", "environment", "region")}
+    assert enerf("convert", scene, tmp_path / "less.nerftree", "--resolution", 4, "--sh-degree", 0).code == 0
+    about = describe(tmp_path / "less.nerftree")
+    assert [cascade["resolution"] for cascade in about["cascades"]] == [[4, 4, 4]] * 3
+    assert (about["brick"], about["environment"], about["sh_degree"]) == (1, [6, 12], 0)
+    refused = enerf("convert", scene, tmp_path / "none.nerftree", "--resolution", 6)
+    assert refused.code == 2
+    assert "resolution 6 from cascades of 12 voxels in bricks of 3; expected one of 12, 4" in refused.err
