@@ -134,7 +134,7 @@ def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview_psnr:
 
 STAGE = Stage(
     name="train",
-    version=2,
+    version=3,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,

@@ -3,6 +3,9 @@
 What one photograph alone shows is explained by density at any distance along its rays. In unbounded scenes, the density voxels in the box that fewer
 than `train.min_views` views have in view are masked; what these views show is learned in the contracted shell instead. Occlusion is not considered.
 See docs/experiments/min-views.md.
+
+A view counts only where its mask keeps the pixel: pixels that are left out tell nothing of what lies behind them. In scenes with masks, in every space, the
+density voxels are masked, too, that no view shows by a pixel that is kept, so that nothing fills them.
 """
 
 from __future__ import annotations
@@ -12,35 +15,112 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, project
 from stages.framing.scene_bounds import in_view
 
 if TYPE_CHECKING:
-    from efficientnerf.geometry.spaces import Space
+    from pathlib import Path
 
+    from efficientnerf.geometry.spaces import Space
+    from stages.io.scene import View
+
+Masks = Sequence[np.ndarray | None]  # (h, w) bool of each view at any size, True where pixels are kept; None: everywhere
+
+MASK_SIZE = 256  # px, longest side of the masks that are looked at
+BLOCK = 8  # density voxels along a side of the blocks that no view shows
+COARSE = 32  # px, longest side of the masks by which such blocks are told: a pixel and its neighbours are wider than the points of a block are apart
 MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is required
 
 
-def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: int, side: int) -> np.ndarray:
+def kept_pixels(folder: Path, views: Sequence[View]) -> Masks | None:
+    """The masks of some views of a scene at small size, True where any pixel below is kept; None where no view has a mask."""
+    from stages.io.scene import read_mask
+
+    masks = [None if mask is None else shrunk(mask, MASK_SIZE) for mask in (read_mask(folder, view) for view in views)]
+    return None if all(mask is None for mask in masks) else masks
+
+
+def cells_below_min_views(space: Space, cameras: Sequence[Camera], min_views: int, side: int, masks: Masks | None = None) -> np.ndarray:
     """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those in the box that `has_min_views` is false for."""
     centre = (np.arange(side) + 0.5) / side * (2 * space.reach) - space.reach  # contraction is the identity in the box
     inside = np.flatnonzero(np.abs(centre) <= 1)
     out = np.zeros((side, side, side), bool)
     unit = np.stack(np.meshgrid(*(centre[inside],) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    few = ~has_min_views(unit * space.half + space.centre, cameras, min_views)
+    few = ~has_min_views(unit * space.half + space.centre, cameras, min_views, masks)
     out[np.ix_(inside, inside, inside)] = few.reshape((len(inside),) * 3)
     return out
 
 
-def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int) -> np.ndarray:
-    """(N,) bool: which points (N, 3) of the world at least `min_views` cameras have in view, or a quarter of the cameras (rounded up) if that is less."""
+def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int, masks: Masks | None = None) -> np.ndarray:
+    """(N,) bool: which points (N, 3) of the world at least `min_views` cameras have in view, or a quarter of the cameras (rounded up) if that is less.
+
+    masks  a camera counts only where its mask keeps the pixel
+    """
     needed = min(min_views, -(-len(cameras) // MAX_FRACTION))
     count = np.zeros(len(points), np.int32)
     undecided = np.arange(len(points) if needed > 1 else 0)
     for n in bit_reversed_order(len(cameras)):
-        count[undecided] += in_view(points[undecided], [cameras[n]])[0]
+        count[undecided] += in_view(points[undecided], [cameras[n]])[0] if masks is None else shows(points[undecided], cameras[n], masks[n])
         undecided = undecided[count[undecided] < needed]
     return (count >= needed) | (needed < 2)
+
+
+def cells_without_view(space: Space, cameras: Sequence[Camera], side: int, masks: Masks) -> np.ndarray:
+    """(D, D, D) bool of the density voxels of any space, D = `side`: those in blocks of which no view shows any point by a pixel that is kept.
+
+    Of a block the corners are tried, the middles of its edges and faces, and its own, with masks whose kept parts are wider than these are apart. What lies
+    a little outside of a picture counts as seen.
+    """
+    import torch
+
+    count = -(-side // BLOCK)
+    lattice = np.minimum(np.arange(2 * count + 1) * (BLOCK / 2 / side), 1.0)
+    grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = space.world(torch.from_numpy(grid))
+    world = (points if space.ndc is None else space.ndc.world(points)).numpy()
+    wide = [None if mask is None else _widened(shrunk(mask, COARSE)) for mask in masks]
+    unseen = np.arange(len(world))
+    for n in bit_reversed_order(len(cameras)):
+        unseen = unseen[~shows(world[unseen], cameras[n], wide[n], margin=1 / COARSE)]
+    free = np.zeros(len(world), bool)
+    free[unseen] = True
+    free = free.reshape((len(lattice),) * 3)
+    for axis in range(3):  # all three points of a block along each axis
+        first, middle, last = (np.take(free, np.arange(count) * 2 + offset, axis) for offset in range(3))
+        free = first & middle & last
+    for axis in range(3):
+        free = np.repeat(free, BLOCK, axis)
+    return free[:side, :side, :side]
+
+
+def shows(points: np.ndarray, camera: Camera, mask: np.ndarray | None, margin: float = 0.0) -> np.ndarray:
+    """(N,) bool: which points (N, 3) a camera shows by a pixel that its mask keeps.
+
+    margin  how far outside of the picture counts as its border, as a share of its longest side
+    """
+    pixels, depth = project(camera, points)
+    size, beyond = np.array([camera.width, camera.height]), margin * max(camera.width, camera.height)
+    with np.errstate(invalid="ignore"):
+        found = (depth > 0) & (pixels >= -beyond).all(1) & (pixels <= size + beyond).all(1)
+    if mask is not None:
+        at = np.flatnonzero(found)
+        cells = np.clip((pixels[at] * (np.array(mask.shape[::-1]) / size)).astype(int), 0, np.array(mask.shape[::-1]) - 1)
+        found[at] = mask[cells[:, 1], cells[:, 0]]
+    return np.asarray(found)
+
+
+def shrunk(mask: np.ndarray, longest: int) -> np.ndarray:
+    """(h, w) bool with a longest side of at most `longest`: whether any pixel of (H, W) below is True. Pixels lie in as many parts of each side."""
+    height, width = (-(-side * longest // max(mask.shape)) if max(mask.shape) > longest else side for side in mask.shape)
+    rows, columns = (np.arange(count) * side // count for count, side in ((height, mask.shape[0]), (width, mask.shape[1])))
+    return np.asarray(np.maximum.reduceat(np.maximum.reduceat(mask, rows, axis=0), columns, axis=1))
+
+
+def _widened(mask: np.ndarray) -> np.ndarray:
+    """With the neighbours of every pixel that is True."""
+    padded = np.pad(mask, 1)
+    height, width = mask.shape
+    return np.asarray(np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0))
 
 
 def bit_reversed_order(count: int) -> list[int]:

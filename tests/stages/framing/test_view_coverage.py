@@ -11,14 +11,15 @@ import torch
 
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import voxel_coordinates
-from efficientnerf.geometry.cameras import Camera, project
-from efficientnerf.geometry.spaces import ContractedSpace
+from efficientnerf.geometry.cameras import Camera, project, rays
+from efficientnerf.geometry.spaces import BoundedSpace, ContractedSpace
 from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
 from stages import bake, train
 from stages.artifacts import BakeOutputs
-from stages.framing.view_coverage import bit_reversed_order, cells_below_min_views, has_min_views
+from stages.framing.view_coverage import bit_reversed_order, cells_below_min_views, cells_without_view, has_min_views, kept_pixels, shows, shrunk
 from stages.io.field_file import load_renderer, space_of
+from stages.io.png import write_png
 from stages.io.scene import Scene, views_of
 from stages.io.scene import load as load_scene
 from stages.io.scene import save as save_scene
@@ -118,8 +119,8 @@ def test_training_puts_no_matter_where_few_look_and_takes_no_sample_there(tmp_pa
     assert torch.equal(torch.isneginf(m.voxels.values), closed)
     for prune in (False, True):
         pixels = Pixels(cameras, [balls.photograph(c) for c in cameras], [None] * len(cameras), np.full(len(cameras), 1.0), np.full(len(cameras), 50.0))
-        rays = [torch.from_numpy(np.ascontiguousarray(a)) for a in pixels.bundle(np.arange(len(pixels)))[:4]]
-        seen = render_rays(m, *rays, torch.full_like(rays[2], 0.5), m.behind(rays[1]), prune=prune, rng=np.random.default_rng(0))
+        bundle = [torch.from_numpy(np.ascontiguousarray(a)) for a in pixels.bundle(np.arange(len(pixels)))[:4]]
+        seen = render_rays(m, *bundle, torch.full_like(bundle[2], 0.5), m.behind(bundle[1]), prune=prune, rng=np.random.default_rng(0))
         at = (seen.coarse.point * m.voxels.side).long().clamp(0, m.voxels.side - 1)
         assert len(at) > 100
         assert not closed[at[:, 0], at[:, 1], at[:, 2]].any()
@@ -151,3 +152,80 @@ def test_matter_may_be_anywhere_where_that_is_asked_for_or_nothing_lies_beyond_t
     for made in (anywhere, bounded):
         train.run(made)
         assert not torch.isneginf(load_renderer(made.out).model.voxels.values).any()
+
+
+def test_a_view_counts_only_where_its_mask_keeps_the_pixel() -> None:
+    cameras = balls.cameras(8)
+    points = np.random.default_rng(3).uniform(-0.6, 0.6, (400, 3))
+    rng = np.random.default_rng(4)
+    masks = [*(rng.random((camera.height, camera.width)) < 0.3 for camera in cameras[:-1]), None]
+    count = np.zeros(len(points), int)
+    for camera, mask in zip(cameras, masks, strict=True):
+        pixels, depth = project(camera, points)
+        for n, (x, y) in enumerate(pixels):
+            inside = depth[n] > 0 and 0 <= x <= camera.width and 0 <= y <= camera.height
+            count[n] += inside and (mask is None or mask[min(int(y), camera.height - 1), min(int(x), camera.width - 1)])
+    np.testing.assert_array_equal(has_min_views(points, cameras, 2, masks), count >= 2)
+    assert 0 < (count >= 2).sum() < len(points)
+    everything = [np.ones((3, 4), bool) for _ in cameras]
+    np.testing.assert_array_equal(has_min_views(points, cameras, 2, everything), has_min_views(points, cameras, 2))
+    assert not has_min_views(points, cameras, 2, [~mask for mask in everything]).any()
+
+
+def test_small_masks_keep_what_any_pixel_keeps() -> None:
+    mask = np.zeros((30, 47), bool)
+    mask[29, 46] = mask[11, 5] = True
+    small = shrunk(mask, 16)
+    assert small.shape == (11, 16)
+    assert small.sum() == 2
+    assert small[-1, -1]
+    np.testing.assert_array_equal(shrunk(mask, 47), mask)
+
+
+def leaving_out(camera: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
+    """The mask (H, W) bool that leaves a ball out."""
+    origins, directions = (np.asarray(part).reshape(-1, 3) for part in rays(camera))
+    along = ((centre - origins) * directions).sum(1)
+    return (np.linalg.norm(origins + along[:, None] * directions - centre, axis=1) > radius).reshape(camera.height, camera.width)
+
+
+@pytest.mark.parametrize("space", [SPACE, BoundedSpace(SPACE.bounds)])
+def test_voxels_that_no_kept_pixel_shows(space: BoundedSpace) -> None:
+    """All that some kept pixel shows stays; what lies well inside of the ignored part of every picture goes."""
+    side, cameras, hidden, radius = 64, balls.cameras(6), np.array([0.1, 0.0, 0.2]), 0.7
+    masks = [leaving_out(camera, hidden, radius) for camera in cameras]
+    found = cells_without_view(space, cameras, side, masks)
+    grid = (np.stack(np.meshgrid(*(np.arange(side),) * 3, indexing="ij"), axis=-1) + 0.5) / side
+    world = space.world(torch.from_numpy(grid).reshape(-1, 3)).numpy()
+    seen = np.any([shows(world, camera, mask) for camera, mask in zip(cameras, masks, strict=True)], axis=0).reshape((side,) * 3)
+    distance = np.linalg.norm(world - hidden, axis=1).reshape((side,) * 3)
+    assert not (found & seen).any()
+    assert found[distance < 0.05].all() or space.contracted
+    assert not found[(distance > 1.3 * radius) & (distance < 1)].any()
+    assert cells_without_view(space, cameras, side, [np.zeros((4, 4), bool) for _ in cameras]).all()
+    assert not cells_without_view(space, cameras, side, [None for _ in cameras])[distance < 0.8].any()
+
+
+def test_training_learns_nothing_behind_ignored_pixels(tmp_path: Path) -> None:
+    """A part of space that all masks leave out stays empty, and nothing else of the ball does."""
+    folder = poses(tmp_path / "poses", count=6, photographs=True)
+    s, hidden = load_scene(folder), np.zeros(3)
+    views = []
+    for view in s.views:
+        path = folder / "masks" / view.camera.name
+        path.parent.mkdir(exist_ok=True)
+        write_png(np.where(leaving_out(view.camera, hidden, 0.8), np.uint8(255), np.uint8(0)), path)
+        views.append(replace(view, mask=f"masks/{view.camera.name}"))
+    save_scene(replace(s, views=tuple(views)), folder)
+    done = job(tmp_path, balls.settings(iterations=2, occupancy_resolution=128), poses=folder)
+    train.run(done)
+    values = load_renderer(done.out).model.voxels.values.numpy()
+    grid = (np.stack(np.meshgrid(*(np.arange(128),) * 3, indexing="ij"), axis=-1) + 0.5) / 128
+    distance = np.linalg.norm(space_of(s).world(torch.from_numpy(grid).reshape(-1, 3)).numpy(), axis=1).reshape(values.shape)
+    assert np.isneginf(values[distance < 0.15]).all()
+    training = views_of(load_scene(folder), "train")
+    cameras, masks = [view.camera for view in training], kept_pixels(folder, training)
+    assert masks is not None
+    expected = cells_below_min_views(space_of(s), cameras, 2, 128, masks) | cells_without_view(space_of(s), cameras, 128, masks)
+    np.testing.assert_array_equal(np.isneginf(values), expected)
+    assert expected[(distance > 0.9) & (distance < 0.98)].mean() < 0.3
