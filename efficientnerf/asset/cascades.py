@@ -109,9 +109,14 @@ def voxel_cascades(tree: NerfTree) -> np.ndarray:
     return out
 
 
+def cascade_sides(tree: NerfTree) -> np.ndarray:
+    """(L,) float64: side of a voxel of each cascade."""
+    return np.asarray([cascade.voxel for cascade in cascades_of(tree)], np.float64)
+
+
 def voxel_sides(tree: NerfTree) -> np.ndarray:
     """(N,) float32: side of each stored voxel."""
-    return np.asarray([cascade.voxel for cascade in cascades_of(tree)], np.float32)[voxel_cascades(tree)]
+    return cascade_sides(tree).astype(np.float32)[voxel_cascades(tree)]
 
 
 def point_cascades(tree: NerfTree, points: np.ndarray) -> np.ndarray:

@@ -243,7 +243,8 @@ def render_reference(tree: NerfTree, origins: Tensor, directions: Tensor, densit
         cascade = cascades[n]
         grid = replace(tree, shape=cascade.shape, voxel=cascade.voxel, bounds_min=cascade.bounds_min, brick_index=cascade.brick_index, outer=())
         start = (origins - torch.as_tensor(cascade.bounds_min, device=device, dtype=dtype)) / cascade.voxel
-        enter, leave = begin / cascade.voxel, end / cascade.voxel
+        met = begin < end
+        enter, leave = torch.where(met, begin, 0) / cascade.voxel, torch.where(met, end, 0) / cascade.voxel
         step = 0.5
         most = 2 * sum(grid.resolution) + 4  # samples of a ray through the grid; distances far beyond it are rounded to more
         count = max(0, int(torch.ceil((leave - enter).clamp(min=0).max() / step).clamp(max=most).item()) + 1) if len(enter) else 0

@@ -118,7 +118,7 @@ def _take_steps(job: Job, state: RefinementState, targets: Targets, steps: int, 
 
 def _prune(job: Job, state: RefinementState, targets: Targets, most: int) -> RefinementState:
     """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most."""
-    from efficientnerf.asset import bake
+    from efficientnerf.asset.cascades import subset
     from efficientnerf.asset.refinement import fit
     from efficientnerf.asset.refinement.state import subset_state
 
@@ -145,18 +145,21 @@ def _prune(job: Job, state: RefinementState, targets: Targets, most: int) -> Ref
         from efficientnerf.asset.components import small_components
 
         keep &= ~small_components(state.tree, keep, settings.min_component)
-    return subset_state(state, keep, bake.with_voxels(state.tree, keep))
+    return subset_state(state, keep, subset(state.tree, keep))
 
 
 def _save_checkpoint(job: Job, state: RefinementState, pruned: bool) -> None:
     from safetensors.numpy import save_file
 
+    from efficientnerf.asset.cascades import voxel_cascades
     from efficientnerf.asset.refinement.state import STATE
     from efficientnerf.asset.tree import voxel_coordinates
 
     state.fetch()
     tensors = {name: np.ascontiguousarray(getattr(state, name)) for name in STATE}
     tensors["coordinates"] = voxel_coordinates(state.tree)
+    if state.tree.outer:
+        tensors["cascades"] = voxel_cascades(state.tree)
     tensors["progress"] = np.array([state.step, pruned], np.int64)
     with atomic(job.work / CHECKPOINT, durable=False) as temporary:
         save_file(tensors, str(temporary), metadata={"sha256": _digest(tensors)})
@@ -174,19 +177,15 @@ def _digest(tensors: Mapping[str, np.ndarray]) -> str:
 def _restored(job: Job, tree: NerfTree, steps: int) -> tuple[RefinementState, bool] | None:
     """The state of the last checkpoint of so many steps, and whether voxels were dropped by then; None where there is none that fits the tree."""
     from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
-    from efficientnerf.asset.tree import tree_from_voxels
 
     path = job.work / CHECKPOINT
     if not exists(path):
         return None
     try:
         found = _read(path)
-        _check(found, tree, steps)
+        kept = _check(found, tree, steps)
         step, pruned = (int(x) for x in found["progress"])
-        fitted = tree_from_voxels(
-            tree.shape, tree.voxel, tree.bounds_min, found["coordinates"], found["density"], found["sh"].reshape(len(found["sh"]), -1, 3),
-            brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup,
-        )  # fmt: skip
+        fitted = _with_values(tree, kept, np.array(found["density"]), np.array(found["sh"]))
         density, sh, visits = (np.array(found[name]) for name in MOMENTS)
         state = RefinementState(fitted, density, sh, visits, step)
     except (OSError, ValueError) as error:
@@ -212,25 +211,56 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _check(found: Mapping[str, np.ndarray], tree: NerfTree, steps: int) -> None:
-    """ValueError where the tensors are no state of a refinement of this tree, or a step in it is out of range."""
-    from efficientnerf.asset.tree import voxel_coordinates
+def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.ndarray) -> NerfTree:
+    """The tree with the voxels `kept`, places of its own, alone, and their values."""
+    from dataclasses import replace
 
+    from efficientnerf.asset.cascades import subset
+
+    keep = np.zeros(len(tree.density_values), bool)
+    keep[kept] = True
+    structure = subset(replace(tree, harmonics=tree.sh[:, :0]), keep)  # harmonics are most of the memory: none are copied
+    return replace(structure, density_values=density, harmonics=sh.reshape(len(sh), -1, 3))
+
+
+def _check(found: Mapping[str, np.ndarray], tree: NerfTree, steps: int) -> np.ndarray:
+    """The places in the tree of the state's voxels. ValueError where the tensors are no state of a refinement of this tree, or a step in it is out of range."""
     kinds = {"density": "float32", "sh": "float32", "square_density": "float32", "square_sh": "float32", "visits": "int32"}
     count = len(found["density"]) if "density" in found and found["density"].ndim else 0
-    shapes = dict.fromkeys(kinds, (count,)) | {"sh": (count, 3 * tree.harmonics_count), "coordinates": (count, 3), "progress": (2,)}
-    for name, kind in (kinds | {"coordinates": "int32", "progress": "int64"}).items():
+    shapes = dict.fromkeys(kinds, (count,)) | {"sh": (count, 3 * tree.harmonics_count), "coordinates": (count, 3), "progress": (2,), "cascades": (count,)}
+    kinds |= {"coordinates": "int32", "progress": "int64"} | ({"cascades": "uint8"} if tree.outer else {})
+    for name, kind in kinds.items():
         if name not in found or found[name].dtype != kind or found[name].shape != shapes[name]:
             raise ValueError(f"'{name}' is missing, or no {kind} {shapes[name]}")
     step, pruned = (int(x) for x in found["progress"])
     low, high = (steps // 2, steps) if pruned else (0, steps // 2)
     if pruned not in (0, 1) or not low <= step <= high:
         raise ValueError(f"step {step} is not from {low} to {high}")
-    size = tuple(side * tree.brick for side in tree.shape)
-    if (found["coordinates"] < 0).any() or (found["coordinates"] >= size).any():
-        raise ValueError("voxels outside of the grid")
-    ours, theirs = (np.ravel_multi_index(tuple(at.T), size) for at in (voxel_coordinates(tree), found["coordinates"]))
-    order = np.argsort(ours)
-    place = order[np.minimum(np.searchsorted(ours, theirs, sorter=order), len(ours) - 1)]  # in the tree that was baked
-    if not count or not np.array_equal(ours[place], theirs) or (np.diff(place) <= 0).any() or (count < len(ours) and not pruned):
+    place = _places(tree, found["coordinates"], found["cascades"] if tree.outer else np.zeros(count, np.uint8))
+    if not count or (np.diff(place) <= 0).any() or (count < len(tree.density_values) and not pruned):
         raise ValueError("its voxels are not those that were baked, in their order")
+    return place
+
+
+def _places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.ndarray:
+    """Which voxels of the tree lie at coordinates (n, 3) of their cascades (n,); ValueError where one of them is not stored."""
+    from efficientnerf.asset.cascades import cascades_of, voxel_cascades
+    from efficientnerf.asset.tree import voxel_coordinates
+
+    sizes = np.asarray([cascade.shape for cascade in cascades_of(tree)], np.int64) * tree.brick
+    if (cascades >= len(sizes)).any() or (coordinates < 0).any() or (coordinates >= sizes[cascades]).any():
+        raise ValueError("voxels outside of the grid")
+    first = np.cumsum([0, *sizes.prod(axis=1)])
+
+    def keys(at: np.ndarray, of: np.ndarray) -> np.ndarray:
+        side = sizes[of]
+        return first[of] + (at[:, 0].astype(np.int64) * side[:, 1] + at[:, 1]) * side[:, 2] + at[:, 2]
+
+    ours, theirs = keys(voxel_coordinates(tree), voxel_cascades(tree)), keys(coordinates, cascades)
+    order = np.argsort(ours)
+    if not len(ours):
+        raise ValueError("voxels of a tree that has none")
+    place = order[np.minimum(np.searchsorted(ours, theirs, sorter=order), len(ours) - 1)]
+    if not np.array_equal(ours[place], theirs):
+        raise ValueError("its voxels are not those that were baked, in their order")
+    return place

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from efficientnerf.asset.refinement.host import grid_of, in_voxels
+from efficientnerf.asset.refinement.host import in_voxels
 from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import gradients as kernels
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
+from efficientnerf.backends.numba.tree.walk import tree_grid
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import uniform_tree
 
@@ -46,7 +47,7 @@ def gradients(
     start, along, bases = in_voxels(tree, origins, directions)
     density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
     records = SampleRecords(dtype)
-    loss, counts = kernels.forward_backward(grid_of(tree), start, along, bases.astype(dtype), density, sh, seen, records, stop=stop)
+    loss, counts = kernels.forward_backward(tree_grid(tree), start, along, bases.astype(dtype), density, sh, seen, records, stop=stop)
     by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)
     kernels.sum_gradients(records, counts, bases.astype(dtype), by_density, by_sh)
     return loss, by_density, by_sh.reshape(tree.sh.shape)

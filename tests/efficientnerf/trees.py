@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from efficientnerf.asset.cascades import cascade_grids, nested
+from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from tests.efficientnerf.balls import pose
@@ -58,6 +58,18 @@ def rays_at(tree: NerfTree, count: int = 60, seed: int = 0) -> tuple[np.ndarray,
     directions = np.where((kind == 2)[:, None], axis, directions / np.linalg.norm(directions, axis=1, keepdims=True))
     origins = target - directions * np.where(kind == 1, 0.0, 4.0)[:, None]
     return np.where((kind == 3)[:, None], target + 3 * directions, origins), directions
+
+
+def nested_rays(tree: NerfTree, count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions through all cascades: from outside, from cascade 0, from anywhere, and along an axis, a quarter each."""
+    rng = np.random.default_rng(seed)
+    bounds = cascades_of(tree)[-1].bounds(tree.brick)
+    target, kind = rng.uniform(*bounds, (count, 3)), np.arange(count) % 4
+    directions = rng.normal(size=(count, 3))
+    axis = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
+    directions = np.where((kind == 3)[:, None], axis, directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    origins = target - directions * np.where(kind == 2, 0.0, 2 * np.linalg.norm(bounds[1] - bounds[0]))[:, None]
+    return np.where((kind == 1)[:, None], rng.uniform(tree.bounds_min, tree.bounds_max, (count, 3)), origins), directions
 
 
 TREES = [(1, 0), (3, 1), (4, 2), (5, 3), (2, 4)]

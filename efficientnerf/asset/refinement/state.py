@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
 from efficientnerf.asset.tree import NerfTree
 
 MAX_INITIAL_THICKNESS = 2.0  # optical thickness of a voxel at the beginning: networks give hundreds, behind which nothing would have a gradient
@@ -71,7 +72,8 @@ STATE = ("density", "sh", *MOMENTS)
 def initial_state(tree: NerfTree, max_thickness: float = np.inf) -> RefinementState:
     """The state before the first step, of a copy. Optical thickness is limited to `max_thickness`, so that what lies behind a floater has a gradient from
     the first step on."""
-    density = np.minimum(tree.density_values, np.float32(max_thickness / tree.voxel))
+    most = (max_thickness / cascade_sides(tree)).astype(np.float32)
+    density = np.minimum(tree.density_values, most[voxel_cascades(tree)] if tree.outer else most)
     tree = replace(tree, density_values=density, harmonics=np.array(tree.sh, np.float32))
     return RefinementState(tree, np.zeros_like(density), np.zeros_like(density), np.zeros(len(density), np.int32))
 

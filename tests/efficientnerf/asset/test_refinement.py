@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.bake import with_voxels
+from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement import state
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
-from efficientnerf.asset.refinement.host import grid_of, in_voxels
+from efficientnerf.asset.refinement.host import in_voxels
 from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
@@ -21,9 +22,10 @@ from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from efficientnerf.backends.numba.tree import gradients as kernels
 from efficientnerf.backends.numba.tree import rmsprop
 from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
+from efficientnerf.backends.numba.tree.walk import tree_grid
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
-from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
 
 @pytest.mark.parametrize(("brick", "degree", "opacity_weight"), [(1, 0, 0.0), (3, 1, 0.7), (4, 2, 0.0), (2, 3, 0.7)])
@@ -65,7 +67,7 @@ def test_records_grow_until_all_samples_fit() -> None:
     start, along, bases = in_voxels(tree, origins, directions)
     o = initial_state(tree)
     seen = seen_at_random(300, 0.0, np.float32)
-    _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
+    _, counts = kernels.forward_backward(tree_grid(tree), start, along, bases, o.density, o.sh, seen, records)
     assert 7 < counts.max() <= records.capacity
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
     kernels.sum_gradients(records, counts, bases, by_density, by_sh)
@@ -220,15 +222,16 @@ def test_greatest_weights_are_those_of_a_march_by_hand_in_any_number_of_parts() 
     for parts in (1, 3):
         into = np.zeros((parts, len(tree.density_values)), np.float32)
         for half in (slice(0, 25), slice(25, 40)):  # what is known is raised
-            kernels.max_contributions(grid_of(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
+            kernels.max_contributions(tree_grid(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
         found.append(into.max(axis=0))
     np.testing.assert_array_equal(*found)
     np.testing.assert_allclose(found[0], weights_by_hand(tree, origins, directions, gain), atol=1e-5)
     assert (found[0] > 0).mean() > 0.3
 
 
-def test_steps_are_those_of_the_formula() -> None:
-    tree = random_tree(4, brick=2, degree=1)
+@pytest.mark.parametrize("tree", [random_tree(4, brick=2, degree=1), random_cascades(4, brick=2)], ids=["one grid", "cascades"])
+def test_steps_are_those_of_the_formula(tree: NerfTree) -> None:
+    sides, cascades = voxel_sides(tree), voxel_cascades(tree)
     o, records = initial_state(tree), SampleRecords()
     sums, stamp = (np.zeros_like(o.density), np.zeros_like(o.sh)), np.zeros(len(o.density), np.int32)
     rates = np.linspace(0.01, 0.02, o.sh.shape[1]).astype(np.float32)
@@ -239,13 +242,13 @@ def test_steps_are_those_of_the_formula() -> None:
         seen = seen_at_random(100, 0.2, np.float32)
         start, along, bases = in_voxels(tree, origins, directions)
         _, by_density, by_sh = gradients(o.result(), origins, directions, seen, np.float32, kernels.EARLY_STOP)
-        _, counts = kernels.forward_backward(grid_of(tree), start, along, bases, o.density, o.sh, seen, records)
-        hyperparameters = rmsprop.Hyperparameters(tree.voxel, 0.1, rates, 0.9, 1e-12)
+        _, counts = kernels.forward_backward(tree_grid(tree), start, along, bases, o.density, o.sh, seen, records)
+        hyperparameters = rmsprop.Hyperparameters(cascade_sides(tree), cascades, 0.1, rates, 0.9, 1e-12)
         rmsprop.rmsprop_step(records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp, number, hyperparameters)
         named = np.unique(records.index[np.concatenate([np.arange(c) + b * records.capacity for b, c in enumerate(counts)])])
         met = np.isin(np.arange(len(density)), named)
         visits += met
-        slope, flat = by_density * np.maximum(density, rmsprop.MIN_THICKNESS / tree.voxel), by_sh.reshape(sh.shape)
+        slope, flat = by_density * np.maximum(density, rmsprop.MIN_THICKNESS / sides), by_sh.reshape(sh.shape)
         square_density = np.where(met, 0.9 * square_density + 0.1 * slope**2, square_density)
         square_sh = np.where(met, 0.9 * square_sh + 0.1 * (flat**2).mean(axis=1), square_sh)
         right = np.maximum(1 - 0.9**visits, 1e-30)

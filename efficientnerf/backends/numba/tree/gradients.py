@@ -121,13 +121,13 @@ def _forward_backward(  # type: ignore[no-untyped-def]
     grid, origins, directions, bases, density, sh, targets, stop, max_samples, capacity, index, fraction, gradient, ray_of, counts, loss
 ):
     """Block b writes its records from b * capacity on, and to counts[b] how many there are; more than `capacity`: the last ones were left out."""
-    rays, terms, step_length, opacity_weight = len(origins), sh.shape[1], grid.step_length, targets.opacity_weight
+    rays, terms, opacity_weight = len(origins), sh.shape[1], targets.opacity_weight
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         b_index, b_fraction = np.full((max_samples, 8), -1, np.int32), np.zeros((max_samples, 3), density.dtype)
-        alpha, light, distance = np.empty(max_samples, np.float64), np.empty(max_samples, np.float64), np.empty(max_samples, np.float64)
+        alpha, light, distance, length = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
         rgb, mixed, grad_colour, accumulated = np.empty((max_samples, 3), np.float64), np.empty(terms, sh.dtype), np.empty(3), np.empty(3)
         tree = walk_pointers(grid, density)
-        buffer = SampleBuffer(max_samples, pointer(b_index), pointer(b_fraction), pointer(alpha), pointer(light), pointer(distance))
+        buffer = SampleBuffer(max_samples, pointer(b_index), pointer(b_fraction), pointer(alpha), pointer(light), pointer(distance), pointer(length))
         written = 0
         for ray in range(block * BLOCK, min(rays, block * BLOCK + BLOCK)):
             count, left = walk(origins[ray], directions[ray], tree, stop, buffer)
@@ -161,7 +161,7 @@ def _forward_backward(  # type: ignore[no-untyped-def]
                     grad_depth += grad_colour[c] * (after * shade - accumulated[c])
                     accumulated[c] += weight * shade
                     gradient[to, 1 + c] = grad_colour[c] * weight * shade * (1 - shade)
-                gradient[to, 0] = grad_depth * step_length
+                gradient[to, 0] = grad_depth * length[n]
                 index[to], fraction[to], ray_of[to] = b_index[n], b_fraction[n], ray
         counts[block] = written
 
@@ -219,9 +219,9 @@ def _max_contributions(grid, origins, directions, density, stop, max_samples, tr
     shares, rays = len(visibility), len(origins)
     for share in numba.prange(shares):
         index, fraction = np.full((max_samples, 8), -1, np.int32), np.zeros((max_samples, 3), density.dtype)
-        alpha, light, distance = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
+        alpha, light, distance, length = np.empty(max_samples), np.empty(max_samples), np.empty(max_samples), np.empty(max_samples)
         tree = walk_pointers(grid, density)
-        buffer = SampleBuffer(max_samples, pointer(index), pointer(fraction), pointer(alpha), pointer(light), pointer(distance))
+        buffer = SampleBuffer(max_samples, pointer(index), pointer(fraction), pointer(alpha), pointer(light), pointer(distance), pointer(length))
         into = visibility[share]
         for ray in range(rays * share // shares, rays * (share + 1) // shares):
             count, _ = walk(origins[ray], directions[ray], tree, stop, buffer)
@@ -247,7 +247,7 @@ def forward_backward(
     grid: TreeGrid, origins: np.ndarray, directions: np.ndarray, bases: np.ndarray, density: np.ndarray, sh: np.ndarray, targets: RayTargets,
     records: SampleRecords, *, stop: float = EARLY_STOP,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Loss (R,) of rays, voxel coordinates, and the number of records in each block; `records` then holds their samples' gradients.
+    """Loss (R,) of rays, voxel coordinates of cascade 0, and the number of records in each block; `records` then holds their samples' gradients.
 
     origins, directions  (R, 3) float64
     bases                (R, K) harmonics of the rays' directions

@@ -13,7 +13,7 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP, STEP
 from efficientnerf.backends.numba.tree.queries import normal_at
-from efficientnerf.backends.numba.tree.walk import SampleBuffer, TreeGrid, walk_on, walk_pointers
+from efficientnerf.backends.numba.tree.walk import SampleBuffer, tree_grid, walk_on, walk_pointers
 from efficientnerf.rendering.harmonics import basis_numpy
 
 if TYPE_CHECKING:
@@ -46,7 +46,8 @@ def _composite(count, buffer, tree, basis, sh, rgb, colour):  # type: ignore[no-
         for c in range(3):
             colour[c] += weight * rgb[c]
         if before - weight <= 0.5 < before:
-            half = buffer.distance[n] - 0.5 * STEP + np.log(2 * before) / (tree.density[voxel] * tree.step_length) * STEP
+            step = STEP * (buffer.length[n] / tree.step_length)  # of the cascade, voxels of cascade 0
+            half = buffer.distance[n] - 0.5 * step + np.log(2 * before) / (tree.density[voxel] * buffer.length[n]) * step
     return half
 
 
@@ -55,8 +56,8 @@ def _render(grid, density, sh, origins, directions, bases, colour, opacity, half
     rays = len(origins)
     for block in numba.prange((rays + BLOCK - 1) // BLOCK):
         index, fraction = np.full((CAPACITY, 8), -1, np.int32), np.zeros((CAPACITY, 3), np.float32)
-        alpha, transmittance, distance, rgb = np.empty(CAPACITY), np.empty(CAPACITY), np.empty(CAPACITY), np.empty(3)
-        buffer = SampleBuffer(CAPACITY, pointer(index), pointer(fraction), pointer(alpha), pointer(transmittance), pointer(distance))
+        alpha, transmittance, distance, length, rgb = np.empty(CAPACITY), np.empty(CAPACITY), np.empty(CAPACITY), np.empty(CAPACITY), np.empty(3)
+        buffer = SampleBuffer(CAPACITY, pointer(index), pointer(fraction), pointer(alpha), pointer(transmittance), pointer(distance), pointer(length))
         tree = walk_pointers(grid, density)
         for ray in range(block * BLOCK, min(rays, block * BLOCK + BLOCK)):
             k, left = 0, 1.0
@@ -76,7 +77,7 @@ def render_rays(
     starts = np.ascontiguousarray((origins - tree.bounds_min) / tree.voxel)
     bases = np.ascontiguousarray(basis_numpy(np.asarray(directions if sh_directions is None else sh_directions, np.float32), tree.degree))
     colour, opacity, half_distance = np.zeros((len(starts), 3)), np.zeros(len(starts)), np.full(len(starts), np.inf)
-    grid = TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, float(STEP * tree.voxel), nearest=True)
+    grid = tree_grid(tree)
     for part in pieces(len(starts)):
         given = (starts[part], directions[part], bases[part], colour[part], opacity[part], half_distance[part])
         _render(grid, tree.density_values, tree.sh, *given)

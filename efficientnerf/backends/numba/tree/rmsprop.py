@@ -1,6 +1,6 @@
 """RMSprop on a tree's values, restricted to the voxels that rays met (numba, all cores).
 
-Tieleman and Hinton 2012; Plenoxels (Fridovich-Keil et al. 2022) are optimised with it. N voxels, K harmonics.
+Tieleman and Hinton 2012; Plenoxels (Fridovich-Keil et al. 2022) are optimised with it. N voxels, K harmonics, L cascades.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ MAX_VISITS = 60000
 class Hyperparameters(NamedTuple):
     """Of a step.
 
-    voxel         size of a voxel, units of the frame
+    sides         (L,) float64: sides of the voxels of each cascade, units of the frame
+    cascades      (N,) uint8: the cascade of each voxel
     density_rate  learning rate of the logarithm of the optical thickness
     sh_rates      (3 K,) learning rates of the coefficients
     decay         of the running mean of the squared gradient
     """
 
-    voxel: float
+    sides: np.ndarray
+    cascades: np.ndarray
     density_rate: float
     sh_rates: np.ndarray
     decay: float
@@ -37,16 +39,16 @@ def _rmsprop_step(  # type: ignore[no-untyped-def]
     slabs, records, density, sh, grad_density, grad_sh, square_density, square_sh, visits, stamp, number, hyperparameters
 ):
     count, terms = len(density), sh.shape[1]
-    voxel, density_rate, decay, epsilon = hyperparameters.voxel, hyperparameters.density_rate, hyperparameters.decay, hyperparameters.epsilon
+    density_rate, decay, epsilon = hyperparameters.density_rate, hyperparameters.decay, hyperparameters.epsilon
     for slab in numba.prange(slabs):
         low, high = count * slab // slabs, count * (slab + 1) // slabs
-        sh_rates = hyperparameters.sh_rates
+        sh_rates, sides, cascades = hyperparameters.sh_rates, hyperparameters.sides, hyperparameters.cascades
         voxels = np.empty(high - low, np.int32)
         found = sum_records(low, high, records, grad_density, grad_sh, stamp, number, voxels)
         for n in range(found):
             v = voxels[n]
             visits[v] = min(visits[v] + 1, MAX_VISITS)
-            correction = 1 / (1 - decay ** float(visits[v]))
+            correction, voxel = 1 / (1 - decay ** float(visits[v])), sides[cascades[v]]
             # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
             thickness = max(density[v] * voxel, MIN_THICKNESS)
             slope = grad_density[v] / voxel * thickness

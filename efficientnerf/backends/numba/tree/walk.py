@@ -1,13 +1,14 @@
 """Ray marching over a tree's own arrays (numba), specialised by lookup; rendering of nearest-lookup trees and refinement share it.
 
-Samples lie as FORMAT.md says, section 6. Interpolated trees are rendered from their packed form: `efficientnerf.backends.numba.tree.march`.
+Samples lie as FORMAT.md says, section 6; in nested trees as `efficientnerf.asset.rendering.ray_parts` says. Interpolated trees are rendered from their packed
+form: `efficientnerf.backends.numba.tree.march`.
 
-N stored voxels, S samples of a ray.
+Coordinates of rays are in voxels of the tree's own grid, cascade 0. N stored voxels, S samples of a ray, L cascades, C coarse cells of all outer cascades.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -15,12 +16,20 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import STEP
 
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
 
 class TreeGrid(NamedTuple):
     """Structure of a tree; see `NerfTree`.
 
-    step_length  of STEP voxels, units of the frame
-    nearest      whether the lookup is nearest, else trilinear
+    step_length        of STEP voxels of cascade 0, units of the frame
+    nearest            whether the lookup is nearest, else trilinear
+    outer_shape        (L - 1, 3) int64 coarse cells of the cascades after the first
+    outer_first        (L - 1,) int64 where each one's cells begin in the next two
+    outer_brick_index  (C,) int32, outer_leap (C,) uint8
+    outer_corner       (L - 1, 3) float64 corner, voxels of cascade 0
+    outer_scale        (L - 1,) float64 side of a voxel, voxels of cascade 0
     """
 
     brick: int
@@ -29,15 +38,27 @@ class TreeGrid(NamedTuple):
     leap: np.ndarray
     step_length: float
     nearest: bool = False
+    outer_shape: np.ndarray = np.zeros((0, 3), np.int64)
+    outer_first: np.ndarray = np.zeros(0, np.int64)
+    outer_brick_index: np.ndarray = np.zeros(0, np.int32)
+    outer_leap: np.ndarray = np.zeros(0, np.uint8)
+    outer_corner: np.ndarray = np.zeros((0, 3))
+    outer_scale: np.ndarray = np.zeros(0)
 
     @property
     def max_samples(self) -> int:
         """Samples on a ray, at most."""
-        return most_samples(*(side * self.brick for side in self.brick_index.shape))
+        sizes = [self.brick_index.shape, *self.outer_shape.tolist()]
+        # Each outer cascade may begin its samples anew behind the one that is cut out of it.
+        return sum(most_samples(*(side * self.brick for side in size)) for size in sizes) + 2 * len(self.outer_shape)
 
 
 class WalkPointers(NamedTuple):
-    """A TreeGrid and densities with arrays as pointers; nx, ny, nz coarse cells, `cube` voxels in a brick."""
+    """A TreeGrid and densities with arrays as pointers; nx, ny, nz coarse cells, `cube` voxels in a brick.
+
+    cascades  L; 1 in the grid of a single cascade that `outer_grid` makes
+    first     where the grid's cells begin in brick_index and leap
+    """
 
     brick: int
     cube: int
@@ -50,6 +71,14 @@ class WalkPointers(NamedTuple):
     density: Any
     step_length: float
     nearest: bool
+    cascades: int
+    first: int
+    outer_shape: Any
+    outer_first: Any
+    outer_brick_index: Any
+    outer_leap: Any
+    outer_corner: Any
+    outer_scale: Any
 
 
 class SampleBuffer(NamedTuple):
@@ -61,6 +90,7 @@ class SampleBuffer(NamedTuple):
     alpha          (S,) float64
     transmittance  (S,) float64 at which light arrives
     distance       (S,) float64 from the origin, voxels
+    length         (S,) float64 of the step, units of the frame
     """
 
     capacity: int
@@ -69,6 +99,30 @@ class SampleBuffer(NamedTuple):
     alpha: Any
     transmittance: Any
     distance: Any
+    length: Any
+
+
+def tree_grid(tree: NerfTree) -> TreeGrid:
+    """The structure of a tree, with its cascades."""
+    outer = _outer_grids(tree) if tree.outer else ()
+    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, float(STEP * tree.voxel), tree.lookup == "nearest", *outer)
+
+
+def _outer_grids(tree: NerfTree) -> tuple[np.ndarray, ...]:
+    """The fields of a TreeGrid that are of the outer cascades, in order, kept with the tree."""
+    if "outer_grids" not in tree.derived:
+        from efficientnerf.asset.tree import leaps
+
+        cells = [cascade.brick_index.size for cascade in tree.outer]
+        tree.derived["outer_grids"] = (
+            np.asarray([cascade.shape for cascade in tree.outer], np.int64),
+            np.cumsum([0, *cells[:-1]]).astype(np.int64),
+            np.concatenate([cascade.brick_index.reshape(-1) for cascade in tree.outer]).astype(np.int32),
+            np.concatenate([leaps(cascade.brick_index >= 0).reshape(-1) for cascade in tree.outer]),
+            np.stack([(cascade.bounds_min - tree.bounds_min) / tree.voxel for cascade in tree.outer]).astype(np.float64),
+            np.asarray([cascade.voxel / tree.voxel for cascade in tree.outer], np.float64),
+        )
+    return tree.derived["outer_grids"]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -83,7 +137,19 @@ def walk_pointers(grid, density):  # type: ignore[no-untyped-def]
     nx, ny, nz = grid.brick_index.shape
     return WalkPointers(
         grid.brick, grid.voxel_index.shape[1], nx, ny, nz, pointer(grid.brick_index), pointer(grid.voxel_index), pointer(grid.leap), pointer(density),
-        grid.step_length, grid.nearest,
+        grid.step_length, grid.nearest, 1 + len(grid.outer_first), 0, pointer(grid.outer_shape), pointer(grid.outer_first),
+        pointer(grid.outer_brick_index), pointer(grid.outer_leap), pointer(grid.outer_corner), pointer(grid.outer_scale),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def outer_grid(tree, n):  # type: ignore[no-untyped-def]
+    """Cascade n, from 1 on, as a grid of its own: rays then are in its voxels."""
+    m = n - 1
+    return WalkPointers(
+        tree.brick, tree.cube, tree.outer_shape[3 * m], tree.outer_shape[3 * m + 1], tree.outer_shape[3 * m + 2], tree.outer_brick_index, tree.voxel_index,
+        tree.outer_leap, tree.density, tree.step_length * tree.outer_scale[m], tree.nearest, 1, tree.outer_first[m], tree.outer_shape, tree.outer_first,
+        tree.outer_brick_index, tree.outer_leap, tree.outer_corner, tree.outer_scale,
     )  # fmt: skip
 
 
@@ -96,7 +162,7 @@ def stored_voxel(i, j, k, tree):  # type: ignore[no-untyped-def]
     a, b, c = i // brick, j // brick, k // brick
     if a >= tree.nx or b >= tree.ny or c >= tree.nz:
         return np.int32(-1)
-    owner = np.int64(tree.brick_index[(a * tree.ny + b) * tree.nz + c])
+    owner = np.int64(tree.brick_index[tree.first + (a * tree.ny + b) * tree.nz + c])
     if owner < 0:
         return np.int32(-1)
     return np.int32(tree.voxel_index[owner * tree.cube + ((i - a * brick) * brick + (j - b * brick)) * brick + (k - c * brick)])
@@ -112,7 +178,7 @@ def corner_voxels(i, j, k, tree, index, at):  # type: ignore[no-untyped-def]
         a, b, c = i // brick, j // brick, k // brick
         owner = np.int64(-1)
         if a < tree.nx and b < tree.ny and c < tree.nz:
-            owner = np.int64(tree.brick_index[(a * tree.ny + b) * tree.nz + c])
+            owner = np.int64(tree.brick_index[tree.first + (a * tree.ny + b) * tree.nz + c])
         first = owner * tree.cube + (li * brick + lj) * brick + lk
         for n in range(8):
             index[at + n] = tree.voxel_index[first + ((n >> 2) * brick + ((n >> 1) & 1)) * brick + (n & 1)] if owner >= 0 else -1
@@ -160,21 +226,31 @@ def walk(origin, direction, tree, stop, buffer):  # type: ignore[no-untyped-def]
     return count, transmittance
 
 
-@numba.njit(cache=True, error_model="numpy")
-def walk_on(origin, direction, tree, stop, buffer, k, transmittance):  # type: ignore[no-untyped-def]
-    """`walk` from sample k on, where so much light arrives; returns the number of samples, the transmittance behind them, and the k to go on with, or -1."""
-    brick = tree.brick
-    nx, ny, nz = tree.nx * brick, tree.ny * brick, tree.nz * brick
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    dx, dy, dz = direction[0], direction[1], direction[2]
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _meeting(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Distances at which a ray enters, 0 at least, and leaves the box of a grid of so many voxels; the second is not greater where it misses it."""
     ix = 1 / dx if dx != 0 else 1e30
     iy = 1 / dy if dy != 0 else 1e30
     iz = 1 / dz if dz != 0 else 1e30
     t0 = max(min(-ox * ix, (nx - ox) * ix), min(-oy * iy, (ny - oy) * iy), min(-oz * iz, (nz - oz) * iz), 0.0)
     t1 = min(max(-ox * ix, (nx - ox) * ix), max(-oy * iy, (ny - oy) * iy), max(-oz * iz, (nz - oz) * iz))
     if not t1 > t0 or (dx == 0 and (ox < 0 or ox > nx)) or (dy == 0 and (oy < 0 or oy > ny)) or (dz == 0 and (oz < 0 or oz > nz)):
-        return 0, transmittance, -1
-    count = 0
+        return t0, t0
+    return t0, t1
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, tree, scale, stop, buffer, count, k, transmittance):  # type: ignore[no-untyped-def]
+    """Samples of a ray between two distances in one grid, coordinates and distances in its voxels, from sample k on.
+
+    scale    side of a voxel of the grid, voxels of cascade 0
+    returns  number of samples in the buffer, `count` of which were there before; the transmittance behind them; and the k to go on with, or -1
+    """
+    brick = tree.brick
+    nx, ny, nz = tree.nx * brick, tree.ny * brick, tree.nz * brick
+    ix = 1 / dx if dx != 0 else 1e30
+    iy = 1 / dy if dy != 0 else 1e30
+    iz = 1 / dz if dz != 0 else 1e30
     last = int(np.floor(min((t1 - t0) / STEP, most_samples(nx, ny, nz)))) + 1
     while k < last:
         if count == buffer.capacity:
@@ -187,7 +263,7 @@ def walk_on(origin, direction, tree, stop, buffer, k, transmittance):  # type: i
             k += 1
             continue
         a, b, c = int(u) // brick, int(v) // brick, int(w) // brick
-        leap = int(tree.leap[(a * tree.ny + b) * tree.nz + c])
+        leap = int(tree.leap[tree.first + (a * tree.ny + b) * tree.nz + c])
         if leap > 0:
             fx = ((a + leap) * brick - ox) * ix if dx > 0 else ((a - leap + 1) * brick - ox) * ix
             fy = ((b + leap) * brick - oy) * iy if dy > 0 else ((b - leap + 1) * brick - oy) * iy
@@ -203,9 +279,71 @@ def walk_on(origin, direction, tree, stop, buffer, k, transmittance):  # type: i
         k += 1
         sigma = _lookup_nearest(u, v, w, tree, buffer, count) if tree.nearest else _lookup_trilinear(u, v, w, tree, buffer, count)
         if sigma > 0:
-            buffer.alpha[count], buffer.transmittance[count], buffer.distance[count] = 1 - np.exp(-sigma * tree.step_length), transmittance, t
+            buffer.alpha[count], buffer.transmittance[count] = 1 - np.exp(-sigma * tree.step_length), transmittance
+            buffer.distance[count], buffer.length[count] = t * scale, tree.step_length
             transmittance *= 1 - buffer.alpha[count]
             count += 1
             if transmittance < stop:
                 break
+    return count, transmittance, -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def walk_on(origin, direction, tree, stop, buffer, k, transmittance):  # type: ignore[no-untyped-def]
+    """`walk` from sample k on, where so much light arrives; returns the number of samples, the transmittance behind them, and the k to go on with, or -1."""
+    if tree.cascades > 1:
+        return _walk_cascades(origin, direction, tree, stop, buffer, k, transmittance)
+    ox, oy, oz, dx, dy, dz = origin[0], origin[1], origin[2], direction[0], direction[1], direction[2]
+    t0, t1 = _meeting(ox, oy, oz, dx, dy, dz, tree.nx * tree.brick, tree.ny * tree.brick, tree.nz * tree.brick)
+    if not t1 > t0:
+        return 0, transmittance, -1
+    return _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, tree, 1.0, stop, buffer, 0, k, transmittance)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _cascade_meeting(origin, direction, tree, n):  # type: ignore[no-untyped-def]
+    """Distances at which a ray enters and leaves the box of cascade n, voxels of cascade 0, as `_meeting`."""
+    dx, dy, dz, brick = direction[0], direction[1], direction[2], tree.brick
+    if n == 0:
+        return _meeting(origin[0], origin[1], origin[2], dx, dy, dz, tree.nx * brick, tree.ny * brick, tree.nz * brick)
+    m = n - 1
+    scale = tree.outer_scale[m]
+    x, y, z = origin[0] - tree.outer_corner[3 * m], origin[1] - tree.outer_corner[3 * m + 1], origin[2] - tree.outer_corner[3 * m + 2]
+    side = scale * brick
+    return _meeting(x, y, z, dx, dy, dz, tree.outer_shape[3 * m] * side, tree.outer_shape[3 * m + 1] * side, tree.outer_shape[3 * m + 2] * side)
+
+
+PART = 2**32  # samples of a part of a ray, at most: `walk_on` of a nested tree goes on with PART times the part plus the sample in it
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _walk_cascades(origin, direction, tree, stop, buffer, k, transmittance):  # type: ignore[no-untyped-def]
+    """`walk_on` in a nested tree: part p of a ray lies in cascade |L - 1 - p|, before or behind the box that is cut out of that."""
+    count, outermost = 0, tree.cascades - 1
+    part, k = k // PART, k % PART
+    while part <= 2 * outermost:
+        n = abs(outermost - part)
+        t0, t1 = _cascade_meeting(origin, direction, tree, n)
+        if n == outermost and not t1 > t0:
+            return count, transmittance, -1
+        if n > 0:
+            enter, leave = _cascade_meeting(origin, direction, tree, n - 1)
+            if leave > enter and part < outermost:
+                t1 = enter
+            elif part > outermost:
+                t0 = leave if leave > enter else t1
+        if t1 > t0:
+            ox, oy, oz, dx, dy, dz = origin[0], origin[1], origin[2], direction[0], direction[1], direction[2]
+            grid, scale = tree, 1.0
+            if n > 0:
+                grid, scale = outer_grid(tree, n), tree.outer_scale[n - 1]
+                ox, oy, oz = ox - tree.outer_corner[3 * n - 3], oy - tree.outer_corner[3 * n - 2], oz - tree.outer_corner[3 * n - 1]
+            count, transmittance, k = _walk_part(
+                ox / scale, oy / scale, oz / scale, dx, dy, dz, t0 / scale, t1 / scale, grid, scale, stop, buffer, count, k, transmittance
+            )
+            if k >= 0:
+                return count, transmittance, part * PART + k
+            if transmittance < stop:
+                break
+        part, k = part + 1, 0
     return count, transmittance, -1

@@ -1,0 +1,79 @@
+"""Checkpoints of a refinement whose tree has cascades."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.cascades import subset, voxel_cascades
+from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state, subset_state
+from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from pipeline.stage import Job
+from stages.baking import refinement
+from tests.efficientnerf.trees import random_cascades
+
+STEPS = 12
+
+
+def job(folder: Path) -> Job:
+    return Job(settings=None, out=folder / "out", work=folder)
+
+
+def some_state(tree: NerfTree, pruned: bool) -> RefinementState:
+    """Random values, and after the pruning a third of the voxels."""
+    rng = np.random.default_rng(2)
+    state = initial_state(tree)
+    if pruned:
+        keep = rng.random(len(state.density)) < 0.3
+        state = subset_state(state, keep, subset(state.tree, keep))
+    for name in STATE:
+        values = getattr(state, name)
+        values[:] = rng.integers(1, 100, values.shape)
+    state.step = 7 if pruned else 4
+    return state
+
+
+@pytest.mark.parametrize("pruned", [False, True])
+def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None:
+    tree = random_cascades(3)
+    state = some_state(tree, pruned)
+    refinement._save_checkpoint(job(tmp_path), state, pruned)
+    found = refinement._restored(job(tmp_path), tree, STEPS)
+    assert found is not None
+    again = found[0]
+    assert (again.step, found[1]) == (state.step, pruned)
+    for name in STATE:
+        np.testing.assert_array_equal(getattr(again, name), getattr(state, name))
+    for name in ("brick_index", "voxel_index", "environment"):
+        np.testing.assert_array_equal(getattr(again.tree, name), getattr(state.tree, name))
+    for one, other in zip(again.tree.outer, state.tree.outer, strict=True):
+        np.testing.assert_array_equal(one.brick_index, other.brick_index)
+        np.testing.assert_array_equal(one.bounds_min, other.bounds_min)
+
+
+
+CHANGES: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
+    "none": lambda tensors: tensors.pop("cascades"),
+    "another cascade": lambda tensors: tensors.update(cascades=(tensors["cascades"] + np.uint8(1)) % np.uint8(3)),
+    "no such cascade": lambda tensors: tensors.update(cascades=np.full_like(tensors["cascades"], 3)),
+    "wide": lambda tensors: tensors.update(cascades=tensors["cascades"].astype(np.int32)),
+    "few": lambda tensors: tensors.update(cascades=tensors["cascades"][:-1]),
+    "outside": lambda tensors: tensors.update(coordinates=tensors["coordinates"] + np.int32(50)),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+@pytest.mark.parametrize("pruned", [False, True])
+def test_cascades_of_another_tree_are_told(pruned: bool, change: Callable[[dict[str, np.ndarray]], Any]) -> None:
+    tree = random_cascades(3)
+    state = some_state(tree, pruned)
+    tensors = {name: getattr(state, name) for name in STATE}
+    tensors |= {"coordinates": voxel_coordinates(state.tree), "cascades": voxel_cascades(state.tree), "progress": np.array([state.step, pruned], np.int64)}
+    assert len(refinement._check(tensors, tree, STEPS)) == len(state.density)
+    change(tensors)
+    with pytest.raises(ValueError, match=r"voxels|cascades"):
+        refinement._check(tensors, tree, STEPS)
