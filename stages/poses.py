@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -165,6 +165,7 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     from stages.io.importers.photographs import masks_of, photographs
     from stages.io.pictures import UnreadableImage, read_header
     from stages.memory.poses import feature_threads
+    from stages.sfm.background import silhouettes_with_surroundings
     from stages.sfm.matches import num_threads
     from stages.sfm.reconstruction import find_cameras
 
@@ -181,21 +182,53 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
         job.safe_point()
         with contextlib.suppress(UnreadableImage):  # said where it is read
             sizes.append(read_header(path).size)
-    found = find_cameras(
-        source.root,
-        paths,
-        max_side=settings.feature_image_size,
-        features=settings.max_features,
-        matching=settings.matching,
-        seed=settings.seed,
-        threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, num_threads()),
-        masks=masks,
-        work=job.work / "cameras",
-        progress=job.progress,
-        safe_point=job.safe_point,
-        warn=warn,
-    )
+
+    def find(name: str, masks: Mapping[str, Path]) -> Capture:
+        return find_cameras(
+            source.root,
+            paths,
+            max_side=settings.feature_image_size,
+            features=settings.max_features,
+            matching=settings.matching,
+            seed=settings.seed,
+            threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, num_threads()),
+            masks=masks,
+            work=job.work / name,
+            progress=job.progress,
+            safe_point=job.safe_point,
+            warn=warn,
+        )
+
+    if silhouettes_with_surroundings(paths, masks, settings.masks, job.safe_point):
+        found = _found_by_surroundings(job, find, masks)
+    else:
+        found = find("cameras", masks)
     return replace(found, rejected_files={name: paths[name] for name, _ in found.rejected})
+
+
+def _found_by_surroundings(job: Job, find: Callable[[str, Mapping[str, Path]], Capture], masks: Mapping[str, Path]) -> Capture:
+    """The capture found from all of the photographs; or from what their silhouettes keep, where these fit to each other better then: the object was turned."""
+    from stages.framing.mask_use import MIN_AGREEING, share_that_fits
+    from stages.io.silhouettes import SmallPictures
+
+    def fit(found: Capture) -> float:
+        return share_that_fits(found, SmallPictures()) * len(found.photos)
+
+    job.say("masks are taken for silhouettes; features are looked for outside of them, too: the background moves with the object")
+    whole: Capture | None = None
+    with contextlib.suppress(BadInput):
+        found = find("cameras", {})
+        whole = replace(found, photos=tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in found.photos))
+        if fit(whole) >= MIN_AGREEING * len(whole.photos):
+            return whole
+    job.say("the silhouettes do not fit to these cameras; they are looked for again by the object alone")
+    try:
+        alone = find("cameras_of_object", masks)
+    except BadInput:
+        if whole is None:
+            raise
+        return whole
+    return alone if whole is None or fit(alone) > fit(whole) else whole
 
 
 def _format_of(capture: Capture) -> str:

@@ -274,9 +274,7 @@ def captured_cameras(tree: NerfTree, frames: int, width: int, height: int, fov: 
 
     captured = captured_of(tree.metadata)
     if captured is None:
-        raise BadInput(
-            "asset: it keeps no captured cameras, which the path `captured` follows. Bake it again, or choose another path."
-        )
+        raise BadInput("asset: it keeps no captured cameras, which the path `captured` follows. Bake it again, or choose another path.")
     focal = captured.focal * math.hypot(width, height) / math.hypot(captured.width, captured.height)
     if fov is not None:
         focal = 0.5 * height / math.tan(math.radians(fov / 2))

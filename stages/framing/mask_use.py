@@ -178,33 +178,47 @@ def _of_renders(pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[bo
     return True, "every image has an alpha channel, and most are transparent somewhere, as renders of an object are", []
 
 
-def _of_photographs(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[bool, str, list[str]]:
-    """Whether these are silhouettes, why, and the names of those that do not fit to the others."""
+def alike(pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[str, list[tuple[Photo, np.ndarray]]]:
+    """Why these cannot be silhouettes of an object, by the pictures alone, or nothing; and those that keep one compact object, as bool."""
     count = len(pictures)
     verdicts = [("have none" if picture is None else compactness(picture >= 128)) for _, picture in pictures]
-    against = Counter(verdict for verdict in verdicts if verdict is not None)
     good = [(photo, picture >= 128) for (photo, picture), verdict in zip(pictures, verdicts, strict=True) if picture is not None and verdict is None]
     if len(good) < max(MIN_IMAGES, MIN_AGREEING * count):
-        why, most = against.most_common(1)[0] if against else ("", 0)
-        return False, f"{most} of {count} photographs {why}" if most else f"there are only {count} photographs", []
-    if _same([picture for _, picture in good]):
-        return False, "they are the same in all photographs", []
-    masks, cameras = [picture for _, picture in good], [photo.camera for photo, _ in good]
-    focus, converging = focus_point(capture)
-    ranges = [(photo.near, photo.far) for photo, _ in good]
-    hull = scene_bounds.visual_hull(masks, cameras, *scene_bounds.bounds_of_frusta(cameras, ranges, focus, converging, least=0.5))
-    if hull is None:
-        return False, "no object has all of these silhouettes (their visual hull is empty)", []
-    overlap = overlaps(masks, cameras, *hull)
+        against = Counter(verdict for verdict in verdicts if verdict is not None).most_common(1)
+        return f"{against[0][1]} of {count} photographs {against[0][0]}" if against else f"there are only {count} photographs", good
+    return "they are the same in all photographs" if _same([picture for _, picture in good]) else "", good
+
+
+def _of_photographs(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray | None]]) -> tuple[bool, str, list[str]]:
+    """Whether these are silhouettes, why, and the names of those that do not fit to the others."""
+    why_not, good = alike(pictures)
+    if why_not:
+        return False, why_not, []
+    masks, overlap = [picture for _, picture in good], hull_overlaps(capture, good)
     fits = overlap >= LEAST_OVERLAP
     if fits.mean() < MIN_AGREEING:
-        return False, f"no object has all of these silhouettes ({fits.sum()} of {len(fits)} fit to their visual hull)", []
+        return False, f"no object has all of these silhouettes: {fits.sum()} of {len(fits)} fit to their visual hull", []
     shares = [float(mask.mean()) for mask in masks]
     why = (
-        f"{len(good)} of {count} photographs keep one object, {min(shares):.0%} to {max(shares):.0%} of the picture,"
+        f"{len(good)} of {len(pictures)} photographs keep one object, {min(shares):.0%} to {max(shares):.0%} of the picture,"
         f" and its visual hull projects onto them (overlap {np.median(overlap):.0%})"
     )
     return True, why, [photo.camera.name for (photo, _), fit in zip(good, fits, strict=True) if not fit]
+
+
+def hull_overlaps(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray]]) -> np.ndarray:
+    """(C,) `overlaps` of silhouettes, (h, w) bool each, with their own visual hull; 0 where that is empty."""
+    cameras, masks = [photo.camera for photo, _ in pictures], [picture for _, picture in pictures]
+    focus, converging = focus_point(capture)
+    ranges = [(photo.near, photo.far) for photo, _ in pictures]
+    hull = scene_bounds.visual_hull(masks, cameras, *scene_bounds.bounds_of_frusta(cameras, ranges, focus, converging, least=0.5))
+    return np.zeros(len(pictures)) if hull is None else overlaps(masks, cameras, *hull)
+
+
+def share_that_fits(capture: Capture, small: SmallPictures) -> float:
+    """How many of the capture's mask files, as silhouettes, fit to their visual hull: a test of the cameras by what they were not found from."""
+    pictures = [(photo, picture >= 128) for photo in scene_bounds.chosen_photos(capture.photos) if (picture := small.mask(photo)) is not None]
+    return float((hull_overlaps(capture, pictures) >= LEAST_OVERLAP).mean()) if len(pictures) >= MIN_IMAGES else 0.0
 
 
 def _same(masks: Sequence[np.ndarray]) -> bool:

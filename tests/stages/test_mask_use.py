@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,10 @@ def ball(index: int, camera: Camera, centre: np.ndarray = BALL, radius: float = 
     along = ((centre - origins) * directions).sum(1)
     distance = np.linalg.norm(origins + along[:, None] * directions - centre, axis=1)
     return np.rint(255 * (distance < radius).reshape(HEIGHT, 4, WIDTH, 4).mean((1, 3))).astype(np.uint8)
+
+
+def off_centre(index: int, camera: Camera) -> np.ndarray:
+    return ball(index, camera, np.array([0.7, 0.4, 0.3]), 0.5)
 
 
 def but_for_a_thing(index: int, camera: Camera) -> np.ndarray:
@@ -261,19 +266,55 @@ def test_soft_edges_reach_training(tmp_path: Path) -> None:
     assert {0, 255} <= set(levels.tolist())
 
 
-def test_silhouettes_for_photographs_without_cameras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = captures.cameras()
-    captures.write_pictures(tmp_path / "source", [camera.name for camera in made])
-    for index, camera in enumerate(made):
-        captures.write_picture(tmp_path / "source/masks" / camera.name, ball(index, camera))
+def photographs_with(folder: Path, draw: Drawing, *, turned: bool) -> Path:
+    """Photographs with masks; `turned`: the object turned, before a background that stood still."""
+    for index, camera in enumerate(captures.cameras()):
+        captures.write_picture(folder / camera.name, captures.picture(0 if turned else index))
+        captures.write_picture(folder / "masks" / camera.name, draw(index, camera))
+    return folder
 
-    def find_cameras(folder: Path, names: dict[str, Path], **options: Any) -> Capture:
-        return Capture("photographs", tuple(Photo(camera, folder / camera.name, folder / "masks" / camera.name) for camera in made), None)
 
-    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find_cameras)
-    found, said, _ = run(tmp_path / "source", tmp_path)
-    assert (found.background, found.space) == (WHITE, "box")
-    assert any(text.startswith("masks are silhouettes: 6 of 6 photographs keep one object") for text in said)
+class Found:
+    """In place of structure from motion: true cameras with the surroundings, the object alone, or both; others are mixed up."""
+
+    def __init__(self, *right: str) -> None:
+        self.right, self.asked = right, list[str]()
+
+    def __call__(self, folder: Path, names: dict[str, Path], *, masks: dict[str, Path], work: Path, **options: Any) -> Capture:
+        self.asked.append("object" if masks else "surroundings")
+        made = captures.cameras()
+        if self.asked[-1] not in self.right:
+            poses_of_others = [camera.world_from_camera for camera in (*made[3:], *made[:3])]
+            heights = [np.diag([1.0, -1.0, -1.0, 1.0]) if index % 2 else np.eye(4) for index in range(len(made))]
+            made = [replace(camera, world_from_camera=turn @ pose) for camera, pose, turn in zip(made, poses_of_others, heights, strict=True)]
+        photos = tuple(Photo(camera, folder / camera.name, masks.get(camera.name)) for camera in made)
+        return Capture("photographs", photos, None)
+
+
+@pytest.mark.parametrize(
+    ("draw", "turned", "right", "asked"),
+    [
+        (off_centre, False, ("surroundings",), ["surroundings"]),
+        (off_centre, True, ("object",), ["object"]),
+        (off_centre, False, ("object",), ["surroundings", "object"]),
+        (off_centre, False, ("surroundings", "object"), ["surroundings"]),
+        (but_for_a_thing, False, ("object",), ["object"]),
+    ],
+)
+def test_features_outside_of_silhouettes(
+    draw: Drawing, turned: bool, right: tuple[str, ...], asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They count where the background moves with the object, and not where the silhouettes contradict what they tell, nor for other masks."""
+    find = Found(*right)
+    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find)
+    made, said, _ = run(photographs_with(tmp_path / "source", draw, turned=turned), tmp_path)
+    assert find.asked == asked
+    if draw is off_centre:
+        assert (made.background, made.space) == (WHITE, "box")
+        assert any(text.startswith("masks are silhouettes: 6 of 6 photographs keep one object") for text in said)
+    else:
+        assert made.background is None
+        assert all(view.mask is not None for view in made.views)
 
 
 def test_the_old_setting_is_answered_and_read() -> None:
