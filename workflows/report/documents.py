@@ -24,6 +24,13 @@ class Quality(msgspec.Struct):
 
     psnr: float | None = None
     ssim: float | None = None
+    psnr_colour_fitted: float | None = None
+
+
+class NetworkQuality(Quality):
+    """Those of the network; `floaters` is its own share of opacity before its surfaces."""
+
+    floaters: float | None = None
 
 
 class ViewQuality(msgspec.Struct):
@@ -32,14 +39,31 @@ class ViewQuality(msgspec.Struct):
     name: str = ""
     network: Quality | None = None
     asset: Quality | None = None
+    gap: Quality | None = None
+    holes: float | None = None
+    floaters: float | None = None
+
+
+class Strip(msgspec.Struct):
+    """A picture of photograph, network and asset: of which view, and the figures of what it shows."""
+
+    which: str = ""
+    view: str = ""
+    network: Quality | None = None
+    asset: Quality | None = None
 
 
 class Metrics(msgspec.Struct):
-    """metrics.json, as far as it is shown."""
+    """metrics.json, as far as it is shown; see `stages.evaluation.summary`."""
 
     split: str = "test"
-    network: Quality | None = None
+    network: NetworkQuality | None = None
     asset: Quality | None = None
+    asset_with_network_background: Quality | None = None
+    gap: Quality | None = None
+    holes: float | None = None
+    floaters: float | None = None
+    strips: list[Strip] = []
     views: list[ViewQuality] = []
 
 

@@ -23,7 +23,7 @@ from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents
 from workflows.report.documents import Damaged, Metrics, PosesReport, Quality
-from workflows.report.summary import quality_in_words, split_of
+from workflows.report.summary import against_network, findings_of, quality_in_words, split_of
 
 if TYPE_CHECKING:
     from pipeline.decide import Decision
@@ -41,6 +41,7 @@ DOWNLOADS = (
     (MESH.ply, "mesh, the capture's frame"),
     (POINTS.ply, "point cloud"),
     (POSES.scene, "cameras and splits"),
+    (EVALUATE.captured_path, "the asset along the captured cameras, H.264"),
     (EVALUATE.metrics, "all figures"),
 )
 TEMPLATE = "report.html.j2"
@@ -103,6 +104,10 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         source=run.source,
         preset=run.preset,
         quality=quality_in_words(found),
+        against=against_network(found),
+        findings=findings_of(found),
+        means=_means(found),
+        strips=_strips(found),
         split=split_of(found),
         poses=POSES,
         train=TRAIN,
@@ -173,14 +178,48 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
     return {"text": text, "rejected": [(each.name, each.reason) for each in report.rejected or []], "warnings": report.warnings or []}
 
 
+def _figures(quality: Quality | None, sign: str = "") -> tuple[str, str]:
+    """PSNR and SSIM as text."""
+    psnr, ssim = (None, None) if quality is None else (quality.psnr, quality.ssim)
+    return "" if psnr is None else f"{psnr:{sign}.2f}", "" if ssim is None else f"{ssim:{sign}.3f}"
+
+
+def _share(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.2f}"
+
+
 def _views(found: Metrics | None) -> list[tuple[str, ...]]:
     """A row of figures for each view that was measured."""
+    views = found.views if found is not None else []
+    return [
+        (view.name, *_figures(view.network), *_figures(view.asset), _figures(view.gap, "+")[0], _share(view.holes), _share(view.floaters)) for view in views
+    ]
 
-    def figures(quality: Quality | None) -> tuple[str, str]:
-        psnr, ssim = (None, None) if quality is None else (quality.psnr, quality.ssim)
-        return "" if psnr is None else f"{psnr:.2f}", "" if ssim is None else f"{ssim:.3f}"
 
-    return [(view.name, *figures(view.network), *figures(view.asset)) for view in (found.views if found is not None else [])]
+def _means(found: Metrics | None) -> list[tuple[str, ...]]:
+    """A row of means for each of what was measured: PSNR, SSIM, PSNR with fitted colours."""
+    if found is None:
+        return []
+    rows = (("network", found.network, ""), ("asset", found.asset, ""), ("asset minus network, on the same pixels", found.gap, "+"),
+            ("asset's innermost box before the network's surroundings", found.asset_with_network_background, ""))  # fmt: skip
+    return [
+        (name, *_figures(quality, sign), "" if quality.psnr_colour_fitted is None else f"{quality.psnr_colour_fitted:{sign}.2f}")
+        for name, quality, sign in rows if quality is not None and quality.psnr is not None
+    ]  # fmt: skip
+
+
+def _strips(found: Metrics | None) -> list[tuple[Path, str]]:
+    """Each strip with its caption; those that metrics.json does not name have none."""
+    named = {strip.which: strip for strip in (found.strips if found is not None else [])}
+    entries = []
+    for which, path in (("worst", EVALUATE.strip_worst), ("median", EVALUATE.strip_median), ("best", EVALUATE.strip_best)):
+        strip, caption = named.get(which), f"The {which} view"
+        if strip is not None:
+            network, asset = (", ".join(f"{value} {unit}" for value, unit in zip(_figures(q), ("dB", "SSIM"), strict=True) if value) for q in
+                              (strip.network, strip.asset))  # fmt: skip
+            caption += f", {strip.view}: photograph | network {network} | asset {asset}"
+        entries.append((path, caption))
+    return entries
 
 
 def _facts(folder: Path, name: Path, damaged: list[str]) -> dict[str, Any]:

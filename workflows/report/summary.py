@@ -22,13 +22,20 @@ ARTIFACTS = {
     "field": TrainOutputs.of_run(RUN).field,
     "asset": BakeOutputs.of_run(RUN).asset,
     "metrics": EvaluateOutputs.of_run(RUN).metrics,
+    "captured_path": EvaluateOutputs.of_run(RUN).captured_path,
+    "strip_worst": EvaluateOutputs.of_run(RUN).strip_worst,
+    "strip_median": EvaluateOutputs.of_run(RUN).strip_median,
+    "strip_best": EvaluateOutputs.of_run(RUN).strip_best,
     "turntable": TurntableOutputs.of_run(RUN).video,
     "mesh_glb": MeshOutputs.of_run(RUN).glb,
     "mesh_ply": MeshOutputs.of_run(RUN).ply,
     "points": PointsOutputs.of_run(RUN).ply,
     "report": RUN / "report.html",
 }
-TITLES = {"asset": "asset", "turntable": "turntable", "mesh_glb": "mesh", "mesh_ply": "mesh", "points": "points", "report": "report"}
+TITLES = {
+    "asset": "asset", "captured_path": "video", "strip_worst": "strip", "turntable": "turntable", "mesh_glb": "mesh", "mesh_ply": "mesh", "points": "points",
+    "report": "report",
+}  # fmt: skip
 
 
 def artifacts(run: Path) -> dict[str, str]:
@@ -72,10 +79,11 @@ def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
         if name in TITLES:
             shown = os.path.relpath(path) if not os.path.relpath(path).startswith("..") else path
             lines.append(f"  {TITLES[name]:<10} {shown}  ({size(os.stat(path).st_size)})")
-    found = metrics(run)
-    if (quality := quality_in_words(None if found is None else msgspec.convert(found, Metrics))) is not None:
+    document = metrics(run)
+    found = None if document is None else msgspec.convert(document, Metrics)
+    if (quality := quality_in_words(found)) is not None:
         lines.append(f"  {'quality':<10} {quality}")
-    return lines
+    return lines + [f"  {'':<10} {text}" for text in (against_network(found), *findings_of(found)) if text]
 
 
 def quality_in_words(found: Metrics | None) -> str | None:
@@ -88,6 +96,27 @@ def quality_in_words(found: Metrics | None) -> str | None:
             parts.append(f"{name} {part.psnr:.2f} dB PSNR, {part.ssim:.3f} SSIM")
     count = len(found.views)
     return "; ".join(parts) + (f" (on {count} {split_of(found)} view{'s' if count != 1 else ''})" if count else "") if parts else None
+
+
+def against_network(found: Metrics | None) -> str | None:
+    """`gap -0.19 dB, -0.012 SSIM; holes 0.02 %; floaters 0.31 %`: the asset against the network, as far as it was measured."""
+    if found is None:
+        return None
+    parts = []
+    if found.gap is not None and found.gap.psnr is not None:
+        parts.append(f"gap {found.gap.psnr:+.2f} dB" + ("" if found.gap.ssim is None else f", {found.gap.ssim:+.3f} SSIM"))
+    parts += [f"{name} {share:.2%}".replace("%", " %") for name, share in (("holes", found.holes), ("floaters", found.floaters)) if share is not None]
+    return "; ".join(parts) or None
+
+
+def findings_of(found: Metrics | None) -> list[str]:
+    """What is poor, what it means and what to do about it."""
+    from stages.evaluation.findings import findings
+
+    if found is None:
+        return []
+    gap = None if found.gap is None else found.gap.psnr
+    return findings(gap, found.holes, found.floaters, None if found.network is None else found.network.floaters)
 
 
 def split_of(found: Metrics | None) -> str:

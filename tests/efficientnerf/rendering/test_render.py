@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -206,3 +207,48 @@ def test_a_fields_picture_does_not_depend_on_how_it_is_cut() -> None:
     np.testing.assert_allclose(cut.colour, whole.colour, atol=1e-6)
     np.testing.assert_allclose(cut.opacity, whole.opacity, atol=1e-6)
     assert calls[-1] == (63, 63)
+
+
+def dense(*, contracted: bool) -> FieldRenderer:
+    m = untrained(contracted=contracted)
+    m.fine.weights[-1].data.mul_(30)
+    m.fine.table.data.mul_(3e3)
+    return FieldRenderer(m, 0.5, 30.0)
+
+
+def test_a_fields_picture_is_split_by_any_box() -> None:
+    field, camera = dense(contracted=True), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
+    usual = field.render(camera)
+    same = field.render(camera, box=np.asarray(field.model.space.bounds))
+    for name in ("colour", "before", "behind", "inside_opacity", "within"):
+        np.testing.assert_allclose(getattr(same, name), getattr(usual, name), atol=1e-5)
+    everything = field.render(camera, box=np.array([[-500.0] * 3, [500.0] * 3]))
+    assert np.array_equal(everything.colour, usual.colour)
+    assert not everything.before.any()
+    np.testing.assert_allclose(everything.inside_opacity, usual.opacity, atol=1e-5)
+    nothing = field.render(camera, box=np.array([[50.0] * 3, [51.0] * 3]))  # not in view
+    assert not nothing.inside_opacity.any()
+    assert not nothing.within.any()
+    np.testing.assert_allclose(nothing.behind, usual.colour, atol=1e-5)
+
+
+def test_opacity_within_grows_with_the_box() -> None:
+    field, camera = dense(contracted=True), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
+    bounds = np.asarray(field.model.space.bounds)
+    within = [field.render(camera, box=bounds, reach=bounds * scale).within for scale in (1.0, 2.0, 4.0, 400.0)]
+    for smaller, larger in itertools.pairwise(within):
+        assert (larger - smaller > -1e-6).all()
+    assert within[0].mean() < within[-1].mean()
+    np.testing.assert_allclose(within[-1], field.render(camera).opacity, atol=1e-5)
+
+
+@pytest.mark.parametrize("contracted", [False, True])
+def test_opacity_nearer_than_the_depth_is_half_at_most(contracted: bool) -> None:
+    field, camera = dense(contracted=contracted), Camera("view", 9, 7, "SIMPLE_PINHOLE", (12.0, 4.5, 3.5), pose(0.3, 0.2, 4.0))
+    assert field.render(camera).nearer is None
+    at = field.render(camera, limits=lambda origins, directions, distance: distance)
+    assert at.nearer is not None
+    assert (at.nearer[at.opacity >= 0.5] < 0.5).all()
+    none, everything = (field.render(camera, limits=lambda o, d, distance, limit=limit: np.full(len(distance), limit)) for limit in (0.0, np.inf))
+    assert not none.nearer.any()  # type: ignore[union-attr]
+    np.testing.assert_allclose(everything.nearer, everything.opacity, atol=1e-5)

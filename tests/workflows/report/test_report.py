@@ -15,6 +15,7 @@ import pytest
 from pipeline.run import Run
 from tests.workflows.command import Enerf, Result
 from workflows.report.page import page
+from workflows.report.summary import in_words
 
 
 class Links(HTMLParser):
@@ -121,6 +122,44 @@ def test_a_damaged_run_gets_a_page_too(tmp_path: Path) -> None:
     assert "not evaluated yet" in page(run, [])
 
 
+POOR = {
+    "network": {"psnr": 29.84, "ssim": 0.91, "psnr_colour_fitted": 30.5, "floaters": 0.01},
+    "asset": {"psnr": 27.95, "ssim": 0.87, "psnr_colour_fitted": 28.25},
+    "asset_with_network_background": {"psnr": 28.75, "ssim": 0.88},
+    "gap": {"psnr": -1.89, "ssim": -0.04, "psnr_colour_fitted": -2.25},
+    "holes": 0.034,
+    "floaters": 0.051,
+    "strips": [{"which": "worst", "view": "<b>.jpg", "network": {"psnr": 25.0, "ssim": 0.8}, "asset": {"psnr": 21.0, "ssim": 0.7}}],
+    "views": [{"name": "a", "network": None, "asset": {"psnr": 27.95}, "gap": None, "holes": None, "floaters": None}],
+}
+
+
+def test_the_page_shows_the_asset_against_its_network_and_what_is_poor(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run", POOR)
+    for name in ("strip_worst.png", "strip_best.png", "captured_path.mp4"):
+        (run.path / "evaluate" / name).write_bytes(b"x")
+    text = page(run, [])
+    found = links(text)
+    assert {"evaluate/strip_worst.png", "evaluate/strip_best.png", "evaluate/captured_path.mp4"} <= set(found)
+    assert "evaluate/strip_median.png" not in found
+    for shown in ("gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %", "28.75", "-2.25", "&lt;b&gt;.jpg: photograph | network 25.00 dB, 0.800 SSIM |",
+                  "1.89 dB behind its network", "The asset has holes: 3.4 %", "The asset has floaters: 5.1 %"):  # fmt: skip
+        assert shown in text, shown
+
+
+def test_the_closing_summary_says_so_too(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "run", POOR)
+    (run.path / "evaluate/strip_worst.png").write_bytes(b"x")
+    lines = in_words(run.path, [])
+    assert any("network 29.84 dB PSNR, 0.910 SSIM; asset 27.95 dB PSNR" in line for line in lines)
+    assert any("gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %" in line for line in lines)
+    assert any("bake.max_mib" in line for line in lines)
+    assert any("strip_worst.png" in line for line in lines)
+    good = a_run(tmp_path / "good", POOR | {"gap": {"psnr": -0.1, "ssim": None}, "holes": 0.0, "floaters": 0.012})
+    lines = in_words(good.path, [])
+    assert lines[-1].strip() == "gap -0.10 dB; holes 0.00 %; floaters 1.20 %"
+
+
 def write(run: Run, name: str, text: str) -> None:
     (run.path / name).parent.mkdir(exist_ok=True)
     (run.path / name).write_text(text, encoding="utf-8")
@@ -131,7 +170,7 @@ ODD = {
         '{"network": {"psnr": 1e999}}',
         '{"network": {"psnr": ' + "9" * 400 + ', "ssim": 1}}', '{"network": {"psnr": ' + "9" * 5000 + "}}",
         '{"views": 7}', '{"views": [3]}', '{"views": [{"name": ["x"]}]}', '{"network": []}', '{"split": {}}', "[1]", "3", "[" * 100_000,
-        '{"network": {"psnr": NaN}}',
+        '{"network": {"psnr": NaN}}', '{"gap": 3}', '{"holes": "many"}', '{"holes": 1e999}', '{"strips": {"which": "worst"}}', '{"strips": [{"which": 1}]}',
     ],
     "poses/report.json": ['{"registered": 5}', '{"rejected": {"a": 1}}', '{"rejected": [{"name": 3}]}', '{"warnings": 4}', '"\\ud800"',
         '{"\\ud800": 1}', '{"reprojection_error": "far"}'],
