@@ -31,7 +31,8 @@ FARTHEST, PATH_FARTHEST = 1.6, 3.0  # distance of a cell from its views over the
 MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
 SUPPORT_TRIES, MAX_SUPPORTS = 400, 3
 MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane holds; of the central rays that end before it, that end behind it: supports hide
-MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.25, 0.012  # of the longest side
+MARGIN, WIDE_MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.1, 0.25, 0.012  # of the longest side
+MIN_MIDDLING = 0.1  # about a third of the way from the middle to the corner, in the mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,7 @@ class Cells:
     distance  (M,) mean distance of the views that agree
     nearest   (M,) least distance from a camera
     central   (M,) weight of the central rays that end there
+    middling  (M,) how near the middle of the pictures it is, from 0 to 1: the mean over the views that agree
     """
 
     side: float
@@ -56,6 +58,7 @@ class Cells:
     distance: np.ndarray
     nearest: np.ndarray
     central: np.ndarray
+    middling: np.ndarray
 
     @property
     def trusted(self) -> np.ndarray:
@@ -100,14 +103,20 @@ def find_foreground(
     centres = np.array([camera.centre for camera in cameras])
     ring = np.linalg.norm(centres[:, :2] - focus[:2], axis=1)
     inside = np.linalg.norm(cells.centres[:, :2] - focus[:2], axis=1) <= max(0.9 * float(np.median(ring)), 0.5 * reach)
-    close = trusted & (cells.distance <= FARTHEST * reach) & (cells.nearest >= 0.1 * reach) & (inside | (not _all_round(centres, focus)))
+    round_it = _all_round(centres, focus)
+    close = trusted & (cells.distance <= FARTHEST * reach) & (cells.nearest >= 0.1 * reach) & (inside | (not round_it))
     observed = close & (share >= OBSERVED)
     if not observed.any():
         return _region_of(cells, trusted, np.zeros(len(trusted), bool), False)
     support, level, hidden = find_support(cells, observed, close, centres, reach)
-    subject = _subject(cells, close & ~support & ~hidden & (share >= REACHED), observed)
+    candidates = close & ~support & ~hidden & (share >= REACHED)
+    if not support.any():  # nothing tells what stands on it from what is beside it, but where the pictures are centred
+        candidates &= cells.middling >= MIN_MIDDLING
+    subject = _subject(cells, candidates, observed)
     if cells.central[subject].sum() < MIN_SHARE * cells.central[close].sum():
         return _region_of(cells, observed, np.zeros(len(trusted), bool), level)
+    if not support.any():
+        return _region_of(cells, subject, support, round_it, WIDE_MARGIN)
     return _region_of(cells, subject, support & close, level)
 
 
@@ -176,9 +185,9 @@ def observed_cells(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, ca
         side *= 1.4
     cell = cell.reshape(-1)
     centres = np.stack([np.bincount(cell, points[kept, axis], len(count)) for axis in range(3)], axis=1) / np.maximum(count, 1)[:, None]
-    central = np.bincount(cell, np.exp(-((pixels[kept] / CENTRAL) ** 2).sum(axis=1)), len(count))
+    central = np.bincount(cell, _weight_in_middle(pixels[kept]), len(count))
     agree, against, in_view = (np.zeros(len(count), np.int64) for _ in range(3))
-    total, nearest = np.zeros(len(count)), np.full(len(count), np.inf)
+    total, middling, nearest = np.zeros(len(count)), np.zeros(len(count)), np.full(len(count), np.inf)
     for number, camera in enumerate(cameras):
         mine = np.flatnonzero(views == number)
         place, depth = project(camera, centres)
@@ -197,7 +206,14 @@ def observed_cells(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, ca
         agree[seen] += ends_there
         against[seen] += (beyond > tolerance).all(axis=1)
         total[seen] += np.where(ends_there, distance[seen], 0)
-    return Cells(side, centres, agree, against, in_view, np.where(agree > 0, total / np.maximum(agree, 1), np.inf), nearest, central)
+        middling[seen] += np.where(ends_there, _weight_in_middle(place[seen]), 0)
+    mean = np.maximum(agree, 1)
+    return Cells(side, centres, agree, against, in_view, np.where(agree > 0, total / mean, np.inf), nearest, central, middling / mean)
+
+
+def _weight_in_middle(pixels: np.ndarray) -> np.ndarray:
+    """(N,) from 1 in the middle of a picture to next to nothing at its edge, for pixels (N, 2) from -1 to 1."""
+    return np.asarray(np.exp(-((pixels / CENTRAL) ** 2).sum(axis=1)))
 
 
 def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras: np.ndarray, reach: float) -> tuple[np.ndarray, bool, np.ndarray]:
@@ -272,7 +288,7 @@ def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.n
     return out
 
 
-def _region_of(cells: Cells, subject: np.ndarray, support: np.ndarray, level: bool) -> Region:
+def _region_of(cells: Cells, subject: np.ndarray, support: np.ndarray, level: bool, margin_share: float = MARGIN) -> Region:
     """A region round the subject's cells and the support beside them."""
     found = cells.centres[subject]
     low, high = found.min(axis=0) - cells.side, found.max(axis=0) + cells.side
@@ -280,7 +296,7 @@ def _region_of(cells: Cells, subject: np.ndarray, support: np.ndarray, level: bo
     room = SUPPORT_MARGIN * size
     beside = cells.centres[support]
     beside = beside[((beside >= low - room) & (beside <= high + room)).all(axis=1)]
-    margin = MARGIN * size + cells.side
+    margin = margin_share * size + cells.side
     if level:  # the floor is clipped to a disc, or to a rounded rectangle about a long subject
         centre, half = (low + high)[:2] / 2, (high - low)[:2] / 2
         round_one = float(np.linalg.norm(found[:, :2] - centre, axis=1).max()) + cells.side
