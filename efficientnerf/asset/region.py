@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.asset.cascades import brick_ranges, cascades_of, subset
+from efficientnerf.asset.cascades import brick_ranges, cascades_of, subset, voxel_sides
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
@@ -27,7 +27,7 @@ class Region:
 
     bounds         (2, 3) least and greatest corner
     corner_radius  of the four vertical edges: 0 is a box, half of the shorter side a disc in plan
-    fade           width of the band inside of its sides in which density fades to nothing
+    fade           width of the band inside of its sides in which opacity fades to nothing
     bricks         (B,) bool, the bricks that belong to it; None: all
     """
 
@@ -48,7 +48,7 @@ def inside_distance(region: Region, points: np.ndarray) -> np.ndarray:
 
 
 def inside_share(region: Region, points: np.ndarray) -> np.ndarray:
-    """(N,) how much of the density at points (N, 3) of the tree's frame belongs to the region's box: 1 inside of the band, 0 outside of its sides."""
+    """(N,) how much of the opacity of voxels at points (N, 3) of the tree's frame belongs to the region's box: 1 inside of the band, 0 outside of its sides."""
     distance = inside_distance(region, points)
     if region.fade <= 0:
         return (distance > 0).astype(np.float64)
@@ -72,7 +72,7 @@ def voxel_centres(tree: NerfTree) -> np.ndarray:
 
 
 def foreground(tree: NerfTree) -> NerfTree:
-    """The tree with what lies in its region alone: no other voxels, densities faded in the region's band, no environment, no outer cascades that would be
+    """The tree with what lies in its region alone: no other voxels, opacity faded in the region's band, no environment, no outer cascades that would be
     empty. The result has no region: all of it is foreground. A tree without a region is returned as it is."""
     region = tree.region
     if region is None:
@@ -103,9 +103,12 @@ def cropped(tree: NerfTree, corners: np.ndarray, world_from_capture: Similarity)
 
 
 def _restricted(tree: NerfTree, share: np.ndarray) -> NerfTree:
-    """The tree with its densities times `share` (N,); voxels without a share are dropped."""
+    """The tree with the opacity of its voxels, along a side, times `share` (N,); voxels without a share are dropped, those with all of it stay as they are."""
     kept = subset(replace(tree, region=None, environment=None), share > 0)
     occupied = [bool((cascade.brick_index >= 0).any()) for cascade in kept.outer]
     outer = kept.outer[: max((n + 1 for n, any_there in enumerate(occupied) if any_there), default=0)]
-    density = (kept.density_values * share[share > 0]).astype(np.float32)
+    part = share[share > 0]
+    side = voxel_sides(kept)[part < 1].astype(np.float64)
+    density = kept.density_values.copy()
+    density[part < 1] = -np.log1p(part[part < 1] * np.expm1(-side * density[part < 1])) / side
     return replace(kept, outer=outer, density_values=density)

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 PATHS = ("auto", "orbit", "sway", "captured")
 MAX_FITTED_FOV = 50.0  # degrees; with a larger one the camera would be too near, and moves back instead
-MAX_SURROUNDING_FOV = 75.0
+MAX_REGION_FOV, MAX_SURROUNDING_FOV = 60.0, 75.0  # where the subject is a region, without its surroundings and with them
 SWAY = 10.0  # degrees, where nothing says how far the captured cameras go
-COVERED = 0.85  # of the captured cameras' range, that a sway uses
+COVERED = 0.8  # of the captured cameras' range, that a sway uses
 FIT_MARGIN = 1.1  # of the field of view
 OUTLIER_FRACTION = 0.005  # of the occupied cells, that may lie outside of the image: floaters at the border of the box
 MAX_FITTED_POINTS = 4000
@@ -219,7 +219,7 @@ def turntable_cameras(
     orbit, sway, rise = _framed_orbit(tree, points, path, sway)
     distance = orbit.radius if radius is None else radius * similarity_of(tree).scale
     orbit = replace(orbit, radius=distance, elevation=orbit.elevation if elevation is None else elevation)
-    widest = math.tan(math.radians((MAX_SURROUNDING_FOV if surroundings else MAX_FITTED_FOV) / 2))
+    widest = math.tan(math.radians((MAX_SURROUNDING_FOV if surroundings else MAX_FITTED_FOV if tree.region is None else MAX_REGION_FOV) / 2))
 
     def needed(poses: list[np.ndarray]) -> float:
         return FIT_MARGIN * fitted_field_of_view(poses, points, width / height)[0]

@@ -45,7 +45,7 @@ class Coverage:
     elevation  median angle above the horizon
     heights    half of the range of elevations, without the tenth at each end
     heading    azimuth of the middle of the cameras, anticlockwise from +x
-    arc        range of azimuths that they cover; 360 where they go round
+    arc        range of azimuths that they cover, without the twentieth at each end; 360 where they go round
     """
 
     distance: float
@@ -103,11 +103,14 @@ def coverage(centres: np.ndarray, target: np.ndarray) -> Coverage:
     widest = int(np.argmax(gaps))
     middle = azimuth[widest] + gaps[widest] / 2 + 180.0
     closed = gaps[widest] <= max(WIDEST_GAP, min(GAP_STEPS * 360.0 / len(centres), 150.0))
+    aside = (azimuth - middle + 180.0) % 360.0 - 180.0
+    first, last = np.quantile(aside, [0.05, 0.95])
+    heading = middle if closed else middle + (first + last) / 2
     low, high = np.quantile(elevation, [0.1, 0.9])
     return Coverage(
         distance=float(np.median(distance)),
         elevation=float(np.median(elevation)),
         heights=float(high - low) / 2,
-        heading=float((middle + 180.0) % 360.0 - 180.0),
-        arc=360.0 if closed else float(360.0 - gaps[widest]),
+        heading=float((heading + 180.0) % 360.0 - 180.0),
+        arc=360.0 if closed else float(last - first),
     )

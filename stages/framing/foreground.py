@@ -31,7 +31,7 @@ FARTHEST, PATH_FARTHEST = 1.6, 3.0  # distance of a cell from its views over the
 MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
 SUPPORT_TRIES, MAX_SUPPORTS = 400, 3
 MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane holds; of the central rays that end before it, that end behind it: supports hide
-MARGIN, WIDE_MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.1, 0.25, 0.012  # of the longest side
+MARGIN, WIDE_MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.1, 0.25, 0.02  # of the longest side
 MIN_MIDDLING = 0.1  # about a third of the way from the middle to the corner, in the mean
 
 

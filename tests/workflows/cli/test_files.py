@@ -207,6 +207,18 @@ def frame(enerf: Enerf, scene: Path, folder: Path, *more: object) -> np.ndarray:
     return np.asarray(Image.open(folder / "frame_0000.png")).astype(int)
 
 
+def test_renders_show_all_with_its_surroundings_or_the_foreground(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    everything = frame(enerf, scene, tmp_path / "all", "--set", "turntable.fov=60")
+    assert everything[0, 0].tolist() == [0, 255, 0]
+    assert everything[18, 24, 0] > 200
+    assert (everything[..., 2] > 200).any(), "the blue ball"
+    on_black = frame(enerf, scene, tmp_path / "black", "--background", "black")
+    assert on_black[0, 0].tolist() == [0, 0, 0], "the background that is asked for takes the surroundings' place"
+    cropped = frame(enerf, scene, tmp_path / "crop", "--crop", 4, 1, 1, 2, -1, -1)
+    assert cropped[18, 24, 2] > 200, "the crop is what is framed"
+    assert (cropped[..., 0] > 200).sum() == (cropped.min(axis=2) > 200).sum(), "nothing red"
+
+
 def test_renders_of_the_foreground_show_nothing_else(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
     subject = frame(enerf, scene, tmp_path / "subject", "--region", "foreground")
     assert subject[0, 0].tolist() == [255, 255, 255]
