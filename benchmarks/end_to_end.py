@@ -106,13 +106,21 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     def cells(row: Mapping[str, Any]) -> list[str]:
         if not row["ok"]:
             return [row["source"], row["error"].replace("|", "/").replace("\n", " "), *[""] * (len(COLUMNS) - 2)]
-        gap, over = row["gap"]["psnr"], row["asset_with_network_background"]
+        gap, over, stages = row["gap"]["psnr"], row["asset_with_network_background"], row["seconds"]
         return [
-            row["source"], f"{row['asset']['views']} of {row['photographs']}", quality(row["network"]), quality(row["asset"]),
-            "" if gap is None else f"{gap:+.2f}", percent(row["holes"]), f"{percent(row['floaters'])} ({percent(row['network']['floaters'])})", "" if over is None else f"{over['psnr']:.2f}",
-            f"{row['total_seconds']:.0f}", ", ".join(f"{row['seconds'][stage] or 0:.0f}" for stage in ("train", "bake", "evaluate")),
-            f"{row['asset_bytes'] / 1e6:.1f}", f"{row['frames_per_second']:.1f}",
-        ]  # fmt: skip
+            row["source"],
+            f"{row['asset']['views']} of {row['photographs']}",
+            quality(row["network"]),
+            quality(row["asset"]),
+            "" if gap is None else f"{gap:+.2f}",
+            percent(row["holes"]),
+            f"{percent(row['floaters'])} ({percent(row['network']['floaters'])})",
+            "" if over is None else f"{over['psnr']:.2f}",
+            f"{row['total_seconds']:.0f}",
+            ", ".join(f"{stages[stage] or 0:.0f}" for stage in ("train", "bake", "evaluate")),
+            f"{row['asset_bytes'] / 1e6:.1f}",
+            f"{row['frames_per_second']:.1f}",
+        ]
 
     lines = [COLUMNS, ["---"] * len(COLUMNS), *(cells(row) for row in rows)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

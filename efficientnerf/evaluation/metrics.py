@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 WINDOW = 11  # pixels a side of SSIM's Gaussian window
-BAND = 256  # rows of an image whose windows are compared at a time; changes memory alone
+BAND = 256  # rows of an image that are compared at a time
 
 
 def mean_squared_error(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -38,10 +38,16 @@ def colour_fitted(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None 
     Arguments as for mean_squared_error, with three channels. Returns (H, W, 3) float64.
     """
     image, truth, mask = _checked(image, truth, mask)
-    used = (slice(None), slice(None)) if mask is None else mask
-    rows = np.concatenate([image, np.ones((*image.shape[:2], 1))], axis=-1)  # (H, W, 4)
-    change = np.linalg.lstsq(rows[used].reshape(-1, 4), truth[used].reshape(-1, 3), rcond=None)[0]
-    return np.clip(rows @ change, 0.0, 1.0)
+    square, mixed = np.zeros((4, 4)), np.zeros((4, 3))
+    for top in range(0, len(image), BAND):
+        band = slice(top, top + BAND)
+        used = np.ones(image[band].shape[:2], bool) if mask is None else mask[band]
+        rows = np.concatenate([image[band][used], np.ones((int(used.sum()), 1))], axis=-1)  # (N, 4)
+        # not by BLAS, whose sums depend on its threads
+        square += np.einsum("ni,nj->ij", rows, rows)
+        mixed += np.einsum("ni,nj->ij", rows, truth[band][used])
+    change = np.linalg.lstsq(square, mixed, rcond=None)[0]
+    return np.clip(np.einsum("hwi,ij->hwj", image, change[:3]) + change[3], 0.0, 1.0)
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:

@@ -48,7 +48,7 @@ def views_needed(tree: NerfTree, cameras: Sequence[Camera], rays: int, field: in
     return Need({
         "a view": most * COMPARED,
         "its rays": rays * FIELD + FIELD_BLOCK,
-        "the asset": tree_bytes(tree),
+        "the asset": tree_bytes(tree) * (2 if tree.outer else 1),  # cascade 0 alone, too
         "the field": 3 * field,
         "libraries": libraries(device),
     })  # fmt: skip
