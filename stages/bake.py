@@ -100,6 +100,7 @@ def run(job: Job) -> None:
     from stages.baking.voxels import choose_voxels, voxel_space, with_min_views
     from stages.io import scene
     from stages.io.field_file import load_renderer
+    from stages.io.refined_cameras import load_scene
     from stages.training.data import pixels_of
 
     settings: BakeSettings = job.settings
@@ -107,7 +108,7 @@ def run(job: Job) -> None:
     m = load_renderer(job.inputs["train"], job.device).model
     if m.settings.field == "nerf":
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
-    s = scene.load(job.inputs["poses"])
+    s = load_scene(job.inputs["poses"], job.inputs["train"])
     space, mib, views = voxel_space(job, m), budget_of(s, given(settings.max_mib)), scene.views_of(s, "train")
     pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, space, mib))
     choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib)

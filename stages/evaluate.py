@@ -30,7 +30,7 @@ from msgspec import Meta
 from efficientnerf.settings import Auto, Off, PositiveInt, given, setting
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
-from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, inputs_of, needs_of
+from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.evaluation.asset import EvaluatedAsset, evaluated
 from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES, evaluate_view
@@ -121,10 +121,10 @@ def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], jo
     tree        the asset's
     load_field  returns a FieldRenderer; called only where one is needed
     """
-    from stages.io.scene import load
+    from stages.io.refined_cameras import load_scene
 
     settings: EvaluateSettings = job.settings
-    scene = load(job.inputs[PosesOutputs.stage])
+    scene = load_scene(job.inputs[PosesOutputs.stage], job.inputs[TrainOutputs.stage])
     views, split = evaluation_views(scene)
     if split == "train":
         job.warn("the scene has no test or validation views: the metrics are of views that training saw")

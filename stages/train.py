@@ -1,6 +1,7 @@
 """The train stage: a scene in, a trained field out.
 
 field.safetensors  both fields, the density voxels, what they mean; the schedule; each photograph's gains where exposure was learned
+cameras.json       the training cameras, where they were refined
 report.json        steps and seconds
 log.jsonl          a line every few steps
 curve.png          PSNR over steps
@@ -25,7 +26,7 @@ from stages.compiling import compiling_kernels
 from stages.cores import use_all_cores
 from stages.training.budget import UNKNOWN, Budget
 from stages.training.checkpoints import Checkpoints
-from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, sparse_depth_of
+from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, sparse_depth_of, with_camera_refinement
 from stages.training.log import TrainLog
 from stages.training.previews import Previews
 
@@ -50,7 +51,7 @@ def run(job: Job) -> None:
     folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
     s = scene.load(folder)
     views = scene.views_of(s, "train")
-    settings, space = with_auto_sizes(job.settings, s, count_pixels(views)), field_file.space_of(s)
+    settings, space = with_camera_refinement(with_auto_sizes(job.settings, s, count_pixels(views)), s), field_file.space_of(s)
     rows = rows_for_training(job, folder, views, settings, space)
     job.progress(0, settings.iterations, "reading images")
     pixels = pixels_of(folder, views, rows)
@@ -58,7 +59,7 @@ def run(job: Job) -> None:
     m = model(space, settings, s.background, job.device, (near, far))
     mask_uncovered_cells(m, views, job)
 
-    t = loop.trainer(m, len(views))
+    t = loop.trainer(m, len(views), cameras=[view.camera for view in views])
     checkpoints = Checkpoints(job)
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
@@ -92,6 +93,7 @@ def run(job: Job) -> None:
     log.flush()
     job.record("schedule", t.schedule.state())
     field_file.save_model(m, near, far, outputs.field, gains_of(t, views), t.schedule)
+    write_cameras(outputs.cameras, t, views)
     write_report(outputs.report, job, t, log.seconds, previews.psnr)
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
@@ -116,6 +118,14 @@ def gains_of(t: Trainer, views: tuple[View, ...]) -> dict[str, np.ndarray] | Non
     return dict(zip((view.image for view in views), np.exp(log_gains(t.exposure.detach()).cpu().numpy()), strict=True))
 
 
+def write_cameras(path: Path, t: Trainer, views: tuple[View, ...]) -> None:
+    """The training cameras, where they were refined."""
+    if t.cameras is not None:
+        from stages.io import refined_cameras
+
+        refined_cameras.write(views, t.cameras.cameras, path)
+
+
 def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview_psnr: float | None) -> None:
     """What was reached; the seconds differ from run to run."""
     settings = t.model.settings
@@ -125,11 +135,21 @@ def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview_psnr:
         "time_budget": job.settings.time_budget,
         "seconds": round(seconds, 1),
         "preview_psnr": preview_psnr,
+        "cameras": camera_changes(t),
         "occupied": t.model.voxels.occupied,
         "log2_hashmap_size": settings.log2_hashmap_size,
         "finest_resolution": settings.finest_resolution,
     }
     path.write_text(json.dumps(report, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def camera_changes(t: Trainer) -> dict[str, float] | None:
+    """How far the cameras were refined: mean and largest change, as each moves the middle of its image, and the focal length's factor."""
+    if t.cameras is None:
+        return None
+    c = t.cameras
+    pixels = np.array([camera.intrinsics["fx"] for camera in c.given])[:, None] * np.abs(c.pose[:, :2] - c.pose[:, [4, 3]] * [1, -1])
+    return {"mean_pixels": round(float(pixels.mean()), 4), "max_pixels": round(float(pixels.max()), 4), "focal_factor": round(float(np.exp(c.focal[0])), 6)}
 
 
 STAGE = Stage(

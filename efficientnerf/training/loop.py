@@ -13,7 +13,7 @@ R rays, C views.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,9 +23,12 @@ from torch import Tensor
 from efficientnerf import model as models
 from efficientnerf.backends import dispatch
 from efficientnerf.backends.transfer import to_device
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.model import Model, RayOutputs, render_rays
 from efficientnerf.sampling.samples import complete_rays
+from efficientnerf.training.alignment import is_due, refine_cameras
 from efficientnerf.training.batch import ray_batch, ray_count
+from efficientnerf.training.camera_refinement import CameraCorrections
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.exposure import exposure_loss
 from efficientnerf.training.losses import colour_losses, distortion_loss, scale_gradients_by_distance
@@ -72,6 +75,7 @@ class Trainer:
     schedule         the one that the next step follows; another may take its place between steps
     samples_per_ray  the running average that sets the number of rays
     exposure         (C, 3) learned logarithms of gains (`efficientnerf.training.exposure`), or None
+    cameras          corrections of the training cameras (`efficientnerf.training.camera_refinement`), or None
     """
 
     model: Model
@@ -80,13 +84,15 @@ class Trainer:
     step: int = 0
     samples_per_ray: float = 0.0
     exposure: torch.nn.Parameter | None = None
+    cameras: CameraCorrections | None = None
 
 
-def trainer(m: Model, views: int = 0, schedule: Schedule | None = None) -> Trainer:
+def trainer(m: Model, views: int = 0, schedule: Schedule | None = None, cameras: Sequence[Camera] = ()) -> Trainer:
     """A trainer at its beginning.
 
     views     number of training images, needed where their exposure is learned
     schedule  None: that of the model's settings
+    cameras   of the training images, needed where they are refined
     """
     schedule = schedule or schedule_of(m.settings)
     groups = parameter_groups(m)
@@ -95,7 +101,8 @@ def trainer(m: Model, views: int = 0, schedule: Schedule | None = None) -> Train
         groups.append(ParameterGroup({"exposure": exposure}))
     # Until it is known better, every interval is sampled, and as many pivots as there may be.
     samples = float(m.max_intervals + m.settings.max_pivots * schedule.samples_per_pivot_at(0))
-    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure)
+    corrections = CameraCorrections.none(cameras) if m.settings.camera_refinement == "on" and cameras else None
+    return Trainer(m, Adam(groups, m.settings.adam_beta2, m.settings.adam_epsilon), schedule, 0, samples, exposure, corrections)
 
 
 def state_of(t: Trainer) -> dict[str, Tensor]:
@@ -103,7 +110,8 @@ def state_of(t: Trainer) -> dict[str, Tensor]:
     moments = {f"adam.{k}.{name}": pair[k] for name, pair in t.adam.moments.items() for k in (0, 1)}
     progress = torch.tensor([float(t.step), t.samples_per_ray], dtype=torch.float64)
     exposure = {} if t.exposure is None else {"exposure": t.exposure.detach()}
-    return models.state_of(t.model) | moments | exposure | {"progress": progress}
+    cameras = {} if t.cameras is None else {f"cameras.{name}": torch.from_numpy(values) for name, values in t.cameras.state.items()}
+    return models.state_of(t.model) | moments | exposure | cameras | {"progress": progress}
 
 
 def restore(t: Trainer, state: dict[str, Tensor]) -> None:
@@ -112,6 +120,9 @@ def restore(t: Trainer, state: dict[str, Tensor]) -> None:
     models.restore(t.model, state)
     if t.exposure is not None:
         t.exposure.data.copy_(state["exposure"])
+    if t.cameras is not None:
+        for name, values in t.cameras.state.items():
+            values[...] = state[f"cameras.{name}"].numpy()
     for name, pair in t.adam.moments.items():
         for k in (0, 1):
             pair[k].copy_(state[f"adam.{k}.{name}"])
@@ -145,6 +156,8 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
     if readback is None and dispatch.on_device(m.voxels.values):
         readback = AsyncReadback()
     source = DevicePixels(pixels, m.device) if m.device.type == "cuda" else pixels
+    if t.cameras is not None and t.step:
+        source.set_cameras(t.cameras.cameras)
     samples_per_pivot = 0
     while t.step < t.schedule.iterations:
         number = t.step + 1
@@ -177,6 +190,8 @@ def train(t: Trainer, pixels: Pixels, sparse_depth: SparseDepthRays | None = Non
         loss.backward()
         t.adam.step(number, t.schedule.learning_rate_at(number))
         update_occupancy(m, outputs, number, rng, padded=capacity is not None, may_wait=readback is None)
+        if t.cameras is not None and is_due(number, fraction):
+            refine_cameras(m, pixels, source, t.cameras, rng, None if t.exposure is None else t.exposure.detach())
 
         t.step = number
         yield _progress(t, count, fine_loss, outputs, readback)

@@ -6,7 +6,7 @@ R rays, C views, P pixels of all views.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -65,6 +65,10 @@ class Pixels:
                 part = np.concatenate([part, np.full((len(part), channels - part.shape[1]), 255, np.uint8)], axis=1)
             self.images[at : at + len(part)] = part
         self.usable = self._usable(masks)
+        self.set_cameras(cameras)
+
+    def set_cameras(self, cameras: Sequence[Camera]) -> None:
+        """Make the rays those of these cameras, of the same sizes."""
         self.rotation = np.stack([camera.world_from_camera[:3, :3] for camera in cameras]).astype(np.float32)
         self.centre = np.stack([camera.centre for camera in cameras]).astype(np.float32)
         self._build_lookup(cameras)
@@ -85,7 +89,7 @@ class Pixels:
             raise ValueError("the masks leave no pixel of the training images. Check them: white (255) is what is used.")
         return bits
 
-    def _build_lookup(self, cameras: list[Camera]) -> None:
+    def _build_lookup(self, cameras: Sequence[Camera]) -> None:
         """The tables of directions, and for each view where its own begins and how many knots a row has."""
         lenses: dict[tuple, list[int]] = {}
         for n, camera in enumerate(cameras):

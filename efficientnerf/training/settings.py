@@ -92,6 +92,9 @@ class TrainSettings:
     exposure: Literal["off", "gain"] = setting(
         "off", "What is learned of the exposure of each photograph in unbounded scenes: nothing (off), or a gain for each colour channel (gain)."
     )
+    camera_refinement: Literal["auto", "off", "on"] = setting(
+        "auto", "Whether poses and the focal length of the training cameras are corrected in training (on), or left alone (off); auto: off.", advanced=True,
+    )
     initial_density: Annotated[float, Meta(ge=1e-6, le=1e3)] = setting(
         0.1, "Density that the hash field begins with, per unit of the training frame.", advanced=True
     )

@@ -133,8 +133,8 @@ def save(scene: Scene, folder: Path) -> None:
             "split": view.split,
             "near": view.near,
             "far": view.far,
-            "camera": _camera_to_json(view.camera),
-            "source_camera": _camera_to_json(view.source_camera),
+            "camera": camera_to_json(view.camera),
+            "source_camera": camera_to_json(view.source_camera),
         }
         for view in scene.views
     ]
@@ -356,7 +356,8 @@ def _forward_from(document: SceneDocument) -> ForwardFacing | None:
     return forward
 
 
-def _camera_to_json(camera: Camera) -> dict[str, Any]:
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """A camera as JSON holds it."""
     return {
         "name": camera.name,
         "width": camera.width,
@@ -367,7 +368,8 @@ def _camera_to_json(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _camera_from(data: CameraDocument, where: str) -> Camera:
+def camera_from(data: CameraDocument, where: str) -> Camera:
+    """The camera of a document; ValueError, which begins with `where`, for what no camera can be."""
     pose = np.array(data.world_from_camera, np.float64)
     if not _is_rotation(pose[:3, :3]) or (pose[3] != (0, 0, 0, 1)).any():
         raise ValueError(f"{where}.world_from_camera is not a rigid motion")
@@ -384,7 +386,7 @@ def _view_from(data: ViewDocument, where: str) -> View:
     for relative in (data.image, data.mask):
         if relative is not None and not is_safe_name(relative):
             raise ValueError(f"{where}: {printable(relative, 100)} lies outside of the scene's folder")
-    camera, source_camera = _camera_from(data.camera, f"{where}.camera"), _camera_from(data.source_camera, f"{where}.source_camera")
+    camera, source_camera = camera_from(data.camera, f"{where}.camera"), camera_from(data.source_camera, f"{where}.source_camera")
     return View(data.image, data.mask, data.split, camera, source_camera, data.near, data.far)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
 
 MIN_TRACK = 3  # images that a sparse point must be observed in
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
+
+
+def with_camera_refinement(settings: TrainSettings, s: Scene) -> TrainSettings:
+    """The settings with "on" or "off" for `camera_refinement`."""  # docs/experiments/photographs.md
+    choice = "off" if settings.camera_refinement == "auto" else settings.camera_refinement
+    return replace(settings, camera_refinement=choice)
 
 
 def pixels_of(folder: Path, views: tuple[View, ...], rows: PixelRows | None = None) -> Pixels:

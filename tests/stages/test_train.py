@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.errors import Interrupted
+from pipeline.errors import CorruptArtifact, Interrupted
 from pipeline.stage import Job
 from stages import train
 from stages.artifacts import TrainOutputs
+from stages.io import refined_cameras
 from stages.io import scene as scenes
 from stages.io.capture import SparsePoints
 from stages.io.field_file import load_gains, load_renderer
+from stages.io.refined_cameras import load_scene
 from stages.training.data import sparse_depth_of
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
 QUICK = {"iterations": 13, "checkpoint_every": 4, "sample_batch_size": 1024, "occupancy_warmup_steps": 6, "preview_every": 5}
+
+REFINED = QUICK | {"camera_refinement": "on", "preview_every": "off", "iterations": 230, "sample_batch_size": 4096}
 
 
 @pytest.fixture(scope="module")
@@ -137,8 +142,6 @@ def test_photographs_with_masks(tmp_path: Path) -> None:
 
     from PIL import Image
 
-    from stages.io import scene as scenes
-
     folder = poses(tmp_path / "poses", photographs=True)
     s = scenes.load(folder)
     mask = np.full((16, 16), 255, np.uint8)
@@ -180,6 +183,51 @@ def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) ->
     assert rays(points)[0] == sorted(before)
     only = SparsePoints(np.repeat(cameras[0].centre[None], 1, axis=0), points.rgb[:1], points.error[:1], ((0, 0, 0),))
     assert rays(only) == ([], None)
+
+
+def test_refined_cameras_are_recorded_and_used(tmp_path: Path) -> None:
+    scene = poses(tmp_path / "poses", photographs=True)
+    made = job(tmp_path / "a", settings(**REFINED), poses=scene)
+    train.run(made)
+    before, after = scenes.load(scene), load_scene(scene, made.out)
+    assert len(json.loads((made.out / TrainOutputs.cameras).read_text())["cameras"]) == 7  # of the training views alone
+    capture = after.world_from_capture.inverse()
+    for old, new in zip(before.views, after.views, strict=True):
+        moved = np.abs(new.camera.world_from_camera - old.camera.world_from_camera).max()
+        assert (0 < moved < 0.2) if old.split == "train" else (moved == 0), moved
+        np.testing.assert_allclose(capture.pose(new.camera.world_from_camera), new.source_camera.world_from_camera, atol=1e-9)
+        assert new.source_camera.params[0] / old.source_camera.params[0] == pytest.approx(new.camera.params[0] / old.camera.params[0])
+    report = json.loads((made.out / "report.json").read_text())["cameras"]
+    assert 0 < report["mean_pixels"] <= report["max_pixels"]
+    made = job(tmp_path / "off", settings(**REFINED | {"camera_refinement": "off"}), poses=scene)
+    train.run(made)
+    assert not (made.out / TrainOutputs.cameras).exists()
+    assert [view.camera.params for view in load_scene(scene, made.out).views] == [view.camera.params for view in before.views]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda d: d.update(format=2), "or the format is another one"),
+        (lambda d: d["cameras"].update({"images/none.png": next(iter(d["cameras"].values()))}), "none.png' is no such view"),
+        (lambda d: next(iter(d["cameras"].values())).update(width=9), "is no such view"),
+        (lambda d: next(iter(d["cameras"].values())).update(world_from_camera=np.eye(4)[::-1].tolist()), "not a rigid motion"),
+        (lambda d: next(iter(d["cameras"].values())).update(params=[-1.0, 8.0, 8.0]), "not positive"),
+        (lambda d: next(iter(d["cameras"].values())).update(params=[1.0]), "parameters"),
+        (lambda d: d.pop("cameras"), "missing required field"),
+    ],
+)
+def test_other_cameras_than_training_wrote_are_refused(tmp_path: Path, spoil: Callable[[dict[str, Any]], None], message: str) -> None:
+    scene = poses(tmp_path / "poses", photographs=True)
+    views = scenes.views_of(scenes.load(scene), "train")
+    path = TrainOutputs(tmp_path).cameras
+    refined_cameras.write(views, [view.camera for view in views], path)
+    document = json.loads(path.read_text())
+    load_scene(scene, tmp_path)
+    spoil(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(CorruptArtifact, match=message):
+        load_scene(scene, tmp_path)
 
 
 def test_exposures_are_saved(tmp_path: Path) -> None:

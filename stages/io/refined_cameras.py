@@ -1,0 +1,60 @@
+"""cameras.json of the train stage: the training cameras as training left them, where it refined them. What comes after uses these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from msgspec import Struct
+
+from efficientnerf.geometry.cameras import MODELS, Camera
+from pipeline.errors import CorruptArtifact
+from pipeline.files import write_json
+from pipeline.text import printable
+from stages.artifacts import TrainOutputs
+from stages.io import scene
+from stages.io.json_file import read_json
+from stages.io.scene import Scene, View, camera_from, camera_to_json
+from stages.io.scene_schema import CameraDocument, decoded
+
+FORMAT = 1
+AGAIN = "Train again."
+
+
+class RefinedDocument(Struct):
+    format: int
+    cameras: dict[str, CameraDocument]  # by the image of the view
+
+
+def write(views: Sequence[View], cameras: Sequence[Camera], path: Path) -> None:
+    """The refined cameras of some views, in their order."""
+    write_json(path, {"format": FORMAT, "cameras": {view.image: camera_to_json(camera) for view, camera in zip(views, cameras, strict=True)}})
+
+
+def load_scene(poses: Path, train: Path) -> Scene:
+    """The scene in the artifact of the poses stage, its training cameras as that of the train stage has them. Raises as `scene.load`."""
+    found, path = scene.load(poses), TrainOutputs(train).cameras
+    if not path.is_file():
+        return found
+    document = decoded(read_json(path, AGAIN), RefinedDocument, path, AGAIN)
+    known = {view.image: view for view in found.views}
+    for image, camera in document.cameras.items():
+        view = known.get(image)
+        size = None if view is None else (view.camera.width, view.camera.height, view.camera.model)
+        if document.format != FORMAT or size != (camera.width, camera.height, camera.model):
+            raise CorruptArtifact(f"{printable(path)}: '{printable(image, 100)}' is no such view of this scene, or the format is another one. {AGAIN}")
+    try:
+        cameras = {image: camera_from(camera, image) for image, camera in document.cameras.items()}
+    except ValueError as error:
+        raise CorruptArtifact(f"{printable(path)}: {printable(error, 300)}. {AGAIN}") from error
+    return replace(found, views=tuple(_with_camera(found, view, cameras[view.image]) if view.image in cameras else view for view in found.views))
+
+
+def _with_camera(s: Scene, view: View, camera: Camera) -> View:
+    """The view with another camera, its source camera as well."""
+    factor = camera.intrinsics["fx"] / view.camera.intrinsics["fx"]
+    source = view.source_camera
+    params = tuple(value * factor if name in ("f", "fx", "fy") else value for name, value in zip(MODELS[source.model], source.params, strict=True))
+    pose = s.world_from_capture.inverse().pose(camera.world_from_camera)
+    return replace(view, camera=replace(camera, name=view.camera.name), source_camera=replace(source, params=params, world_from_camera=pose))
