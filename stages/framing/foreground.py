@@ -28,6 +28,7 @@ CENTRAL = 0.4  # of half the image: rays in its middle
 NEAR_QUANTILE = 0.35  # of a view's central distances: its subject, behind which there is always something
 OBSERVED, REACHED = 0.6, 0.2  # views of a cell over those of the cells with most: what is well observed; what the subject may still reach into
 FARTHEST, PATH_FARTHEST = 1.6, 3.0  # distance of a cell from its views over the usual distance
+# docs/experiments/foreground.md
 MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
 SUPPORT_TRIES, MAX_SUPPORTS = 400, 3
 MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane holds; of the central rays that end before it, that end behind it: supports hide

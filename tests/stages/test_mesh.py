@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from efficientnerf.asset import format
+from efficientnerf.asset.region import Region
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Similarity
-from pipeline.errors import Interrupted, StageFailed
+from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
 from stages import mesh as stage
 from stages.mesh import MeshSettings
@@ -117,3 +119,31 @@ def test_progress_never_goes_back(ball: Path) -> None:
     assert [each[:2] for each in told] == sorted(each[:2] for each in told)
     assert {each[2] for each in told} == set(stage.PARTS)
     assert told[-1][0] == told[-1][1]
+
+
+def with_region(ball: Path, folder: Path) -> Path:
+    """The same asset whose foreground is its upper half and a little more."""
+    folder.mkdir(parents=True)
+    region = Region(np.array([[-0.9, -0.9, -0.2], [0.9, 0.9, 0.9]]), 0.9, 0.05)
+    format.save(replace(format.load(ball / "asset.nerftree"), region=region), folder / "asset.nerftree")
+    return folder
+
+
+@pytest.mark.parametrize(("region", "lowest"), [("foreground", -0.2), ("all", -RADIUS)])
+def test_the_foreground_is_meshed_unless_all_is_asked_for(ball: Path, tmp_path: Path, region: str, lowest: float) -> None:
+    bake = with_region(ball, tmp_path / "bake")
+    settings = MeshSettings(max_faces=3000, region=region)  # type: ignore[arg-type]
+    stage.run(Job(settings=settings, inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    corners = WORLD_FROM_CAPTURE.points(np.array(report["bounds"]))
+    assert corners[:, 2].min() == pytest.approx(lowest, abs=0.06)
+    assert corners[:, 2].max() == pytest.approx(RADIUS, abs=0.05)
+    assert report["watertight"]
+
+
+def test_a_region_without_anything_is_said(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "bake").mkdir()
+    far = Region(np.array([[0.9, 0.9, 0.9], [0.95, 0.95, 0.95]]))
+    format.save(replace(format.load(ball / "asset.nerftree"), region=far), tmp_path / "bake" / "asset.nerftree")
+    with pytest.raises(UsageError, match="nothing of the asset lies in its foreground region"):
+        stage.run(Job(settings=MeshSettings(), inputs={"bake": tmp_path / "bake"}, out=tmp_path / "out", work=tmp_path / "work"))

@@ -12,7 +12,7 @@ from pipeline.stage import Job
 from stages import points
 from stages.points import PointsSettings
 
-from .test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball
+from .test_mesh import RADIUS, WORLD_FROM_CAPTURE, bake_ball, with_region
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +44,13 @@ def test_the_same_seed_gives_the_same_points(bake: Path, tmp_path: Path) -> None
 def test_a_threshold_out_of_reach_names_the_remedy(bake: Path, tmp_path: Path) -> None:
     with pytest.raises(StageFailed, match=r"Lower points.density_threshold"):
         points.run(Job(settings=PointsSettings(density_threshold=1e4), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
+
+
+def test_points_lie_on_the_foreground_unless_all_is_asked_for(bake: Path, tmp_path: Path) -> None:
+    half = with_region(bake, tmp_path / "bake")
+    for region, lowest in (("foreground", -0.2), ("all", -RADIUS)):
+        settings = PointsSettings(num_points=2000, region=region)  # type: ignore[arg-type]
+        points.run(Job(settings=settings, inputs={"bake": half}, out=tmp_path / region, work=tmp_path / "work"))
+        body = (tmp_path / region / "points.ply").read_bytes().split(b"end_header\n", 1)[1]
+        rows = np.frombuffer(body, [("position", "<f4", 3), ("normal", "<f4", 3), ("colour", "u1", 3)])
+        assert WORLD_FROM_CAPTURE.points(rows["position"])[:, 2].min() == pytest.approx(lowest, abs=0.06)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -123,3 +124,25 @@ def test_the_stage_reads_an_asset_file(tmp_path: Path) -> None:
     frame = read_png(job.out / "frame_0000.png").astype(int)
     assert (frame[0, 0] == 0).all()
     assert abs(frame[20, 20] - 128).max() <= 3, "coefficients of zero are the middle of the sigmoid"
+
+
+def test_the_foreground_is_shown_unless_all_is_asked_for_and_framed_in_both(tmp_path: Path) -> None:
+    from efficientnerf.asset.region import Region
+    from efficientnerf.asset.tree import tree_from_voxels
+
+    indices = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    tree = tree_from_voxels((4, 4, 4), 0.125, np.full(3, -1.0), indices, np.full(len(indices), 400.0), np.zeros((len(indices), 1, 3)))
+    (tmp_path / "bake").mkdir()
+    region = Region(np.array([[-0.5, -0.5, -1.0], [0.5, 0.5, 0.0]]))
+    format.save(replace(tree, region=region), tmp_path / "bake" / "asset.nerftree")
+    frames = {}
+    for name in ("foreground", "all"):
+        settings = TurntableSettings(frames=2, width=64, height=64, exr="off", region=name)  # type: ignore[arg-type]
+        job = job_in(tmp_path / name, settings=settings, inputs={"bake": tmp_path / "bake"})
+        STAGE.run(job)
+        frames[name] = read_png(job.out / "frame_0000.png").min(axis=2) < 200
+    rows, columns = np.nonzero(frames["foreground"])
+    assert 2 <= rows.min() <= 63 - rows.max() + 4
+    assert min(rows.min(), columns.min(), 63 - rows.max(), 63 - columns.max()) >= 1, "whole"
+    assert np.ptp(rows) > 40
+    assert frames["all"].sum() > 1.15 * frames["foreground"].sum()
