@@ -77,7 +77,7 @@ def run(job: Job) -> None:
         last = done.step == t.schedule.iterations
         goal = t.schedule.iterations if budget is None else budget.goal
         psnr = previews.draw(done.step)
-        shown = log.record(done, goal, psnr, last=last) | ({} if previews.psnr is None else {"preview_psnr": previews.psnr})
+        shown = log.record(done, goal, psnr, last=last) | previews.figures
         job.progress(min(done.step, goal), goal, "training", **shown)
         if psnr is not None:
             log.draw_curve(job.work / TrainOutputs.curve)
@@ -94,7 +94,7 @@ def run(job: Job) -> None:
     job.record("schedule", t.schedule.state())
     field_file.save_model(m, near, far, outputs.field, gains_of(t, views), t.schedule)
     write_cameras(outputs.cameras, t, views)
-    write_report(outputs.report, job, t, log.seconds, previews.psnr)
+    write_report(outputs.report, job, t, log.seconds, previews.figures)
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
     previews.publish(outputs.previews, job.warn)
@@ -126,7 +126,7 @@ def write_cameras(path: Path, t: Trainer, views: tuple[View, ...]) -> None:
         refined_cameras.write(views, t.cameras.cameras, path)
 
 
-def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview_psnr: float | None) -> None:
+def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview: dict[str, float]) -> None:
     """What was reached; the seconds differ from run to run."""
     settings = t.model.settings
     report = {
@@ -134,7 +134,8 @@ def write_report(path: Path, job: Job, t: Trainer, seconds: float, preview_psnr:
         "schedule": t.schedule.state(),
         "time_budget": job.settings.time_budget,
         "seconds": round(seconds, 1),
-        "preview_psnr": preview_psnr,
+        "preview_psnr": preview.get("preview_psnr"),
+        "preview_ssim": preview.get("preview_ssim"),
         "cameras": camera_changes(t),
         "occupied": t.model.voxels.occupied,
         "log2_hashmap_size": settings.log2_hashmap_size,

@@ -33,13 +33,13 @@ class Previews:
         """
         self.renderer, self.poses, self.work, self.every = renderer, poses, work, every
         self.view = preview_view(s)
-        self.psnr: float | None = None
+        self.figures: dict[str, float] = {}  # PSNR and SSIM of the last preview, the latter where it is large enough
 
     def draw(self, step: int) -> float | None:
         """Render where it is time after a step; the PSNR of the preview, None where none is drawn."""
         if self.view is None or self.every is None or step == 0 or step % self.every:
             return None
-        from efficientnerf.evaluation.metrics import psnr
+        from efficientnerf.evaluation.metrics import WINDOW, psnr, ssim
         from stages.evaluation.views import ground_truth, subsample, subsample_camera
         from stages.figures.plots import to_uint8
         from stages.io.png import write_png
@@ -48,8 +48,10 @@ class Previews:
         truth = subsample(ground_truth(self.poses, self.view, self.renderer.model.background).colour, stride)
         render = np.clip(self.renderer.render(subsample_camera(self.view.camera, stride)).colour, 0, 1)
         write_png(to_uint8(np.concatenate([truth, render], axis=1)), self.work / f"preview_{step:06d}.png")
-        self.psnr = round(float(psnr(render, truth)), 2)
-        return self.psnr
+        self.figures = {"preview_psnr": round(float(psnr(render, truth)), 2)}
+        if min(render.shape[:2]) >= WINDOW:
+            self.figures["preview_ssim"] = round(ssim(render, truth), 3)
+        return self.figures["preview_psnr"]
 
     def publish(self, folder: Path, warn: Warn) -> None:
         """Copy all previews, those of earlier attempts too, into `folder`, which is made if there are any; without such as can't be read."""

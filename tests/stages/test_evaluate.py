@@ -77,7 +77,7 @@ def settings(**more: Any) -> EvaluateSettings:
 
 
 def job_in(folder: Path, poses: Path, chosen: EvaluateSettings | None = None, out: str = "out", **more: Any) -> Job:
-    return Job(settings=chosen or settings(), out=folder / out, work=folder / "work", inputs={"poses": poses}, **more)
+    return Job(settings=chosen or settings(), out=folder / out, work=folder / "work", inputs={"poses": poses, "train": folder / "no refined cameras"}, **more)
 
 
 def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, **more: Any) -> None:

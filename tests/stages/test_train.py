@@ -71,7 +71,7 @@ def test_it_leaves_a_field_a_log_a_curve_and_previews(scene: Path, tmp_path: Pat
     assert checkpoints(made) == ["checkpoint_00000008.safetensors", "checkpoint_00000012.safetensors"]
     assert events[-1]["event"] == "progress"
     assert events[-1]["done"] == events[-1]["total"] == 13
-    assert {"loss", "psnr", "preview_psnr", "samples_per_s", "occupied", "left"} <= events[-1].keys()
+    assert {"loss", "psnr", "preview_psnr", "preview_ssim", "samples_per_s", "occupied", "left"} <= events[-1].keys()
     assert events[-1]["samples_per_s"] > 0
     assert events[-1]["left"] == 0
     assert (made.work / "curve.png").exists()  # drawn at each preview, for those who wait
