@@ -197,7 +197,8 @@ def _of_photographs(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray
     masks, overlap = [picture for _, picture in good], hull_overlaps(capture, good)
     fits = overlap >= LEAST_OVERLAP
     if fits.mean() < MIN_AGREEING:
-        return False, f"no object has all of these silhouettes: {fits.sum()} of {len(fits)} fit to their visual hull", []
+        found = "; the cameras that were found may be wrong" if capture.kind == "photographs" else ""
+        return False, f"no object has all of these silhouettes: {fits.sum()} of {len(fits)} fit to their visual hull{found}", []
     shares = [float(mask.mean()) for mask in masks]
     why = (
         f"{len(good)} of {len(pictures)} photographs keep one object, {min(shares):.0%} to {max(shares):.0%} of the picture,"

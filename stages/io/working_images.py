@@ -15,6 +15,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo, Silhouettes
+from stages.io.matting import without_background
 from stages.io.photo import apply_exif_orientation, same_aspect, upright_mask, working_size
 from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, rgb_and_alpha
 from stages.io.png import FAST, write_png
@@ -89,7 +90,7 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouett
         whole, usable = reduced[..., :3], reduced[..., 3] >= OPAQUE
     if photo.mask is not None and silhouettes.masks:
         levels, warnings = mask_levels(photo, found.orientation)
-        whole = _with_alpha(whole, levels)
+        whole = _cut_out(whole, levels, size)
     elif photo.mask is not None:
         kept, warnings = _usable(photo, size, found.orientation)
         usable = kept if usable is None else usable & kept
@@ -158,14 +159,22 @@ def _resized(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return np.clip(np.rint(whole), 0, 255).astype(np.uint8)
 
 
-def _with_alpha(pixels: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """(H, W, 4) with the levels of a mask of any size as alpha, or the lower of these and the alpha that is there."""
+def _cut_out(pixels: np.ndarray, levels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """(h, w, 4) at working size: the levels of a mask of any size as alpha, or the lower of these and the alpha that is there.
+
+    A photograph without alpha has its surroundings yet, which the colours of soft edges are freed of.
+    """
     import cv2
 
-    size = pixels.shape[1::-1]
-    if levels.shape[::-1] != size:
-        levels = cv2.resize(levels, size, interpolation=cv2.INTER_AREA if levels.shape[1] >= size[0] else cv2.INTER_LINEAR)
-    return np.dstack([pixels[..., :3], levels if pixels.shape[2] == 3 else np.minimum(levels, pixels[..., 3])])
+    def to(size: tuple[int, int]) -> np.ndarray:
+        if levels.shape[::-1] == size:
+            return levels
+        return np.asarray(cv2.resize(levels, size, interpolation=cv2.INTER_AREA if levels.shape[1] >= size[0] else cv2.INTER_LINEAR))
+
+    if pixels.shape[2] == 4:
+        return _resized(np.dstack([pixels[..., :3], np.minimum(to(pixels.shape[1::-1]), pixels[..., 3])]), size)
+    colour, cover = _resized(np.ascontiguousarray(pixels), size), to(size)
+    return np.dstack([np.where(cover[..., None] > 0, without_background(colour, cover), np.uint8(0)), cover])
 
 
 def mask_levels(photo: Photo, orientation: int) -> tuple[np.ndarray, list[str]]:

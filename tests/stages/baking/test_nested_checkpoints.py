@@ -55,7 +55,6 @@ def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None
         np.testing.assert_array_equal(one.bounds_min, other.bounds_min)
 
 
-
 CHANGES: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
     "none": lambda tensors: tensors.pop("cascades"),
     "another cascade": lambda tensors: tensors.update(cascades=(tensors["cascades"] + np.uint8(1)) % np.uint8(3)),

@@ -1,0 +1,58 @@
+"""Colours at the edges of silhouettes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.io.matting import without_background
+
+
+def disc(side: int = 48, radius: float = 14.0) -> np.ndarray:
+    """(side, side) uint8: how much of each pixel a disc covers."""
+    fine = np.arange(8 * side) / 8 + 1 / 16
+    inside = np.hypot(fine[:, None] - side / 2, fine[None] - side / 2) < radius
+    return np.rint(255 * inside.reshape(side, 8, side, 8).mean((1, 3))).astype(np.uint8)
+
+
+def seen(cover: np.ndarray, front: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    share = cover[..., None] / 255
+    return np.rint(share * front + (1 - share) * behind).astype(np.uint8)
+
+
+@pytest.mark.parametrize("behind", [(0, 0, 0), (255, 255, 255), (20, 200, 90)])
+def test_an_edge_keeps_nothing_of_the_background(behind: tuple[int, int, int]) -> None:
+    cover, front = disc(), np.array([180.0, 60.0, 40.0])
+    photograph = seen(cover, front, np.array(behind, float))
+    found = without_background(photograph, cover).astype(float)
+    shown = cover > 0
+    assert abs(found[shown] - front).max() <= 4
+    assert abs(photograph[shown].astype(float) - front).max() > 30
+    np.testing.assert_array_equal(found[~shown], photograph[~shown])
+    np.testing.assert_array_equal(found[cover == 255], photograph[cover == 255])
+
+
+def test_a_mask_that_is_too_small_or_too_large_gives_no_colours_that_are_nowhere() -> None:
+    front, behind = np.array([180.0, 60.0, 40.0]), np.array([20.0, 200.0, 90.0])
+    for radius in (12.0, 16.0):
+        cover = disc(radius=radius)
+        found = without_background(seen(disc(), front, behind), cover).astype(float)
+        shown = found[cover > 0]
+        assert (shown >= np.minimum(front, behind) - 1).all()
+        assert (shown <= np.maximum(front, behind) + 1).all()
+
+
+def test_what_has_no_soft_edge_or_no_surroundings_stays() -> None:
+    photograph = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    hard = np.where(np.arange(30) < 12, np.uint8(255), np.uint8(0)) * np.ones((20, 1), np.uint8)
+    np.testing.assert_array_equal(without_background(photograph, hard), photograph)
+    veil = np.full((20, 30), 200, np.uint8)
+    np.testing.assert_array_equal(without_background(photograph, veil), photograph)
+
+
+def test_a_wire_thinner_than_a_pixel_takes_colours_of_its_kind() -> None:
+    """No pixel shows it alone: the solution is the colour that explains the pixel."""
+    cover = np.zeros((20, 30), np.uint8)
+    cover[10] = 128
+    photograph = seen(cover, np.array([200.0, 180.0, 20.0]), np.array([90.0, 90.0, 90.0]))
+    assert abs(without_background(photograph, cover)[10].astype(float) - (200, 180, 20)).max() <= 3
