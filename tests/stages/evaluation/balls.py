@@ -1,0 +1,69 @@
+"""Evaluations of a ball with a closed form: its photographs, jobs and figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from efficientnerf.geometry.cameras import Camera, Similarity
+from pipeline.stage import Job
+from stages.evaluate import EvaluateSettings, evaluate
+from stages.figures.plots import to_uint8
+from stages.framing.camera_paths import pose_on_sphere
+from stages.io.exporters.frames import frame_from_rendering
+from stages.io.png import write_png
+from stages.io.scene import Orbit, Scene, View, save
+from tests.fakes import WHITE, BallField, BallTree
+
+TREE = BallTree()
+WIDTH, HEIGHT = 60, 44
+
+
+def make_scene(folder: Path, splits: str, *, background: tuple[float, float, float] | None = WHITE, masked: bool = False) -> Path:
+    """A poses artifact that photographs TREE: RGBA on a constant background, RGB with the field's surroundings without. One letter of splits per view."""
+    (folder / "images").mkdir(parents=True)
+    views = []
+    for k, letter in enumerate(splits):
+        pose = pose_on_sphere((0.0, 0.0, 0.0), 3.0, 30.0 * k, 20.0)
+        camera = Camera(f"v{k}.png", WIDTH, HEIGHT, "SIMPLE_PINHOLE", (70.0, WIDTH / 2, HEIGHT / 2), pose)
+        if background is None:
+            frame = to_uint8(BallField(TREE).render(camera).colour)
+        else:
+            seen = TREE.render(camera)
+            frame = frame_from_rendering(seen.colour, seen.opacity, None)
+        mask = None
+        if masked:
+            # The photograph is spoilt where the mask says so.
+            frame = frame.copy()
+            frame[:10, :, :3] = 255 - frame[:10, :, :3]
+            mask = f"images/mask{k}.png"
+            used = np.full((HEIGHT, WIDTH), 255, np.uint8)
+            used[:10] = 0
+            Image.fromarray(used).save(folder / mask)
+        write_png(frame, folder / "images" / f"v{k}.png")
+        split = {"r": "train", "v": "val", "t": "test"}[letter]
+        views.append(View(f"images/v{k}.png", mask, split, camera, camera, 1.0, 5.0))
+    scene = Scene("ball", tuple(views), np.array([[-1.0] * 3, [1.0] * 3]), background, Similarity.identity(), Orbit((0.0, 0.0, 0.0), 3.0, 20.0, False, 0.0))
+    save(scene, folder)
+    return folder
+
+
+def settings(**more: Any) -> EvaluateSettings:
+    return EvaluateSettings(**{"strips": "off", "captured_path_frames": "off", **more})
+
+
+def job_in(folder: Path, poses: Path, chosen: EvaluateSettings | None = None, out: str = "out", **more: Any) -> Job:
+    return Job(settings=chosen or settings(), out=folder / out, work=folder / "work", inputs={"poses": poses, "train": folder / "no refined cameras"}, **more)
+
+
+def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, **more: Any) -> None:
+    evaluate(tree.evaluated(**more), tree, load_field, job)
+
+
+def figures_of(job: Job) -> dict[str, Any]:
+    return json.loads((job.out / "metrics.json").read_text())
