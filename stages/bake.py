@@ -1,15 +1,15 @@
 """The bake stage: a trained field in, the asset out.
 
     asset.nerftree  see efficientnerf/asset/FORMAT.md
-    report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the refinement
+    report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the refinement; of a scene without a
+                    constant background, which is baked whole (`stages.baking.whole_scene`): its cascades, and the share of the rays that end in holes
 
-The scratch folder keeps what takes long: the visibility of the voxels, each block of baked values, and the state of the refinement.
+The scratch folder keeps what takes long: the visibility of the voxels or the field's samples, each block of baked values, and the state of the refinement.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,12 +25,9 @@ from stages.compiling import compiling_kernels
 from stages.cores import use_all_cores
 
 if TYPE_CHECKING:
-    from efficientnerf.asset.bake import Visibility
     from efficientnerf.asset.refinement.targets import Targets
-    from efficientnerf.asset.tree import NerfTree
-    from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import Pixels
-    from stages.baking.resolution import Choice
+    from stages.baking.plan import Plan
     from stages.io.scene import Scene
 
 
@@ -39,13 +36,23 @@ class BakeSettings:
     """How finely the field is baked."""
 
     resolution: Annotated[int, Meta(ge=1, le=4096)] | Auto = setting(
-        "auto", "Voxels along the longest side of the box; auto: train.discretise, or as many as max_mib holds and the images resolve."
+        "auto", "Voxels along the longest side of the box, of a whole scene of its innermost cascade; auto: train.discretise, or as many as max_mib holds and"
+        " images resolve.",
     )
     lookup: Literal["trilinear", "nearest"] = setting(
         "trilinear", "Value of a point in the asset: interpolated from the voxels around it (trilinear), or that of its own voxel (nearest).", advanced=True
     )
     max_resolution: Annotated[int, Meta(ge=32, le=4096)] | Auto = setting(
-        "auto", "Most voxels along the longest side where resolution is auto; auto: 384 in contracted scenes, else 1024.", advanced=True
+        "auto", "Most voxels along the longest side where resolution is auto; auto: 1024, or as many as 2^24 coarse cells of all cascades allow.", advanced=True
+    )
+    cascades: Annotated[int, Meta(ge=1, le=16)] | Auto = setting(
+        "auto",
+        "Nested grids of a scene without a constant background, each twice as wide as the one before; auto: as many as hold 99 % of what the field shows, at"
+        " most 8. What lies beyond is in the environment map.",
+        advanced=True,
+    )
+    environment_size: Annotated[int, Meta(ge=4, le=1024)] = setting(
+        128, "Rows of the environment map of a scene without a constant background; it has twice as many columns.", advanced=True
     )
     ndc_voxel_depth: Annotated[float, Meta(ge=1.0, le=8.0)] | Auto = setting(
         "auto", "Depth of a voxel over its width, in normalised device coordinates; auto: 2, or 1 with train.discretise.", advanced=True
@@ -57,8 +64,8 @@ class BakeSettings:
     weight_threshold: Fraction = setting(1e-3, "A voxel is kept where its weight in some pixel exceeds this.", advanced=True)
     max_mib: PositiveInt | Auto = setting(
         "auto",
-        "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 24, or 36 bytes for each pixel"
-        " of a forward-facing capture, from 24 to 56.",
+        "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 24; 38 of a"
+        " scene without a constant background; 36 bytes for each pixel of a forward-facing capture, from 24 to 56.",
         unit="MiB",
     )
     layout: Literal["compact", "small", "sparse"] = setting(
@@ -93,11 +100,13 @@ class BakeSettings:
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset import format
-    from efficientnerf.asset.bake import grid_of
+    from efficientnerf.asset.cascades import voxel_cascades
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.resolution import budget_of
-    from stages.baking.voxels import choose_voxels, voxel_space, with_min_views
+    from stages.baking.values import baked_tree
+    from stages.baking.whole_scene import room_of
+    from stages.evaluation.views import constant_background
     from stages.io import scene
     from stages.io.field_file import load_renderer
     from stages.io.refined_cameras import load_scene
@@ -109,72 +118,63 @@ def run(job: Job) -> None:
     if m.settings.field == "nerf":
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = load_scene(job.inputs["poses"], job.inputs["train"])
-    space, mib, views = voxel_space(job, m), budget_of(s, given(settings.max_mib)), scene.views_of(s, "train")
-    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, space, mib))
-    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib)
-    indices = with_min_views(m, s, indices, choice.resolution)
-    _check(job, m, choice, indices)
-    shape, _ = grid_of(space.bounds, choice.resolution, settings.brick_size)
-    refuse_more_than_fits(job, m, views, pixels, choice, math.prod(shape), len(visibility.cells), len(indices), mib)
+    whole = constant_background(s) is None
+    mib, views = budget_of(s, given(settings.max_mib), whole=whole), scene.views_of(s, "train")
+    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, whole=whole))
+    plan = _plan(job, m, s, pixels, mib, whole=whole)
+    _check(job, m, plan)
+    refuse_more_than_fits(job, m, views, pixels, plan, mib)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
     tree, report = refined(
-        job, _baked_tree(job, m, s, space, choice.resolution, indices, metadata), _targets(s, pixels, visibility), _most_voxels(settings, m, space, choice, mib)
+        job, baked_tree(job, m, s, plan, metadata), _targets(s, pixels, plan), room_of(settings, m, plan.grids, mib, environment=whole), plan.samples
     )
     provenance = {**metadata["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": report["psnr_after"]}}
     outputs = BakeOutputs(job.out)
     format.save(tree.with_metadata(provenance=provenance), outputs.asset, settings.layout)
     found: dict[str, Any] = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index)}
     found |= {"bytes": outputs.asset.stat().st_size, "optimisation": report}
-    found |= {"voxels_along_longest_side": choice.resolution, "resolution_decided_by": choice.why, "max_mib": mib}
+    found |= {"voxels_along_longest_side": plan.choice.resolution, "resolution_decided_by": plan.choice.why, "max_mib": mib}
+    if whole:
+        found |= {"cascades": np.bincount(voxel_cascades(tree), minlength=len(plan.grids)).tolist(), "voxel": tree.voxel}
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _check(job: Job, m: Any, choice: Choice, indices: np.ndarray) -> None:
+def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: int, *, whole: bool) -> Plan:
+    """The voxels to bake: cascades of a whole scene, or else one grid of what lies in the field's box."""
+    from efficientnerf.asset.bake import grid_of
+    from stages.baking.plan import Plan
+    from stages.baking.voxels import choose_voxels, voxel_space, with_min_views
+    from stages.baking.whole_scene import choose_scene_voxels
+
+    space = voxel_space(job, m)
+    if whole:
+        return choose_scene_voxels(job, m, s, pixels, space, mib)
+    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib)
+    indices = with_min_views(m, s, indices, choice.resolution)
+    shape, voxel = grid_of(space.bounds, choice.resolution, job.settings.brick_size)
+    return Plan(choice, space, [(shape, voxel, np.asarray(space.bounds[0], np.float64))], [indices], len(visibility.cells))
+
+
+def _check(job: Job, m: Any, plan: Plan) -> None:
     """Say what is baked; StageFailed where nothing is."""
-    if job.settings.lookup == "nearest" and m.settings.discretise not in ("off", choice.resolution):
+    resolution = plan.choice.resolution
+    if job.settings.lookup == "nearest" and m.settings.discretise not in ("off", resolution):
         trained = f"the field was trained on train.discretise={m.settings.discretise}"
-        job.warn(f"bake.resolution={choice.resolution}, but {trained}: on other voxels than are baked")
-    if not len(indices):
+        job.warn(f"bake.resolution={resolution}, but {trained}: on other voxels than are baked")
+    if not plan.voxels:
         found = "no voxel of the box contributes to any training image"
         raise StageFailed(f"bake: the trained field is empty: {found}. Train longer, or check the box (poses.crop_box).")
-    job.say(f"{choice.resolution} voxels along the longest side ({choice.why}); {len(indices):,} voxels are baked")
+    of = f" of {len(plan.grids)} cascades" if plan.samples is not None else ""
+    job.say(f"{resolution} voxels along the longest side ({plan.choice.why}); {plan.voxels:,} voxels{of} are baked")
 
 
-def _baked_tree(job: Job, m: Any, s: Scene, space: Space, resolution: int, indices: np.ndarray, metadata: dict[str, Any]) -> NerfTree:
-    """The tree with the field's values."""
-    from efficientnerf.asset.bake import grid_of
-    from efficientnerf.asset.tree import tree_from_voxels
-    from stages.baking.values import baked_values
-
-    settings: BakeSettings = job.settings
-    shape, voxel = grid_of(space.bounds, resolution, settings.brick_size)
-    low = np.asarray(space.bounds[0], np.float64)
-    samples = 0 if m.settings.discretise == resolution and space is m.space else settings.samples_per_voxel
-    return tree_from_voxels(
-        shape, voxel, low, indices, *baked_values(job, m, indices, voxel, low, samples, space),
-        brick=settings.brick_size, background=s.background, metadata=metadata, ndc=space.ndc, lookup=settings.lookup,
-    )  # fmt: skip
-
-
-def _targets(s: Scene, pixels: Pixels, visibility: Visibility) -> Targets:
+def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
     """What the tree is fitted to."""
     from efficientnerf.asset.refinement.targets import Targets
     from stages.evaluation.views import constant_background
 
-    background = constant_background(s)
-    if background is None:
-        return Targets(pixels, None, visibility.chosen, visibility.before, visibility.behind)
-    return Targets(pixels, background, reaches_infinity=s.background is None)
+    return Targets(pixels, constant_background(s), plan.environment, reaches_infinity=plan.space.reaches_infinity)
 
 
-def _most_voxels(settings: BakeSettings, m: Any, space: Space, choice: Choice, mib: int) -> int:
-    """How many voxels an asset of `mib` MiB holds."""
-    from efficientnerf.asset.bake import grid_of
-    from efficientnerf.asset.file.serialisation import most_voxels
-
-    shape, _ = grid_of(space.bounds, choice.resolution, settings.brick_size)
-    return most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, settings.brick_size)
-
-
-STAGE = Stage(name="bake", version=4, settings=BakeSettings, needs=needs_of(BakeInputs), run=run)
+STAGE = Stage(name="bake", version=5, settings=BakeSettings, needs=needs_of(BakeInputs), run=run)

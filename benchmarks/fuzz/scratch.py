@@ -259,7 +259,7 @@ def refinement_seeds() -> list[bytes]:
 
     with tempfile.TemporaryDirectory() as folder:
         job = Job(settings=None, out=Path(folder) / "out", work=Path(folder) / "work")
-        refinement._save_checkpoint(job, _refinement()[1], pruned=False)
+        refinement._save_checkpoint(job, _refinement()[1], None)
         return [(job.work / refinement.CHECKPOINT).read_bytes()]
 
 

@@ -1,12 +1,12 @@
 """From a trained model to a NerfTree (EfficientNeRF, section 3.5; the choice and averaging of voxels after PlenOctree).
 
-1. `visible_voxels`: the greatest fine weight of each voxel over training pixels, both stages run as in training; and, of unbounded scenes, what
-   these pixels show before and behind the box.
+1. `visible_voxels`: the greatest fine weight of each voxel over training pixels, both stages run as in training. Of unbounded scenes the field's samples
+   are kept instead, and voxels of nested grids weighed by them (`efficientnerf.asset.field_samples`).
 2. `chosen_voxels`: those above a threshold, dilated by one voxel so that linear interpolation has all its corners.
 3. `voxel_values`: density and harmonics averaged over several jittered points of each voxel, in blocks.
 4. `efficientnerf.asset.refinement` fits the tree of these to the training images; voxels that do not show are dropped.
 
-B coarse cells, P pixels, N voxels.
+B coarse cells, N voxels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinat
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
-from efficientnerf.rendering.field_renderer import split_by_box
 from efficientnerf.sampling.occupancy import cell_of
 from efficientnerf.training.pixels import Pixels
 
@@ -40,20 +39,14 @@ def grid_of(bounds: np.ndarray, resolution: int, brick: int) -> tuple[tuple[int,
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The greatest weight of each voxel in training pixels, and what these show outside of the box.
+    """The greatest weight of each voxel in training pixels.
 
     cells     (B,) int64 flat coarse cells (x slowest) that hold any sample, ascending
     greatest  (B, brick^3) float32, each voxel's greatest weight
-    chosen    (P,) int64 the pixels
-    before    (P, 4) float16 premultiplied colour and opacity between camera and box; None on a constant background, as the next
-    behind    (P, 3) float16 colour beyond the box
     """
 
     cells: np.ndarray
     greatest: np.ndarray
-    chosen: np.ndarray
-    before: np.ndarray | None
-    behind: np.ndarray | None
 
 
 @torch.no_grad()
@@ -73,15 +66,11 @@ def visible_voxels(
     rows = 0
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
     chosen = spread_pixels(pixels, count)
-    outside = []
     for begin in range(0, len(chosen), RAYS_PER_BLOCK):
         bundle = pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])
         origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
         behind = m.behind(directions)
         outputs = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
-        if m.background is None:
-            parts = split_by_box(m, origins, directions, torch.ones_like(near), outputs, behind)
-            outside.append([part.cpu().numpy().astype(np.float16) for part in parts[3:5]])
         at = torch.floor((space.world(outputs.fine.point).cpu() - low) / voxel).long()
         inside = ((at >= 0) & (at < size)).all(dim=1)
         at, weight = at[inside], outputs.fine_weight.cpu()[inside]
@@ -96,8 +85,7 @@ def visible_voxels(
         greatest.view(-1).scatter_reduce_(0, slot, weight, reduce="amax")
         done(min(len(chosen), begin + RAYS_PER_BLOCK), len(chosen))
     cells = torch.nonzero(row_of >= 0).squeeze(1)
-    before, beyond = (np.concatenate(part) for part in zip(*outside, strict=True)) if outside else (None, None)
-    return Visibility(cells.numpy(), greatest[row_of[cells].long()].numpy(), chosen, before, beyond)
+    return Visibility(cells.numpy(), greatest[row_of[cells].long()].numpy())
 
 
 def spread_pixels(pixels: Pixels, count: int) -> np.ndarray:
@@ -165,7 +153,8 @@ def voxel_values(
             harmonics weighted by density; 0: the centre of the voxel alone, for fields trained on these (`train.discretise`)
     space   as in `visible_voxels`
 
-    The density is zero where the density voxels or the coarse field have space empty: the fine field is hardly evaluated there in training.
+    The density is per unit of the frame: in the shell of a contracted space the field's own is per contracted unit. It is zero where the density voxels or
+    the coarse field have space empty: the fine field is hardly evaluated there in training.
     """
     space = space or m.space
     low = torch.as_tensor(bounds_min, dtype=torch.float32)
@@ -181,6 +170,8 @@ def voxel_values(
         valid = m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold
         density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
         density = density * _has_pivots(m, space.grid((block + 0.5) * voxel + low))[:, None]
+        if space.contracted:
+            density = density / space.unit(world).abs().amax(dim=-1).clamp(min=1).square().to(density)
         share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
         yield density.mean(dim=1).cpu().numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().cpu().numpy()

@@ -129,6 +129,27 @@ def point_cascades(tree: NerfTree, points: np.ndarray) -> np.ndarray:
     return out
 
 
+def voxels_around(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+    """(n, 8) int32: the stored voxels that values at points (n, 3) of the tree's frame are interpolated from, -1 where none is stored."""
+    out = np.full((len(points), 8), -1, np.int32)
+    which = point_cascades(tree, points)
+    corner = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+    for n, cascade in enumerate(cascades_of(tree)):
+        here = np.flatnonzero(which == n)
+        at = np.floor((points[here] - cascade.bounds_min) / cascade.voxel - 0.5).astype(np.int64)[:, None] + corner  # (n, 8, 3)
+        size = np.asarray(cascade.shape) * tree.brick
+        inside = ((at >= 0) & (at < size)).all(axis=-1)
+        at = np.clip(at, 0, size - 1)
+        cell, local = np.divmod(at, tree.brick)
+        owner = cascade.brick_index[cell[..., 0], cell[..., 1], cell[..., 2]]
+        slot = (local[..., 0] * tree.brick + local[..., 1]) * tree.brick + local[..., 2]
+        stored = inside & (owner >= 0)
+        found = np.full(stored.shape, -1, np.int32)
+        found[stored] = tree.voxel_index[owner[stored], slot[stored]]
+        out[here] = found
+    return out
+
+
 def cascade_tree(tree: NerfTree, number: int) -> NerfTree:
     """One cascade as a tree of its own, without the environment."""
     cascade, (first, end) = cascades_of(tree)[number], brick_ranges(tree)[number]

@@ -1,4 +1,4 @@
-"""Small connected components of a tree: what the box cuts off from the rest of the scene, and floaters."""
+"""Small connected components of a tree: what the box cuts off from the rest of the scene, and floaters. N voxels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from efficientnerf.asset.cascades import cascades_of, point_cascades
+
 if TYPE_CHECKING:
+    from efficientnerf.asset.field_samples import FieldSamples
     from efficientnerf.asset.tree import NerfTree
 
 INTERIOR_RATIO = 0.01  # of `share`: the limit of components that reach no face of the grid
@@ -44,3 +47,59 @@ def small_components(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarr
     out = np.zeros(len(keep), bool)
     out[tree.voxel_index[stored]] = np.repeat(small[component_of], count_of)
     return out
+
+
+MIN_SUPPORT = 3  # views whose rays end in a component: what so many photographs show is never dropped
+SUPPORT_WEIGHT = 0.1  # of a sample that counts as its ray's end
+
+
+def unsupported_components(tree: NerfTree, keep: np.ndarray, share: float, samples: FieldSamples) -> np.ndarray:
+    """Which of the voxels `keep`, (N,) bool, of a whole scene belong to small components that fewer than MIN_SUPPORT views show: (N,) bool.
+
+    Components are those of `small_components`, of each cascade by itself. Small is one in the innermost cascade, next to the cameras, with less than `share`
+    of the voxels of the largest one, and in the others with less than INTERIOR_RATIO of that.
+    """
+    out = np.zeros(len(keep), bool)
+    if share <= 0 or not keep.any():
+        return out
+    labelled = [_label(tree, cascade.brick_index, keep) for cascade in cascades_of(tree)]
+    largest = max(float(voxels.max()) for _, voxels, _ in labelled)
+    views = _views_of_components(tree, [labels for labels, _, _ in labelled], [len(voxels) for _, voxels, _ in labelled], samples)
+    for n, (labels, voxels, cells) in enumerate(labelled):
+        small = (voxels < share * largest * (INTERIOR_RATIO if n else 1.0)) & (views[n] < MIN_SUPPORT)
+        rows = tree.voxel_index[cascades_of(tree)[n].brick_index.reshape(-1)[cells[small[labels.reshape(-1)[cells]]]]]
+        out[rows[rows >= 0]] = True
+    return out & keep
+
+
+def _label(tree: NerfTree, brick_index: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of a cascade the component of each coarse cell, 0 where it holds no voxel that is kept; the number of voxels of each component; and the cells of any."""
+    from scipy import ndimage
+
+    brick = brick_index.reshape(-1)
+    cells = np.flatnonzero(brick >= 0)
+    rows = tree.voxel_index[brick[cells]]
+    count = ((rows >= 0) & keep[rows]).sum(axis=1)
+    cells, count = cells[count > 0], count[count > 0]
+    occupied = np.zeros(brick_index.shape, bool)
+    occupied.reshape(-1)[cells] = True
+    labels, components = ndimage.label(occupied, structure=np.ones((3, 3, 3), bool))
+    return labels, np.bincount(labels.reshape(-1)[cells], weights=count, minlength=components + 1), cells
+
+
+def _views_of_components(tree: NerfTree, labels: list[np.ndarray], counts: list[int], samples: FieldSamples) -> list[np.ndarray]:
+    """How many views have rays that end in each component, of each cascade."""
+    views = len(samples.origin)
+    seen = [np.zeros(count * views, bool) for count in counts]
+    for rays, part in samples.blocks():
+        heavy = part.start + np.flatnonzero(samples.weight[part] >= SUPPORT_WEIGHT)
+        ray = rays.start + np.searchsorted(samples.first[rays.start : rays.stop + 1], heavy, side="right") - 1
+        points = samples.points(heavy, ray)
+        which = point_cascades(tree, points)
+        for n, cascade in enumerate(cascades_of(tree)):
+            here = which == n
+            cell = np.floor((points[here] - cascade.bounds_min) / (cascade.voxel * tree.brick)).astype(np.int64)
+            cell = np.clip(cell, 0, np.asarray(cascade.shape) - 1)
+            component = labels[n][cell[:, 0], cell[:, 1], cell[:, 2]].astype(np.int64)
+            seen[n][component * views + samples.view[ray[here]]] = True
+    return [one.reshape(-1, views).sum(axis=1) for one in seen]

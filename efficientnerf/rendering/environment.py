@@ -10,7 +10,12 @@ H, W rows and columns, R rays.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def directions_of(height: int, width: int) -> np.ndarray:
@@ -33,3 +38,50 @@ def lookup(environment: np.ndarray, directions: np.ndarray) -> np.ndarray:
     upper = environment[top, left % width] * (1 - across) + environment[top, (left + 1) % width] * across
     lower = environment[low, left % width] * (1 - across) + environment[low, (left + 1) % width] * across
     return np.asarray(upper * (1 - down) + lower * down, np.float32)
+
+
+def lookup_on(environment: Tensor, directions: Tensor) -> Tensor:
+    """`lookup` on the tensors' device."""
+    import torch
+
+    height, width = environment.shape[:2]
+    column = (torch.atan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) + 0.5) * width - 0.5
+    row = (torch.acos(directions[:, 2].clamp(-1, 1)) / np.pi * height - 0.5).clamp(0, height - 1)
+    left, top = column.floor().long(), row.floor().long()
+    across, down = (column - left)[:, None], (row - top)[:, None]
+    low = (top + 1).clamp(max=height - 1)
+    upper = environment[top, left % width] * (1 - across) + environment[top, (left + 1) % width] * across
+    lower = environment[low, left % width] * (1 - across) + environment[low, (left + 1) % width] * across
+    return upper * (1 - down) + lower * down
+
+
+def texels_of(directions: np.ndarray, height: int) -> np.ndarray:
+    """(R,) int64 flat texels, row by row, that unit directions (R, 3) fall into in a map of so many rows."""
+    d = np.asarray(directions, np.float64)
+    column = np.floor((np.arctan2(d[:, 1], d[:, 0]) / (2 * np.pi) + 0.5) * 2 * height).astype(np.int64) % (2 * height)
+    row = np.floor(np.arccos(np.clip(d[:, 2], -1, 1)) / np.pi * height).astype(np.int64).clip(0, height - 1)
+    return np.asarray(row * 2 * height + column)
+
+
+SURE = 4.0  # weight of a texel at which half of its colour is its own
+
+
+def filled(total: np.ndarray, weight: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """A map (H, 2 H, 3) float32 of weighted sums of colours (H, 2 H, 3): where the weight (H, 2 H) is small, what is known around it fades in, from near and
+    far, and where nothing is known at all `mean` (3,)."""
+    from scipy.ndimage import gaussian_filter
+
+    known = weight.sum()
+    out = np.broadcast_to(np.asarray(mean if known < 1e-6 else total.reshape(-1, 3).sum(axis=0) / known, np.float64), total.shape)
+    sigma = len(total) / 4
+    while True:
+        def blurred(values: np.ndarray, width: float = sigma) -> np.ndarray:
+            return values if width < 0.5 else np.asarray(gaussian_filter(values, width, mode=("nearest", "wrap")))
+
+        around = np.maximum(blurred(weight) * max(1.0, 2 * np.pi * sigma**2), 0)
+        colour = np.stack([blurred(total[..., channel]) for channel in range(3)], axis=-1) * max(1.0, 2 * np.pi * sigma**2)
+        share = (around / (around + SURE))[..., None]
+        out = np.where(around[..., None] > 1e-9, share * colour / np.maximum(around, 1e-9)[..., None] + (1 - share) * out, out)
+        if sigma < 0.5:
+            return np.clip(out, 0, 1).astype(np.float32)
+        sigma /= 2

@@ -15,16 +15,16 @@ from stages.training.data import channels_of, count_pixels
 from stages.training.pixel_file import PixelFile
 
 if TYPE_CHECKING:
-    from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import PixelRows
     from stages.bake import BakeSettings
+    from stages.baking.plan import Plan
     from stages.io.scene import Scene, View
 
 COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement
 # Bytes. Of a voxel besides its values: coordinates and keys while it is sorted into the tree; of a coarse cell: its brick, its row while voxels are chosen,
 # its distance to the next one; of a brick's voxel: greatest weight, three times while they grow, and its number; of a training pixel that visibility is
-# measured on: its number, what it shows before and behind the box; of a ray of a refinement step: the records of its samples.
-VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 5000
+# measured on: its number, or of whole scenes the field's samples along its ray, twice while they are joined; of a ray of a refinement step: its records.
+VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 400, 5000
 MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.gradients
 
 
@@ -47,16 +47,18 @@ def free_on_device(device: str) -> int:
 
 
 def needed(
-    settings: BakeSettings, trained: Any, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool, device: str
-) -> Need:
+    settings: BakeSettings, trained: Any, views: Sequence[View], channels: int, *, cells: int, bricks: int, voxels: int, degree: int, stored: bool,
+    whole: bool, device: str,
+) -> Need:  # fmt: skip
     """What baking takes.
 
     trained   settings of the field
     channels  of the pixels
-    cells     coarse cells of the finest grid in question
+    cells     coarse cells of the finest grids in question
     bricks    that are reached by samples, at most
     voxels    that are baked
     stored    whether the pixels are in a file
+    whole     whether a whole scene is baked
     """
     from efficientnerf.settings import given
 
@@ -66,35 +68,32 @@ def needed(
         PIXELS: pixels[PIXELS],
         "voxels": max(voxels_needed(voxels, (degree + 1) ** 2), pixels["reading images"] + pixels["directions of pixels"]),
         "the grid": CELL * cells + BRICK_VOXEL * settings.brick_size**3 * bricks,
-        "rays": VISIBILITY_RAY * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
+        "rays": (SCENE_RAY if whole else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
         "the field": 3 * 4 * parameters(trained) + DENSITY_VOXEL * (given(trained.occupancy_resolution) or 192) ** 3 // 4,
         "libraries": libraries(device),
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], space: Space, mib: int) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: int, *, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
-    from efficientnerf.asset.bake import grid_of
     from efficientnerf.asset.file.serialisation import most_voxels
-    from stages.baking.voxels import MAX_OVERSHOOT, finest_choice
+    from stages.baking.voxels import MAX_OVERSHOOT
 
     settings, degree = job.settings, m.fine.degree
     channels = channels_of(job.inputs["poses"], views)
-    finest = finest_choice(settings, m, s)
-    shape, _ = grid_of(space.bounds, finest.resolution, settings.brick_size)
-    cells = math.prod(shape)
+    finest, cells = _finest_cells(job, m, s, whole=whole)
     room = MAX_OVERSHOOT * most_voxels(mib * 2**20, settings.layout, degree, (1, 1, 1), settings.brick_size)
     voxels = min(room, cells * settings.brick_size**3)
 
     def at_most(count: int, *, stored: bool) -> Need:
-        about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": degree, "device": job.device}
+        about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": degree, "whole": whole, "device": job.device}
         return needed(settings, m.settings, views, channels, **about, stored=stored)
 
     stored = not has_room(job, at_most(voxels, stored=False))
-    remedy = f"Lower bake.max_resolution ({finest.resolution} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
+    remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
     if job.memory is not None and (most := at_most(voxels, stored=stored).total) > job.memory.bytes:
         job.warn(f"an asset of {mib} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. Should it not fit, that is said"
@@ -102,13 +101,32 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], space: 
     return rows
 
 
-def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, choice: Any, cells: int, bricks: int, voxels: int, mib: int) -> None:
+def _finest_cells(job: Job, m: Any, s: Scene, *, whole: bool) -> tuple[int, int]:
+    """Voxels along the longest side of the finest grid in question, and coarse cells of it and of those around it, before the foreground region is known."""
+    from efficientnerf.asset.bake import grid_of
+    from efficientnerf.settings import given
+    from stages.baking.resolution import MAX_CASCADES, MAX_CELLS
+    from stages.baking.voxels import finest_choice
+    from stages.baking.whole_scene import grids_of
+
+    settings = job.settings
+    finest = finest_choice(settings, m, s).resolution
+    if not whole:
+        return finest, math.prod(grid_of(m.space.bounds, finest, settings.brick_size)[0])
+    count = given(settings.cascades) or MAX_CASCADES
+    cells = sum(math.prod(shape) for shape, _, _ in grids_of(m.space.bounds, finest, settings.brick_size, count, None))
+    stated = given(settings.resolution) or given(settings.max_resolution) or given(m.settings.discretise)
+    return finest, cells if stated else min(cells, 2 * MAX_CELLS)  # coarse cells are more by those that make grids fit each other
+
+
+def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: int) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
     pixels  as they were placed
-    choice  the resolution
     """
-    about: dict[str, Any] = {"cells": cells, "bricks": bricks, "voxels": voxels, "degree": m.fine.degree, "device": job.device}
+    voxels, whole = plan.voxels, plan.samples is not None
+    about: dict[str, Any] = {"cells": plan.cells, "bricks": plan.bricks, "voxels": voxels, "degree": m.fine.degree, "whole": whole, "device": job.device}
     need = needed(job.settings, m.settings, views, pixels.images.shape[1], **about, stored=isinstance(pixels.images, PixelFile))
-    remedy = f"Lower bake.max_mib ({mib}) or bake.resolution ({choice.resolution}): {voxels:,} voxels with {(m.fine.degree + 1) ** 2} harmonics are too many."
+    harmonics = (m.fine.degree + 1) ** 2
+    remedy = f"Lower bake.max_mib ({mib}) or bake.resolution ({plan.choice.resolution}): {voxels:,} voxels with {harmonics} harmonics are too many."
     refuse_what_does_not_fit(job, need, remedy)

@@ -11,6 +11,7 @@ import hashlib
 import math
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,11 @@ import numpy as np
 from efficientnerf.settings import given
 from pipeline.files import atomic, exists, remove
 from pipeline.stage import Job
+from stages.baking.holes import find_holes, voxels_of_holes
 from stages.scratch import opened, unusable
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.field_samples import FieldSamples
     from efficientnerf.asset.refinement.state import RefinementState
     from efficientnerf.asset.refinement.targets import Targets
     from efficientnerf.asset.tree import NerfTree
@@ -38,8 +41,27 @@ MIN_STEPS, STEP_RAYS_PER_VOXEL, UNBOUNDED_STEPS = 320, 5, 160  # see `refinement
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
 
-def refined(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[NerfTree, dict[str, Any]]:
-    """The refined tree with at most `most` voxels, and the entries of the report."""
+@dataclass(frozen=True)
+class Pruned:
+    """That voxels were dropped, and of whole scenes the shares of the rays that end in holes.
+
+    without   after voxels were dropped
+    restored  after `voxels` of them were restored
+    """
+
+    without: float = 0.0
+    restored: float = 0.0
+    voxels: int = 0
+
+    def report(self) -> dict[str, Any]:
+        return {"pruned": round(self.without, 6), "restored": round(self.restored, 6), "voxels_restored": self.voxels}
+
+
+def refined(job: Job, tree: NerfTree, targets: Targets, most: int, samples: FieldSamples | None = None) -> tuple[NerfTree, dict[str, Any]]:
+    """The refined tree with at most `most` voxels, and the entries of the report.
+
+    samples  of the field, for whole scenes: what was dropped wrongly is restored by them
+    """
     from efficientnerf.asset.refinement import fit
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 
@@ -49,16 +71,22 @@ def refined(job: Job, tree: NerfTree, targets: Targets, most: int) -> tuple[Nerf
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets)
     before = fit.error(tree, targets, sample, settings.seed)
-    state, pruned = _restored(job, tree, steps) or (initial_state(tree, MAX_INITIAL_THICKNESS if steps else math.inf), False)
+    most_thick = MAX_INITIAL_THICKNESS if steps else math.inf
+    state, pruned = _restored(job, tree, steps) or (initial_state(tree, most_thick), None)
+    baked = None if samples is None or pruned is not None else initial_state(replace(tree, harmonics=tree.sh[:, :0]), most_thick).density
     del tree  # the state has values of its own
-    if not pruned:
-        _take_steps(job, state, targets, steps, steps // 2, pruned)
-        state = _prune(job, state, targets, most)
-        _save_checkpoint(job, state, True)
-    _take_steps(job, state, targets, steps, steps, True)
+    if pruned is None:
+        _take_steps(job, state, targets, steps, steps // 2, None)
+        state, pruned = _prune(job, state, targets, most, samples, baked)
+        _save_checkpoint(job, state, pruned)
+    _take_steps(job, state, targets, steps, steps, pruned)
     state.to_host()
     tree = state.tree
     report["psnr_before"], report["psnr_after"] = _psnr(before), _psnr(fit.error(tree, targets, sample, settings.seed))
+    if samples is not None:
+        report["holes"] = {**pruned.report(), "refined": round(find_holes(job, tree, samples)[1], 6)}
+        job.say(f"holes, where the field is opaque and the asset is not: {report['holes']['pruned']:.2%} of the rays after the first half of the refinement,"
+                f" {report['holes']['restored']:.2%} with {pruned.voxels:,} voxels restored, {report['holes']['refined']:.2%} at the end")  # fmt: skip
     return tree, report
 
 
@@ -90,7 +118,7 @@ def refinement_steps(settings: BakeSettings, voxels: int, constant_background: b
     return steps if constant_background else UNBOUNDED_STEPS
 
 
-def _take_steps(job: Job, state: RefinementState, targets: Targets, steps: int, until: int, pruned: bool) -> None:
+def _take_steps(job: Job, state: RefinementState, targets: Targets, steps: int, until: int, pruned: Pruned | None) -> None:
     """Take steps up to `until` of `steps`, with checkpoints on the way and where it is stopped."""
     from efficientnerf.asset.refinement import fit
 
@@ -116,14 +144,50 @@ def _take_steps(job: Job, state: RefinementState, targets: Targets, steps: int, 
             raise
 
 
-def _prune(job: Job, state: RefinementState, targets: Targets, most: int) -> RefinementState:
-    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most."""
+def _prune(
+    job: Job, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None, baked: np.ndarray | None
+) -> tuple[RefinementState, Pruned]:
+    """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most. Of a whole scene,
+    voxels without which a ray would end in a hole stay.
+
+    baked  (N,) densities before the first step, of a whole scene
+    """
     from efficientnerf.asset.cascades import subset
-    from efficientnerf.asset.refinement import fit
     from efficientnerf.asset.refinement.state import subset_state
 
-    settings = job.settings
     state.to_host()
+    greatest = _greatest_weights(job, state, targets)
+    keep = _heaviest(job, greatest, most)
+    if not keep.any():
+        return state, Pruned()
+    if samples is None:
+        if state.tree.background is None:
+            from efficientnerf.asset.components import small_components
+
+            keep &= ~small_components(state.tree, keep, job.settings.min_component)
+        return subset_state(state, keep, subset(state.tree, keep)), Pruned()
+    from efficientnerf.asset.components import unsupported_components
+
+    assert baked is not None
+    keep &= ~unsupported_components(state.tree, keep, job.settings.min_component, samples)
+    holes, pruned_share = find_holes(job, subset(state.tree, keep), samples)
+    needed = voxels_of_holes(state.tree, samples, holes)
+    restored = needed & ~keep
+    state.density[needed] = np.maximum(state.density, baked)[needed]
+    keep |= restored
+    over = int(keep.sum()) - most
+    if over > 0:
+        others = np.flatnonzero(keep & ~restored)
+        keep[others[np.argsort(greatest[others], kind="stable")[:over]]] = False
+    tree = subset(state.tree, keep)
+    return subset_state(state, keep, tree), Pruned(pruned_share, find_holes(job, tree, samples)[1], int((restored & keep).sum()))
+
+
+def _greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.ndarray:
+    """(N,) the greatest contribution of each voxel to one of many training pixels."""
+    from efficientnerf.asset.refinement import fit
+
+    settings = job.settings
     per_voxel = RAYS_PER_VOXEL if state.tree.ndc is None else NDC_RAYS_PER_VOXEL
     count = min(max(settings.visibility_rays, int(per_voxel * len(state.density))), 4 * len(targets.pixels))
 
@@ -131,24 +195,22 @@ def _prune(job: Job, state: RefinementState, targets: Targets, most: int) -> Ref
         job.progress(done, total, "rendering for voxel weights")
         job.safe_point()
 
-    greatest = fit.max_weights(state.tree, targets, count, settings.seed, progress)
-    keep = greatest > settings.weight_threshold
+    return fit.max_weights(state.tree, targets, count, settings.seed, progress)
+
+
+def _heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:
+    """(N,) bool: voxels whose weight exceeds bake.weight_threshold, at most `most`."""
+    keep = greatest > job.settings.weight_threshold
     if keep.sum() > most:
         order = np.argsort(-greatest, kind="stable")
         keep = np.zeros(len(keep), bool)
         keep[order[:most]] = True
         left_out = float(greatest[order[most]])
         job.say(f"voxels that never weigh more than {left_out:.3g} in a pixel are left out: bake.max_mib has room for {most:,}")
-    if not keep.any():
-        return state
-    if state.tree.background is None:
-        from efficientnerf.asset.components import small_components
-
-        keep &= ~small_components(state.tree, keep, settings.min_component)
-    return subset_state(state, keep, subset(state.tree, keep))
+    return keep
 
 
-def _save_checkpoint(job: Job, state: RefinementState, pruned: bool) -> None:
+def _save_checkpoint(job: Job, state: RefinementState, pruned: Pruned | None) -> None:
     from safetensors.numpy import save_file
 
     from efficientnerf.asset.cascades import voxel_cascades
@@ -160,7 +222,9 @@ def _save_checkpoint(job: Job, state: RefinementState, pruned: bool) -> None:
     tensors["coordinates"] = voxel_coordinates(state.tree)
     if state.tree.outer:
         tensors["cascades"] = voxel_cascades(state.tree)
-    tensors["progress"] = np.array([state.step, pruned], np.int64)
+    tensors["progress"] = np.array([state.step, pruned is not None], np.int64)
+    if pruned is not None:
+        tensors["holes"] = np.array([pruned.without, pruned.restored, pruned.voxels], np.float64)
     with atomic(job.work / CHECKPOINT, durable=False) as temporary:
         save_file(tensors, str(temporary), metadata={"sha256": _digest(tensors)})
 
@@ -174,8 +238,8 @@ def _digest(tensors: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _restored(job: Job, tree: NerfTree, steps: int) -> tuple[RefinementState, bool] | None:
-    """The state of the last checkpoint of so many steps, and whether voxels were dropped by then; None where there is none that fits the tree."""
+def _restored(job: Job, tree: NerfTree, steps: int) -> tuple[RefinementState, Pruned | None] | None:
+    """The state of the last checkpoint of so many steps, and what was dropped by then; None where there is none that fits the tree."""
     from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
 
     path = job.work / CHECKPOINT
@@ -185,6 +249,7 @@ def _restored(job: Job, tree: NerfTree, steps: int) -> tuple[RefinementState, bo
         found = _read(path)
         kept = _check(found, tree, steps)
         step, pruned = (int(x) for x in found["progress"])
+        without, restored, voxels = found["holes"].tolist() if pruned else (0.0, 0.0, 0)
         fitted = _with_values(tree, kept, np.array(found["density"]), np.array(found["sh"]))
         density, sh, visits = (np.array(found[name]) for name in MOMENTS)
         state = RefinementState(fitted, density, sh, visits, step)
@@ -193,7 +258,7 @@ def _restored(job: Job, tree: NerfTree, steps: int) -> tuple[RefinementState, bo
         remove(path)
         return None
     job.say(f"the refinement goes on from step {state.step}")
-    return state, bool(pruned)
+    return state, Pruned(without, restored, int(voxels)) if pruned else None
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -213,8 +278,6 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.ndarray) -> NerfTree:
     """The tree with the voxels `kept`, places of its own, alone, and their values."""
-    from dataclasses import replace
-
     from efficientnerf.asset.cascades import subset
 
     keep = np.zeros(len(tree.density_values), bool)
@@ -233,6 +296,8 @@ def _check(found: Mapping[str, np.ndarray], tree: NerfTree, steps: int) -> np.nd
         if name not in found or found[name].dtype != kind or found[name].shape != shapes[name]:
             raise ValueError(f"'{name}' is missing, or no {kind} {shapes[name]}")
     step, pruned = (int(x) for x in found["progress"])
+    if pruned and ("holes" not in found or found["holes"].dtype != "float64" or found["holes"].shape != (3,) or not np.isfinite(found["holes"]).all()):
+        raise ValueError("'holes' is missing, or no three numbers")
     low, high = (steps // 2, steps) if pruned else (0, steps // 2)
     if pruned not in (0, 1) or not low <= step <= high:
         raise ValueError(f"step {step} is not from {low} to {high}")

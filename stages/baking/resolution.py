@@ -19,11 +19,13 @@ if TYPE_CHECKING:
     from stages.io.scene import Scene
 
 MIN_RESOLUTION = 32  # voxels along the longest side
-# docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background and without one (images hold noise that finer
-# voxels would learn); voxels along the longest side, at most; MiB of an asset, at most
-VOXEL_PIXELS, UNBOUNDED_VOXEL_PIXELS = 0.5, 4 / 3
-MAX_RESOLUTION = {"constant background": 1024, "unbounded": 384, "ndc": 1024}
-MAX_MIB = 24
+# docs/experiments/bake-resolution.md: width of a voxel in pixels, at least, with a constant background, of a whole scene (in its innermost cascade), and in
+# normalised device coordinates (images hold noise that finer voxels would learn); voxels along the longest side, at most; MiB of an asset, at most
+VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
+MAX_RESOLUTION = 1024
+MAX_MIB, SCENE_MAX_MIB = 24, 38
+# Of whole scenes: cascades at most; the share of what the field shows that may lie beyond the last one, in the environment map; coarse cells of all of them.
+MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 NDC_BYTES, NDC_MAX_MIB = 36, 56  # in normalised device coordinates: bytes for each pixel of the box's face; MiB at most. docs/experiments/ndc.md
 MIN_FILL = 0.93  # of the size that is used, at least
 MAX_TRIES = 4
@@ -38,32 +40,49 @@ class Choice:
 
 
 def finest_resolution(s: Scene, most: int | None) -> Choice:
-    """Voxels along the longest side of the box, so that a voxel covers half a pixel at the box's centre, for the median camera, and 4/3 of it
-    without a constant background; at most `most` of them, or MAX_RESOLUTION where it is None.
+    """Voxels along the longest side of the box, so that a voxel covers half a pixel at the box's centre, for the median camera; at most `most` of them, or
+    MAX_RESOLUTION where it is None.
 
     In normalised device coordinates, where a pixel is as wide at any depth, a voxel is as wide as 4/3 of a pixel.
     """
     if s.forward is not None:
-        wide, share = ndc_pixel(s, s.forward), UNBOUNDED_VOXEL_PIXELS
+        wide, share = ndc_pixel(s, s.forward), NDC_VOXEL_PIXELS
         side = float((s.forward.bounds[1] - s.forward.bounds[0])[:2].max())
     else:
-        centre = np.asarray(s.bounds, np.float64).mean(axis=0)
-        wide = float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
-        share = VOXEL_PIXELS if s.background is not None else UNBOUNDED_VOXEL_PIXELS
+        wide, share = pixel_at_centre(s, s.bounds), VOXEL_PIXELS
         side = float((s.bounds[1] - s.bounds[0]).max())
+    return _resolved(side / (share * wide), share, MAX_RESOLUTION if most is None else most)
+
+
+def finest_of_cascades(s: Scene, bounds: np.ndarray, count: int, brick: int, most: int | None) -> Choice:
+    """`finest_resolution` of the innermost of so many cascades, which covers `bounds` (2, 3): a voxel covers a pixel at its centre. At most `most`, or as many
+    as MAX_CELLS allow where it is None."""
+    sides = np.asarray(bounds[1] - bounds[0], np.float64)
     if most is None:
-        most = MAX_RESOLUTION["ndc" if s.forward is not None else "unbounded" if s.background is None else "constant background"]
-    resolved = max(MIN_RESOLUTION, round(side / (share * wide)))
+        cells_at_one = float(np.prod(sides / sides.max())) / brick**3  # of a cascade, over the cube of the resolution
+        most = max(MIN_RESOLUTION, int((MAX_CELLS / count / cells_at_one) ** (1 / 3)))
+    return _resolved(float(sides.max()) / (SCENE_VOXEL_PIXELS * pixel_at_centre(s, bounds)), SCENE_VOXEL_PIXELS, most)
+
+
+def _resolved(voxels: float, share: float, most: int) -> Choice:
+    """So many voxels, each `share` of a pixel wide, but `most` at most."""
+    resolved = max(MIN_RESOLUTION, round(voxels))
     if resolved > most:
         return Choice(most, f"bake.max_resolution; pixels resolve {resolved}")
     return Choice(resolved, f"a voxel covers {share:.2g} of a pixel")
 
 
-def budget_of(s: Scene, given: int | None) -> int:
-    """MiB that an asset may have: those given, or else MAX_MIB. In normalised device coordinates, where nothing is empty and each pixel needs voxels
-    of its own, NDC_BYTES to each pixel of the box's face, where that is more; at most NDC_MAX_MIB."""
+def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
+    """Width of a pixel of the median camera at the centre of a box (2, 3), world units."""
+    centre = np.asarray(bounds, np.float64).mean(axis=0)
+    return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
+
+
+def budget_of(s: Scene, given: int | None, *, whole: bool = False) -> int:
+    """MiB that an asset may have: those given, or else MAX_MIB, or SCENE_MAX_MIB of a whole scene. In normalised device coordinates, where nothing is empty
+    and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, where that is more; at most NDC_MAX_MIB."""
     if given is not None or s.forward is None:
-        return MAX_MIB if given is None else given
+        return (SCENE_MAX_MIB if whole else MAX_MIB) if given is None else given
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
     return int(np.clip(NDC_BYTES * across * down / 2**20, MAX_MIB, NDC_MAX_MIB))
 

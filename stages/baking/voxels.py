@@ -1,11 +1,10 @@
-"""Which voxels of which grid are baked: the resolution, and the voxels that training images show.
+"""Which voxels of one grid are baked: the resolution, and the voxels that training images show. Of whole scenes: `stages.baking.whole_scene`.
 
 N voxels.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -102,37 +101,27 @@ def _visibility(job: Job, m: Any, pixels: Pixels, shape: tuple[int, int, int], v
     from efficientnerf.asset import bake
 
     settings: BakeSettings = job.settings
-    kinds = {"cells": ("int64", 1), "greatest": ("float32", 2), "chosen": ("int64", 1), "before": ("float16", 2), "behind": ("float16", 2)}
+    kinds = {"cells": ("int64", 1), "greatest": ("float32", 2)}
     stored = read_arrays(job.work / "visibility", kinds, job.warn)
     if stored is not None:
         found = bake.Visibility(**{name: np.array(part) for name, part in stored.items()})
-        if _fits(found, int(np.prod(shape)), settings.brick_size**3, len(pixels), outside=m.background is None):
-            # With a constant background `before` and `behind` are None, and empty arrays in the files.
-            return found if m.background is None else replace(found, before=None, behind=None)
-        job.warn(unusable(job.work / "visibility", "of another grid or of other images"))
+        if _fits(found, int(np.prod(shape)), settings.brick_size**3):
+            return found
+        job.warn(unusable(job.work / "visibility", "of another grid"))
 
     def progress(done: int, total: int) -> None:
         job.progress(done, total, "rendering for visible voxels")
         job.safe_point()
 
     visibility = bake.visible_voxels(m, pixels, shape, voxel, low, settings.brick_size, settings.visibility_rays, progress, space)
-    parts = {name: getattr(visibility, name) for name in kinds}
-    write_arrays({name: np.empty((0, 4), np.float16) if part is None else part for name, part in parts.items()}, job.work / "visibility")
+    write_arrays({name: getattr(visibility, name) for name in kinds}, job.work / "visibility")
     return visibility
 
 
-def _fits(found: Visibility, cells: int, per_cell: int, pixels: int, *, outside: bool) -> bool:
-    """Whether a visibility is of so many coarse cells with so many voxels each, and of so many pixels.
-
-    outside  whether `before` and `behind` are of each pixel; else they are empty
-    """
-    assert found.before is not None
-    assert found.behind is not None
+def _fits(found: Visibility, cells: int, per_cell: int) -> bool:
+    """Whether a visibility is of so many coarse cells with so many voxels each."""
     ascending = not len(found.cells) or (found.cells[0] >= 0 and found.cells[-1] < cells and (np.diff(found.cells) > 0).all())
-    of_pixels = not len(found.chosen) or (found.chosen.min() >= 0 and found.chosen.max() < pixels)
-    rows = len(found.chosen) if outside else 0
-    shapes = found.greatest.shape == (len(found.cells), per_cell) and found.before.shape == (rows, 4) and len(found.behind) == rows
-    return bool(ascending and of_pixels and shapes and (not rows or found.behind.shape[1] == 3))
+    return bool(ascending and found.greatest.shape == (len(found.cells), per_cell))
 
 
 def _heaviest_voxels(job: Job, visibility: Visibility, shape: tuple[int, int, int], most: int) -> np.ndarray:

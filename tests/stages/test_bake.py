@@ -177,6 +177,7 @@ def test_a_state_of_another_refinement_is_told(pruned: int, change: Callable[[di
     tensors = {name: np.zeros(count, np.float32) for name in ("density", "square_density", "square_sh")}
     tensors |= {"sh": np.zeros((count, 3), np.float32), "visits": np.zeros(count, np.int32), "coordinates": coordinates}
     tensors["progress"] = np.array([7 if pruned else 3, pruned], np.int64)
+    tensors |= {"holes": np.zeros(3)} if pruned else {}
     refinement._check(tensors, tree, 12)
     change(tensors)
     with pytest.raises(ValueError, match=r"step|voxels|missing|progress"):

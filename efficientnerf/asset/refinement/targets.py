@@ -1,6 +1,6 @@
 """What a tree is fitted to: training pixels, and the background that it is composited with.
 
-R rays, P pixels.
+R rays, H rows.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from efficientnerf.backends.numba.tree.gradients import RayTargets
+from efficientnerf.rendering import environment
 from efficientnerf.training.pixels import Pixels
 
 if TYPE_CHECKING:
@@ -26,10 +27,8 @@ class Targets:
     """Training pixels, and what the tree is composited with.
 
     pixels            of the training views
-    background        constant sRGB colour behind the scene; None: an unbounded scene, of which the next three hold what lies outside of the box
-    chosen            (P,) indices of the pixels that may be drawn
-    before            (P, 4) premultiplied colour and opacity of what lies between the camera and the box
-    behind            (P, 3) colour of what lies beyond the box
+    background        constant sRGB colour behind the scene; None: an unbounded scene, which is laid over its environment map
+    environment       (H, 2 H, 3) float32 sRGB colours by direction (`efficientnerf.rendering.environment`), of unbounded scenes
     reaches_infinity  whether the box reaches to infinity, so that the tree should be opaque
 
     Objects with alpha, and boxes that reach to infinity, are compared over a random background, each channel uniform over 0 to 1. The expected error is
@@ -38,14 +37,12 @@ class Targets:
 
     pixels: Pixels | DevicePixels
     background: tuple[float, float, float] | None
-    chosen: np.ndarray | None = None
-    before: Any = None
-    behind: Any = None
+    environment: Any = None
     reaches_infinity: bool = False
 
     def __post_init__(self) -> None:
-        if self.background is None and (self.chosen is None or self.before is None or self.behind is None):
-            raise ValueError("targets of an unbounded scene need what lies before and behind the box")
+        if self.background is None and self.environment is None:
+            raise ValueError("targets of an unbounded scene need its environment map")
 
     @property
     def on_device(self) -> bool:
@@ -67,29 +64,26 @@ class Targets:
         from efficientnerf.training.device_pixels import DevicePixels
 
         assert isinstance(self.pixels, Pixels)
-        before, behind = (None if part is None else torch.from_numpy(np.ascontiguousarray(part)).to(device) for part in (self.before, self.behind))
-        return replace(self, pixels=DevicePixels(self.pixels, device), before=before, behind=behind)
+        sent = None if self.environment is None else torch.from_numpy(np.ascontiguousarray(self.environment)).to(device)
+        return replace(self, pixels=DevicePixels(self.pixels, device), environment=sent)
 
     def draw(self, count: int, rng: np.random.Generator, *, constant_background: bool = False) -> tuple[Any, Any, RayTargets]:
         """Origins (R, 3) and unit directions (R, 3) of `count` random pixels, world frame, and their targets; arrays, or tensors of the device.
 
         constant_background  objects are compared over the background of the scene, not over a random one
         """
-        if self.chosen is None:
-            return self.of(self.pixels.choose(count, rng), None, constant_background=constant_background)
-        at = rng.integers(len(self.chosen), size=count)
-        return self.of(self.chosen[at], at, constant_background=constant_background)
+        return self.of(self.pixels.choose(count, rng), constant_background=constant_background)
 
-    def of(self, index: np.ndarray, at: np.ndarray | None, *, constant_background: bool = False) -> tuple[Any, Any, RayTargets]:
-        """`draw` for pixels `index`; `at` are their places in `chosen`."""
+    def of(self, index: np.ndarray, *, constant_background: bool = False) -> tuple[Any, Any, RayTargets]:
+        """`draw` for pixels `index`."""
         bundle: tuple[Any, ...] = self.pixels.bundle(index)
         origins, directions, _, _, colour = bundle
         ones = colour[:, 0] * 0 + 1
         truth = colour[:, :3]
         if self.background is None:
-            assert at is not None
-            before, behind = self._rows(self.before, at), self._rows(self.behind, at)
-            return origins, directions, RayTargets(truth - before[:, :3], behind, 1 - before[:, 3], ones, 0.0)
+            lookup = environment.lookup_on if self.on_device else environment.lookup
+            behind = lookup(self.environment, directions)
+            return origins, directions, RayTargets(truth * 1, behind, ones, ones * 1, 0.0)
         has_alpha = colour.shape[1] == 4
         random_background = (has_alpha or self.reaches_infinity) and not constant_background
         behind = colour[:, :3] * 0
@@ -101,12 +95,6 @@ class Targets:
             opacity = colour[:, 3] * 1
             truth = truth * opacity[:, None] + behind * (1 - opacity[:, None])
         return origins, directions, RayTargets(truth * 1, behind, ones, opacity, VARIANCE if random_background else 0.0)
-
-    def _rows(self, part: Any, at: np.ndarray) -> Any:
-        """Rows `at` of an array, or of a tensor on the pixels' device, in float32."""
-        if isinstance(self.pixels, Pixels):
-            return part[at].astype(np.float32)
-        return part[self.pixels.to_device(at)].float()
 
 
 def step_rng(seed: int, step: int) -> np.random.Generator:

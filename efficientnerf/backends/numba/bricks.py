@@ -77,3 +77,66 @@ def resample_weights(
                 at = (x % brick * brick + y % brick) * brick + z % brick
                 into[to, at] = max(into[to, at], weight)
     return rows
+
+
+MAX_PIECES = 64  # of a sample that reaches through many voxels
+
+
+@numba.njit(cache=True, error_model="numpy")
+def weigh_voxels(  # type: ignore[no-untyped-def]
+    origin, direction, first, start, extent, weight, thickness, threshold, shape, voxel, low, hole, brick, row_of, into, rows
+) -> int:
+    """Raise voxels to the weights above `threshold` of samples that pass through them; returns the number of rows in use.
+
+    origin, direction, first  of rays: (R, 3), (R, 3), (R + 1,)
+    start, extent, weight, thickness  of their samples, (M,): a sample is cut into pieces of about a voxel, and its weight as its optical thickness says
+    hole          (2, 3) box that is left out
+    row_of, into  as in `resample_weights`
+    """
+    size_x, size_y, size_z = shape[0] * brick, shape[1] * brick, shape[2] * brick
+    for r in range(len(first) - 1):
+        for n in range(first[r], first[r + 1]):
+            depth = np.float64(thickness[n])
+            absorbed = -np.expm1(-depth)
+            light = weight[n] / absorbed if absorbed > 0 else 0.0
+            count = max(1, min(MAX_PIECES, int(np.ceil(extent[n] / voxel))))
+            passed = 1.0
+            for k in range(count):
+                after = np.exp(-depth * (k + 1) / count)
+                share = np.float32(light * (passed - after)) if count > 1 else weight[n]
+                passed = after
+                if not share > threshold:
+                    continue
+                t = start[n] + (k + 0.5) / count * extent[n]
+                px, py, pz = origin[r, 0] + t * direction[r, 0], origin[r, 1] + t * direction[r, 1], origin[r, 2] + t * direction[r, 2]
+                if hole[0, 0] <= px < hole[1, 0] and hole[0, 1] <= py < hole[1, 1] and hole[0, 2] <= pz < hole[1, 2]:
+                    continue
+                x, y, z = int(np.floor((px - low[0]) / voxel)), int(np.floor((py - low[1]) / voxel)), int(np.floor((pz - low[2]) / voxel))
+                if x < 0 or y < 0 or z < 0 or x >= size_x or y >= size_y or z >= size_z:
+                    continue
+                owner = (x // brick * shape[1] + y // brick) * shape[2] + z // brick
+                if row_of[owner] < 0:
+                    row_of[owner] = rows
+                    rows += 1
+                to = row_of[owner]
+                if to < len(into):
+                    at = (x % brick * brick + y % brick) * brick + z % brick
+                    into[to, at] = max(into[to, at], share)
+    return rows
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def greatest_around(indices: np.ndarray, greatest: np.ndarray, shape: tuple[int, int, int], brick: int, row_of: np.ndarray, out: np.ndarray) -> None:
+    """The greatest weight of voxels (N, 3) and of the 26 around each, to `out` (N,).
+
+    greatest  (B, brick^3) of the coarse cells of which `row_of` (cells,) int32 has the row, or -1
+    """
+    for n in numba.prange(len(indices)):
+        best = np.float32(0)
+        for x in range(max(0, indices[n, 0] - 1), min(shape[0] * brick, indices[n, 0] + 2)):
+            for y in range(max(0, indices[n, 1] - 1), min(shape[1] * brick, indices[n, 1] + 2)):
+                for z in range(max(0, indices[n, 2] - 1), min(shape[2] * brick, indices[n, 2] + 2)):
+                    row = row_of[(x // brick * shape[1] + y // brick) * shape[2] + z // brick]
+                    if row >= 0:
+                        best = max(best, greatest[row, (x % brick * brick + y % brick) * brick + z % brick])
+        out[n] = best

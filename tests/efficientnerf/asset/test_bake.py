@@ -14,7 +14,6 @@ from efficientnerf.asset.bake import Visibility, blocks_of, chosen_voxels, grid_
 from efficientnerf.asset.queries import density_at, density_block
 from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
 from efficientnerf.fields.bakeable import BakeableField
-from efficientnerf.geometry.spaces import ContractedSpace
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
 from tests.efficientnerf.balls import BOUNDS, pixels, untrained
@@ -55,7 +54,7 @@ def sparse(weight: np.ndarray, brick: int) -> Visibility:
     x, y, z = (n // brick for n in weight.shape)
     rows = weight.reshape(x, brick, y, brick, z, brick).transpose(0, 2, 4, 1, 3, 5).reshape(-1, brick**3)
     cells = np.flatnonzero(rows.any(axis=1))
-    return Visibility(cells, rows[cells], np.zeros(0, np.int64), None, None)
+    return Visibility(cells, rows[cells])
 
 
 @pytest.mark.parametrize(("extent", "resolution", "brick"), [((2, 2, 2), 64, 4), ((2, 1, 0.3), 100, 4), ((0.7, 2, 1.1), 33, 5), ((1e-3, 1, 1), 8, 16)])
@@ -116,23 +115,6 @@ def test_looked_at_pixels_are_spread_over_columns_and_rows() -> None:
     assert len(np.unique(index)) == len(index)
     assert len(np.unique(index % 25)) == 25
     assert len(np.unique(index // 25)) > 240
-
-
-def test_of_photographs_it_is_kept_what_lies_before_and_behind_the_box() -> None:
-    """A ball within the box over a sky: before is nothing, behind is the sky, for each pixel that was looked at."""
-    m = model_of_a_ball()
-    m.space, m.background = ContractedSpace(BOUNDS), None
-    some = pixels(6, 16)
-    shape, voxel = grid_of(BOUNDS, 16, 4)
-    seen = visible_voxels(m, some, shape, voxel, BOUNDS[0], 4, 10**6, lambda done, total: None)
-    assert seen.before is not None
-    assert seen.behind is not None
-    assert len(seen.chosen) == len(seen.before) == len(seen.behind) == len(some)
-    assert seen.before.dtype == seen.behind.dtype == np.float16
-    assert np.abs(seen.before).max() < 1e-3
-    directions = torch.from_numpy(some.bundle(seen.chosen)[1])
-    np.testing.assert_allclose(seen.behind, m.behind(directions).detach(), atol=2e-3)
-    assert (dense(seen, shape, 4) > 1e-3).any()
 
 
 def test_chosen_voxels_are_those_above_the_threshold_and_their_neighbours() -> None:

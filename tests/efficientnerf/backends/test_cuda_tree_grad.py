@@ -148,15 +148,14 @@ def test_targets_on_the_device_say_the_same(kind: str) -> None:
         made = cameras(5, 12)
         some = Pixels(made, [photograph(c) for c in made], [None] * 5, np.full(5, 1.0), np.full(5, 5.0))
         rng = np.random.default_rng(0)
-        chosen = np.sort(rng.choice(len(some), 300, replace=False))
-        targets = Targets(some, None, chosen, rng.random((300, 4)).astype(np.float16), rng.random((300, 3)).astype(np.float16))
+        targets = Targets(some, None, rng.random((8, 16, 3)).astype(np.float32))
     else:
         if kind == "infinite":
             some.images = np.ascontiguousarray(some.images[:, :3])
         targets = Targets(some, (0.2, 0.5, 0.7), reaches_infinity=kind == "infinite")
     same = [each.draw(100, np.random.default_rng(1), constant_background=kind == "declared") for each in (targets, targets.sent(DEVICE))]
     for ours, theirs in zip((*same[1][:2], *same[1][2][:4]), (*same[0][:2], *same[0][2][:4]), strict=True):
-        np.testing.assert_allclose(ours.cpu().numpy(), theirs, atol=2e-6)
+        np.testing.assert_allclose(ours.cpu().numpy(), theirs, atol=1e-5 if kind == "photographs" else 2e-6)
         assert theirs.dtype == np.float32
     assert same[0][2].opacity_weight == same[1][2].opacity_weight
 

@@ -41,11 +41,12 @@ def some_state(tree: NerfTree, pruned: bool) -> RefinementState:
 def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None:
     tree = random_cascades(3)
     state = some_state(tree, pruned)
-    refinement._save_checkpoint(job(tmp_path), state, pruned)
+    dropped = refinement.Pruned(0.25, 0.125, 7) if pruned else None
+    refinement._save_checkpoint(job(tmp_path), state, dropped)
     found = refinement._restored(job(tmp_path), tree, STEPS)
     assert found is not None
     again = found[0]
-    assert (again.step, found[1]) == (state.step, pruned)
+    assert (again.step, found[1]) == (state.step, dropped)
     for name in STATE:
         np.testing.assert_array_equal(getattr(again, name), getattr(state, name))
     for name in ("brick_index", "voxel_index", "environment"):
@@ -72,6 +73,7 @@ def test_cascades_of_another_tree_are_told(pruned: bool, change: Callable[[dict[
     state = some_state(tree, pruned)
     tensors = {name: getattr(state, name) for name in STATE}
     tensors |= {"coordinates": voxel_coordinates(state.tree), "cascades": voxel_cascades(state.tree), "progress": np.array([state.step, pruned], np.int64)}
+    tensors |= {"holes": np.zeros(3)} if pruned else {}
     assert len(refinement._check(tensors, tree, STEPS)) == len(state.density)
     change(tensors)
     with pytest.raises(ValueError, match=r"voxels|cascades"):

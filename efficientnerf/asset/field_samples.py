@@ -1,0 +1,193 @@
+"""What a trained field shows along training rays, kept as its samples: from them follow the foreground region, which voxels of which grids are visible, what
+lies beyond all of these, and which rays should be opaque. The field is rendered once; the rest are passes over some tens of megabytes.
+
+P rays, M samples, C views, L cascades.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from efficientnerf.asset.bake import Visibility, spread_pixels
+from efficientnerf.backends.pieces import pieces
+from efficientnerf.model import Model, render_rays
+from efficientnerf.rendering import environment
+from efficientnerf.rendering.compositing import activate, ray_of_sample
+from efficientnerf.training.pixels import Pixels
+
+RAYS_PER_BLOCK = 8192  # that are rendered at once
+RAYS_PER_PASS = 2**15  # whose samples a kernel is given at once
+
+Grid = tuple[tuple[int, int, int], float, np.ndarray]  # coarse cells along x, y, z; side of a voxel; corner (3,)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSamples:
+    """Fine samples of a field along training rays: those that weigh more than a threshold.
+
+    pixel, view  (P,) int64 and int32: which training pixel of which view
+    origin       (C, 3) float32 centres of the views
+    direction    (P, 3) float32 unit directions
+    opacity      (P,) float32 of all samples, those left out too
+    behind       (P, 3) float16 the field's colour beyond all samples
+    first        (P + 1,) int64: ray r owns samples first[r] to first[r + 1]
+    start, extent  (M,) float32 along the ray, world units
+    weight, thickness  (M,) float32: contribution to the ray's colour, and optical thickness
+    colour       (M, 3) uint8
+    """
+
+    pixel: np.ndarray
+    view: np.ndarray
+    origin: np.ndarray
+    direction: np.ndarray
+    opacity: np.ndarray
+    behind: np.ndarray
+    first: np.ndarray
+    start: np.ndarray
+    extent: np.ndarray
+    weight: np.ndarray
+    thickness: np.ndarray
+    colour: np.ndarray
+
+    def ray(self) -> np.ndarray:
+        """(M,) the ray of each sample."""
+        return np.repeat(np.arange(len(self.pixel)), np.diff(self.first))
+
+    def points(self, samples: np.ndarray, ray: np.ndarray) -> np.ndarray:
+        """World points (n, 3) in the middle of some samples, of which the rays are given."""
+        along = self.start[samples] + self.extent[samples] / 2
+        return self.origin[self.view[ray]] + along[:, None] * self.direction[ray]
+
+    def blocks(self) -> Iterator[tuple[slice, slice]]:
+        """Rays and their samples, some of them at a time."""
+        for begin in range(0, len(self.pixel), RAYS_PER_PASS):
+            end = min(len(self.pixel), begin + RAYS_PER_PASS)
+            yield slice(begin, end), slice(int(self.first[begin]), int(self.first[end]))
+
+
+@torch.no_grad()
+def field_samples(m: Model, pixels: Pixels, count: int, threshold: float, done: Callable[[int, int], None]) -> FieldSamples:
+    """The samples of about `count` training pixels, evenly spread, that weigh more than `threshold`.
+
+    done  called with the number of pixels done and of all
+    """
+    chosen = spread_pixels(pixels, count)
+    rays: list[tuple[np.ndarray, ...]] = []
+    samples: list[tuple[np.ndarray, ...]] = []
+    for begin in range(0, len(chosen), RAYS_PER_BLOCK):
+        bundle = pixels.bundle(chosen[begin : begin + RAYS_PER_BLOCK])
+        origins, directions, near, far = (torch.from_numpy(np.ascontiguousarray(a)).to(m.device) for a in bundle[:4])
+        behind = m.behind(directions)
+        outputs = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), behind)
+        fine = outputs.fine
+        keep = outputs.fine_weight > threshold
+        counts = torch.bincount(ray_of_sample(fine.first, len(fine.start))[keep], minlength=len(near))
+        rays.append((bundle[1], outputs.fine_opacity.cpu().numpy(), behind.cpu().numpy().astype(np.float16), counts.cpu().numpy()))
+        thickness = activate(outputs.fine_raw[:, 0], m.fine.activation) * fine.length
+        colour = (outputs.fine_rgb[keep].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        samples.append((*(part[keep].cpu().numpy() for part in (fine.start, fine.extent, outputs.fine_weight, thickness)), colour))
+        done(min(len(chosen), begin + RAYS_PER_BLOCK), len(chosen))
+    direction, opacity, sky, counts_of = (np.concatenate(part) for part in zip(*rays, strict=True))
+    first = np.concatenate([[0], np.cumsum(counts_of)]).astype(np.int64)
+    joined = [np.concatenate(part) for part in zip(*samples, strict=True)]
+    return FieldSamples(chosen, pixels.view_of(chosen).astype(np.int32), pixels.centre, direction, opacity, sky, first, *joined)
+
+
+def surface_points(samples: FieldSamples) -> np.ndarray:
+    """World points (P, 3) where half of each ray's light is gone; infinity where less than half ever is."""
+    out = np.full((len(samples.pixel), 3), np.inf)
+    for rays, part in samples.blocks():
+        first = samples.first[rays.start : rays.stop + 1] - part.start
+        gone = np.concatenate([[0.0], np.cumsum(samples.weight[part], dtype=np.float64)])
+        ray = np.repeat(np.arange(len(first) - 1), np.diff(first))
+        passed = gone[1:] - gone[first[:-1]][ray] >= 0.5
+        at = np.flatnonzero(passed)
+        hit, where = np.unique(ray[at], return_index=True)
+        out[rays.start + hit] = samples.points(part.start + at[where], rays.start + hit)
+    return out
+
+
+def weight_by_box(samples: FieldSamples, boxes: Sequence[np.ndarray]) -> np.ndarray:
+    """(L + 1,) total weight of the samples in each of nested boxes (2, 3), that of the boxes inside of it left out, and of what lies beyond the last."""
+    out = np.zeros(len(boxes) + 1)
+    for _, box, weight in _boxes_of(samples, boxes):
+        out += np.bincount(box, weights=weight, minlength=len(out))
+    return out
+
+
+def _boxes_of(samples: FieldSamples, boxes: Sequence[np.ndarray]) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Rays, and the number of the first box that holds the middle of each of their samples, with its weight, block by block."""
+    every = np.stack([np.asarray(box, np.float64) for box in boxes])  # (L, 2, 3)
+    for rays, part in samples.blocks():
+        ray = np.repeat(np.arange(rays.start, rays.stop), np.diff(samples.first[rays.start : rays.stop + 1]))
+        point = samples.points(np.arange(part.start, part.stop), ray)
+        box = np.full(len(point), len(boxes))
+        for n in range(len(boxes) - 1, -1, -1):
+            box[((point >= every[n, 0]) & (point < every[n, 1])).all(axis=1)] = n
+        yield rays, box, samples.weight[part]
+
+
+def cascade_visibility(samples: FieldSamples, grids: Sequence[Grid], brick: int, threshold: float) -> list[Visibility]:
+    """The greatest weight of each voxel of nested grids; a sample counts in the innermost one whose box holds it, and along all of its extent: the density
+    is taken to be the same throughout. Weights that do not exceed `threshold` are left out."""
+    from efficientnerf.backends.numba.bricks import weigh_voxels
+
+    found = []
+    hole = np.zeros((2, 3))
+    for shape, voxel, low in grids:
+        row_of = np.full(math.prod(shape), -1, np.int32)
+        greatest, rows = np.zeros((0, brick**3), np.float32), 0
+        for _ in range(2):  # rows are counted, then filled
+            for rays, part in samples.blocks():
+                values = (samples.start[part], samples.extent[part], samples.weight[part], samples.thickness[part])
+                of_rays = (samples.origin[samples.view[rays]], samples.direction[rays], samples.first[rays.start : rays.stop + 1] - part.start)
+                rows = weigh_voxels(*of_rays, *values, float(threshold), shape, float(voxel), np.asarray(low, np.float64), hole, brick, row_of, greatest, rows)
+            if not len(greatest):
+                greatest = np.zeros((rows, brick**3), np.float32)
+        cells = np.flatnonzero(row_of >= 0)
+        found.append(Visibility(cells, greatest[row_of[cells]]))
+        hole = np.stack([low, low + np.asarray(shape) * brick * voxel])
+    return found
+
+
+def seen_opacity(visibility: Visibility, indices: np.ndarray, shape: tuple[int, int, int], brick: int) -> np.ndarray:
+    """(N,) float32: the greatest weight that voxels (N, 3), or those next to them, have on any ray: what is in full view absorbs no more than that."""
+    from efficientnerf.backends.numba.bricks import greatest_around
+
+    row_of = np.full(math.prod(shape), -1, np.int32)
+    row_of[visibility.cells] = np.arange(len(visibility.cells))
+    out = np.empty(len(indices), np.float32)
+    for part in pieces(len(indices), 2**16):
+        greatest_around(indices[part], visibility.greatest, shape, brick, row_of, out[part])
+    return out
+
+
+def environment_beyond(samples: FieldSamples, boxes: Sequence[np.ndarray], height: int, mean: np.ndarray) -> np.ndarray:
+    """An environment map (H, 2 H, 3) of what the field shows beyond the last of nested boxes (2, 3).
+
+    mean  (3,) colour where nothing is known of any direction
+    """
+    total, weight = np.zeros((height * 2 * height, 3)), np.zeros(height * 2 * height)
+    for rays, box, share in _boxes_of(samples, boxes):
+        count = rays.stop - rays.start
+        first = samples.first[rays.start : rays.stop + 1]
+        ray = np.repeat(np.arange(count), np.diff(first))
+        beyond = box == len(boxes)
+        colour = np.zeros((count, 3))
+        for channel in range(3):
+            colour[:, channel] = np.bincount(
+                ray[beyond], weights=share[beyond] * samples.colour[first[0] : first[-1], channel][beyond] / 255.0, minlength=count
+            )
+        after = np.bincount(ray[beyond], weights=share[beyond], minlength=count)
+        rest = np.clip(1 - samples.opacity[rays].astype(np.float64), 0, 1)
+        colour += rest[:, None] * samples.behind[rays]
+        texel = environment.texels_of(samples.direction[rays], height)
+        weight += np.bincount(texel, weights=after + rest, minlength=len(weight))
+        for channel in range(3):
+            total[:, channel] += np.bincount(texel, weights=colour[:, channel], minlength=len(weight))
+    return environment.filled(total.reshape(height, 2 * height, 3), weight.reshape(height, 2 * height), mean)
