@@ -26,14 +26,15 @@ CELLS_TO_FOCUS = 40  # along the distance from the cameras to what they look at
 NEIGHBOURS = 4  # samples of a view that a cell is compared with
 CENTRAL = 0.4  # of half the image: rays in its middle
 NEAR_QUANTILE = 0.35  # of a view's central distances: its subject, behind which there is always something
-OBSERVED, REACHED = 0.6, 0.2  # views of a cell over those of the cells with most: what is well observed; what the subject may still reach into
+OBSERVED, REACHED = 0.6, 0.05  # views of a cell over those of the cells with most: what is well observed; what the subject may still reach into
 FARTHEST, PATH_FARTHEST = 1.6, 3.0  # distance of a cell from its views over the usual distance
 # docs/experiments/foreground.md
 MIN_SHARE, MIN_PART = 0.2, 0.02  # of the central rays: that a subject holds at least; that a connected part of it does
 SUPPORT_TRIES, MAX_SUPPORTS = 400, 3
 MIN_SUPPORT, MAX_BEHIND = 0.08, 0.125  # of the observed cells, that a plane holds; of the central rays that end before it, that end behind it: supports hide
 MARGIN, WIDE_MARGIN, SUPPORT_MARGIN, FADE = 0.06, 0.1, 0.25, 0.02  # of the longest side
-MIN_MIDDLING = 0.1  # about a third of the way from the middle to the corner, in the mean
+FEET = 0.3  # of the subject's size, that a part of it stands above a support at most
+MIN_MIDDLING, MAX_BESIDE = 0.1, 1.8  # about a third of the way from the middle to the corner, in the mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ def find_foreground(
     if trusted.sum() < 10:
         return None
     if not converging:
-        return _region_of(cells, trusted & (cells.distance <= PATH_FARTHEST * reach), np.zeros(len(trusted), bool), False)
+        return _region_of(cells.centres[trusted & (cells.distance <= PATH_FARTHEST * reach)], cells.side)
     share = cells.in_view / max(1.0, float(np.quantile(cells.in_view[trusted], 0.95)))
     centres = np.array([camera.centre for camera in cameras])
     ring = np.linalg.norm(centres[:, :2] - focus[:2], axis=1)
@@ -108,17 +109,19 @@ def find_foreground(
     close = trusted & (cells.distance <= FARTHEST * reach) & (cells.nearest >= 0.1 * reach) & (inside | (not round_it))
     observed = close & (share >= OBSERVED)
     if not observed.any():
-        return _region_of(cells, trusted, np.zeros(len(trusted), bool), False)
-    support, level, hidden = find_support(cells, observed, close, centres, reach)
+        return _region_of(cells.centres[trusted], cells.side)
+    planes, support, hidden = find_support(cells, observed, close, centres, reach)
+    level = any(normal[2] > 0.8 for normal, _ in planes)
     candidates = close & ~support & ~hidden & (share >= REACHED)
-    if not support.any():  # nothing tells what stands on it from what is beside it, but where the pictures are centred
-        candidates &= cells.middling >= MIN_MIDDLING
     subject = _subject(cells, candidates, observed)
+    if not planes:  # nothing tells the subject from what is beside it but where the pictures are centred; if that leaves little out, it is the subject's own
+        central = _subject(cells, candidates & (cells.middling >= MIN_MIDDLING), observed)
+        subject = central if _volume(cells.centres[subject]) > MAX_BESIDE * _volume(cells.centres[central]) else subject
     if cells.central[subject].sum() < MIN_SHARE * cells.central[close].sum():
-        return _region_of(cells, observed, np.zeros(len(trusted), bool), level)
-    if not support.any():
-        return _region_of(cells, subject, support, round_it, WIDE_MARGIN)
-    return _region_of(cells, subject, support & close, level)
+        return _region_of(cells.centres[observed], cells.side, level=level)
+    if not planes:
+        return _region_of(cells.centres[subject], cells.side, level=round_it, margin=WIDE_MARGIN)
+    return _region_of(with_feet(cells.centres[subject], planes), cells.side, cells.centres[support & close], level=level)
 
 
 def find_focus(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, float, bool]:
@@ -217,13 +220,17 @@ def _weight_in_middle(pixels: np.ndarray) -> np.ndarray:
     return np.asarray(np.exp(-((pixels / CENTRAL) ** 2).sum(axis=1)))
 
 
-def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras: np.ndarray, reach: float) -> tuple[np.ndarray, bool, np.ndarray]:
-    """Cells (M,) on the planes that support the subject, whether one of them is level, and the cells behind a plane.
+Plane = tuple[np.ndarray, float]
+
+
+def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras: np.ndarray, reach: float) -> tuple[list[Plane], np.ndarray, np.ndarray]:
+    """The planes that support the subject, unit normals towards the cameras and offsets, the cells (M,) on them, and the cells behind one.
 
     A plane supports where it holds many cells, the cameras (C, 3) are on one side of it, and so is most of what the photographs' middles show beside it.
     """
     tolerance = max(1.5 * cells.side, 0.03 * reach)
-    support, hidden, level = np.zeros(len(observed), bool), np.zeros(len(observed), bool), False
+    support, hidden = np.zeros(len(observed), bool), np.zeros(len(observed), bool)
+    planes: list[Plane] = []
     left = observed.copy()
     for _ in range(MAX_SUPPORTS):
         found = _plane(cells.centres[left], tolerance)
@@ -242,11 +249,11 @@ def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras:
             continue
         support |= np.abs(height) <= tolerance
         hidden |= height < -tolerance
-        level |= bool(normal[2] > 0.8)
-    return support, level, hidden & ~support
+        planes.append((normal, offset))
+    return planes, support, hidden & ~support
 
 
-def _plane(points: np.ndarray, tolerance: float) -> tuple[np.ndarray, float] | None:
+def _plane(points: np.ndarray, tolerance: float) -> Plane | None:
     """Normal and offset of the plane with most of the points (N, 3) within a tolerance."""
     if len(points) < 3:
         return None
@@ -289,18 +296,33 @@ def _subject(cells: Cells, candidates: np.ndarray, observed: np.ndarray) -> np.n
     return out
 
 
-def _region_of(cells: Cells, subject: np.ndarray, support: np.ndarray, level: bool, margin_share: float = MARGIN) -> Region:
-    """A region round the subject's cells and the support beside them."""
-    found = cells.centres[subject]
-    low, high = found.min(axis=0) - cells.side, found.max(axis=0) + cells.side
+def _volume(points: np.ndarray) -> float:
+    """Of the box of points (N, 3)."""
+    return float(np.ptp(points, axis=0).prod()) if len(points) else 0.0
+
+
+def with_feet(subject: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
+    """Points (N, 3) of a subject and where those near a support would stand on it: what touches a plane counts as plane."""
+    size = float(np.ptp(subject, axis=0).max())
+    feet = [subject]
+    for normal, offset in planes:
+        height = subject @ normal - offset
+        near = height <= FEET * size
+        feet.append(subject[near] - height[near, None] * normal)
+    return np.concatenate(feet)
+
+
+def _region_of(found: np.ndarray, side: float, beside: np.ndarray | None = None, *, level: bool = False, margin: float = MARGIN) -> Region:
+    """A region round the subject's points (N, 3) and the support's points beside them; `level`: it may be round in plan."""
+    low, high = found.min(axis=0) - side, found.max(axis=0) + side
     size = float((high - low).max())
     room = SUPPORT_MARGIN * size
-    beside = cells.centres[support]
+    beside = np.zeros((0, 3)) if beside is None else beside
     beside = beside[((beside >= low - room) & (beside <= high + room)).all(axis=1)]
-    margin = margin_share * size + cells.side
+    margin = margin * size + side
     if level:  # the floor is clipped to a disc, or to a rounded rectangle about a long subject
         centre, half = (low + high)[:2] / 2, (high - low)[:2] / 2
-        round_one = float(np.linalg.norm(found[:, :2] - centre, axis=1).max()) + cells.side
+        round_one = float(np.linalg.norm(found[:, :2] - centre, axis=1).max()) + side
         half = np.full(2, round_one) if round_one <= 1.3 * half.min() else half
         low, high = np.append(centre - half, low[2]), np.append(centre + half, high[2])
     if len(beside):

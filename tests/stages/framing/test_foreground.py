@@ -122,6 +122,31 @@ def test_plain_ears_that_reach_towards_the_cameras_belong_to_the_head() -> None:
     assert found.bounds[1, 1] < 0.5
 
 
+@pytest.mark.parametrize("away", [1.5, 2.0, 2.6])
+@pytest.mark.parametrize("uncertain", [0.0, 0.03, 0.15])
+def test_a_head_is_whole_in_close_ups_and_before_a_wall_of_uncertain_depth(away: float, uncertain: float) -> None:
+    """Photographs by hand; a plain wall, whose depth the field does not know. The closest have the tips of the ears in a tenth of them."""
+    centre, ears = [0, -0.45, 0], [([0.3, -1.0, 0.35], [0.42, -0.6, 0.9]), ([-0.42, -1.0, 0.35], [-0.3, -0.6, 0.9])]
+    nose = ([-0.06, -1.25, -0.1], [0.06, -0.75, 0.0])
+    generator = np.random.default_rng(3)
+    cameras = []
+    for a in np.radians(np.linspace(-55, 50, 16)):
+        for z in (-0.3, 0.2, 0.7):
+            shaken = 0.1 * generator.normal(size=3)
+            cameras.append(camera([away * np.sin(a) + shaken[0], -0.3 - away * np.cos(a), z], [shaken[1], -0.4, 0.1 + shaken[2]], 50))
+    subject = [ball(centre, 0.4), *(box(*ear) for ear in ears), box(*nose)]
+    points, views, pixels = cast(cameras, [*subject, box([-8, 0, -8], [8, 1, 8])])
+    wall = ~np.isfinite(cast(cameras, subject)[0]).all(axis=1)
+    centres = np.array([one.centre for one in cameras])[views]
+    points[wall] = centres[wall] + (points - centres)[wall] * (1 + uncertain * generator.normal(size=(int(wall.sum()), 1)))
+    found = find_foreground(points, views, pixels, cameras)
+    assert found is not None
+    for low, high in (*ears, nose):
+        assert (inside_distance(found, in_box(low, high)) > found.fade).all()
+    assert (inside_distance(found, on_ball(centre, 0.4)) > 0).all()
+    assert (found.bounds[1] - found.bounds[0]).max() < 4.5  # of a wall of 16
+
+
 def test_floaters_before_the_cameras_and_scattered_ends_change_little() -> None:
     cameras = ring(30, 2.5, 1.2)
     shapes = [ball([0, 0, 0], 0.5), ROOM]
