@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from efficientnerf.geometry.cameras import Camera
 
 LONGEST = 480  # pixels, the longer side of the video
-FPS, CRF = 20, 20
+FPS, CRF = 15, 20
 
 
 def write_captured_path(asset: EvaluatedAsset, tree: Any, scene: Scene, frames: int, job: Job) -> None:
