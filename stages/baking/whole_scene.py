@@ -17,12 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from efficientnerf.settings import given
+from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.stage import Job
+from stages.artifacts import PosesOutputs
 from stages.baking.plan import Plan
 from stages.baking.scratch import read_arrays, write_arrays
+from stages.io.json_file import read_json
 from stages.scratch import unusable
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from efficientnerf.asset.bake import Visibility
     from efficientnerf.asset.field_samples import FieldSamples, Grid
     from efficientnerf.asset.region import Region
@@ -55,7 +60,7 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
     samples = _samples(job, m, pixels)
     job.safe_point()
     discretise: int | None = given(m.settings.discretise)
-    region = region_of(samples, pixels, s)
+    region = region_of(samples, pixels, s, job.inputs["poses"])
     # A field that was trained on the voxels of its box is baked on these.
     bounds = np.asarray(m.space.bounds if discretise else region.bounds, np.float64)
     count = cascades_needed(samples, bounds, given(settings.cascades))
@@ -129,13 +134,15 @@ def cascades_needed(samples: FieldSamples, bounds: np.ndarray, stated: int | Non
     return int(np.argmax(np.append(beyond[:-1] <= MAX_BEYOND * max(weight.sum(), 1e-9), True))) + 1
 
 
-def region_of(samples: FieldSamples, pixels: Pixels, s: Scene) -> Region:
-    """The foreground region; the scene bounds where the field says too little."""
+def region_of(samples: FieldSamples, pixels: Pixels, s: Scene, poses: Path) -> Region:
+    """The foreground region; the scene bounds where they were given by hand (poses.crop_box), and where the field says too little."""
     from efficientnerf.asset.field_samples import surface_points
     from efficientnerf.asset.region import Region
     from stages.framing.foreground import find_foreground
     from stages.io import scene
 
+    if bounds_are_given(poses):
+        return Region(np.asarray(s.bounds, np.float64))
     every = slice(None, None, max(1, len(samples.pixel) // FOREGROUND_RAYS))
     view = samples.view[every]
     row, column = np.divmod(samples.pixel[every] - pixels.offsets[view], pixels.width[view])
@@ -143,6 +150,17 @@ def region_of(samples: FieldSamples, pixels: Pixels, s: Scene) -> Region:
     cameras = [one.camera for one in scene.views_of(s, "train")]
     found = find_foreground(surface_points(samples)[every], view, place, cameras, weights=samples.opacity[every])
     return Region(np.asarray(s.bounds, np.float64)) if found is None else found
+
+
+def bounds_are_given(poses: Path) -> bool:
+    """Whether the scene bounds of an artifact of the stage poses are a box given by hand, by its report."""
+    path = PosesOutputs(poses).report
+    try:
+        report = read_json(path, "Run the poses stage again.") if path.is_file() else {}
+    except BadInput as error:
+        raise CorruptArtifact(str(error)) from error
+    framing = report.get("framing") if isinstance(report, dict) else None
+    return isinstance(framing, dict) and framing.get("bounds_from") == "given"
 
 
 def chosen_of(seen: Sequence[Visibility], grids: Sequence[Grid], settings: BakeSettings, threshold: float) -> list[np.ndarray]:

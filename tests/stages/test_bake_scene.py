@@ -20,7 +20,7 @@ from efficientnerf.rendering.field_renderer import FieldRenderer
 from pipeline.errors import Interrupted, UsageError
 from pipeline.executors.memory import Limit
 from stages import bake
-from stages.artifacts import BakeOutputs, TrainOutputs
+from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
 from stages.baking import holes, refinement, resolution, whole_scene
 from stages.baking.resolution import MAX_CELLS, SCENE_MAX_MIB, budget_of, finest_of_cascades
@@ -251,3 +251,16 @@ def test_voxels_of_a_cascade_reach_into_the_one_before_by_one(inputs: dict[str, 
     assert reaching > 0
     ground = np.abs(cascades_of(tree)[1].bounds_min[2] + (at[of == 1, 2] + 0.5) * sides[1] - GROUND) < 2 * sides[1]
     assert ground.any()
+
+
+def test_bounds_given_by_hand_are_the_region(tmp_path: Path, inputs: dict[str, Path]) -> None:
+    poses = shutil.copytree(inputs["poses"], tmp_path / "poses")
+    found, _ = baked(tmp_path / "found", inputs | {"poses": poses}, refine_steps=0)
+    assert found.region is not None
+    assert np.abs(found.region.bounds - BOUNDS).max() > 0.01
+    (poses / PosesOutputs.report).write_text(json.dumps({"framing": {"bounds_from": "given"}}))
+    given, _ = baked(tmp_path / "given", inputs | {"poses": poses}, refine_steps=0)
+    assert given.region is not None
+    assert np.array_equal(given.region.bounds, BOUNDS)
+    assert (given.bounds_min <= BOUNDS[0] + 1e-9).all()
+    assert (given.bounds_max >= BOUNDS[1] - 1e-9).all()

@@ -122,8 +122,7 @@ def test_plain_ears_that_reach_towards_the_cameras_belong_to_the_head() -> None:
     assert found.bounds[1, 1] < 0.5
 
 
-@pytest.mark.parametrize("away", [1.5, 2.0, 2.6])
-@pytest.mark.parametrize("uncertain", [0.0, 0.03, 0.15])
+@pytest.mark.parametrize(("away", "uncertain"), [(1.5, 0.0), (2.0, 0.03), (2.6, 0.15)])
 def test_a_head_is_whole_in_close_ups_and_before_a_wall_of_uncertain_depth(away: float, uncertain: float) -> None:
     """Photographs by hand; a plain wall, whose depth the field does not know. The closest have the tips of the ears in a tenth of them."""
     centre, ears = [0, -0.45, 0], [([0.3, -1.0, 0.35], [0.42, -0.6, 0.9]), ([-0.42, -1.0, 0.35], [-0.3, -0.6, 0.9])]
