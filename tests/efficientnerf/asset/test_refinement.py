@@ -121,7 +121,7 @@ def test_any_background_is_the_mean_over_random_ones() -> None:
     tree = ball_tree()
     targets = Targets(some, (1.0, 1.0, 1.0))
     index = np.arange(600, 700)
-    origins, directions, seen = targets.of(index, None)
+    origins, directions, seen = targets.of(index)
     loss = gradients(tree, origins, directions, seen, np.float32)[0]
     rng = np.random.default_rng(0)
     seen_as = render_rays(tree, origins, directions)
@@ -130,7 +130,7 @@ def test_any_background_is_the_mean_over_random_ones() -> None:
     truth = rgba[:, :3] * rgba[:, 3:] + behind * (1 - rgba[:, 3:])
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - truth) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
-    white = targets.of(index, None, constant_background=True)[2]
+    white = targets.of(index, constant_background=True)[2]
     assert white.opacity_weight == 0
     np.testing.assert_array_equal(white.background, 1)
 
@@ -141,13 +141,13 @@ def test_what_reaches_to_infinity_should_be_opaque_before_any_background() -> No
     tree = ball_tree()
     targets = Targets(some, (0.5, 0.5, 0.5), reaches_infinity=True)
     index = np.arange(600, 700)
-    origins, directions, seen = targets.of(index, None)
+    origins, directions, seen = targets.of(index)
     loss = gradients(tree, origins, directions, seen, np.float32)[0]
     seen_as = render_rays(tree, origins, directions)
     behind = np.random.default_rng(0).random((20000, 1, 3))
     drawn = ((seen_as.colour + behind * (1 - seen_as.opacity[:, None]) - some.images[index] / 255) ** 2).sum(axis=2).mean(axis=0)
     np.testing.assert_allclose(loss, drawn, atol=0.02)
-    declared = targets.of(index, None, constant_background=True)[2]
+    declared = targets.of(index, constant_background=True)[2]
     assert declared.opacity_weight == 0
     np.testing.assert_array_equal(declared.background, 0.5)
 
