@@ -6,6 +6,10 @@ See docs/experiments/min-views.md.
 
 A view counts only where its mask keeps the pixel: pixels that are left out tell nothing of what lies behind them. In scenes with masks, in every space, the
 density voxels are masked, too, that no view shows by a pixel that is kept, so that nothing fills them.
+
+Rays begin at their near plane: density before it costs a view nothing, yet other views put their background there, in the middle of the ring that the
+cameras stand in, and an asset, whose rays begin at the eye, would show it as fog. In contracted scenes the density voxels before the near plane of a view
+that has them in view are masked, and those close to the cameras and to the way from each to its neighbours. See docs/experiments/near-cameras.md.
 """
 
 from __future__ import annotations
@@ -29,6 +33,9 @@ Masks = Sequence[np.ndarray | None]  # (h, w) bool of each view at any size, Tru
 MASK_SIZE = 256  # px, longest side of the masks that are looked at
 BLOCK = 8  # density voxels along a side of the blocks that no view shows
 COARSE = 32  # px, longest side of the masks by which such blocks are told: a pixel and its neighbours are wider than the points of a block are apart
+CLEARANCE = 0.8  # of the near plane's distance: how far from the cameras' path nothing is. docs/experiments/near-cameras.md
+NEIGHBOURS = 4  # of a camera that its path leads to, where they are within twice the near plane's distance
+NEAR_BLOCK = 2  # density voxels along a side of the blocks before the near planes
 MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is required
 
 
@@ -91,6 +98,63 @@ def cells_without_view(space: Space, cameras: Sequence[Camera], side: int, masks
     for axis in range(3):
         free = np.repeat(free, BLOCK, axis)
     return free[:side, :side, :side]
+
+
+def cells_before_near(space: Space, cameras: Sequence[Camera], near: Sequence[float], side: int) -> np.ndarray:
+    """(D, D, D) bool of the density voxels of a contracted space, D = `side`: those in blocks all of whose corners one view has in view before its near plane,
+    or that lie within CLEARANCE of the cameras' path."""
+    import torch
+
+    count = -(-side // NEAR_BLOCK)
+    lattice = np.minimum(np.arange(count + 1) * (NEAR_BLOCK / side), 1.0)
+    grid = np.stack(np.meshgrid(*(lattice,) * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    world = space.world(torch.from_numpy(grid)).numpy()
+
+    def blocks(corners: np.ndarray) -> np.ndarray:
+        whole = corners.reshape((count + 1,) * 3)
+        for axis in range(3):
+            low, high = (np.take(whole, range(begin, begin + count), axis) for begin in (0, 1))
+            whole = low & high
+        return whole
+
+    found = blocks(close_to_path(world, cameras, near))
+    for camera, plane in zip(cameras, near, strict=True):
+        depth = (world - camera.centre) @ camera.forward
+        at = np.flatnonzero((depth > 0) & (depth < plane))
+        corners = np.zeros(len(world), bool)
+        corners[at[before_near(world[at], camera, plane)]] = True
+        found |= blocks(corners)
+    for axis in range(3):
+        found = np.repeat(found, NEAR_BLOCK, axis)
+    return found[:side, :side, :side]
+
+
+def close_to_path(points: np.ndarray, cameras: Sequence[Camera], near: Sequence[float]) -> np.ndarray:
+    """(N,) bool: which points (N, 3) lie within CLEARANCE times the near plane's distance of a camera, or of the way to one of its nearest neighbours."""
+    from scipy.spatial import cKDTree
+
+    centres, plane = np.array([camera.centre for camera in cameras]), np.asarray(near, np.float64)
+    count = min(NEIGHBOURS + 1, len(centres))
+    distance, other = cKDTree(centres).query(centres, k=count)
+    way, radius = [centres], [CLEARANCE * plane]
+    for n, m in zip(*np.nonzero(np.reshape(distance, (-1, count)) <= 2 * plane[:, None]), strict=True):
+        to = np.reshape(other, (-1, count))[n, m]
+        steps = np.linspace(0, 1, 5)[1:-1, None]
+        way.append(centres[n] + steps * (centres[to] - centres[n]))
+        radius.append(np.full(len(steps), CLEARANCE * min(plane[n], plane[to])))
+    found = np.zeros(len(points), bool)
+    places, reach = np.concatenate(way), np.concatenate(radius)
+    tree = cKDTree(points)
+    for at in tree.query_ball_point(places, reach):
+        found[at] = True
+    return found
+
+
+def before_near(points: np.ndarray, camera: Camera, near: float) -> np.ndarray:
+    """(N,) bool: which points (N, 3) a camera has in view before its near plane."""
+    pixels, depth = project(camera, points)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((depth > 0) & (depth < near) & (pixels >= 0).all(1) & (pixels <= (camera.width, camera.height)).all(1))
 
 
 def shows(points: np.ndarray, camera: Camera, mask: np.ndarray | None, margin: float = 0.0) -> np.ndarray:

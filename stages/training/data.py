@@ -106,18 +106,20 @@ def sparse_depth_of(folder: Path, s: Scene) -> SparseDepthRays | None:
 
 def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> None:
     """Mask the density voxels whose density could be at any depth: in unbounded scenes those that fewer than `train.min_views` training views have in view,
-    and where views have masks, in any scene, those that no pixel shows which is kept."""
+    and those that the cameras must have looked through; and where views have masks, in any scene, those that no pixel shows which is kept."""
     import torch
 
     from efficientnerf.sampling.occupancy import mask_cells
-    from stages.framing.view_coverage import cells_below_min_views, cells_without_view, kept_pixels
+    from stages.framing.view_coverage import cells_before_near, cells_below_min_views, cells_without_view, kept_pixels
 
     few = given(m.settings.min_views) if m.space.contracted else None
-    if few is None and all(view.mask is None for view in views):
+    if not m.space.contracted and all(view.mask is None for view in views):
         return
     job.progress(0, m.settings.iterations, "computing view coverage")
     cameras, masks, side = [view.camera for view in views], kept_pixels(job.inputs[PosesOutputs.stage], views), m.voxels.side
     if few is not None:
         mask_cells(m.voxels, torch.from_numpy(cells_below_min_views(m.space, cameras, few, side, masks)))
+    if m.space.contracted:
+        mask_cells(m.voxels, torch.from_numpy(cells_before_near(m.space, cameras, [view.near for view in views], side)))
     if masks is not None:
         mask_cells(m.voxels, torch.from_numpy(cells_without_view(m.space, cameras, side, masks)))
