@@ -17,7 +17,19 @@ from efficientnerf.model import render_rays
 from efficientnerf.training.pixels import Pixels
 from stages import bake, train
 from stages.artifacts import BakeOutputs
-from stages.framing.view_coverage import bit_reversed_order, cells_below_min_views, cells_without_view, has_min_views, kept_pixels, shows, shrunk
+from stages.framing.view_coverage import (
+    CLEARANCE,
+    before_near,
+    bit_reversed_order,
+    cells_before_near,
+    cells_below_min_views,
+    cells_without_view,
+    close_to_path,
+    has_min_views,
+    kept_pixels,
+    shows,
+    shrunk,
+)
 from stages.io.field_file import load_renderer, space_of
 from stages.io.png import write_png
 from stages.io.scene import Scene, views_of
@@ -229,3 +241,34 @@ def test_training_learns_nothing_behind_ignored_pixels(tmp_path: Path) -> None:
     expected = cells_below_min_views(space_of(s), cameras, 2, 128, masks) | cells_without_view(space_of(s), cameras, 128, masks)
     np.testing.assert_array_equal(np.isneginf(values), expected)
     assert expected[(distance > 0.9) & (distance < 0.98)].mean() < 0.3
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_space_that_cameras_look_through_is_masked_and_no_other(count: int) -> None:
+    cameras = balls.cameras(count)
+    near = [0.3 * float(np.linalg.norm(camera.centre)) for camera in cameras]
+    side = 64
+    masked = cells_before_near(SPACE, cameras, near, side)
+    grid = (np.stack(np.meshgrid(*(np.arange(side),) * 3, indexing="ij"), axis=-1) + 0.5) / side
+    world = SPACE.world(torch.from_numpy(grid).reshape(-1, 3)).numpy()
+    allowed = close_to_path(world, cameras, near)
+    for camera, plane in zip(cameras, near, strict=True):
+        allowed |= before_near(world, camera, plane)
+    assert masked.any()
+    assert allowed.reshape(masked.shape)[masked].mean() > 0.98  # but for the curved edges of blocks in the shell
+    for camera, plane in zip(cameras, near, strict=True):
+        at = SPACE.grid(torch.from_numpy(camera.centre + 0.3 * plane * camera.forward)).numpy()
+        assert masked[tuple((at * side).astype(int))]
+        beyond = SPACE.grid(torch.from_numpy(camera.centre + 1.6 * plane * camera.forward)).numpy()
+        assert not masked[tuple((beyond * side).astype(int))]
+
+
+def test_the_path_leads_to_neighbours_alone_that_are_close() -> None:
+    first, last = aimed(np.zeros(3), 2)
+    far = float(np.linalg.norm(first.centre - last.centre))
+    middle = (first.centre + last.centre)[None] / 2
+    assert close_to_path(middle, [first, last], [0.6 * far, 0.6 * far])[0]
+    assert not close_to_path(middle, [first, last], [0.3 * far, 0.3 * far])[0]
+    beside = first.centre[None] + np.array([[0.0, 0.0, 1.01 * CLEARANCE * 0.3 * far]])
+    assert not close_to_path(beside, [first], [0.3 * far])[0]
+    assert close_to_path(first.centre[None], [first], [0.3 * far])[0]
