@@ -239,7 +239,7 @@ def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras:
         normal, offset = found
         if np.median(cameras @ normal - offset) < 0:
             normal, offset = -normal, -offset
-        height = cells.centres @ normal - offset
+        height = along(cells.centres, normal) - offset
         on = left & (np.abs(height) <= tolerance)
         if on.sum() < MIN_SUPPORT * observed.sum():
             break
@@ -251,6 +251,11 @@ def find_support(cells: Cells, observed: np.ndarray, close: np.ndarray, cameras:
         hidden |= height < -tolerance
         planes.append((normal, offset))
     return planes, support, hidden & ~support
+
+
+def along(points: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(N,) coordinates of points (N, 3) along a direction: in sums whose order no number of threads changes."""
+    return np.asarray(points[:, 0] * direction[0] + points[:, 1] * direction[1] + points[:, 2] * direction[2])
 
 
 def _plane(points: np.ndarray, tolerance: float) -> Plane | None:
@@ -266,15 +271,15 @@ def _plane(points: np.ndarray, tolerance: float) -> Plane | None:
         return None
     normals = normals[good] / length[good, None]
     offsets = (normals * triple[good, 0]).sum(axis=1)
-    counts = [(np.abs(points @ normal - offset) <= tolerance).sum() for normal, offset in zip(normals, offsets, strict=True)]
+    counts = [(np.abs(along(points, normal) - offset) <= tolerance).sum() for normal, offset in zip(normals, offsets, strict=True)]
     best = int(np.argmax(counts))
     normal, offset = normals[best], float(offsets[best])
     for _ in range(3):
-        near = points[np.abs(points @ normal - offset) <= tolerance]
+        near = points[np.abs(along(points, normal) - offset) <= tolerance]
         if len(near) < 3:
             break
         middle = near.mean(axis=0)
-        normal = np.linalg.eigh((near - middle).T @ (near - middle))[1][:, 0]
+        normal = np.linalg.eigh(np.einsum("ni,nj->ij", near - middle, near - middle))[1][:, 0]
         offset = float(normal @ middle)
     return normal, offset
 
@@ -306,7 +311,7 @@ def with_feet(subject: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
     size = float(np.ptp(subject, axis=0).max())
     feet = [subject]
     for normal, offset in planes:
-        height = subject @ normal - offset
+        height = along(subject, normal) - offset
         near = height <= FEET * size
         feet.append(subject[near] - height[near, None] * normal)
     return np.concatenate(feet)

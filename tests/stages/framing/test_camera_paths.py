@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import typing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,17 @@ import av
 import numpy as np
 import pytest
 
-from efficientnerf.asset.region import Region
+from efficientnerf.asset.region import REGIONS, Region
 from efficientnerf.asset.rendering import MOST_PIXELS, Rendering
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.geometry.cameras import Camera, Similarity, opengl_from_pose, project
 from pipeline.errors import BadInput, UsageError
 from stages.figures.frames import RenderOptions, render_path
-from stages.framing.camera_paths import orbit_of, pose_on_sphere, similarity_of, turntable_cameras
+from stages.framing.camera_paths import PATHS, orbit_of, pose_on_sphere, similarity_of, turntable_cameras
 from stages.framing.captured import captured_metadata, captured_of, coverage
 from stages.io.camera_path import read_camera_path
 from stages.io.png import read_png
+from stages.turntable import TurntableSettings
 from tests.efficientnerf.trees import random_cascades, random_tree
 from tests.efficientnerf.walls import wall
 from tests.fakes import BallTree
@@ -408,3 +410,17 @@ def test_coverage_of_cameras_round_a_point() -> None:
     assert 5 < found.heights < 10
     assert coverage(np.array([camera.centre for camera in arc(360.0, count=4)]), np.zeros(3)).arc == 360  # four on all sides
     assert coverage(np.zeros((1, 3)), np.ones(3)).arc == pytest.approx(0)
+
+
+def test_paths_of_the_setting_are_those_that_there_are() -> None:
+    assert typing.get_args(typing.get_type_hints(TurntableSettings)["path"]) == PATHS
+    assert typing.get_args(typing.get_type_hints(TurntableSettings)["region"]) == REGIONS
+
+
+@pytest.mark.parametrize("path", ["orbit", "sway"])
+def test_a_forward_facing_asset_takes_other_paths_too(path: str) -> None:
+    cameras = turntable_cameras(wall(voxels=12), frames=6, width=64, height=48, path=path)
+    assert len(cameras) == 6
+    assert np.isfinite([camera.world_from_camera for camera in cameras]).all()
+    spiral = turntable_cameras(wall(voxels=12), frames=6, width=64, height=48)
+    assert not np.allclose(cameras[1].world_from_camera, spiral[1].world_from_camera)
