@@ -3,7 +3,8 @@
     python benchmarks/silhouettes.py FOLDER
 
     FOLDER/photographs_masks   photographs, masks/ beside them: the objects without table and cloth (cameras by structure from motion)
-    FOLDER/photographs_rgba    the same as PNG with alpha
+    FOLDER/photographs_rgba    the same as PNG with alpha, whose colours are left below what is transparent
+    FOLDER/photographs_cutouts the same, black there
     FOLDER/llff_masks          poses_bounds.npy, images/, masks/; undistorted, for LLFF knows no distortion
     FOLDER/json_masks          transforms.json with mask_path
     FOLDER/json_rgba           transforms.json, PNG with alpha
@@ -121,15 +122,16 @@ def main() -> None:
         with opened(PHOTOGRAPHS / name) as image:
             pixels, exif = np.asarray(image.convert("RGB")), image.info["exif"]
         mask = silhouette(mesh, camera)
-        rgba = np.dstack([np.where(mask[..., None] > 0, pixels, 0).astype(np.uint8), mask])
+        cutout = np.dstack([np.where(mask[..., None] > 0, pixels, 0).astype(np.uint8), mask])
         moving, used = with_moving_thing(pixels, index)
         for place in ("photographs_masks", "json_masks/images"):
             (folder / place).mkdir(parents=True, exist_ok=True)
             shutil.copyfile(PHOTOGRAPHS / name, folder / place / name)
         for place in ("photographs_masks/masks", "json_masks/masks"):
             save(mask, folder / place / f"{stem}.png")
-        for place in ("photographs_rgba", "json_rgba/images"):
-            save(rgba, folder / place / f"{stem}.png", exif=exif)
+        save(np.dstack([pixels, mask]), folder / "photographs_rgba" / f"{stem}.png", exif=exif)
+        for place in ("photographs_cutouts", "json_rgba/images"):
+            save(cutout, folder / place / f"{stem}.png", exif=exif)
         for place in ("photographs_moving", "json_moving/images"):
             save(moving, folder / place / f"{stem}.jpg", quality=95, exif=exif)
         for place in ("photographs_moving/masks", "json_moving/masks"):

@@ -23,7 +23,7 @@ from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
 from stages.io import importers
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import Capture, Photo, Silhouettes, SparsePoints
 from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.scene import SPLITS, Scene, View, save, save_points
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 else:
     Format = Literal[importers.FORMATS]  # the names of the table of importers
 
+Find = Callable[[str, Mapping[str, Path | None]], Capture]
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
 
 
@@ -183,7 +184,7 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
         with contextlib.suppress(UnreadableImage):  # said where it is read
             sizes.append(read_header(path).size)
 
-    def find(name: str, masks: Mapping[str, Path]) -> Capture:
+    def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
         return find_cameras(
             source.root,
             paths,
@@ -199,25 +200,28 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
             warn=warn,
         )
 
-    if silhouettes_with_surroundings(paths, masks, settings.masks, job.safe_point):
-        found = _found_by_surroundings(job, find, masks)
-    else:
-        found = find("cameras", masks)
+    kind = silhouettes_with_surroundings(paths, masks, settings.masks, job.safe_point)
+    # Alpha channels leave pixels out where these are no silhouettes.
+    found = _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths)) if kind else find("cameras", masks)
     return replace(found, rejected_files={name: paths[name] for name, _ in found.rejected})
 
 
-def _found_by_surroundings(job: Job, find: Callable[[str, Mapping[str, Path]], Capture], masks: Mapping[str, Path]) -> Capture:
-    """The capture found from all of the photographs; or from what their silhouettes keep, where these fit to each other better then: the object was turned."""
+def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None]) -> Capture:
+    """The capture found from all of the photographs; or from what their silhouettes keep, where these fit to each other better then: the object was turned.
+
+    masks, everywhere  what leaves out what is not of the object, and what does not
+    """
     from stages.framing.mask_use import MIN_AGREEING, share_that_fits
     from stages.io.silhouettes import SmallPictures
 
     def fit(found: Capture) -> float:
-        return share_that_fits(found, SmallPictures()) * len(found.photos)
+        return share_that_fits(found, kind, SmallPictures()) * len(found.photos)
 
-    job.say("masks are taken for silhouettes; features are looked for outside of them, too: the background moves with the object")
+    what = "masks" if kind.masks else "alpha channels"
+    job.say(f"{what} are taken for silhouettes; features are looked for outside of them, too: the background moves with the object")
     whole: Capture | None = None
     with contextlib.suppress(BadInput):
-        found = find("cameras", {})
+        found = find("cameras", everywhere)
         whole = replace(found, photos=tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in found.photos))
         if fit(whole) >= MIN_AGREEING * len(whole.photos):
             return whole

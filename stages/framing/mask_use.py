@@ -30,6 +30,8 @@ PARTS, LEAST_OF_PARTS = 5, 0.9  # the largest connected parts of a compact objec
 SAME, HALF = 0.97, 0.5  # overlap of all masks, and share kept, from which they are of a lens, not of an object
 LEAST_OVERLAP = 0.7  # intersection over union of a silhouette and the projected visual hull
 
+WRONG_CAMERAS = "; the cameras that were found from the photographs may be wrong"
+
 
 @dataclass(frozen=True)
 class MaskUse:
@@ -197,7 +199,7 @@ def _of_photographs(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray
     masks, overlap = [picture for _, picture in good], hull_overlaps(capture, good)
     fits = overlap >= LEAST_OVERLAP
     if fits.mean() < MIN_AGREEING:
-        found = "; the cameras that were found may be wrong" if capture.kind == "photographs" else ""
+        found = WRONG_CAMERAS if capture.kind == "photographs" else ""
         return False, f"no object has all of these silhouettes: {fits.sum()} of {len(fits)} fit to their visual hull{found}", []
     shares = [float(mask.mean()) for mask in masks]
     why = (
@@ -216,9 +218,10 @@ def hull_overlaps(capture: Capture, pictures: Sequence[tuple[Photo, np.ndarray]]
     return np.zeros(len(pictures)) if hull is None else overlaps(masks, cameras, *hull)
 
 
-def share_that_fits(capture: Capture, small: SmallPictures) -> float:
-    """How many of the capture's mask files, as silhouettes, fit to their visual hull: a test of the cameras by what they were not found from."""
-    pictures = [(photo, picture >= 128) for photo in scene_bounds.chosen_photos(capture.photos) if (picture := small.mask(photo)) is not None]
+def share_that_fits(capture: Capture, kind: Silhouettes, small: SmallPictures) -> float:
+    """How many of the capture's silhouettes fit to their visual hull: a test of the cameras by what they were not found from."""
+    photos = scene_bounds.chosen_photos(capture.photos)
+    pictures = [(photo, picture >= 128) for photo in photos if (picture := small.mask(photo) if kind.masks else small.alpha(photo)) is not None]
     return float((hull_overlaps(capture, pictures) >= LEAST_OVERLAP).mean()) if len(pictures) >= MIN_IMAGES else 0.0
 
 
@@ -247,5 +250,8 @@ def points_of_object(capture: Capture, small: SmallPictures) -> np.ndarray:
 
 
 def doubts(use: MaskUse) -> list[str]:
-    """Warnings about silhouettes that do not fit to the others'."""
-    return [f"the silhouettes of {len(use.doubtful)} photographs do not fit to the others': {abbreviated(use.doubtful)}."] if use.doubtful else []
+    """Warnings about silhouettes that do not fit to the others', or to the cameras that were found."""
+    sentences = [f"{kind}: {why}." for kind, why in use.reasons.items() if why.endswith(WRONG_CAMERAS)]
+    if use.doubtful:
+        sentences.append(f"the silhouettes of {len(use.doubtful)} photographs do not fit to the others': {abbreviated(use.doubtful)}.")
+    return sentences

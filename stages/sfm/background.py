@@ -13,7 +13,8 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 from stages.framing.mask_use import alike
-from stages.io.capture import Photo
+from stages.framing.scene_bounds import chosen_photos
+from stages.io.capture import Photo, Silhouettes
 from stages.io.photo import read_photo
 from stages.io.pictures import UnreadableImage, read_header
 from stages.io.silhouettes import SMALL, SmallPictures
@@ -24,22 +25,22 @@ STANDING = 0.5  # correlation of the texture of two photographs, from which the 
 LEAST_TEXTURE = 1.0  # of 255, standard deviation
 
 
-def silhouettes_with_surroundings(paths: Mapping[str, Path], masks: Mapping[str, Path], choice: str, safe_point: Callable[[], None]) -> bool:
-    """Whether masks are silhouettes before a background in which features should be looked for, too.
+def silhouettes_with_surroundings(paths: Mapping[str, Path], masks: Mapping[str, Path], choice: str, safe_point: Callable[[], None]) -> Silhouettes:
+    """Which of masks and alpha channels are silhouettes before a background in which features should be looked for, too; of alpha channels where colours
+    were left below what is transparent.
 
     paths, masks  file of each photograph, and of its mask, by name
     choice        `poses.masks`
     """
-    if choice == "ignore" or not masks:
-        return False
     photos = [photo for name in sorted(paths) if (photo := _photo(name, paths[name], masks.get(name))) is not None]
-    small = SmallPictures()
-    if choice == "auto" and alike([(photo, small.mask(photo)) for photo in photos])[0]:
-        return False
-    return not stands_still(photos, small, safe_point)
+    kind, small = Silhouettes(alpha=not masks, masks=bool(masks)), SmallPictures()
+    pictures = [] if choice == "ignore" else [(photo, small.mask(photo) if masks else small.alpha(photo)) for photo in chosen_photos(photos)]
+    if all(picture is None for _, picture in pictures) or (choice == "auto" and alike(pictures)[0]):
+        return Silhouettes()
+    return Silhouettes() if stands_still(photos, kind, small, safe_point) else kind
 
 
-def stands_still(photos: Sequence[Photo], small: SmallPictures, safe_point: Callable[[], None]) -> bool:
+def stands_still(photos: Sequence[Photo], kind: Silhouettes, small: SmallPictures, safe_point: Callable[[], None]) -> bool:
     """Whether what lies outside of the silhouettes is the same in photographs that follow each other, or has no texture at all."""
     import cv2
 
@@ -48,7 +49,7 @@ def stands_still(photos: Sequence[Photo], small: SmallPictures, safe_point: Call
         safe_point()
         pair = []
         for photo in photos[index : index + 2]:
-            mask = small.mask(photo)
+            mask = small.mask(photo) if kind.masks else small.alpha(photo)
             try:
                 grey = read_photo(photo.image, SMALL).rgb.astype(np.float32).mean(2)
             except UnreadableImage:
@@ -56,8 +57,9 @@ def stands_still(photos: Sequence[Photo], small: SmallPictures, safe_point: Call
             if mask is None:
                 continue
             mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-            near = cv2.dilate((mask > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-            pair.append((grey - cv2.GaussianBlur(grey, (0, 0), FINE), ~near))
+            outside = (cv2.dilate((mask > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0).astype(np.float32)
+            smooth = cv2.GaussianBlur(grey * outside, (0, 0), FINE) / np.maximum(cv2.GaussianBlur(outside, (0, 0), FINE), 1e-3)
+            pair.append((grey - smooth, outside > 0))
         if len(pair) == 2 and pair[0][0].shape == pair[1][0].shape:
             outside = pair[0][1] & pair[1][1]
             one, other = (texture[outside] for texture, _ in pair)

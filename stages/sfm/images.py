@@ -24,6 +24,8 @@ LAYOUT = 3  # of the work folder; raise it when what is written there changes me
 Side = Annotated[int, msgspec.Meta(ge=1, le=2**20)]  # pixels
 Progress = Callable[..., None]
 SafePoint = Callable[[], None]
+Masks = Mapping[str, Path | None]  # file of the mask of each photograph that has one; None: what is transparent is used, too
+WHOLE = "whole"  # in the place of the digest of a mask
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ def prepare_images(
     max_side: int,
     features: int,
     seed: int,
-    masks: Mapping[str, Path],
+    masks: Masks,
     paths: Mapping[str, Path] | None = None,
     work: Path,
     progress: Progress,
@@ -73,6 +75,7 @@ def prepare_images(
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
     """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
+    masks    of some or all names; None: the photograph as a whole, whatever its alpha channel says
     paths    of some or all names: the file that is read, where it is not the name below the folder
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 
@@ -98,7 +101,7 @@ def prepare_images(
         record = work / f"copy_{index:05d}.json"
         copied = noted(record, Copy, warn_once, partial(_check, name, index, max_side, work))
         if copied is None:
-            copied, outputs = _copy(name, paths[name], index, max_side, masks.get(name), work)
+            copied, outputs = _copy(name, paths[name], index, max_side, masks, work)
             note(record, msgspec.to_builtins(copied), outputs)
         if copied.image is None:
             rejected.append((name, copied.remark))
@@ -111,11 +114,12 @@ def prepare_images(
     return images, rejected
 
 
-def _digests(paths: Mapping[str, Path], masks: Mapping[str, Path], safe_point: SafePoint) -> list[list[str | None]]:
+def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> list[list[str | None]]:
     rows: list[list[str | None]] = []
     for name in sorted(paths):
         safe_point()
-        rows.append([name, _sha256(paths[name]), _sha256(masks[name]) if name in masks else None])
+        mask = masks.get(name)
+        rows.append([name, _sha256(paths[name]), _sha256(mask) if mask is not None else WHOLE if name in masks else None])
     return rows
 
 
@@ -131,7 +135,7 @@ def _file(index: int) -> str:
     return f"{index:05d}.png"
 
 
-def _copy(name: str, path: Path, index: int, max_side: int, mask_path: Path | None, work: Path) -> tuple[Copy, list[Path]]:
+def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, work: Path) -> tuple[Copy, list[Path]]:
     """Copy one photograph; with the files written."""
     try:
         photo: DecodedPhoto = read_photo(path, max_side)
@@ -140,7 +144,9 @@ def _copy(name: str, path: Path, index: int, max_side: int, mask_path: Path | No
     outputs = [work / "images" / _file(index)]
     write_png(photo.rgb, outputs[0], compress_level=FAST, durable=False)
     mask, remark = photo.opaque, ""
-    if mask_path is not None:
+    if (mask_path := masks.get(name)) is None:
+        mask = None if name in masks else mask
+    else:
         try:
             given = read_mask_file(mask_path, photo)
             mask = given if mask is None else mask & given

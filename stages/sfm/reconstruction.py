@@ -25,7 +25,7 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import mapping, matches, process
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, open_database, remove_database, verified_pairs
-from stages.sfm.images import WorkImage, prepare_images
+from stages.sfm.images import Masks, WorkImage, prepare_images
 
 MAX_EXHAUSTIVE = 100  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
 WAIT = 0.05  # seconds between two looks at a lock
@@ -41,7 +41,7 @@ def find_cameras(
     matching: str = "auto",
     seed: int = 0,
     threads: int | None = None,
-    masks: Mapping[str, Path] | None = None,
+    masks: Masks | None = None,
     work: Path,
     progress: Callable[..., None],
     safe_point: Callable[[], None],
@@ -54,7 +54,7 @@ def find_cameras(
     features        most features of a photograph
     threads         on which features are detected; None: as many as the process may use. Changes no bit
     matching        "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
-    masks           of some or all names: no features where the mask is black
+    masks           of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
 
@@ -65,7 +65,7 @@ def find_cameras(
     masks, paths = masks or {}, _paths(folder, names)
     arguments: dict[str, Any] = {"folder": os.path.abspath(folder), "names": {name: os.path.abspath(path) for name, path in paths.items()}}
     arguments |= {"max_side": max_side, "features": features, "matching": matching, "seed": seed, "threads": threads}
-    arguments |= {"masks": {name: os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
+    arguments |= {"masks": {name: mask and os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
     resumed = database_path(work).exists()
     try:
         found = process.run(arguments, progress=progress, safe_point=safe_point, warn=warn)
@@ -83,7 +83,7 @@ def _paths(folder: Path, names: Sequence[str] | Mapping[str, Path]) -> dict[str,
 def capture_for(arguments: Mapping[str, Any], **callables: Callable[..., None]) -> dict[str, Any]:
     """`reconstruct` for arguments that have come through JSON; the capture as JSON can hold it."""
     paths: dict[str, Any] = {"folder": Path(arguments["folder"]), "work": Path(arguments["work"])}
-    paths |= {of: {name: Path(path) for name, path in arguments[of].items()} for of in ("names", "masks")}
+    paths |= {of: {name: path and Path(path) for name, path in arguments[of].items()} for of in ("names", "masks")}
     with _alone(Path(arguments["work"]), callables["safe_point"]):
         return _plain(reconstruct(**{**arguments, **paths}, **callables))  # type: ignore[arg-type]
 
@@ -117,7 +117,7 @@ def reconstruct(
     matching: str,
     seed: int,
     threads: int | None = None,
-    masks: Mapping[str, Path],
+    masks: Masks,
     work: Path,
     progress: Callable[..., None],
     safe_point: Callable[[], None],
@@ -176,7 +176,7 @@ def _plain(capture: Capture) -> dict[str, Any]:
     }
 
 
-def _capture_from(found: Mapping[str, Any], folder: Path, paths: Mapping[str, Path], masks: Mapping[str, Path]) -> Capture:
+def _capture_from(found: Mapping[str, Any], folder: Path, paths: Mapping[str, Path], masks: Masks) -> Capture:
     """The inverse of `_plain`."""
     xyz, rgb, error, poses = (np.frombuffer(base64.b64decode(data), dtype).reshape(shape).copy() for dtype, shape, data in found["arrays"])
     lenses = zip(found["lenses"], poses, strict=True)
@@ -251,7 +251,7 @@ def _failure(folder: Path, images: Sequence[WorkImage], models: Sequence[Any], r
     )
 
 
-def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Mapping[str, Path], rejected: list[tuple[str, str]]) -> Capture:
+def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Masks, rejected: list[tuple[str, str]]) -> Capture:
     by_file = {image.file: image for image in images}
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     at_work = [mapping.camera_of(model, image, by_file[image.name]) for image in registered]  # at working size

@@ -280,8 +280,9 @@ class Found:
     def __init__(self, *right: str) -> None:
         self.right, self.asked = right, list[str]()
 
-    def __call__(self, folder: Path, names: dict[str, Path], *, masks: dict[str, Path], work: Path, **options: Any) -> Capture:
-        self.asked.append("object" if masks else "surroundings")
+    def __call__(self, folder: Path, names: dict[str, Path], *, masks: dict[str, Path | None], work: Path, **options: Any) -> Capture:
+        everywhere = not masks if (folder / "masks").is_dir() else bool(masks) and not any(masks.values())
+        self.asked.append("surroundings" if everywhere else "object")
         made = captures.cameras()
         if self.asked[-1] not in self.right:
             poses_of_others = [camera.world_from_camera for camera in (*made[3:], *made[:3])]
@@ -315,6 +316,20 @@ def test_features_outside_of_silhouettes(
     else:
         assert made.background is None
         assert all(view.mask is not None for view in made.views)
+
+
+@pytest.mark.parametrize(("blank", "asked"), [(False, ["surroundings"]), (True, ["object"])])
+def test_colours_below_transparent_pixels_are_surroundings(blank: bool, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for index, camera in enumerate(captures.cameras()):
+        cover = off_centre(index, camera)
+        colour = np.where(cover[..., None] > 0, captures.picture(index), 0) if blank else captures.picture(index)
+        captures.write_picture(tmp_path / "source" / camera.name, np.dstack([colour.astype(np.uint8), cover]))
+    find = Found("surroundings", "object")
+    monkeypatch.setattr("stages.sfm.reconstruction.find_cameras", find)
+    made, said, _ = run(tmp_path / "source", tmp_path)
+    assert find.asked == asked
+    assert (made.background, made.space) == (WHITE, "box")
+    assert any(text.startswith("alpha channels are silhouettes: 6 of 6 photographs keep one object") for text in said)
 
 
 def test_the_old_setting_is_answered_and_read() -> None:

@@ -107,6 +107,18 @@ def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
     assert not opaque[:, :4].any()
 
 
+@pytest.mark.parametrize(("masks", "masked"), [({}, True), ({"a.png": None}, False)])
+def test_what_is_transparent_may_count(masks: dict[str, Path | None], masked: bool, tmp_path: Path) -> None:
+    rgba = np.random.default_rng(0).integers(0, 256, (40, 60, 4), np.uint8)
+    rgba[..., 3] = np.where(np.arange(60) < 30, 0, 255)
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    quiet: dict[str, Any] = {"progress": lambda *_: None, "safe_point": lambda: None, "warn": lambda *_: None}
+    for _ in range(2):  # the second finds what the first left
+        images, _ = prepare_images(tmp_path, ["a.png"], max_side=60, features=100, seed=0, masks=masks, work=tmp_path / "work", **quiet)
+        assert len(images) == 1
+        assert (tmp_path / "work/masks" / f"{images[0].file}.png").exists() == masked
+
+
 def test_mask_must_fit(tmp_path: Path) -> None:
     Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
     photo = reading.read_photo(tmp_path / "a.png", 20)
