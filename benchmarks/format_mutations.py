@@ -12,7 +12,8 @@ import numpy as np
 
 NUMBERS = [0, 1, -1, 2, 3, 7, 8, 16, 17, 63, 64, 65, 255, 256, 257, 2**16, 2**31, 2**32, 2**53, 2**63, 2**64, 10**30, 0.5, -0.0, 1e-30, 1e30, 1e300, 1e-320]
 TEXTS = [
-    "", "sparse", "compact", "full", "ndc-sparse", "ndc-compact", "ndc-full", "U8", "U16", "U64", "F16", "F32", "F64", "1.0", "1.9", "2.0",
+    "", "sparse", "compact", "full", "ndc-sparse", "ndc-compact", "ndc-full", "nested-sparse", "nested-compact", "nearest-nested-sparse",
+    "U8", "U16", "U64", "F16", "F32", "F64", "1.0", "1.3", "1.4", "1.9", "2.0",
     "x.a", "nerftree", "\ud7ff\0", "9" * 50,
 ]  # fmt: skip
 # Densities and harmonics that strain sums: halves and what lies between.
@@ -120,10 +121,10 @@ def with_tensor(rng: Rng, data: bytes) -> bytes:
 
 
 def with_numbers(rng: Rng, data: bytes) -> bytes:
-    """Numbers of the metadata scaled within what the format may allow: places, sizes, the reference camera, the orbit and the spiral."""
+    """Numbers of the metadata scaled within what the format may allow: places, sizes, cascades, the region, the reference camera, the orbit and the spiral."""
     header, meta, body = header_of(data)
     for _ in range(1 + number(rng, 4)):
-        kind = number(rng, 6)
+        kind = number(rng, 9)
         factor = float(10.0 ** rng.uniform(-14, 14))
         if kind == 0:
             meta["voxel"] *= factor
@@ -140,7 +141,30 @@ def with_numbers(rng: Rng, data: bytes) -> bytes:
             meta["orbit"] = {"centre": place, "radius": factor, "elevation": float(rng.uniform(-90, 90)), "heading": 0, "forward_facing": bool(number(rng, 2))}
         elif kind == 5:
             meta["spiral"] = {"radii": [factor, 0, 1], "focus": 1 / factor, "tangents": [0.5, factor], "far": factor}
+        elif kind == 6:
+            corners = np.sort(rng.normal(size=(2, 3)) * factor, axis=0)
+            meta["region"] = {"bounds": corners.tolist(), "corner_radius": abs(float(rng.normal())) * factor, "fade": factor * number(rng, 2), "bricks": False}
+            meta["format_version"] = "1.4"
+        elif kind in (7, 8) and meta.get("cascades"):
+            _with_cascades(rng, meta, factor)
     return file_of(header, meta, body)
+
+
+def _with_cascades(rng: Rng, meta: dict[str, Any], factor: float) -> None:
+    """All grids moved or scaled together, so that they nest still; or one of them moved by cells."""
+    grids = [meta, *meta["cascades"]]
+    kind, shift = number(rng, 3), [float(x) for x in rng.normal(size=3) * factor]
+    for grid in grids:
+        if kind == 0:
+            grid["bounds_min"] = [x + y for x, y in zip(grid["bounds_min"], shift, strict=True)]
+        elif kind == 1:
+            grid["bounds_min"] = [x * factor for x in grid["bounds_min"]]
+    if kind == 1:
+        meta["voxel"] *= factor
+    if kind == 2:
+        n = number(rng, len(grids))
+        cell = meta["brick"] * meta["voxel"] * 2.0**n
+        grids[n]["bounds_min"] = [x + cell * float(rng.choice([-1, 0, 1, 0.5, 1e-4])) for x in grids[n]["bounds_min"]]
 
 
 def with_values_of_tensors(rng: Rng, data: bytes) -> bytes:
@@ -166,22 +190,65 @@ def _random_shape(rng: Rng) -> tuple[int, int, int]:
     return x, y, z
 
 
-def built(rng: Rng) -> bytes:
-    """A sound file from nothing: any proportions of the grid, any brick, few voxels, values of all sizes; in the world or in device coordinates."""
-    shape, brick, degree = _random_shape(rng), 1 + number(rng, 16), number(rng, 5)
-    layout, nearest, ndc = LAYOUTS[number(rng, 3)], not number(rng, 3), not number(rng, 3)
-    cells, cube, terms = math.prod(shape), brick**3, (degree + 1) ** 2
+def _random_occupancy(rng: Rng, shape: tuple[int, ...]) -> np.ndarray:
+    """A few cells of a grid, (cells,) bool."""
+    cells = math.prod(shape)
     bricks = min(cells, 1 + number(rng, 8))
     occupied = np.zeros(cells, bool)
     occupied[rng.choice(cells, bricks, replace=False) if cells < 2**12 else rng.integers(cells, size=bricks)] = True
+    return occupied
+
+
+def _nested(rng: Rng, meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> int:
+    """Cascades around the grid of a file, an environment map, and a region of some bricks; how many bricks the cascades have."""
+    shape, low, bricks = list(meta["shape"]), list(meta["bounds_min"]), 0
+    meta["cascades"], meta["environment"] = [], None
+    for n in range(1, 1 + number(rng, 4)):
+        before = [number(rng, 4) for _ in range(3)]
+        after = [number(rng, 4) for _ in range(3)]
+        after = [b + (side // 2 + a + b) % 2 for side, a, b in zip(shape, before, after, strict=True)]  # even, for the next one
+        shape = [side // 2 + a + b for side, a, b in zip(shape, before, after, strict=True)]
+        low = [x - a * meta["brick"] * meta["voxel"] * 2.0**n for x, a in zip(low, before, strict=True)]
+        occupied = _random_occupancy(rng, tuple(shape))
+        bricks += int(occupied.sum())
+        tensors[f"coarse.occupancy.{n}"] = np.packbits(occupied, bitorder="little")
+        meta["cascades"].append({"shape": list(shape), "bounds_min": list(low)})
+    if number(rng, 2):
+        meta["environment"] = rows = 1 + number(rng, 30)
+        tensors["environment"] = rng.integers(256, size=(rows, 2 * rows, 3)).astype("<u1")
+    return bricks
+
+
+def _region(rng: Rng, meta: dict[str, Any], tensors: dict[str, np.ndarray], bricks: int) -> None:
+    corners = np.sort(rng.uniform(-0.5, 1.5, (2, 3)), axis=0) * meta["voxel"] * meta["brick"] * np.array(meta["shape"]) + meta["bounds_min"]
+    meta["region"] = {"bounds": corners.tolist(), "corner_radius": float(rng.choice([0.0, meta["voxel"], 1.0])), "fade": float(rng.choice([0, meta["voxel"]]))}
+    meta["region"]["bricks"] = bool(number(rng, 2))
+    if meta["region"]["bricks"]:
+        tensors["x.region.bricks"] = np.packbits(rng.random(bricks) < 0.5, bitorder="little")
+
+
+def built(rng: Rng) -> bytes:
+    """A sound file from nothing: any proportions of the grid, any brick, few voxels, values of all sizes; in the world, with cascades or without, or in
+    device coordinates."""
+    shape, brick, degree = _random_shape(rng), 1 + number(rng, 16), number(rng, 5)
+    layout, nearest, ndc = LAYOUTS[number(rng, 3)], not number(rng, 3), not number(rng, 3)
+    nested = not ndc and bool(number(rng, 2))
+    if nested:
+        shape = tuple(side + side % 2 for side in shape)  # type: ignore[assignment]
+    cube, terms = brick**3, (degree + 1) ** 2
+    occupied = _random_occupancy(rng, shape)
     bricks = int(occupied.sum())
     tensors: dict[str, np.ndarray] = {"coarse.occupancy": np.packbits(occupied, bitorder="little")}
+    voxel = float(10.0 ** rng.uniform(-6, 6)) if number(rng, 2) else 0.05
+    meta: dict[str, Any] = {"shape": list(shape), "brick": brick, "voxel": voxel, "bounds_min": [float(x) for x in rng.normal(size=3)]}
+    bricks += _nested(rng, meta, tensors) if nested else 0
+    if not number(rng, 3):
+        _region(rng, meta, tensors, bricks)
 
     def drawn(*size: int, signed: bool = True) -> np.ndarray:
         values = rng.choice(VALUES, size)
         return values * rng.choice([-1.0, 1.0], size) if signed else values
 
-    meta: dict[str, Any] = {}
     if layout == "full":
         tensors |= {"brick.density": drawn(bricks, cube, signed=False).astype("<f2"), "brick.sh": drawn(bricks, cube, terms, 3).astype("<f2")}
     else:
@@ -207,9 +274,8 @@ def built(rng: Rng) -> bytes:
         header[name] = {"dtype": kind, "shape": list(values.shape), "data_offsets": [len(body), len(body) + len(raw)]}
         body += raw
     meta |= {
-        "format": "nerftree", "format_version": "1.3", "layout": ("nearest-" if nearest else "") + ("ndc-" if ndc else "") + layout,
-        "shape": list(shape), "brick": brick, "voxel": float(10.0 ** rng.uniform(-6, 6)) if number(rng, 2) else 0.05,
-        "bounds_min": [float(x) for x in rng.normal(size=3)],
+        "format": "nerftree", "format_version": "1.4",
+        "layout": ("nearest-" if nearest else "") + ("ndc-" if ndc else "nested-" if nested else "") + layout,
         "sh_degree": degree, "sh_convention": "real-orthonormal-plenoctree", "colour_space": "srgb-sigmoid", "background": None,
         "sha256": {name: hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest() for name, values in tensors.items()},
     }  # fmt: skip

@@ -78,7 +78,8 @@ def views(tree: Any, rng: Rng) -> Iterator[Any]:
     """Cameras inside, outside, far and very far away, on a face, beside and behind; lenses from a point to the whole sky, with and without distortion."""
     from efficientnerf.geometry.cameras import Camera
 
-    low, high = tree.bounds_min, tree.bounds_max
+    outermost = tree.outer[-1].bounds(tree.brick) if tree.outer and number(rng, 2) else (tree.bounds_min, tree.bounds_max)
+    low, high = outermost
     middle, extent = (low + high) / 2, float(np.max(high - low))
     if tree.ndc is not None:  # of the world: before the near plane
         middle, extent = tree.ndc.world_from_camera[:3, 3], float(tree.ndc.near)
@@ -123,12 +124,19 @@ def use(tree: Any, rng: Rng, took: dict[str, float]) -> None:
     """All that is done with an asset: rendered, and sometimes turned, meshed and converted. FormatError where a layout cannot hold it."""
     from efficientnerf.asset.conversion import pruned, with_degree, with_resolution
     from efficientnerf.asset.format import WRITERS, FormatError, serialize
+    from efficientnerf.asset.region import cropped, foreground
+    from efficientnerf.geometry.cameras import Similarity
     from efficientnerf.surface.isosurface import NoSurface, points, surface
     from efficientnerf.surface.volume import volume_of
     from pipeline.errors import BadInput
     from stages.framing.camera_paths import turntable_cameras
 
     draw(tree, rng, took)
+    if not number(rng, 4):
+        with step("region", took):
+            identity = Similarity(1.0, np.eye(3), np.zeros(3))
+            for part in (foreground(tree), cropped(tree, rng.uniform(tree.bounds_min, tree.bounds_max, (2, 3)), identity)):
+                draw(part, rng, {})
     if not number(rng, 4):
         with step("turntable", took), suppress(BadInput):
             for camera in turntable_cameras(tree, frames=2, width=SIZE, height=SIZE):
@@ -142,7 +150,9 @@ def use(tree: Any, rng: Rng, took: dict[str, float]) -> None:
         with step("convert", took):
             smaller = [lambda: with_degree(tree, number(rng, tree.degree + 1)), lambda: pruned(tree), lambda: tree][number(rng, 3)]()
             if max(tree.resolution) <= 64 and not number(rng, 2):
-                smaller = with_resolution(tree, 1 + number(rng, max(tree.resolution)))
+                most = max(tree.resolution)
+                divisors = [n for n in range(1, tree.brick + 1) if tree.brick % n == 0]
+                smaller = with_resolution(smaller, most // divisors[number(rng, len(divisors))] if tree.outer else 1 + number(rng, most))
             with suppress(FormatError):
                 serialize(smaller, [None, *WRITERS][number(rng, 1 + len(WRITERS))] if len(tree.density_values) <= MOST_CONVERTED else None)
 
