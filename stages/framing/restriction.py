@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from stages.framing.camera_paths import similarity_of
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Similarity
 
 
 def restricted(tree: NerfTree, region: str, crop: Sequence[float] | None = None) -> NerfTree:
@@ -29,15 +30,28 @@ def restricted(tree: NerfTree, region: str, crop: Sequence[float] | None = None)
         raise UsageError("nothing of the asset lies in its foreground region. Choose the region all.")
     if crop is None:
         return out
-    before = len(out.density_values)
+    whole, similarity = out, similarity_of(tree)
     try:
-        out = cropped(out, np.array(crop, np.float64).reshape(2, 3), similarity_of(tree))
+        out = cropped(whole, np.array(crop, np.float64).reshape(2, 3), similarity)
     except ValueError as error:
         raise UsageError(f"--crop: {error}") from error
-    if before and not len(out.density_values):
-        numbers = " ".join(f"{x:g}" for x in crop)
-        raise UsageError(f"--crop {numbers}: nothing of the asset lies in this box of the capture's frame. enerf inspect shows the asset's bounds.")
+    if len(whole.density_values) and not len(out.density_values):
+        raise UsageError(f"--crop {_numbers(crop)}: nothing of the asset lies in this box of the capture's frame{_reach(whole, similarity)}.")
     return out
+
+
+def _reach(tree: NerfTree, world_from_capture: Similarity) -> str:
+    """Where a tree's voxels are in the capture's frame, in words; nothing where some are at infinity."""
+    places = voxel_centres(tree)
+    with np.errstate(all="ignore"):
+        places = world_from_capture.inverse().points(places if tree.ndc is None else np.asarray(tree.ndc.world(places)))
+    if not np.isfinite(places).all():
+        return ""
+    return f", where it reaches from {_numbers(places.min(axis=0))} to {_numbers(places.max(axis=0))}"
+
+
+def _numbers(values: Iterable[float]) -> str:
+    return " ".join(f"{value:g}" for value in values)
 
 
 def with_region(tree: NerfTree) -> NerfTree:

@@ -119,6 +119,8 @@ def _lines(found: dict[str, Any], indent: str) -> list[str]:
             first = value[0] if value else {}
             if {"name", "model", "params"} <= first.keys():
                 lines.append(f"{label:<24} {len(value)}, listed with --json; the first: {first['name']}, {first['model']} {_shown(first['params'])}")
+        elif name == "captured_path" and isinstance(value, dict) and isinstance(value.get("poses"), list):
+            lines.append(f"{label:<24} {len(value['poses'])} cameras, listed with --json")
         elif name == "warnings" and isinstance(value, list):
             lines += [f"{label:<24} {sentence}" for sentence in value] or [f"{label:<24} nothing"]
         elif name in SCENE_PARTS and value and not isinstance(value, int):  # "environment" is the bytes of a tensor too

@@ -187,6 +187,12 @@ def test_exports_take_the_foreground_unless_all_is_asked_for(enerf: Enerf, scene
     assert enerf("inspect", tmp_path / "points.ply", "--json").object["bounds"][1][0] == pytest.approx(3.9, abs=0.45)
 
 
+def test_inspecting_an_asset_tells_its_captured_cameras_by_their_number(enerf: Enerf, scene: Path) -> None:
+    lines = [line for line in enerf("inspect", scene).out.splitlines() if line.startswith("captured path")]
+    assert [line.split(maxsplit=2)[2] for line in lines] == ["11 cameras, listed with --json"]
+    assert len(enerf("inspect", scene, "--json").object["captured_path"]["poses"]) == 11
+
+
 def test_a_crop_is_in_the_frame_of_the_capture_and_replaces_the_region(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
     found = enerf("export", scene, "--to", tmp_path / "a.ply", "--crop", 4, 1, 1, 2, -1, -1, "--set", "mesh.max_faces=3000")
     assert found.code == 0, found.err
@@ -194,7 +200,8 @@ def test_a_crop_is_in_the_frame_of_the_capture_and_replaces_the_region(enerf: En
     assert low[0] == pytest.approx(2.6, abs=0.25)
     assert high[0] == pytest.approx(3.9, abs=0.25)
     assert enerf("export", scene, "--to", tmp_path / "b.ply", "--crop", 4, 1, 1, 2, -1, -1, "--region", "foreground").code == 2
-    for numbers, words in (((0, 0, 0, 1, 1, 0), "some volume"), ((50, 50, 50, 51, 51, 51), "nothing of the asset"), ((0, 0, 0, 1, 1, "nan"), "some volume")):
+    nothing = "nothing of the asset lies in this box of the capture's frame, where it reaches from -1."
+    for numbers, words in (((0, 0, 0, 1, 1, 0), "some volume"), ((50, 50, 50, 51, 51, 51), nothing), ((0, 0, 0, 1, 1, "nan"), "some volume")):
         refused = enerf("export", scene, "--to", tmp_path / "c.ply", "--crop", *numbers)
         assert refused.code == 2
         assert words in refused.err
