@@ -19,6 +19,7 @@ MIN_PIXELS, MAX_PIXELS = 64, 512  # of a photograph in a round
 EVERY = 100  # steps between rounds
 BEGIN, END = 0.15, 0.9  # of the schedule
 RAYS_AT_A_TIME = 4096
+SAMPLES_AT_A_TIME = 2**19  # where nothing is pruned
 TRIES = 4  # pixels that are drawn for one that is wanted, where masks forbid some
 
 
@@ -73,8 +74,10 @@ def _alignment(pixels: Pixels, view: int, index: np.ndarray, shown: np.ndarray, 
 def _rendered(m: Model, source: Pixels | DevicePixels, index: np.ndarray, gains: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
     """Colours (R, 3) and points (R, 3) in the world that the field shows at pixels, float64."""
     colours, points = [], []
-    for begin in range(0, len(index), RAYS_AT_A_TIME):
-        part = index[begin : begin + RAYS_AT_A_TIME]
+    # Where nothing is pruned a ray has as many samples as there are.
+    block = RAYS_AT_A_TIME if m.prunes else max(64, SAMPLES_AT_A_TIME // (m.num_coarse_samples + m.settings.num_importance_samples))
+    for begin in range(0, len(index), block):
+        part = index[begin : begin + block]
         origins, directions, near, far = (torch.as_tensor(a, device=m.device) for a in source.bundle(part)[:4])
         outputs = render_rays(m, origins, directions, near, far, torch.full_like(near, 0.5), m.behind(directions))
         colour = outputs.fine_colour

@@ -153,8 +153,10 @@ def add_round(c: CameraCorrections, seen: Sequence[Alignment | None]) -> None:
         size = np.linalg.norm(residual, axis=1)
         scale = max(1.4826 * float(np.median(size)), 1e-3)
         weight = np.repeat(np.minimum(1, HUBER * scale / np.maximum(size, 1e-12)), 3) / (SHARED * scale**2 / 3)
-        c.normal[n] += (slope * weight[:, None]).T @ slope
-        c.right[n] -= (slope * weight[:, None]).T @ residual.reshape(-1)
+        # einsum sums in one order on any number of threads; a product of matrices need not.
+        weighted = slope * weight[:, None]
+        c.normal[n] += np.einsum("np,nq->pq", weighted, slope)
+        c.right[n] -= np.einsum("np,n->p", weighted, residual.reshape(-1))
 
 
 def solve(c: CameraCorrections) -> float:
@@ -194,7 +196,7 @@ def take_similarity_out(c: CameraCorrections) -> None:
     mean_given, mean_now = given[:, :3, 3].mean(axis=0), now[:, :3, 3].mean(axis=0)
     centre_given, centre_now = given[:, :3, 3] - mean_given, now[:, :3, 3] - mean_now
     axes = np.einsum("c,cij,ckj->ik", c.depth[known] ** 2, given[:, :3, :3], now[:, :3, :3])
-    u, _, vt = np.linalg.svd(axes + centre_given.T @ centre_now)
+    u, _, vt = np.linalg.svd(axes + np.einsum("ci,cj->ij", centre_given, centre_now))
     rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     spread = float((centre_now**2).sum())
     scale = float((centre_given * (centre_now @ rotation.T)).sum()) / spread if spread > 0 else 1.0

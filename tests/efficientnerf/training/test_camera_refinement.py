@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from efficientnerf.geometry.cameras import Camera, project, rays
-from efficientnerf.training.alignment import EVERY, _choose, is_due
+from efficientnerf.training.alignment import EVERY, _choose, is_due, refine_cameras
 from efficientnerf.training.camera_refinement import (
     Alignment,
     CameraCorrections,
@@ -21,6 +21,7 @@ from efficientnerf.training.camera_refinement import (
     solve,
     take_similarity_out,
 )
+from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.loop import restore, state_of, train, trainer
 from efficientnerf.training.pixels import Pixels
 from efficientnerf.training.schedule import schedule_of
@@ -137,6 +138,31 @@ def test_pixels_are_chosen_inside_the_photograph_and_the_mask() -> None:
         assert x.min() == least
         assert (x.max(), y.min(), y.max()) == (14, 1, 14)
     assert len(_choose(Pixels(made, [photograph(c) for c in made], [None, np.eye(16) > 0], p.near, p.far), 1, 100, rng)) == 0
+
+
+@pytest.mark.parametrize("changes", [{}, {"sampling": "uniform", "field": "mlp"}], ids=["hash", "mlp"])
+def test_pixels_of_a_device_are_refined_alike(changes: dict[str, str]) -> None:
+    """Also with gains of the photographs, and with a field of which nothing is pruned."""
+    made = cameras(3, 16)
+    m = untrained(contracted=True, initial_density=3.0, **changes)
+    gains = torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.0, 0.5], [-0.5, 0.0, -0.5]])
+    found = []
+    for on_device in (False, True):
+        p = photographs(made, made)
+        source = DevicePixels(p, "cpu") if on_device else p
+        c = CameraCorrections.none(made)
+        moved_by = refine_cameras(m, p, source, c, np.random.default_rng(9), gains)
+        assert 0 < moved_by <= 1
+        bundle = source.bundle(np.arange(0, 768, 7))
+        expected = photographs(made, c.cameras).bundle(np.arange(0, 768, 7))
+        for a, b in zip(bundle, expected, strict=True):
+            np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-6, atol=1e-6)
+        found.append(c)
+    np.testing.assert_allclose(found[0].pose, found[1].pose, rtol=1e-9, atol=1e-12)
+    plain = CameraCorrections.none(made)
+    p = photographs(made, made)
+    refine_cameras(m, p, p, plain, np.random.default_rng(9), None)
+    assert np.abs(plain.pose - found[0].pose).max() > 1e-9
 
 
 @pytest.mark.slow
