@@ -46,7 +46,8 @@ def lookup_on(environment: Tensor, directions: Tensor) -> Tensor:
 
     height, width = environment.shape[:2]
     column = (torch.atan2(directions[:, 1], directions[:, 0]) / (2 * np.pi) + 0.5) * width - 0.5
-    row = (torch.acos(directions[:, 2].clamp(-1, 1)) / np.pi * height - 0.5).clamp(0, height - 1)
+    # The angle by both of its sides: in float32 the arc cosine loses half of the digits at the poles.
+    row = (torch.atan2(torch.hypot(directions[:, 0], directions[:, 1]), directions[:, 2]) / np.pi * height - 0.5).clamp(0, height - 1)
     left, top = column.floor().long(), row.floor().long()
     across, down = (column - left)[:, None], (row - top)[:, None]
     low = (top + 1).clamp(max=height - 1)

@@ -90,7 +90,7 @@ def training_step() -> None:
 def images() -> None:
     from efficientnerf.backends.triton import tree as cuda_tree
     from efficientnerf.geometry.cameras import Camera
-    from tests.efficientnerf.trees import random_tree
+    from tests.efficientnerf.trees import random_cascades, random_tree
 
     camera = Camera("view", 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), np.eye(4))
     for degree in range(5):
@@ -99,15 +99,16 @@ def images() -> None:
         if degree == 2:
             cuda_tree.render_image(cuda_tree.device_tree(random_tree(0, degree=degree, brick=4, lookup="nearest"), "cpu"), camera)
             cuda_tree.render_rays(tree, torch.zeros(8, 3), torch.ones(8, 3))
+            cuda_tree.render_image(cuda_tree.device_tree(random_cascades(0, degree=degree, brick=4), "cpu"), camera)
 
 
 def fit() -> None:
     from efficientnerf.backends.triton import tree_gradients
-    from tests.efficientnerf.trees import random_tree
+    from tests.efficientnerf.trees import random_cascades, random_tree
 
     rays = tree_gradients.Rays(torch.zeros(8, 3), torch.ones(8, 3), torch.ones(8, 3))
-    for degree, lookup in [*((degree, "trilinear") for degree in range(5)), (2, "nearest")]:
-        tree = random_tree(0, degree=degree, brick=4, lookup=lookup)
+    trees = [random_tree(0, degree=degree, brick=4) for degree in range(5)]
+    for tree in [*trees, random_tree(0, degree=2, brick=4, lookup="nearest"), random_cascades(0, degree=2, brick=4)]:
         g, count, width = tree_gradients.device_grid(tree, "cpu"), len(tree.density_values), 3 * tree.harmonics_count
         values, squares = (torch.zeros(count), torch.zeros(count, width)), (torch.zeros(count), torch.zeros(count))
         sums = torch.zeros(count, dtype=torch.int64), torch.zeros(count, width, dtype=torch.int64)

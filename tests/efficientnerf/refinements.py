@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels
 from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
@@ -76,4 +77,4 @@ def device_gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray
     by_thickness, by_sh = (part.cpu().double().numpy() / tree_gradients.fixed_point_scale(len(origins)) for part in sums)
     assert set(stamp.tolist()) <= {0, 3}
     assert not (by_sh.any(axis=1) & (stamp.cpu().numpy() != 3)).any()
-    return loss.cpu().numpy(), by_thickness * tree.voxel, by_sh.reshape(tree.sh.shape)
+    return loss.cpu().numpy(), by_thickness * voxel_sides(tree), by_sh.reshape(tree.sh.shape)

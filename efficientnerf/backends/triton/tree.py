@@ -18,31 +18,70 @@ import torch
 import triton
 from torch import Tensor
 
+from efficientnerf.asset.cascades import brick_ranges, cascades_of
+from efficientnerf.backends.numba.tree.leaps import leaps
 from efficientnerf.backends.transfer import constant, to_device
 from efficientnerf.backends.triton.launch import INTERPRETED
 from efficientnerf.backends.triton.tree_rendering import render
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.rendering import environment
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 TILE = (32, 16) if INTERPRETED else (8, 4)  # pixels of a program
 BRICKS_PER_BLOCK = 2**14
-# A program's warps by the length of a voxel's row of coefficients: as few as keep the row and the basis in registers.
+# A program's warps by the length of a voxel's row of coefficients: as few as keep the row and the basis in registers; twice as many for nested trees.
 WARPS = {4: 1, 16: 1, 32: 1, 64: 4, 128: 4}
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+class DeviceCascades(NamedTuple):
+    """The grids of a tree on a device.
+
+    shape   coarse cells of cascade 0
+    shapes  (L, 3) int32 coarse cells of each
+    first   (L,) int64 where each one's cells begin
+    place   (L, 4) float32 corner, and side of a voxel, voxels of cascade 0
+    """
+
+    shape: tuple[int, int, int]
+    shapes: Tensor
+    first: Tensor
+    place: Tensor
+
+    @property
+    def grids(self) -> int:
+        """L."""
+        return len(self.first)
+
+    @property
+    def arrays(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.shapes, self.first, self.place
+
+
+def device_cascades(tree: NerfTree, device: str | torch.device) -> DeviceCascades:
+    """The grids of a tree, sent to a device."""
+    cascades = cascades_of(tree)
+    sizes = [cascade.brick_index.size for cascade in cascades]
+    place = [(*((cascade.bounds_min - tree.bounds_min) / tree.voxel), cascade.voxel / tree.voxel) for cascade in cascades]
+    shapes = torch.tensor([cascade.shape for cascade in cascades], dtype=torch.int32, device=device)
+    first = torch.tensor(np.cumsum([0, *sizes[:-1]]), dtype=torch.int64, device=device)
+    return DeviceCascades(tree.shape, shapes, first, torch.tensor(np.asarray(place), dtype=torch.float32, device=device))
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceTree:
     """What the kernel reads.
 
-    grid     (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may skip
+    grid     (X, Y, Z) int32: the brick that a coarse cell owns, or the negative of the cells that a ray may skip; of a nested tree those of all cascades
+             one after the other
     density  (B, E^3) float16, voxels of a brick with its border, z fastest; 0 where nothing is stored
     index    (B, E^3) int32: which voxel's coefficients, -1 where nothing is stored
     sh       (N, row) float16: K coefficients for red, green and blue each, then zeros
-    low      (3,) corner of the grid in the tree's frame; `voxel` its unit there
+    low      (3,) corner of cascade 0 in the tree's frame; `voxel` its unit there
     nearest  whether voxels are not interpolated
+    environment  (H, 2 H, 3) float32 or None, see `NerfTree`
     """
 
     grid: Tensor
@@ -53,11 +92,14 @@ class DeviceTree:
     terms: int
     voxel: float
     low: np.ndarray
+    cascades: DeviceCascades
     nearest: bool = False
+    environment: Tensor | None = None
 
     @property
     def bytes(self) -> int:
-        return sum(t.numel() * t.element_size() for t in (self.grid, self.density, self.index, self.sh))
+        tensors = (self.grid, self.density, self.index, self.sh, *(() if self.environment is None else (self.environment,)))
+        return sum(t.numel() * t.element_size() for t in tensors)
 
 
 class DeviceRendering(NamedTuple):
@@ -71,17 +113,25 @@ class DeviceRendering(NamedTuple):
 
 def brick_arrays(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Tensor]:
     """`grid` and `index` of a DeviceTree, on the device; bricks are taken in blocks, so that little more than the result is needed."""
-    brick_index = torch.from_numpy(tree.brick_index).to(device)
-    leap = torch.from_numpy(tree.leap.astype(np.int32)).to(device)
     voxel_index = torch.from_numpy(np.ascontiguousarray(tree.voxel_index, np.int32)).to(device)
-    d, edge, bricks = tree.brick, tree.brick + 2, len(tree.voxel_index)
-    reach = torch.arange(-1, d + 1, device=device)
+    index = torch.empty(len(voxel_index), (tree.brick + 2) ** 3, dtype=torch.int32, device=device)
+    grids = []
+    for n, (cascade, (first, end)) in enumerate(zip(cascades_of(tree), brick_ranges(tree), strict=True)):
+        brick_index = torch.from_numpy(np.ascontiguousarray(cascade.brick_index)).to(device)
+        leap = torch.from_numpy((leaps(cascade.brick_index >= 0) if n else tree.leap).astype(np.int32)).to(device)
+        _bordered(brick_index, voxel_index, tree.brick, index[first:end])
+        grids.append(torch.where(brick_index >= 0, brick_index, -leap))
+    return torch.cat([grid.reshape(-1) for grid in grids]) if tree.outer else grids[0].contiguous(), index
+
+
+def _bordered(brick_index: Tensor, voxel_index: Tensor, d: int, index: Tensor) -> None:
+    """The voxels of a cascade's bricks into `index` (b, E^3), with a border of their neighbours in it."""
+    reach = torch.arange(-1, d + 1, device=index.device)
     border = torch.stack(torch.meshgrid(reach, reach, reach, indexing="ij"), dim=-1).reshape(-1, 3)  # (E^3, 3)
-    cells = torch.nonzero(brick_index >= 0)  # (B, 3), in the order of the cells
+    cells = torch.nonzero(brick_index >= 0)  # (b, 3), in the order of the cells
     cells = cells[torch.argsort(brick_index[tuple(cells.unbind(1))])]
-    size = torch.tensor(tree.resolution, device=device)
-    index = torch.empty(bricks, edge**3, dtype=torch.int32, device=device)
-    for begin in range(0, bricks, BRICKS_PER_BLOCK):
+    size = torch.tensor(brick_index.shape, device=index.device) * d
+    for begin in range(0, len(index), BRICKS_PER_BLOCK):
         at = cells[begin : begin + BRICKS_PER_BLOCK, None] * d + border  # (b, E^3, 3)
         there = ((at >= 0) & (at < size)).all(dim=-1)
         at = at.clamp(min=0).minimum(size - 1)
@@ -90,7 +140,6 @@ def brick_arrays(tree: NerfTree, device: str | torch.device) -> tuple[Tensor, Te
         local = at - cell * d
         slot = (local[..., 0] * d + local[..., 1]) * d + local[..., 2]
         index[begin : begin + BRICKS_PER_BLOCK] = torch.where(there & (owner >= 0), voxel_index[owner.clamp(min=0), slot], -1)
-    return torch.where(brick_index >= 0, brick_index, -leap).contiguous(), index
 
 
 def device_tree_of(tree: NerfTree) -> DeviceTree:
@@ -114,7 +163,9 @@ def device_tree(tree: NerfTree, device: str | torch.device = "cuda") -> DeviceTr
     for begin in range(0, len(values), step):
         part = torch.from_numpy(np.ascontiguousarray(tree.coefficients(slice(begin, begin + step)))).to(device)
         sh[begin : begin + step, : 3 * terms] = part.transpose(1, 2).reshape(len(part), 3 * terms).clamp(-65504, 65504).half()
-    return DeviceTree(grid, density, index, sh, tree.brick, terms, tree.voxel, tree.bounds_min, tree.lookup == "nearest")
+    surroundings = None if tree.environment is None else torch.from_numpy(np.ascontiguousarray(tree.environment, np.float32)).to(device)
+    cascades = device_cascades(tree, device)
+    return DeviceTree(grid, density, index, sh, tree.brick, terms, tree.voxel, tree.bounds_min, cascades, tree.lookup == "nearest", surroundings)
 
 
 def _launch(
@@ -130,16 +181,17 @@ def _launch(
     # Without voxels there is nothing that the kernel would read, but it must have something to point at.
     density, index, sh = (x if len(x) else x.new_zeros(1, x.shape[1]) for x in (t.density, t.index, t.sh))
     render[(programs,)](
-        *(buffers or (out.colour, out.colour, out.colour)), t.grid, density, index, sh, *out,
-        count, *size, *t.grid.shape, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
-        PINHOLE=buffers is None, OVER=background is not None, NEAREST=t.nearest, BRICK=t.brick, K=t.terms, ROW=t.sh.shape[1], WIDE=wide, HIGH=high,
-        num_warps=WARPS[t.sh.shape[1]],
+        *(buffers or (out.colour, out.colour, out.colour)), t.grid, *t.cascades.arrays, density, index, sh, *out,
+        count, *size, *t.cascades.shape, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
+        PINHOLE=buffers is None, OVER=background is not None, NEAREST=t.nearest, CASCADES=t.cascades.grids, BRICK=t.brick, K=t.terms,
+        ROW=t.sh.shape[1], WIDE=wide, HIGH=high, num_warps=WARPS[t.sh.shape[1]] * min(2, t.cascades.grids),
     )  # fmt: skip
     return out
 
 
 def render_rays(t: DeviceTree, origins: Tensor, directions: Tensor, views: Tensor | None = None) -> DeviceRendering:
-    """Rays of the tree's frame on the device: origins (R, 3), unit directions (R, 3), and those in the world where the frame is another.
+    """Rays of the tree's frame on the device: origins (R, 3), unit directions (R, 3), and those in the world where the frame is another; colours are
+    premultiplied, without the environment.
 
     Depth is the distance along the ray, normals are of the frame; nothing waits for the device.
     """
@@ -170,13 +222,14 @@ def _camera_directions(width: int, height: int, model: str, params: tuple[float,
 def render_image(t: DeviceTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> DeviceRendering:
     """The image of a camera in the tree's frame, (H, W, ...), on the device; nothing waits for it.
 
-    One launch where the camera is a pinhole and `supersample` is 1; else rays are made, or samples averaged, by some more. See
+    One launch where the camera is a pinhole and `supersample` is 1; else rays are made, samples averaged, or the environment looked up, by some more. See
     `efficientnerf.asset.rendering.render`.
     """
     if supersample < 1:
         raise ValueError(f"supersample {supersample}: expected at least 1")
     height, width = camera.height * supersample, camera.width * supersample
     over = background if supersample == 1 else None
+    rotation = to_device(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), t.grid.device)
     if camera.model in PINHOLES:
         k = camera.intrinsics
         place = (*((camera.centre - t.low) / t.voxel), *camera.world_from_camera[:3, :3].ravel())
@@ -184,12 +237,14 @@ def render_image(t: DeviceTree, camera: Camera, *, background: tuple[float, floa
         flat = _launch(t, height * width, None, tuple(float(x) for x in (*place, *lens)), (width, height), over)
     else:
         local = _camera_directions(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
-        rotation = to_device(torch.from_numpy(camera.world_from_camera[:3, :3].T.astype(np.float32)), local.device)
         place = tuple(float(x) for x in (camera.centre - t.low) / t.voxel)
         start = torch.stack([torch.full_like(local[:, 0], x) for x in place], dim=1)
         along = local @ rotation
         flat = _launch(t, len(start), (start, along, along), (0.0,) * 16, (0, 0), over)
         flat = flat._replace(depth=flat.depth * local[:, 2])
+    if background is None and t.environment is not None:
+        local = _camera_directions(camera.width, camera.height, camera.model, camera.params, supersample, t.grid.device)
+        flat = flat._replace(colour=flat.colour + (1 - flat.opacity[:, None]) * environment.lookup_on(t.environment, local @ rotation))
     shape = (camera.height, supersample, camera.width, supersample)
     if supersample == 1:
         return DeviceRendering(*(x.reshape(camera.height, camera.width, *x.shape[1:]) for x in flat))

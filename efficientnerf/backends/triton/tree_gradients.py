@@ -15,17 +15,19 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.backends.numba.tree.gradients import RayTargets
 from efficientnerf.backends.numba.tree.rmsprop import MAX_THICKNESS, MIN_THICKNESS
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
-from efficientnerf.backends.triton.tree import brick_arrays
-from efficientnerf.backends.triton.tree_march import STEP, Grid, colour_of, corner_place, corner_weight, interpolate_harmonics, march, ray_in_grid
+from efficientnerf.backends.triton.tree import DeviceCascades, brick_arrays, device_cascades
+from efficientnerf.backends.triton.tree_march import STEP, Cascades, colour_of, corner_place, corner_weight, interpolate_harmonics, march_cascades
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, store_vec3, zeros_vec3
 
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ MAX_VISITS = 60000  # beyond it the bias correction is one
 
 
 class Rays(NamedTuple):
-    """Of a batch, on the device, contiguous float32 (R, 3): origins and directions in voxel coordinates, and directions in the world, `views`."""
+    """Of a batch, on the device, contiguous float32 (R, 3): origins and directions in voxel coordinates of cascade 0, and directions in the world, `views`."""
 
     origins: Tensor
     directions: Tensor
@@ -60,14 +62,19 @@ class LearningRates(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DeviceGrid:
-    """Where the voxels of a tree lie; `grid` and `index` as in `efficientnerf.backends.triton.tree.DeviceTree`."""
+    """Where the voxels of a tree lie; `grid`, `cascades` and `index` as in `efficientnerf.backends.triton.tree.DeviceTree`.
+
+    cascade_of  (N,) uint8 the cascade of each voxel; (1,) where there is one
+    """
 
     grid: Tensor
+    cascades: DeviceCascades
     index: Tensor
     brick: int
     terms: int
     voxel: float
     nearest: bool
+    cascade_of: Tensor
 
     @property
     def row(self) -> int:
@@ -84,11 +91,12 @@ def device_grid(tree: NerfTree, device: str | torch.device) -> DeviceGrid:
     grid, index = brick_arrays(tree, device)
     if not len(index):
         index = index.new_full((1, index.shape[1]), -1)  # nothing is read, but kernels need a pointer
-    return DeviceGrid(grid, index, tree.brick, tree.harmonics_count, tree.voxel, tree.lookup == "nearest")
+    cascade_of = torch.from_numpy(voxel_cascades(tree) if tree.outer else np.zeros(1, np.uint8)).to(device)
+    return DeviceGrid(grid, device_cascades(tree, device), index, tree.brick, tree.harmonics_count, tree.voxel, tree.lookup == "nearest", cascade_of)
 
 
 class Scene(NamedTuple):
-    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: a voxel's side in the frame; basis (R, C) harmonics of the columns; column (C,)."""
+    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels; basis (R, C) harmonics of the columns; column (C,)."""
 
     index: Any
     density: Any
@@ -142,7 +150,7 @@ def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.c
     for n in tl.static_range(1 if NEAREST else 8):
         place = tl.load(index + corner_place(sample.corner, n, BRICK), sample.inside, other=-1)
         sigma += corner_weight(sample.fraction, n) * tl.load(density + place, place >= 0, other=0.0)
-    return sigma * (STEP * voxel)
+    return sigma * (STEP * voxel * sample.unit)
 
 
 @triton.jit
@@ -173,15 +181,15 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
 
 @triton.jit
 def _forward(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, index, density, sh, colour, transmittance, rays, nx, ny, nz, voxel,
-    NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
+    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, rays, nx, ny, nz, voxel,
+    NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Premultiplied colour (R, 3) and final transmittance (R,) of rays."""
     r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
-    grid = Grid(owner, Vec3(nx, ny, nz))
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
     scene = Scene(index, density, sh, voxel, basis, tl.arange(0, ROW))
     start = Forward(tl.full((BLOCK,), 1.0, tl.float32), zeros_vec3(BLOCK))
-    end = march(grid, ray_in_grid(grid, origin, direction, BRICK), live, scene, start, _composite, BRICK, NEAREST, K, ROW)
+    end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
     store_vec3(colour, r, end.colour, live)
     tl.store(transmittance + r, end.transmittance, live)
 
@@ -201,7 +209,7 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
     for n in tl.static_range(1 if NEAREST else 8):
         voxel = tl.load(scene.index + corner_place(sample.corner, n, BRICK), visible, other=-1).to(tl.int64)
         stored = voxel >= 0
-        scaled = corner_weight(sample.fraction, n) * sums.scale
+        scaled = tl.where(stored, corner_weight(sample.fraction, n), 0.0) * sums.scale  # by the sum of the stored ones, the others' may be beyond any integer
         tl.store(sums.stamp + voxel, sums.number, stored)
         tl.atomic_add(sums.thickness + voxel, (scaled * by_depth * STEP).to(tl.int64), stored, sem="relaxed")
         row = sums.sh + voxel[:, None] * (3 * K) + column[None, :]
@@ -211,20 +219,20 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 
 @triton.jit(do_not_specialize=["number"])
 def _backward(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, index, density, sh, colour, transmittance, grad_colour, grad_opacity, sum_thickness, sum_sh, stamp,
+    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, grad_colour, grad_opacity, sum_thickness, sum_sh, stamp,
     rays, nx, ny, nz, voxel, number, scale,
-    NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
+    NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds `scale` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as integers; stamps the voxels that rays meet."""
     r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
-    grid = Grid(owner, Vec3(nx, ny, nz))
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
     scene = Scene(index, density, sh, voxel, basis, tl.arange(0, ROW))
     behind = load_vec3(colour, r, live)
     by_colour = load_vec3(grad_colour, r, live)
     by_end = tl.load(transmittance + r, live, other=1.0) * tl.load(grad_opacity + r, live, other=0.0)
     given = (scene, Upstream(by_colour, by_end), Sums(sum_thickness, sum_sh, stamp, number, scale))
     start = Backward(tl.full((BLOCK,), 1.0, tl.float32), behind)
-    march(grid, ray_in_grid(grid, origin, direction, BRICK), live, given, start, _add_gradients, BRICK, NEAREST, K, ROW)
+    march_cascades(cascades, origin, direction, live, given, start, _add_gradients, CASCADES, BRICK, NEAREST, K, ROW)
 
 
 @triton.jit
@@ -241,23 +249,23 @@ def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 
 @triton.jit
 def _max_contributions(  # type: ignore[no-untyped-def]
-    origins, directions, owner, index, density, transmittance, maximum, rays, nx, ny, nz, voxel,
-    NEAREST: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr,
+    origins, directions, owner, shapes, first, place, index, density, transmittance, maximum, rays, nx, ny, nz, voxel,
+    NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Raises `maximum` (N,) to what voxels contribute to rays."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = r < rays
-    grid = Grid(owner, Vec3(nx, ny, nz))
-    ray = ray_in_grid(grid, load_vec3(origins, r, live), load_vec3(directions, r, live), BRICK)
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
+    origin, direction = load_vec3(origins, r, live), load_vec3(directions, r, live)
     given = (index, density, voxel, tl.load(transmittance + r, live, other=0.0), maximum)
-    march(grid, ray, live, given, Absorption(tl.full((BLOCK,), 1.0, tl.float32)), _raise_maximum, BRICK, NEAREST, 0, 0)
+    march_cascades(cascades, origin, direction, live, given, Absorption(tl.full((BLOCK,), 1.0, tl.float32)), _raise_maximum, CASCADES, BRICK, NEAREST, 0, 0)
 
 
 @triton.jit(do_not_specialize=["number"])
 def _rmsprop_step(  # type: ignore[no-untyped-def]
-    density, sh, sum_thickness, sum_sh, square_density, square_sh, visits, stamp,
+    density, sh, sum_thickness, sum_sh, square_density, square_sh, visits, stamp, cascade_of, place,
     voxels, number, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, min_thickness, max_thickness, max_visits,
-    WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
+    CASCADES: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """`efficientnerf.backends.numba.tree.rmsprop.rmsprop_step` from gradients as integers, of `unit` each."""
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -266,12 +274,15 @@ def _rmsprop_step(  # type: ignore[no-untyped-def]
         visited = tl.minimum(tl.load(visits + v, met, other=0) + 1, max_visits)
         tl.store(visits + v, visited, met)
         correction = 1 / (1 - tl.exp(visited.to(tl.float32) * log_decay))
+        side = voxel
+        if CASCADES > 1:
+            side = voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
         # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
-        depth = tl.maximum(tl.load(density + v, met, other=0.0) * voxel, min_thickness)
+        depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, min_thickness)
         g = tl.load(sum_thickness + v, met, other=0).to(tl.float32) * unit * depth
         square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * g * g
         change = density_rate * g / (tl.sqrt(square * correction) + epsilon)
-        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), min_thickness), max_thickness) / voxel, met)
+        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), min_thickness), max_thickness) / side, met)
         tl.store(square_density + v, square, met)
         tl.store(sum_thickness + v, tl.zeros_like(v), met)
         column = tl.arange(0, ROW)
@@ -296,8 +307,8 @@ def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor) -> tuple[Ten
     count = len(rays.origins)
     colour, transmittance = torch.empty(count, 3, device=density.device), torch.empty(count, device=density.device)
     _forward[(blocks(count, g.rays),)](
-        *rays, g.grid, g.index, density, sh, colour, transmittance, count, *g.grid.shape, float(g.voxel),
-        NEAREST=g.nearest, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
+        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, colour, transmittance, count, *g.cascades.shape, float(g.voxel),
+        NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
     return colour, transmittance
 
@@ -323,9 +334,9 @@ def backward(
     """
     count = len(rays.origins)
     _backward[(blocks(count, g.rays),)](
-        *rays, g.grid, g.index, density, sh, *outputs, *(part.contiguous() for part in by), *sums, stamp,
-        count, *g.grid.shape, float(g.voxel), number, fixed_point_scale(count),
-        NEAREST=g.nearest, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
+        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, *outputs, *(part.contiguous() for part in by), *sums, stamp,
+        count, *g.cascades.shape, float(g.voxel), number, fixed_point_scale(count),
+        NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
 
 
@@ -333,8 +344,8 @@ def max_contributions(g: DeviceGrid, rays: Rays, density: Tensor, transmittance:
     """Raise `maximum` (N,) to the greatest contributions of voxels to rays, which reach the box with `transmittance` (R,)."""
     count = len(rays.origins)
     _max_contributions[(blocks(count, RAYS_PER_PROGRAM),)](
-        rays.origins, rays.directions, g.grid, g.index, density, transmittance, maximum, count, *g.grid.shape, float(g.voxel),
-        NEAREST=g.nearest, BRICK=g.brick, BLOCK=RAYS_PER_PROGRAM, num_warps=1,
+        rays.origins, rays.directions, g.grid, *g.cascades.arrays, g.index, density, transmittance, maximum, count, *g.cascades.shape, float(g.voxel),
+        NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, BLOCK=RAYS_PER_PROGRAM, num_warps=1,
     )  # fmt: skip
 
 
@@ -345,6 +356,7 @@ def rmsprop_step(
     """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree.rmsprop.rmsprop_step`."""
     voxels = len(visits)
     _rmsprop_step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
-        *values, *sums, *squares, visits, stamp, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel), *map(float, rates),
-        decay, math.log(decay), epsilon, MIN_THICKNESS, MAX_THICKNESS, MAX_VISITS, WIDTH=3 * g.terms, ROW=g.row, BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
+        *values, *sums, *squares, visits, stamp, g.cascade_of, g.cascades.place, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel),
+        *map(float, rates), decay, math.log(decay), epsilon, MIN_THICKNESS, MAX_THICKNESS, MAX_VISITS, CASCADES=g.cascades.grids, WIDTH=3 * g.terms, ROW=g.row,
+        BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

@@ -4,6 +4,9 @@ Rays are sampled as `efficientnerf/asset/FORMAT.md` says, sections 6 and 9: ever
 skips to the end of the empty cube around it. Coordinates are in voxels. `grid` and `index`: see `efficientnerf.backends.triton.tree.DeviceTree`.
 Offsets that grow with the tree have 64 bits: 1536^3 cells are more than 2^31.
 
+In a nested tree a ray passes its parts in the cascades one after the other, as `efficientnerf.asset.rendering.ray_parts` says; coordinates are in voxels of
+the cascade that is marched, those that callers give and get in voxels of cascade 0.
+
 NEAREST: a sample takes the value of the voxel that holds it, which stands for corner 0 with weight 1; there are no other corners.
 """
 
@@ -28,24 +31,43 @@ class Grid(NamedTuple):
     shape: Any
 
 
+class Cascades(NamedTuple):
+    """owner  pointer to the coarse cells of all grids, as in Grid
+    shape     of cascade 0, as in Grid
+    others    of L cascades, pointers, see `efficientnerf.backends.triton.tree.DeviceCascades`: shapes, first, place
+    """
+
+    owner: Any
+    shape: Any
+    shapes: Any
+    first: Any
+    place: Any
+
+
 class Ray(NamedTuple):
-    """origin, direction (unit), inverse (1 / direction) Vec3; enter, leave: distances between which it is in the grid, enter >= 0."""
+    """origin, direction (unit), inverse (1 / direction) Vec3; enter, leave: distances between which it is in the grid, enter >= 0.
+
+    unit  side of a voxel of the grid, voxels of cascade 0
+    """
 
     origin: Any
     direction: Any
     inverse: Any
     enter: Any
     leave: Any
+    unit: Any
 
 
 class Sample(NamedTuple):
     """distance  along the ray
+    unit         of distances and steps, voxels of cascade 0
     inside       whether it lies in a brick
     corner       place of its lowest corner in the arrays of bricks with border
     fraction     Vec3 from there to the next corner, 0 to 1
     """
 
     distance: Any
+    unit: Any
     inside: Any
     corner: Any
     fraction: Any
@@ -62,7 +84,7 @@ def _slab(o, d, high):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def ray_in_grid(grid, origin, direction, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def ray_in_grid(grid, origin, direction, unit, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
     """A Ray from its origin and direction, voxel coordinates."""
     ix, ax, bx = _slab(origin.x, direction.x, grid.shape.x * BRICK)
     iy, ay, by = _slab(origin.y, direction.y, grid.shape.y * BRICK)
@@ -70,7 +92,7 @@ def ray_in_grid(grid, origin, direction, BRICK: tl.constexpr):  # type: ignore[n
     enter = tl.maximum(tl.maximum(ax, ay), tl.maximum(az, 0.0))
     # No ray is longer in the grid than its sides together, but where distances far beyond it are rounded: so its samples are bounded, too.
     longest = (grid.shape.x + grid.shape.y + grid.shape.z) * BRICK + 2.0
-    return Ray(origin, direction, Vec3(ix, iy, iz), enter, tl.minimum(tl.minimum(tl.minimum(bx, by), bz), enter + longest))
+    return Ray(origin, direction, Vec3(ix, iy, iz), enter, tl.minimum(tl.minimum(tl.minimum(bx, by), bz), enter + longest), unit)
 
 
 @triton.jit
@@ -132,7 +154,7 @@ def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  #
     exit = tl.minimum(_cube_exit(o.x, d.x, inverse.x, cell.x, radius, BRICK), tl.minimum(exit_y, exit_z))
     after = tl.minimum(tl.maximum(tl.ceil((tl.minimum(exit, ray.leave) - ray.enter) / STEP - 0.5), 0.0), 1e9).to(tl.int32)
     corner, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
-    return Sample(t, alive & (owner >= 0), corner, fraction), tl.where(owner < 0, tl.maximum(k + 1, after), k + 1)
+    return Sample(t, ray.unit, alive & (owner >= 0), corner, fraction), tl.where(owner < 0, tl.maximum(k + 1, after), k + 1)
 
 
 @triton.jit
@@ -158,6 +180,50 @@ def march(  # type: ignore[no-untyped-def]
         if tl.max(sample.inside.to(tl.int32), 0) > 0:
             state = VISIT(scene, sample, state, BRICK, NEAREST, K, COLUMNS)
         alive = alive & (state.transmittance >= STOP) & _in_grid(ray, k)
+    return state
+
+
+@triton.jit
+def cascade_grid(cascades, n):  # type: ignore[no-untyped-def]
+    """The Grid of cascade n, its corner (Vec3) and the side of its voxels, voxels of cascade 0."""
+    shape, place = cascades.shapes + 3 * n, cascades.place + 4 * n
+    grid = Grid(cascades.owner + tl.load(cascades.first + n), Vec3(tl.load(shape), tl.load(shape + 1), tl.load(shape + 2)))
+    return grid, Vec3(tl.load(place), tl.load(place + 1), tl.load(place + 2)), tl.load(place + 3)
+
+
+@triton.jit
+def in_cascade(point, corner, unit):  # type: ignore[no-untyped-def]
+    """Points of cascade 0's voxel coordinates in those of a cascade."""
+    return Vec3((point.x - corner.x) / unit, (point.y - corner.y) / unit, (point.z - corner.z) / unit)
+
+
+@triton.jit
+def _ray_in_cascade(cascades, n, origin, direction, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+    """The Grid of cascade n and rays in it."""
+    grid, corner, unit = cascade_grid(cascades, n)
+    return grid, ray_in_grid(grid, in_cascade(origin, corner, unit), direction, unit, BRICK)
+
+
+@triton.jit
+def march_cascades(  # type: ignore[no-untyped-def]
+    cascades, origin, direction, live, scene, state, VISIT: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr,
+    K: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
+    """`march` through all parts of rays: part p lies in cascade |L - 1 - p|, before or behind the box that is cut out of that."""
+    if CASCADES == 1:
+        grid = Grid(cascades.owner, cascades.shape)
+        state = march(grid, ray_in_grid(grid, origin, direction, 1.0, BRICK), live, scene, state, VISIT, BRICK, NEAREST, K, COLUMNS)
+    else:
+        OUTERMOST: tl.constexpr = CASCADES - 1
+        for part in range(2 * CASCADES - 1):
+            n = tl.maximum(part - OUTERMOST, OUTERMOST - part)
+            grid, ray = _ray_in_cascade(cascades, n, origin, direction, BRICK)
+            _, inner = _ray_in_cascade(cascades, tl.maximum(n - 1, 0), origin, direction, BRICK)
+            meets = inner.leave > inner.enter
+            leave = tl.where((part < OUTERMOST) & meets, 0.5 * inner.enter, ray.leave)
+            enter = tl.where(part > OUTERMOST, tl.where(meets, 0.5 * inner.leave, ray.leave), ray.enter)
+            through = Ray(ray.origin, ray.direction, ray.inverse, enter, leave, ray.unit)
+            state = march(grid, through, live & (state.transmittance >= STOP), scene, state, VISIT, BRICK, NEAREST, K, COLUMNS)
     return state
 
 

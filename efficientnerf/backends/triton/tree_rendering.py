@@ -12,7 +12,18 @@ import triton
 import triton.language as tl
 
 from efficientnerf.backends.triton.harmonics import basis_columns
-from efficientnerf.backends.triton.tree_march import STEP, Grid, colour_of, density_at, interpolate_density, interpolate_harmonics, march, ray_in_grid
+from efficientnerf.backends.triton.tree_march import (
+    STEP,
+    Cascades,
+    Grid,
+    cascade_grid,
+    colour_of,
+    density_at,
+    in_cascade,
+    interpolate_density,
+    interpolate_harmonics,
+    march_cascades,
+)
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, along, load_vec3, store_vec3, zeros_vec3
 
 MIN_WEIGHT = tl.constexpr(1e-4)  # below it a sample's colour is not looked up, and its weight is added to that of the next one
@@ -32,7 +43,7 @@ class Camera(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """density, index, sh of `DeviceTree`; voxel: length of a step's unit; basis (R, C) harmonics of the columns; column (C,)."""
+    """density, index, sh of `DeviceTree`; voxel: side of cascade 0's voxels in the frame; basis (R, C) harmonics of the columns; column (C,)."""
 
     density: Any
     index: Any
@@ -43,7 +54,8 @@ class Scene(NamedTuple):
 
 
 class State(NamedTuple):
-    """transmittance; pending_weight of samples without a colour; colour (Vec3, premultiplied); depth along the ray where the transmittance is a half."""
+    """transmittance; pending_weight of samples without a colour; colour (Vec3, premultiplied); depth along the ray where the transmittance is a half,
+    voxels of cascade 0."""
 
     transmittance: Any
     pending_weight: Any
@@ -71,7 +83,7 @@ def _pixel_rays(camera, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr): 
 def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
     """Add a sample to the State of its rays."""
     sigma = interpolate_density(scene.density, sample.corner, sample.fraction, sample.inside, BRICK, NEAREST)
-    alpha = 1 - tl.exp(-sigma * (STEP * scene.voxel))
+    alpha = 1 - tl.exp(-sigma * (STEP * scene.voxel * sample.unit))
     pending = state.pending_weight + state.transmittance * alpha
     visible = sample.inside & (pending > MIN_WEIGHT) & (sigma > 0)
     colour = state.colour
@@ -82,7 +94,7 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
         pending = tl.where(visible, 0.0, pending)
     after = state.transmittance * (1 - alpha)
     crossing = sample.inside & (state.transmittance > 0.5) & (after <= 0.5)
-    at_half = sample.distance - 0.5 * STEP + tl.log(2 * tl.maximum(state.transmittance, 0.5)) / (tl.maximum(sigma, 1e-20) * scene.voxel)
+    at_half = (sample.distance - 0.5 * STEP) * sample.unit + tl.log(2 * tl.maximum(state.transmittance, 0.5)) / (tl.maximum(sigma, 1e-20) * scene.voxel)
     return State(after, pending, colour, tl.where(crossing, at_half, state.depth))
 
 
@@ -98,11 +110,28 @@ def _normal(grid, density, p, live, BRICK: tl.constexpr, NEAREST: tl.constexpr):
 
 
 @triton.jit
+def _surface_normal(cascades, density, p, live, CASCADES: tl.constexpr, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
+    """`_normal` in the cascades that points belong to."""
+    if CASCADES == 1:
+        facing = _normal(Grid(cascades.owner, cascades.shape), density, p, live, BRICK, NEAREST)
+    else:
+        facing = Vec3(0 * p.x, 0 * p.y, 0 * p.z)
+        for n in range(CASCADES):
+            grid, corner, unit = cascade_grid(cascades, n)
+            q, size = in_cascade(p, corner, unit), grid.shape
+            here = live & (q.x >= 0) & (q.y >= 0) & (q.z >= 0) & (q.x < size.x * BRICK) & (q.y < size.y * BRICK) & (q.z < size.z * BRICK)
+            found = _normal(grid, density, q, here, BRICK, NEAREST)
+            facing = Vec3(tl.where(here, found.x, facing.x), tl.where(here, found.y, facing.y), tl.where(here, found.z, facing.z))
+            live = live & (here == 0)
+    return facing
+
+
+@triton.jit
 def render(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, density, index, sh, colour, opacity, depth, normal,
+    origins, directions, views, owner, shapes, first, place, density, index, sh, colour, opacity, depth, normal,
     rays, width, height, nx, ny, nz, voxel, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, red, green, blue,
-    PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr,
-    WIDE: tl.constexpr, HIGH: tl.constexpr,
+    PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr,
+    ROW: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
 ):  # fmt: skip
     """PINHOLE: pixels of a camera at (ox, oy, oz), voxel coordinates, with the rotation r, camera to world; depth along the view axis, infinity
     where the opacity is below a half. Else: rays of the buffers, voxel coordinates, harmonics along `views`; depth along the ray.
@@ -122,14 +151,14 @@ def render(  # type: ignore[no-untyped-def]
         origin = load_vec3(origins, r, live)
         cosine = tl.full((BLOCK,), 1.0, tl.float32)
         basis = basis_columns(load_vec3(views, r, live), column % K, K)
-    grid = Grid(owner, Vec3(nx, ny, nz))
-    ray = ray_in_grid(grid, origin, direction, BRICK)
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
     start = State(tl.full((BLOCK,), 1.0, tl.float32), tl.zeros((BLOCK,), tl.float32), zeros_vec3(BLOCK), tl.full((BLOCK,), float("inf"), tl.float32))
-    end = march(grid, ray, live, Scene(density, index, sh, voxel, basis, column), start, _composite, BRICK, NEAREST, K, ROW)
+    scene = Scene(density, index, sh, voxel, basis, column)
+    end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
 
     opaque = live & (end.transmittance <= 0.5)
     surface = along(origin, direction, tl.where(opaque, end.depth, 0.0))
-    facing = _normal(grid, density, surface, opaque, BRICK, NEAREST)
+    facing = _surface_normal(cascades, density, surface, opaque, CASCADES, BRICK, NEAREST)
     rgb = end.colour
     if OVER:
         rgb = add_scaled(rgb, end.transmittance, Vec3(red, green, blue))

@@ -12,9 +12,10 @@ from efficientnerf.asset.queries import density_block
 from efficientnerf.asset.rendering import Rendering, render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.rendering import environment
 from tests import reference
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.trees import LOW, looking, random_tree, rays_at, tensors, uniform_tree
+from tests.efficientnerf.trees import LOW, looking, nested_rays, random_cascades, random_tree, rays_at, tensors, uniform_tree
 
 cuda = pytest.importorskip("efficientnerf.backends.triton.tree")
 
@@ -176,6 +177,51 @@ def test_rays_of_another_frame_have_the_colours_along_those_of_the_world() -> No
     from efficientnerf.backends.numba.tree.rendering import render_rays
 
     agree(Rendering(*(t.cpu().numpy() for t in found)), Rendering(*render_rays(tree, origins, directions, looking)), faces=0.02)
+
+
+@pytest.mark.parametrize(("count", "brick", "degree", "lookup"), [(1, 3, 1, "trilinear"), (2, 1, 0, "trilinear"), (3, 4, 2, "trilinear"), (3, 2, 1, "nearest")])
+def test_rays_through_cascades_are_those_of_the_torch_function(count: int, brick: int, degree: int, lookup: str) -> None:
+    tree = replace(random_cascades(count, count=count, brick=brick, degree=degree, lookup=lookup), environment=None)
+    origins, directions = nested_rays(tree, 160)
+    colour, opacity = (part.numpy() for part in render_reference(tree, *tensors(origins, directions)))
+    found = device_rays(tree, origins, directions)
+    faces = 0.03 if lookup == "nearest" else 0.01  # samples at faces of voxels and of boxes: float32 may see the one on the other side
+    assert (np.abs(found.opacity - opacity) > 1.1e-3).mean() <= faces
+    assert (np.abs(found.colour - colour) > 1.1e-3).mean() <= faces
+    assert (found.opacity > 0.05).mean() > 0.2
+    agree(found, render_rays(tree, origins, directions), faces=0.03)
+
+
+@pytest.mark.parametrize(("model", "params"), [("PINHOLE", (12.0, 11.0, 9.0, 12.0)), ("OPENCV", (12.0, 11.0, 9.0, 12.0, 0.05, -0.02, 0.003, 0.002))])
+def test_images_of_cascades_lie_over_the_environment_or_the_background(model: str, params: tuple[float, ...]) -> None:
+    tree = random_cascades(2, degree=1, share=0.3)
+    tree = replace(tree, density_values=tree.density_values / 4)
+    camera = replace(looking(tree), width=18, model=model, params=params)
+    for supersample, background in ((1, None), (2, None), (1, (1.0, 0.5, 0.0))) if model == "PINHOLE" else ((1, None),):
+        found = device_image(tree, camera, background=background, supersample=supersample)
+        agree(found, render(tree, camera, background=background, supersample=supersample), faces=0.04)  # normals beside the face of a box
+        assert found.opacity.min() < 0.4 < 0.6 < found.opacity.max()
+
+
+@pytest.mark.parametrize("side", [(1, 2), (8, 16), (64, 128)])
+def test_the_environment_of_the_device_is_that_of_the_host(side: tuple[int, int]) -> None:
+    """With directions at the poles, at the seam, and exactly along the axes."""
+    rng = np.random.default_rng(0)
+    image, directions = rng.random((*side, 3)).astype(np.float32), rng.normal(size=(500, 3))
+    directions[::5, :2] *= 1e-3
+    directions[1::5, 1] *= 1e-4
+    directions = np.concatenate([directions / np.linalg.norm(directions, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+    found = environment.lookup_on(torch.from_numpy(image).to(DEVICE), torch.from_numpy(directions.astype(np.float32)).to(DEVICE))
+    np.testing.assert_allclose(found.cpu().numpy(), environment.lookup(image, directions), atol=1e-4)
+
+
+@pytest.mark.gpu
+def test_cascades_on_the_device_render_as_on_the_cpu() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    tree = random_cascades(4, count=4, cells=8, brick=4, degree=2, share=0.2)
+    camera = looking(tree, 200)
+    agree(render(tree.to("cuda"), camera), render(tree, camera), faces=0.01)
 
 
 @pytest.mark.gpu

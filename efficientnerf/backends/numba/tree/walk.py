@@ -14,6 +14,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.tree.leaps import leaps
 from efficientnerf.backends.numba.tree.march import STEP
 
 if TYPE_CHECKING:
@@ -111,8 +112,6 @@ def tree_grid(tree: NerfTree) -> TreeGrid:
 def _outer_grids(tree: NerfTree) -> tuple[np.ndarray, ...]:
     """The fields of a TreeGrid that are of the outer cascades, in order, kept with the tree."""
     if "outer_grids" not in tree.derived:
-        from efficientnerf.asset.tree import leaps
-
         cells = [cascade.brick_index.size for cascade in tree.outer]
         tree.derived["outer_grids"] = (
             np.asarray([cascade.shape for cascade in tree.outer], np.int64),
