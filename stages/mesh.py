@@ -32,6 +32,7 @@ class MeshSettings:
     region: Literal["foreground", "all"] = setting(
         "foreground",
         "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
+        advanced=True,
     )
     max_faces: Annotated[int, Meta(ge=100)] = setting(200_000, "Most faces of the mesh, which is decimated to this many.")
     density_threshold: float | Auto = setting("auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.")

@@ -25,7 +25,7 @@ class PointsSettings:
     """How points are spread over the surface."""
 
     region: Literal["foreground", "all"] = setting(
-        "foreground", "What gets points: the subject with what supports it, its edge clipped (foreground), or the whole scene (all)."
+        "foreground", "What gets points: the subject with what supports it, its edge clipped (foreground), or the whole scene (all).", advanced=True
     )
     num_points: PositiveInt = setting(200_000, "Number of points.")
     density_threshold: float | Auto = setting(

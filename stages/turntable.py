@@ -29,6 +29,7 @@ class TurntableSettings:
         "auto",
         "The camera's path: a circle (orbit), to and fro on the side that the photographs were taken from (sway), past the captured cameras (captured), or a"
         " circle where the photographs go round and else a sway (auto).",
+        advanced=True,
     )
     frames: Annotated[int, Meta(ge=1, le=9999)] = setting(60, "Number of frames in the circle.")
     width: Annotated[int, Meta(ge=16, le=8192)] = setting(640, "Width of the frames.", unit="pixels")
