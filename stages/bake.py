@@ -48,7 +48,7 @@ class BakeSettings:
     cascades: Annotated[int, Meta(ge=1, le=16)] | Auto = setting(
         "auto",
         "Nested grids of a scene without a constant background, each twice as wide as the one before; auto: as many as hold 99 % of what the field shows, at"
-        " most 8. What lies beyond is in the environment map.",
+        " most 8; what lies beyond is in the environment map.",
         advanced=True,
     )
     environment_size: Annotated[int, Meta(ge=4, le=1024)] = setting(

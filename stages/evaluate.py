@@ -72,7 +72,7 @@ class EvaluateSettings:
     strips: Literal["on", "off"] = setting(
         "on", "Whether photograph, network and asset are shown side by side at full size, for the worst, the median and the best view."
     )
-    captured_path_frames: Annotated[int, Meta(ge=1, le=9999)] | Off = setting(90, "Number of frames of the video along the captured cameras.")
+    captured_path_frames: Annotated[int, Meta(ge=1, le=9999)] | Off = setting(90, "Number of frames of the video along the captured cameras; off: none.")
     lpips: Literal["off", "alex", "vgg", "both"] = setting("off", "Network of LPIPS, where that is measured too; its weights are files of their own.")
     lpips_weights: str = setting(
         "auto", "Folder with the weights of LPIPS; auto: torch's cache and the package torchmetrics, which are searched in any case.", advanced=True
