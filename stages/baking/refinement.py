@@ -92,9 +92,12 @@ def refined(job: Job, tree: NerfTree, targets: Targets, most: int, samples: Fiel
 
 def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
     """The targets on the run's device, where the tree is then fitted; on the host where the device's memory is too small."""
+    from efficientnerf.asset.cascades import cascades_of
     from stages.baking.memory import free_on_device, needed_on_device
 
-    needed = needed_on_device(len(tree.density_values), tree.harmonics_count, len(tree.voxel_index), tree.brick_index.size, tree.brick)
+    cells = sum(cascade.brick_index.size for cascade in cascades_of(tree))
+    needed = needed_on_device(len(tree.density_values), tree.harmonics_count, len(tree.voxel_index), cells, tree.brick)
+    needed += len(tree.density_values) * bool(tree.outer)  # the cascade of each voxel
     if targets.pixels.images is not None:
         needed += targets.pixels.images.nbytes
     if job.device == "cpu" or needed <= (free := free_on_device(job.device)):

@@ -153,6 +153,9 @@ def test_the_room_that_a_fit_takes_is_known_before() -> None:
     taken = sum(t.numel() * t.element_size() for t in tensors)
     # The grid is there once then; three times while it is sent.
     assert needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4) == taken + 8 * tree.brick_index.size
+    nest = device.DeviceArrays(initial_state(random_cascades(4)), torch.device(DEVICE)).grid
+    assert nest.grid.numel() == 3 * 4**3
+    assert len(nest.cascade_of) == len(random_cascades(4).density_values)
 
 
 @pytest.mark.parametrize("tree", [
