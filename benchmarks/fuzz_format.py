@@ -226,16 +226,21 @@ def batch(seed: int, first: int, count: int, folder: Path, keep: Path | None) ->
             "peak_rss_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024}  # fmt: skip
 
 
+def warm_up() -> None:
+    """Compiles or loads the kernels, which no step's time is to hold."""
+    rng = np.random.Generator(np.random.Philox(key=1))
+    signal.signal(signal.SIGPROF, signal.SIG_IGN)
+    for path in sorted(GOLDEN.glob("*.nerftree")):
+        for _ in range(6):
+            try_file(path, rng, {})
+
+
 def child(seed: int, first: int, count: int, folder: Path, keep: Path | None) -> None:
     """Imports and loads kernels, then limits its memory, then works."""
     import warnings
 
     sys.path.insert(0, str(HERE.parent))
-    warm = np.random.Generator(np.random.Philox(key=1))
-    signal.signal(signal.SIGPROF, signal.SIG_IGN)
-    for path in sorted(GOLDEN.glob("*.nerftree")):
-        for _ in range(6):
-            try_file(path, warm, {})
+    warm_up()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else 0
     if pages:
