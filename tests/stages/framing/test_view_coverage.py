@@ -239,6 +239,7 @@ def test_training_learns_nothing_behind_ignored_pixels(tmp_path: Path) -> None:
     cameras, masks = [view.camera for view in training], kept_pixels(folder, training)
     assert masks is not None
     expected = cells_below_min_views(space_of(s), cameras, 2, 128, masks) | cells_without_view(space_of(s), cameras, 128, masks)
+    expected |= cells_before_near(space_of(s), cameras, [view.near for view in training], 128)
     np.testing.assert_array_equal(np.isneginf(values), expected)
     assert expected[(distance > 0.9) & (distance < 0.98)].mean() < 0.3
 
