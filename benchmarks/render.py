@@ -1,9 +1,10 @@
 """Speed of rendering an asset on the CPU, and what bounds it: written to benchmarks/results/render_cpu.json.
 
     python benchmarks/render.py ASSET [--width 800 --height 800] [--frames 24] [--threads N] [--json FILE]
+    python benchmarks/render.py --whole-scene --width 640 --height 480
 
-Cameras are spread evenly on the asset's orbit. Besides frames a second: samples and colours of a ray, the bytes that they read, the measured
-bandwidth of the memory, and the load average.
+Cameras are spread evenly on the asset's orbit, or inside of the scene that `whole_scene.py` makes, of nested grids. Besides frames a second: samples and
+colours of a ray, the bytes that they read, the measured bandwidth of the memory, and the load average.
 """
 
 from __future__ import annotations
@@ -123,36 +124,42 @@ def memory(tree: Any, view: Any) -> dict[str, float]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("asset", type=Path)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("asset", type=Path, nargs="?")
+    what.add_argument("--whole-scene", action="store_true", help="render the made scene")
     parser.add_argument("--width", type=int, default=800)
     parser.add_argument("--height", type=int, default=800)
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--fov", type=float, default=39.6, help="vertical, degrees; by default that of the Realistic Synthetic scenes")
     parser.add_argument("--supersample", type=int, default=1)
     parser.add_argument("--threads", type=int, help="of numba; all cores by default")
-    parser.add_argument("--json", type=Path, default=HERE / "results" / "render_cpu.json")
+    parser.add_argument("--json", type=Path, help="results/render_cpu.json or results/render_whole_scene_cpu.json by default")
     given = parser.parse_args()
+    given.json = given.json or HERE / "results" / ("render_whole_scene_cpu.json" if given.whole_scene else "render_cpu.json")
     if given.threads is not None:
         os.environ["NUMBA_NUM_THREADS"] = str(given.threads)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     sys.path.insert(0, str(HERE.parent))
 
     import numba
+    import whole_scene
 
     from efficientnerf.asset import format
 
     before = os.getloadavg()
     begin = time.perf_counter()
-    tree = format.load(given.asset)
+    tree = whole_scene.whole_scene() if given.whole_scene else format.load(given.asset)
     loading = time.perf_counter() - begin
-    views = cameras(tree, given.width, given.height, given.frames, given.fov)
+    size = given.width, given.height, given.frames
+    views = whole_scene.cameras(*size) if given.whole_scene else cameras(tree, *size, given.fov)
     result = {
         "date": datetime.date.today().isoformat(),
         "asset": {
-            "name": given.asset.name,
-            "bytes": given.asset.stat().st_size,
+            "name": "made scene" if given.whole_scene else given.asset.name,
+            "bytes": 0 if given.whole_scene else given.asset.stat().st_size,
             "voxels": len(tree.density_values),
             "resolution": list(tree.resolution),
+            "cascades": 1 + len(tree.outer),
             "sh_degree": tree.degree,
             "load_s": round(loading, 3),
         },

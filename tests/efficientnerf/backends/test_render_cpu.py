@@ -124,7 +124,7 @@ def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple
     values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
     direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
     colours[-1, 1:] = np.nan
-    compute_view_colours(0, len(packed_of(tree).cells), 0, packed_of(tree), tree.brick, direction, np.float32(2), tree.degree, colours)
+    compute_view_colours(0, len(packed_of(tree).cells), 0, packed_of(tree), tree.brick, direction, np.zeros(5), np.float32(2), tree.degree, colours)
     laid_out(packed_of(tree), colours, tree.brick, direction, nearest, tree.degree, owners, kind, values)
     back = np.argsort(owners)
     return values[back].reshape(-1, side, side, side, 4), kind[back]

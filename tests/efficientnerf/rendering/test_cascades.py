@@ -281,6 +281,33 @@ def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, d
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
 
 
+@pytest.mark.parametrize("distance", [0.02, 0.8, 2.5])
+@pytest.mark.parametrize("focal", [8.0, 20.0, 200.0])
+def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their colours are not summed. All blocks hold colours of the view here, and so would show what was left out."""
+    tree = random_cascades(8, count=3, cells=20, brick=2, degree=2, share=0.1)
+    camera = camera_of(tree, distance=distance)
+    camera = replace(camera, params=(focal, focal, *camera.params[2:]))
+    monkeypatch.setattr(rendering, "VOXELS_PER_SLOPE", -100.0)
+    filled, whole = [], rendering.compute_view_colours
+
+    def over_nan(*given: Any) -> None:
+        if not filled:
+            given[-1][:-1] = np.nan
+        whole(*given)
+        filled.append(np.isfinite(given[-1][:-1, 1]).mean())
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rendering, "compute_view_colours", over_nan)
+        usual = render(tree, camera)
+    monkeypatch.setattr(rendering, "_cone", lambda camera: rendering.EVERYWHERE)
+    other = render(tree, camera)
+    assert other.opacity.max() > 0.5
+    assert focal < 200 or filled[-1] < 0.9
+    for name in FIELDS:
+        assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
 @pytest.mark.parametrize("distance", [1e9, 1e15, 1e18, 1e25, 1e200])
 def test_rays_from_far_away_end(distance: float) -> None:
     tree = random_cascades(0, count=4)

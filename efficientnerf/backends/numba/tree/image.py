@@ -157,7 +157,7 @@ def _all_clear(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
     return n == scene.cascades
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _render_part(t0, t1, clear, origin, direction, sh_direction, grid, view, pool, scratch):  # type: ignore[no-untyped-def]
     """Adds what a ray meets from t0 to t1, voxels of the grid, to its state; returns its beginning (x, y, z), rounded to float32 as the samples are."""
     ox, oy, oz = origin
@@ -208,7 +208,9 @@ def _render_ray(row, column, tile, rays, scene, pool, scratch, result, normal): 
                 t0 = leave[n - 1] / 2 if meets else t1
             if not t1 > t0:
                 continue
-        clear = _clear(n, tile, rays, scene, scratch)
+        clear = scratch.clear[n]
+        if clear < 0:
+            clear = _clear(n, tile, rays, scene, scratch)
         if clear == np.inf:
             continue
         grid, view = _cascade(n, scene)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 SLOPE_VOXELS = 2**16  # voxels that `colour_slope` is estimated from
+FEWEST_PAIRS = 64  # of neighbours, for what they share to be estimated
 VOXELS_PER_CALL = 2**23  # of bricks that one call of a kernel goes through, so that signals are answered between
 
 
@@ -132,14 +133,33 @@ def _stored_ranks(voxel_index: np.ndarray) -> np.ndarray:
     return out
 
 
-def _colour_slope(tree: NerfTree, first: int, end: int) -> float:
-    """`Packed.colour_slope` of voxels first <= N < end, from a regular subset of them."""
+def _slope(coefficients: np.ndarray, degree: int) -> float:
+    """Mean over voxels (N, K, 3) of the change of colour before the sigmoid per radian, see `Packed.colour_slope`."""
     from efficientnerf.rendering.harmonics import squared_slopes
 
-    if end == first or tree.degree == 0:
+    return float(np.sqrt(np.einsum("nkc,nkc,k->nc", coefficients, coefficients, squared_slopes(degree))).max(axis=1).mean())
+
+
+def _colour_slope(tree: NerfTree, first: int, end: int) -> float:
+    """`Packed.colour_slope` of the voxels of bricks first <= B < end, from a regular subset of them.
+
+    Of nested grids the part of it that neighbours do not share: what they share is reproduced by the interpolation between them.
+    """
+    voxels = tree.voxel_index[first:end]
+    stored = voxels[voxels >= 0]
+    if not len(stored) or tree.degree == 0:
         return 0.0
-    sample = tree.coefficients(np.arange(first, end, -(-(end - first) // SLOPE_VOXELS)))
-    return float(np.sqrt(np.einsum("nkc,nkc,k->nc", sample, sample, squared_slopes(tree.degree))).max(axis=1).mean())
+    slope = _slope(tree.coefficients(stored[:: -(-len(stored) // SLOPE_VOXELS)]), tree.degree)
+    if not tree.outer:
+        return slope
+    each = max(1, SLOPE_VOXELS // tree.brick**2)
+    rows = voxels[:: -(-len(voxels) // each)].reshape(-1, tree.brick)
+    pairs = np.stack([rows[:, :-1], rows[:, 1:]], axis=-1).reshape(-1, 2)  # neighbours along z
+    pairs = pairs[(pairs >= 0).all(axis=1)]
+    if len(pairs) < FEWEST_PAIRS or slope == 0:
+        return slope
+    apart = _slope((tree.coefficients(pairs[:, 0]) - tree.coefficients(pairs[:, 1])) / np.float32(2**0.5), tree.degree)
+    return apart * min(1.0, apart / slope)  # docs/experiments/renderer.md
 
 
 def _in_order(tree: NerfTree) -> NerfTree:
@@ -221,8 +241,7 @@ def pack(tree: NerfTree) -> Packed:
     else:
         none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
         coded = np.ascontiguousarray(harmonics, np.float32), *none
-    ranks, stored = _stored_ranks(tree.voxel_index), (tree.voxel_index >= 0).sum(axis=1)
-    slopes = [_colour_slope(tree, int(stored[:first].sum()), int(stored[:end].sum())) for first, end in bricks]
+    ranks, slopes = _stored_ranks(tree.voxel_index), [_colour_slope(tree, *ends) for ends in bricks]
     joined = (leap[0], brick_index[0]) if len(leap) == 1 else (np.concatenate(leap), np.concatenate(brick_index))
     own = np.ascontiguousarray(joined[1]), tree.voxel_index, tree.density_values
     return Packed(*_places(tree), joined[0], has_density, ranks, cells, *own, *coded, np.array(slopes))

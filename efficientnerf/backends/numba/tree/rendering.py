@@ -29,6 +29,7 @@ PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 # Distance, in voxels per unit of `Packed.colour_slope`, from which a voxel's colour is summed once for a view: docs/experiments/renderer.md
 VOXELS_PER_SLOPE = 500.0
 VOXELS_PER_SLOPE_NDC = 250.0
+EVERYWHERE = np.zeros(5)  # as a cone
 DIRECTIONS_PER_BAND = 2**22  # directions of cameras with distortion that are cached between images: 48 MB
 
 
@@ -46,15 +47,24 @@ class ViewColours(NamedTuple):
     colours: np.ndarray
 
 
-def _view_colours(tree: NerfTree, view_direction: np.ndarray) -> ViewColours:
-    """Of all cascades; the direction is that of cascade 0."""
+def _cone(camera: Camera) -> np.ndarray:
+    """The `cone` of `compute_view_colours` in which all rays of a camera lie."""
+    if camera.model not in PINHOLES:
+        return EVERYWHERE
+    corners = np.array([[x, y] for x in (0, camera.width) for y in (0, camera.height)], np.float64)
+    cosine = min(1.0, float((rays(camera, corners)[1] @ camera.forward).min()))
+    return np.array([*camera.forward, cosine, np.sqrt(1 - cosine**2)])
+
+
+def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray = EVERYWHERE) -> ViewColours:
+    """Of all cascades, as far as the cone reaches; the direction is that of cascade 0."""
     colours, packed = np.empty((len(tree.density_values) + 1, 4), np.float32), packed_of(tree)
     colours[-1] = 0, np.nan, np.nan, np.nan
     views = _views(tree, view_direction, _min_distance(tree))
     for cascade, bricks in enumerate(bricks_of(tree)):
         for first, end in brick_ranges(*bricks, tree.brick):
             direction, scale = views.direction[cascade], views.density_scale[cascade]
-            compute_view_colours(first, end, cascade, packed, tree.brick, direction, scale, tree.degree, colours)
+            compute_view_colours(first, end, cascade, packed, tree.brick, direction, cone, scale, tree.degree, colours)
     return ViewColours(views, colours)
 
 
@@ -209,7 +219,7 @@ def render_image(
     if camera.model not in PINHOLES:
         most = min(most, DIRECTIONS_PER_BAND)
     step = max(1, most // max(1, width * supersample**2))
-    colours = _view_colours(tree, _direction_from(_camera_centre(tree, camera)))
+    colours = _view_colours(tree, _direction_from(_camera_centre(tree, camera)), _cone(camera))
     for top in range(0, height, step):
         low = min(top + step, height)
         part = tuple(whole[top:low] if len(whole) else whole for whole in image)

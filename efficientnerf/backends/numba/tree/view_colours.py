@@ -271,9 +271,12 @@ def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def compute_view_colours(first, end, cascade, packed, brick, direction, density_scale, degree, out):  # type: ignore[no-untyped-def]
+def compute_view_colours(first, end, cascade, packed, brick, direction, cone, density_scale, degree, out):  # type: ignore[no-untyped-def]
     """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of the voxels of bricks first <= B < end, all of one cascade,
     into out (N + 1, 4).
+
+    cone  (5,) axis, cosine and sine of the half angle of a cone round all that is seen, in the frame of directions: bricks that are farther from it than any
+          whose voxels a ray or its normal may need are left out. Zeros: none are
 
     The last row, of voxels that are not stored, is for the caller to fill: density 0, colour NaN.
     """
@@ -282,5 +285,11 @@ def compute_view_colours(first, end, cascade, packed, brick, direction, density_
         steps, stored, basis = np.empty(3 * cube, np.float32), np.empty(cube + 3, np.int64), np.empty(128, np.float32)
         grid, view = packed_pointers(packed, brick, cascade), View(pointer(direction), 0.0, 0.0, density_scale, degree)
         _voxel_steps(brick, view.direction, pointer(steps))
+        # From a ray to a normal's block one voxel, through that block and to the middle of the brick beside it; and one for rounding.
+        half, reach = 0.5 * brick, np.sqrt(3.0) * (1.5 * brick + 1) + 2
         for owner in range(first + BRICKS_PER_TASK * task, min(end, first + BRICKS_PER_TASK * task + BRICKS_PER_TASK)):
-            _brick_colours(owner, grid, view, pointer(steps), pointer(stored), pointer(basis), pointer(out))
+            a, e, c = grid.cells[3 * owner] * brick + half, grid.cells[3 * owner + 1] * brick + half, grid.cells[3 * owner + 2] * brick + half
+            x, y, z = view_direction(a, e, c, view.direction)
+            along = x * cone[0] + y * cone[1] + z * cone[2]
+            if np.sqrt(max(x * x + y * y + z * z - along * along, 0.0)) * cone[3] - along * cone[4] <= reach:
+                _brick_colours(owner, grid, view, pointer(steps), pointer(stored), pointer(basis), pointer(out))
