@@ -168,11 +168,15 @@ def voxel_values(
         point = space.grid(world.reshape(-1, 3)).to(m.device)
         raw = m.fine(m.snapped_points(point))
         valid = m.voxels.values.view(-1)[cell_of(point, m.voxels.side)] > m.voxels.threshold
-        density = (activate(raw[:, 0], m.fine.activation) * valid).reshape(len(block), points)
+        every = activate(raw[:, 0], m.fine.activation)
+        density = (every * valid).reshape(len(block), points)
         density = density * _has_pivots(m, space.grid((block + 0.5) * voxel + low))[:, None]
+        heavy = density
         if space.contracted:
+            # Of a whole scene a voxel may be given density where there seems to be none, if rays end there: its colour is that of what was hidden.
+            heavy = torch.where(density.sum(dim=1, keepdim=True) > 0, density, every.reshape(len(block), points))
             density = density / space.unit(world).abs().amax(dim=-1).clamp(min=1).square().to(density)
-        share = density / density.sum(dim=1, keepdim=True).clamp(min=1e-12)
+        share = heavy / heavy.sum(dim=1, keepdim=True).clamp(min=1e-12)
         sh = (raw[:, 1:].reshape(len(block), points, -1) * share[..., None]).sum(dim=1)
         yield density.mean(dim=1).cpu().numpy(), sh.reshape(len(block), 3, -1).transpose(1, 2).contiguous().cpu().numpy()
 

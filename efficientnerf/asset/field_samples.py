@@ -155,16 +155,30 @@ def cascade_visibility(samples: FieldSamples, grids: Sequence[Grid], brick: int,
     return found
 
 
-def seen_opacity(visibility: Visibility, indices: np.ndarray, shape: tuple[int, int, int], brick: int) -> np.ndarray:
-    """(N,) float32: the greatest weight that voxels (N, 3), or those next to them, have on any ray: what is in full view absorbs no more than that."""
+def seen_weights(visibility: Visibility, indices: np.ndarray, shape: tuple[int, int, int], brick: int) -> np.ndarray:
+    """(N, 2) float32: the greatest weight that voxels (N, 3) have on any ray, and that they or those next to them have."""
     from efficientnerf.backends.numba.bricks import greatest_around
 
     row_of = np.full(math.prod(shape), -1, np.int32)
     row_of[visibility.cells] = np.arange(len(visibility.cells))
-    out = np.empty(len(indices), np.float32)
+    out = np.empty((len(indices), 2), np.float32)
     for part in pieces(len(indices), 2**16):
         greatest_around(indices[part], visibility.greatest, shape, brick, row_of, out[part])
     return out
+
+
+LEAST_SHARE, MOST_SHARE, MAX_OPACITY = 0.7, 3.0, 0.9999  # of the weights seen; an optical thickness of 9
+
+
+def density_as_seen(density: np.ndarray, seen: np.ndarray, voxel: float) -> np.ndarray:
+    """Densities (N,) of voxels within what rays saw of them, `seen` (N, 2) of `seen_weights`.
+
+    What the field holds is not all that it shows: its coarse stage hides some. Where a ray lost light in a voxel the voxel absorbs about as much; and what is
+    in full view absorbs no more than was seen to be lost there or next to it.
+    """
+    least, most = (-np.log1p(-np.minimum(share * seen[:, k], MAX_OPACITY)) / np.float32(voxel) for k, share in enumerate((LEAST_SHARE, MOST_SHARE)))
+    most = np.where(MOST_SHARE * seen[:, 1] >= MAX_OPACITY, np.inf, most)
+    return np.asarray(np.clip(density, least, most), np.float32)
 
 
 def environment_beyond(samples: FieldSamples, boxes: Sequence[np.ndarray], height: int, mean: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ class Plan:
     grids        nested, the innermost first; of others than whole scenes one
     indices      coordinates (N, 3) of the voxels in each of them
     bricks       coarse cells that hold a sample, of all grids
-    opacity      of whole scenes, for each grid (N,) what the voxels may absorb at most
+    seen         of whole scenes, for each grid (N, 2) what rays saw of the voxels (`efficientnerf.asset.field_samples.seen_weights`)
     samples      what the field shows along training rays, of whole scenes alone, as the next two
     region       the foreground
     environment  (H, 2 H, 3) what lies beyond all grids
@@ -34,7 +34,7 @@ class Plan:
     grids: list[Grid]
     indices: list[np.ndarray]
     bricks: int
-    opacity: list[np.ndarray] | None = None
+    seen: list[np.ndarray] | None = None
     samples: FieldSamples | None = None
     region: Region | None = None
     environment: np.ndarray | None = None

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from stages.baking.plan import Plan
     from stages.io.scene import Scene
 
-OPACITY_ROOM, MAX_OPACITY = 2.0, 0.9999  # of a voxel over what any ray was seen to lose in it or next to it; optical thickness of 9
-
-
 def baked_values(
     job: Job, m: Any, indices: np.ndarray, voxel: float, low: np.ndarray, points: int, space: Space, name: str = "block"
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -62,6 +59,7 @@ def baked_values(
 def baked_tree(job: Job, m: Any, s: Scene, plan: Plan, metadata: dict[str, Any]) -> NerfTree:
     """The tree with the field's values."""
     from efficientnerf.asset.cascades import nested
+    from efficientnerf.asset.field_samples import density_as_seen
     from efficientnerf.asset.tree import tree_from_voxels
 
     settings: BakeSettings = job.settings
@@ -69,9 +67,8 @@ def baked_tree(job: Job, m: Any, s: Scene, plan: Plan, metadata: dict[str, Any])
     for n, ((shape, voxel, low), indices) in enumerate(zip(plan.grids, plan.indices, strict=True)):
         samples = 0 if m.settings.discretise == plan.choice.resolution and plan.space is m.space and not n else settings.samples_per_voxel
         density, sh = baked_values(job, m, indices, voxel, low, samples, plan.space, f"cascade{n}" if plan.samples is not None else "block")
-        if plan.opacity is not None:
-            # The field may hide density where its coarse stage does: nothing that is in full view absorbs more than was seen to.
-            density = np.minimum(density, -np.log1p(-np.minimum(OPACITY_ROOM * plan.opacity[n], MAX_OPACITY)) / np.float32(voxel))
+        if plan.seen is not None:
+            density = density_as_seen(density, plan.seen[n], voxel)
         one = tree_from_voxels(
             shape, voxel, low, indices, density, sh,
             brick=settings.brick_size, background=s.background, metadata=metadata, ndc=plan.space.ndc, lookup=settings.lookup,

@@ -52,7 +52,7 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
 
 def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) -> Plan:
     """The cascades, their voxels, the region and the environment."""
-    from efficientnerf.asset.field_samples import cascade_visibility, environment_beyond, seen_opacity
+    from efficientnerf.asset.field_samples import cascade_visibility, environment_beyond, seen_weights
     from stages.baking.resolution import Choice, affordable_resolution, finest_of_cascades
     from stages.baking.voxels import MAX_OVERSHOOT, OVERSHOOT
 
@@ -93,8 +93,8 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
     indices = [keep_clear(job, m, s, part, grid) for part, grid in zip(indices, grids, strict=True)]
     mean = pixels.images[samples.pixel[:: max(1, len(samples.pixel) // 4096)]][:, :3].mean(axis=0) / 255.0
     environment = environment_beyond(samples, boxes_of(grids, settings.brick_size), settings.environment_size, mean)
-    opacity = [seen_opacity(one, part, shape, settings.brick_size) for one, part, (shape, _, _) in zip(seen, indices, grids, strict=True)]
-    return Plan(choice, space, grids, indices, sum(len(one.cells) for one in seen), opacity, samples, region, environment)
+    weights = [seen_weights(one, part, shape, settings.brick_size) for one, part, (shape, _, _) in zip(seen, indices, grids, strict=True)]
+    return Plan(choice, space, grids, indices, sum(len(one.cells) for one in seen), weights, samples, region, environment)
 
 
 def room_of(settings: BakeSettings, m: Any, grids: Sequence[Grid], mib: int, *, environment: bool = True) -> int:
@@ -193,10 +193,11 @@ def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], ind
 
 def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
     """The voxels that are not before the lens of a training camera, and that in the box of the field enough training images have in view."""
-    from stages.framing.view_coverage import has_min_views
+    from stages.framing.view_coverage import has_min_views, kept_pixels
     from stages.io import scene
 
     views = scene.views_of(s, "train")
+    masks = kept_pixels(job.inputs["poses"], views)
     cameras = [view.camera for view in views]
     _, voxel, low = grid
     box = np.asarray(m.space.bounds, np.float64)
@@ -208,7 +209,7 @@ def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> n
         keep = ~before_lenses(centre, cameras, [view.near for view in views])
         if min_views is not None:
             inside = np.flatnonzero(((centre >= box[0]) & (centre <= box[1])).all(axis=1) & keep)
-            keep[inside] = has_min_views(centre[inside], cameras, min_views)
+            keep[inside] = has_min_views(centre[inside], cameras, min_views, masks)
         kept.append(keep)
     return indices[np.concatenate(kept)] if kept else indices
 

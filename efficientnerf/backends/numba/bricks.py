@@ -127,16 +127,19 @@ def weigh_voxels(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def greatest_around(indices: np.ndarray, greatest: np.ndarray, shape: tuple[int, int, int], brick: int, row_of: np.ndarray, out: np.ndarray) -> None:
-    """The greatest weight of voxels (N, 3) and of the 26 around each, to `out` (N,).
+    """The greatest weight of voxels (N, 3), and that of each and the 26 around it, to the columns of `out` (N, 2).
 
     greatest  (B, brick^3) of the coarse cells of which `row_of` (cells,) int32 has the row, or -1
     """
     for n in numba.prange(len(indices)):
-        best = np.float32(0)
+        best, own = np.float32(0), np.float32(0)
         for x in range(max(0, indices[n, 0] - 1), min(shape[0] * brick, indices[n, 0] + 2)):
             for y in range(max(0, indices[n, 1] - 1), min(shape[1] * brick, indices[n, 1] + 2)):
                 for z in range(max(0, indices[n, 2] - 1), min(shape[2] * brick, indices[n, 2] + 2)):
                     row = row_of[(x // brick * shape[1] + y // brick) * shape[2] + z // brick]
                     if row >= 0:
-                        best = max(best, greatest[row, (x % brick * brick + y % brick) * brick + z % brick])
-        out[n] = best
+                        weight = greatest[row, (x % brick * brick + y % brick) * brick + z % brick]
+                        best = max(best, weight)
+                        if x == indices[n, 0] and y == indices[n, 1] and z == indices[n, 2]:
+                            own = weight
+        out[n, 0], out[n, 1] = own, best
