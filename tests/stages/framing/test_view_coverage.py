@@ -248,7 +248,7 @@ def test_training_learns_nothing_behind_ignored_pixels(tmp_path: Path) -> None:
 def test_space_that_cameras_look_through_is_masked_and_no_other(count: int) -> None:
     cameras = balls.cameras(count)
     near = [0.3 * float(np.linalg.norm(camera.centre)) for camera in cameras]
-    side = 64
+    side = 160
     masked = cells_before_near(SPACE, cameras, near, side)
     grid = (np.stack(np.meshgrid(*(np.arange(side),) * 3, indexing="ij"), axis=-1) + 0.5) / side
     world = SPACE.world(torch.from_numpy(grid).reshape(-1, 3)).numpy()
