@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from stages.io.scene import Scene
 
 FOREGROUND_RAYS = 2**18  # that the foreground region is found from
-NEAR_SHARE = 0.5  # of a camera's near plane: nothing is baked nearer to it
 CENTRES_PER_BLOCK = 2**20
 KINDS = {
     "pixel": ("int64", 1), "view": ("int32", 1), "origin": ("float32", 2), "direction": ("float32", 2), "opacity": ("float32", 1), "behind": ("float16", 2),
@@ -192,8 +191,8 @@ def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], ind
 
 
 def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> np.ndarray:
-    """The voxels that are not before the lens of a training camera, and that in the box of the field enough training images have in view."""
-    from stages.framing.view_coverage import has_min_views, kept_pixels
+    """The voxels that are not close to the path of the training cameras, and that in the box of the field enough training images have in view."""
+    from stages.framing.view_coverage import close_to_path, has_min_views, kept_pixels
     from stages.io import scene
 
     views = scene.views_of(s, "train")
@@ -206,22 +205,12 @@ def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> n
     for at in range(0, len(indices), CENTRES_PER_BLOCK):
         job.safe_point()
         centre = (indices[at : at + CENTRES_PER_BLOCK] + 0.5) * voxel + low
-        keep = ~before_lenses(centre, cameras, [view.near for view in views])
+        keep = ~close_to_path(centre, cameras, [view.near for view in views])
         if min_views is not None:
             inside = np.flatnonzero(((centre >= box[0]) & (centre <= box[1])).all(axis=1) & keep)
             keep[inside] = has_min_views(centre[inside], cameras, min_views, masks)
         kept.append(keep)
     return indices[np.concatenate(kept)] if kept else indices
-
-
-def before_lenses(points: np.ndarray, cameras: Sequence[Any], near: Sequence[float]) -> np.ndarray:
-    """(N,) bool: points (N, 3) nearer to some camera than half of its near plane."""
-    out = np.zeros(len(points), bool)
-    for camera, plane in zip(cameras, near, strict=True):
-        reach = NEAR_SHARE * plane
-        close = np.flatnonzero((np.abs(points[:, 0] - camera.centre[0]) < reach) & ~out)
-        out[close] = ((points[close] - camera.centre) ** 2).sum(axis=1) < reach**2
-    return out
 
 
 def _samples(job: Job, m: Any, pixels: Pixels) -> FieldSamples:

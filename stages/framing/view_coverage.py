@@ -34,7 +34,7 @@ MASK_SIZE = 256  # px, longest side of the masks that are looked at
 BLOCK = 8  # density voxels along a side of the blocks that no view shows
 COARSE = 32  # px, longest side of the masks by which such blocks are told: a pixel and its neighbours are wider than the points of a block are apart
 CLEARANCE = 0.8  # of the near plane's distance: how far from the cameras' path nothing is. docs/experiments/near-cameras.md
-NEIGHBOURS = 4  # of a camera that its path leads to, where they are within twice the near plane's distance
+NEIGHBOURS = 8  # of a camera that its path leads to, where they are within twice the near plane's distance
 NEAR_BLOCK = 2  # density voxels along a side of the blocks before the near planes
 MAX_FRACTION = 4  # at most one in so many of the cameras (rounded up) is required
 

@@ -22,8 +22,9 @@ from pipeline.executors.memory import Limit
 from stages import bake
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
-from stages.baking import holes, refinement, resolution, whole_scene
+from stages.baking import holes, refinement, resolution
 from stages.baking.resolution import MAX_CELLS, SCENE_MAX_MIB, budget_of, finest_of_cascades
+from stages.framing.view_coverage import close_to_path
 from stages.io import field_file
 from stages.io.png import write_png
 from stages.io.scene import Scene, View, load, save
@@ -206,12 +207,24 @@ def test_rays_that_end_in_holes_are_those_without_their_voxels(inputs: dict[str,
     assert not holes.voxels_of_holes(tree, samples, rays[:0]).any()
 
 
-def test_nothing_is_baked_before_a_lens(inputs: dict[str, Path], tmp_path: Path) -> None:
-    points = np.array([[0.0, 0, 0], [0.3, 0, 0], [1.0, 0, 0], [2.05, 0, 0]])
-    cameras = around(2)
-    for camera, x in zip(cameras, (0.0, 2.0), strict=True):
-        camera.world_from_camera[:3, 3] = (x, 0, 0)
-    np.testing.assert_array_equal(whole_scene.before_lenses(points, cameras, [0.4, 0.2]), [True, False, False, True])
+def test_nothing_is_baked_where_the_cameras_pass(inputs: dict[str, Path], tmp_path: Path) -> None:
+    """Nearer planes far out make room that is known to be filled: there is the wall, of which what is near the cameras is left out."""
+    s = load(inputs["poses"])
+    poses = tmp_path / "poses"
+    shutil.copytree(inputs["poses"], poses)
+    cameras, near = [view.camera for view in s.views if view.split == "train"], 1.5
+    save(replace(s, views=tuple(replace(view, near=near) for view in s.views)), poses)
+
+    def close(made: NerfTree) -> int:
+        at, of = voxel_coordinates(made), voxel_cascades(made)
+        centres = np.concatenate([(at[of == n] + 0.5) * grid.voxel + grid.bounds_min for n, grid in enumerate(cascades_of(made))])
+        return int(close_to_path(centres, cameras, [near] * len(cameras)).sum())
+
+    with_room = baked(tmp_path / "room", {**inputs, "poses": poses}, refine_steps=0)[0]
+    without = baked(tmp_path / "none", inputs, refine_steps=0)[0]
+    assert close(without) > 0
+    assert close(with_room) == 0
+
 
 
 def test_a_scene_is_as_fine_as_pixels_cells_and_settings_allow(inputs: dict[str, Path]) -> None:
