@@ -10,7 +10,7 @@ The scratch folder keeps what takes long: the visibility of the voxels or the fi
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -101,11 +101,12 @@ class BakeSettings:
 def run(job: Job) -> None:
     from efficientnerf.asset import format
     from efficientnerf.asset.cascades import voxel_cascades
+    from efficientnerf.asset.components import foreground_bricks
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.resolution import budget_of
     from stages.baking.values import baked_tree
-    from stages.baking.whole_scene import room_of
+    from stages.baking.whole_scene import bounds_are_given, room_of
     from stages.evaluation.views import constant_background
     from stages.io import scene
     from stages.io.field_file import load_renderer
@@ -129,6 +130,8 @@ def run(job: Job) -> None:
     tree, report = refined(
         job, baked_tree(job, m, s, plan, metadata), _targets(s, pixels, plan), room_of(settings, m, plan.grids, mib, environment=whole), plan.samples
     )
+    if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
+        tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
     provenance = {**metadata["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": report["psnr_after"]}}
     outputs = BakeOutputs(job.out)
     format.save(tree.with_metadata(provenance=provenance), outputs.asset, settings.layout)

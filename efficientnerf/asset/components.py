@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascades_of, point_cascades
+from efficientnerf.asset.cascades import cascades_of, point_cascades, voxel_sides
 
 if TYPE_CHECKING:
     from efficientnerf.asset.field_samples import FieldSamples
@@ -46,6 +46,32 @@ def small_components(tree: NerfTree, keep: np.ndarray, share: float) -> np.ndarr
     small = voxels < share * voxels.max() * np.where(at_face, 1.0, INTERIOR_RATIO)
     out = np.zeros(len(keep), bool)
     out[tree.voxel_index[stored]] = np.repeat(small[component_of], count_of)
+    return out
+
+
+FOREGROUND_SHARE = 0.005  # of the largest component's voxels: smaller ones are no part of the foreground
+MIN_THICKNESS = 0.05  # optical thickness of a voxel from which it joins its neighbours to a component
+
+
+def foreground_bricks(tree: NerfTree) -> np.ndarray:
+    """Which bricks belong to the foreground, (B,) bool, for `Region.bricks`: in the innermost cascade those of its components, of what is thick enough to show
+    in the region, that are not small, and the bricks around them; of the other cascades all."""
+    from scipy import ndimage
+
+    from efficientnerf.asset.region import inside_share, voxel_centres
+
+    if tree.region is None:
+        return np.ones(len(tree.voxel_index), bool)
+    keep = (inside_share(tree.region, voxel_centres(tree)) > 0) & (tree.density_values * voxel_sides(tree) > MIN_THICKNESS)
+    out = np.ones(len(tree.voxel_index), bool)
+    labels, voxels, cells = _label(tree, tree.brick_index, keep)
+    if len(cells):  # else nothing shows there, and all of it is as good as any
+        large = voxels >= FOREGROUND_SHARE * voxels.max()
+        large[0] = False
+        near = ndimage.binary_dilation(large[labels], structure=np.ones((3, 3, 3), bool))
+        own = tree.brick_index.reshape(-1)
+        owned = np.flatnonzero(own >= 0)
+        out[own[owned]] = near.reshape(-1)[owned]
     return out
 
 

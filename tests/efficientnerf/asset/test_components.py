@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from efficientnerf.asset.components import small_components
+from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
+from efficientnerf.asset.components import foreground_bricks, small_components
+from efficientnerf.asset.region import Region, foreground
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from efficientnerf.geometry.ndc import Ndc
 from tests.efficientnerf.walls import looking_along_y
@@ -67,3 +69,18 @@ def test_the_largest_piece_is_never_a_scrap(brick: int) -> None:
 def test_an_empty_tree_has_none() -> None:
     tree, _ = tree_of()
     assert small_components(tree, np.zeros(0, bool), 0.02).shape == (0,)
+
+
+def test_small_parts_that_touch_nothing_are_no_foreground() -> None:
+    tree, box = tree_of(((2, 2, 2), (32, 32, 32)), ((40, 40, 40), (43, 43, 43)), ((36, 4, 36), (44, 12, 44)))
+    grids = cascade_grids(np.stack([tree.bounds_min, tree.bounds_max]), tree.voxel, tree.brick, 2)
+    shape, voxel, low = grids[1]
+    around = tree_from_voxels(shape, voxel, low, np.array([[0, 0, 0], [40, 40, 40]]), np.ones(2), np.zeros((2, 1, 3), np.float32), brick=tree.brick)
+    whole = replace(nested([tree, around]), region=Region(np.stack([tree.bounds_min - 9, tree.bounds_max + 9])))
+    bricks = foreground_bricks(whole)
+    kept = foreground(replace(whole, region=replace(whole.region, bricks=bricks)))  # type: ignore[type-var]
+    inner = voxel_coordinates(kept)[voxel_cascades(kept) == 0]
+    assert {tuple(at) for at in inner} == {tuple(at) for at in voxel_coordinates(tree)[box != 1]}
+    assert (voxel_cascades(kept) == 1).sum() == 2
+    faint = replace(whole, density_values=np.full_like(whole.density_values, 1e-3))
+    assert foreground_bricks(faint).all()
