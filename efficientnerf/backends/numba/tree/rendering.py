@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascades_of
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.blocks import MIN_BLOCKS, POOL_BYTES
 from efficientnerf.backends.numba.tree.image import TILE, WORK, downsample, render_batch
@@ -70,6 +69,8 @@ def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray =
 
 def _views(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray) -> Views:
     """The view of each cascade, from the direction of cascade 0."""
+    from efficientnerf.asset.cascades import cascades_of
+
     ratio, shift = packed_of(tree).places[:, 0], packed_of(tree).places[:, 1:]
     matrix = np.broadcast_to(view_direction[:, :3], (len(ratio), 3, 3))  # directions may have any length: per voxel of each cascade
     at_zero = view_direction[:, 3] / ratio[:, None] - np.einsum("ij,lj->li", view_direction[:, :3], shift)
