@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from stages.bake import BakeSettings
     from stages.io.scene import Scene
 
+# Of the near plane's distance: how far from the cameras' path nothing is baked. Less than in training, which masks whole density voxels alone: what it learned
+# in those that are partly as close, such as a wall behind the cameras, is baked. docs/experiments/near-cameras.md
+BAKED_CLEARANCE = 0.5
 FOREGROUND_RAYS = 2**18  # that the foreground region is found from
 CENTRES_PER_BLOCK = 2**20
 KINDS = {
@@ -205,7 +208,7 @@ def keep_clear(job: Job, m: Any, s: Scene, indices: np.ndarray, grid: Grid) -> n
     for at in range(0, len(indices), CENTRES_PER_BLOCK):
         job.safe_point()
         centre = (indices[at : at + CENTRES_PER_BLOCK] + 0.5) * voxel + low
-        keep = ~close_to_path(centre, cameras, [view.near for view in views])
+        keep = ~close_to_path(centre, cameras, [view.near for view in views], BAKED_CLEARANCE)
         if min_views is not None:
             inside = np.flatnonzero(((centre >= box[0]) & (centre <= box[1])).all(axis=1) & keep)
             keep[inside] = has_min_views(centre[inside], cameras, min_views, masks)

@@ -129,19 +129,19 @@ def cells_before_near(space: Space, cameras: Sequence[Camera], near: Sequence[fl
     return found[:side, :side, :side]
 
 
-def close_to_path(points: np.ndarray, cameras: Sequence[Camera], near: Sequence[float]) -> np.ndarray:
-    """(N,) bool: which points (N, 3) lie within CLEARANCE times the near plane's distance of a camera, or of the way to one of its nearest neighbours."""
+def close_to_path(points: np.ndarray, cameras: Sequence[Camera], near: Sequence[float], clearance: float = CLEARANCE) -> np.ndarray:
+    """(N,) bool: which points (N, 3) lie within `clearance` times the near plane's distance of a camera, or of the way to one of its nearest neighbours."""
     from scipy.spatial import cKDTree
 
     centres, plane = np.array([camera.centre for camera in cameras]), np.asarray(near, np.float64)
     count = min(NEIGHBOURS + 1, len(centres))
     distance, other = cKDTree(centres).query(centres, k=count)
-    way, radius = [centres], [CLEARANCE * plane]
+    way, radius = [centres], [clearance * plane]
     for n, m in zip(*np.nonzero(np.reshape(distance, (-1, count)) <= 2 * plane[:, None]), strict=True):
         to = np.reshape(other, (-1, count))[n, m]
         steps = np.linspace(0, 1, 5)[1:-1, None]
         way.append(centres[n] + steps * (centres[to] - centres[n]))
-        radius.append(np.full(len(steps), CLEARANCE * min(plane[n], plane[to])))
+        radius.append(np.full(len(steps), clearance * min(plane[n], plane[to])))
     found = np.zeros(len(points), bool)
     places, reach = np.concatenate(way), np.concatenate(radius)
     tree = cKDTree(points)

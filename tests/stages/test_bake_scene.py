@@ -22,7 +22,7 @@ from pipeline.executors.memory import Limit
 from stages import bake
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
-from stages.baking import holes, refinement, resolution
+from stages.baking import holes, refinement, resolution, whole_scene
 from stages.baking.resolution import MAX_CELLS, SCENE_MAX_MIB, budget_of, finest_of_cascades
 from stages.framing.view_coverage import close_to_path
 from stages.io import field_file
@@ -212,13 +212,13 @@ def test_nothing_is_baked_where_the_cameras_pass(inputs: dict[str, Path], tmp_pa
     s = load(inputs["poses"])
     poses = tmp_path / "poses"
     shutil.copytree(inputs["poses"], poses)
-    cameras, near = [view.camera for view in s.views if view.split == "train"], 1.5
+    cameras, near = [view.camera for view in s.views if view.split == "train"], 2.4
     save(replace(s, views=tuple(replace(view, near=near) for view in s.views)), poses)
 
     def close(made: NerfTree) -> int:
         at, of = voxel_coordinates(made), voxel_cascades(made)
         centres = np.concatenate([(at[of == n] + 0.5) * grid.voxel + grid.bounds_min for n, grid in enumerate(cascades_of(made))])
-        return int(close_to_path(centres, cameras, [near] * len(cameras)).sum())
+        return int(close_to_path(centres, cameras, [near] * len(cameras), whole_scene.BAKED_CLEARANCE).sum())
 
     with_room = baked(tmp_path / "room", {**inputs, "poses": poses}, refine_steps=0)[0]
     without = baked(tmp_path / "none", inputs, refine_steps=0)[0]
