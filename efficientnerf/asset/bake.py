@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from efficientnerf.geometry.spaces import Space
 from efficientnerf.model import Model, render_rays
 from efficientnerf.rendering.compositing import activate
@@ -196,11 +195,3 @@ def _has_pivots(m: Model, grid: torch.Tensor) -> torch.Tensor:
 def blocks_of(count: int, points: int) -> int:
     """How many blocks `voxel_values` yields for so many voxels."""
     return math.ceil(count / max(1, POINTS_PER_BLOCK // max(1, points)))
-
-
-def with_voxels(tree: NerfTree, keep: np.ndarray) -> NerfTree:
-    """The tree with some of its voxels, (N,) bool, alone; they keep their order."""
-    return tree_from_voxels(
-        tree.shape, tree.voxel, tree.bounds_min, voxel_coordinates(tree)[keep], tree.density_values[keep], tree.sh[keep],
-        brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup,
-    )  # fmt: skip

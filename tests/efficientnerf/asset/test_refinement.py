@@ -9,8 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset.bake import with_voxels
-from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
+from efficientnerf.asset.cascades import cascade_sides, subset, voxel_cascades, voxel_sides
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement import state
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
@@ -182,7 +181,7 @@ def test_weights_are_what_voxels_contribute() -> None:
     assert weights.min() > 0
     assert weights.max() <= 1 - np.exp(-4 * 0.125) + 1e-6  # of a single sample
     assert weights[skin].mean() > 2 * weights[~skin].mean()
-    without = with_voxels(tree, weights > np.median(weights))
+    without = subset(tree, weights > np.median(weights))
     assert len(without.density_values) == (weights > np.median(weights)).sum()
     np.testing.assert_array_equal(voxel_coordinates(without), at[weights > np.median(weights)])
 
