@@ -47,6 +47,20 @@ def flat_indices(into: np.ndarray, cells: np.ndarray, shape: tuple[int, int, int
                 n += 1
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _raise_voxel(x, y, z, weight, shape, brick, row_of, into, rows):  # type: ignore[no-untyped-def]
+    """Raise voxel (x, y, z) to a weight, in the row of its cell, which gets one if it has none and there is room; returns the number of rows in use."""
+    owner = (x // brick * shape[1] + y // brick) * shape[2] + z // brick
+    if row_of[owner] < 0:
+        row_of[owner] = rows
+        rows += 1
+    to = row_of[owner]
+    if to < len(into):
+        at = (x % brick * brick + y % brick) * brick + z % brick
+        into[to, at] = max(into[to, at], weight)
+    return rows
+
+
 @numba.njit(cache=True, error_model="numpy")
 def resample_weights(
     cells: np.ndarray, greatest: np.ndarray, threshold: float, shape: tuple[int, int, int], to_shape: tuple[int, int, int], ratio: float, brick: int,
@@ -68,14 +82,7 @@ def resample_weights(
             x = min(int((a * brick + local // (brick * brick) + 0.5) * ratio), to_shape[0] * brick - 1)
             y = min(int((b * brick + local // brick % brick + 0.5) * ratio), to_shape[1] * brick - 1)
             z = min(int((c * brick + local % brick + 0.5) * ratio), to_shape[2] * brick - 1)
-            owner = (x // brick * to_shape[1] + y // brick) * to_shape[2] + z // brick
-            if row_of[owner] < 0:
-                row_of[owner] = rows
-                rows += 1
-            to = row_of[owner]
-            if to < len(into):
-                at = (x % brick * brick + y % brick) * brick + z % brick
-                into[to, at] = max(into[to, at], weight)
+            rows = _raise_voxel(x, y, z, weight, to_shape, brick, row_of, into, rows)
     return rows
 
 
@@ -114,14 +121,7 @@ def weigh_voxels(  # type: ignore[no-untyped-def]
                 x, y, z = int(np.floor((px - low[0]) / voxel)), int(np.floor((py - low[1]) / voxel)), int(np.floor((pz - low[2]) / voxel))
                 if x < 0 or y < 0 or z < 0 or x >= size_x or y >= size_y or z >= size_z:
                     continue
-                owner = (x // brick * shape[1] + y // brick) * shape[2] + z // brick
-                if row_of[owner] < 0:
-                    row_of[owner] = rows
-                    rows += 1
-                to = row_of[owner]
-                if to < len(into):
-                    at = (x % brick * brick + y % brick) * brick + z % brick
-                    into[to, at] = max(into[to, at], share)
+                rows = _raise_voxel(x, y, z, share, shape, brick, row_of, into, rows)
     return rows
 
 
