@@ -255,41 +255,42 @@ def _refinement() -> tuple[Any, Any]:
 
 def refinement_seeds() -> list[bytes]:
     from pipeline.stage import Job
-    from stages.baking import refinement
+    from stages.baking import checkpoint
 
     with tempfile.TemporaryDirectory() as folder:
         job = Job(settings=None, out=Path(folder) / "out", work=Path(folder) / "work")
-        refinement._save_checkpoint(job, _refinement()[1], None)
-        return [(job.work / refinement.CHECKPOINT).read_bytes()]
+        checkpoint.save(job, checkpoint.Point(_refinement()[1]))
+        return [(job.work / checkpoint.CHECKPOINT).read_bytes()]
 
 
 def refinement_changed(rng: Random, data: bytes) -> bytes:
     """A change, the digest put right in most."""
     from safetensors.numpy import load
 
-    from stages.baking.refinement import _digest as digest
+    from stages.baking.checkpoint import digest_of
 
     found = safetensors_bytes.changed(rng, data)
     parts = safetensors_bytes.parts(found)
     if rng.random() < 0.15 or parts is None:
         return found
     with contextlib.suppress(Exception):
-        return safetensors_bytes.joined({**parts[0], "__metadata__": {"sha256": digest(load(found))}}, parts[1])
+        return safetensors_bytes.joined({**parts[0], "__metadata__": {"sha256": digest_of(load(found))}}, parts[1])
     return found
 
 
 def open_refinement(folder: Path) -> Opened:
     """The state that a refinement goes on from."""
+    from efficientnerf.asset.refinement.schedule import PHASES
     from pipeline.stage import Job
-    from stages.baking import refinement
+    from stages.baking import checkpoint
 
     tree, _ = _refinement()
     job = Job(settings=None, out=folder / "out", work=folder / "work")
 
     def read(data: bytes) -> None:
-        (job.work / refinement.CHECKPOINT).write_bytes(data)
-        found = refinement._restored(job, tree, 2 * STEP)
-        assert found is None or 0 <= found[0].step <= 2 * STEP, "a step out of range"
+        (job.work / checkpoint.CHECKPOINT).write_bytes(data)
+        found = checkpoint.restored(job, tree, PHASES, 2 * STEP)
+        assert found is None or 0 <= found.state.step <= 2 * STEP, "a step out of range"
 
     return Opened(read)
 

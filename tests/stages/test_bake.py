@@ -17,6 +17,7 @@ import torch
 from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format
 from efficientnerf.asset.file import serialisation
+from efficientnerf.asset.refinement.schedule import PHASES
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
 from efficientnerf.rendering.compositing import activate
@@ -26,7 +27,7 @@ from pipeline.stage import Job
 from stages import bake, train
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
-from stages.baking import memory, refinement, resolution
+from stages.baking import checkpoint, memory, refinement, resolution
 from stages.evaluation.views import ground_truth
 from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
@@ -178,10 +179,10 @@ def test_a_state_of_another_refinement_is_told(pruned: int, change: Callable[[di
     tensors |= {"sh": np.zeros((count, 3), np.float32), "visits": np.zeros(count, np.int32), "coordinates": coordinates}
     tensors["progress"] = np.array([7 if pruned else 3, pruned], np.int64)
     tensors |= {"holes": np.zeros(3)} if pruned else {}
-    refinement._check(tensors, tree, 12)
+    checkpoint.check(tensors, tree, PHASES, 12)
     change(tensors)
     with pytest.raises(ValueError, match=r"step|voxels|missing|progress"):
-        refinement._check(tensors, tree, 12)
+        checkpoint.check(tensors, tree, PHASES, 12)
 
 
 def test_a_refinement_that_does_not_fit_begins_again(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], stopped: Path) -> None:
@@ -191,7 +192,7 @@ def test_a_refinement_that_does_not_fit_begins_again(inputs: dict[str, Path], tm
     path = tmp_path / "work" / "refinement.safetensors"
     tensors = load_file(path)
     tensors["coordinates"] = np.ascontiguousarray(tensors["coordinates"][::-1])
-    save_file(tensors, path, metadata={"sha256": refinement._digest(tensors)})
+    save_file(tensors, path, metadata={"sha256": checkpoint.digest_of(tensors)})
     events: list[dict[str, Any]] = []
     assert run(job(tmp_path, QUICK, events=events, **inputs)) == undisturbed[0]
     assert [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"] == [path.name]

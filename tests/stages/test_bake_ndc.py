@@ -18,7 +18,7 @@ from efficientnerf.geometry.spaces import NdcSpace
 from stages import bake, train
 from stages.artifacts import BakeOutputs
 from stages.bake import BakeSettings
-from stages.baking.refinement import NDC_RAYS_PER_VOXEL
+from stages.baking.pruning import NDC_RAYS_PER_VOXEL
 from stages.baking.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, budget_of, finest_resolution, ndc_pixel
 from stages.framing.forward_facing import detect_forward_facing
 from stages.io.field_file import load_renderer

@@ -22,7 +22,7 @@ from pipeline.executors.memory import Limit
 from stages import bake
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
-from stages.baking import holes, refinement, resolution, whole_scene
+from stages.baking import holes, pruning, resolution, whole_scene
 from stages.baking.resolution import MAX_CELLS, SCENE_MAX_MIB, budget_of, finest_of_cascades
 from stages.framing.view_coverage import close_to_path
 from stages.io import field_file
@@ -164,7 +164,7 @@ def test_one_cascade_leaves_the_rest_to_the_environment(inputs: dict[str, Path],
 
 def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the prune drops a piece of the ball that the photographs show it comes back, within the room there is."""
-    heaviest = refinement._heaviest
+    heaviest = pruning.heaviest
     dropped: list[int] = []
 
     def without_half(made: Any, greatest: np.ndarray, most: int) -> np.ndarray:
@@ -174,7 +174,7 @@ def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_
         dropped.append(int((lost & keep).sum()))
         return keep & ~lost
 
-    monkeypatch.setattr(refinement, "_heaviest", without_half)
+    monkeypatch.setattr(pruning, "heaviest", without_half)
     events: list[dict[str, Any]] = []
     _, report = baked(tmp_path, inputs, events)
     found = report["optimisation"]["holes"]

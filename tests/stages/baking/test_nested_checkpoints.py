@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.cascades import subset, voxel_cascades
+from efficientnerf.asset.refinement.schedule import PHASES
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state, subset_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from pipeline.stage import Job
-from stages.baking import refinement
+from stages.baking import checkpoint
+from stages.baking.checkpoint import Point
+from stages.baking.pruning import Pruned
 from tests.efficientnerf.trees import random_cascades
 
 STEPS = 12
@@ -41,12 +44,12 @@ def some_state(tree: NerfTree, pruned: bool) -> RefinementState:
 def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None:
     tree = random_cascades(3)
     state = some_state(tree, pruned)
-    dropped = refinement.Pruned(0.25, 0.125, 7) if pruned else None
-    refinement._save_checkpoint(job(tmp_path), state, dropped)
-    found = refinement._restored(job(tmp_path), tree, STEPS)
+    point = Point(state, int(pruned), Pruned(0.25, 0.125, 7) if pruned else None)
+    checkpoint.save(job(tmp_path), point)
+    found = checkpoint.restored(job(tmp_path), tree, PHASES, STEPS)
     assert found is not None
-    again = found[0]
-    assert (again.step, found[1]) == (state.step, dropped)
+    again = found.state
+    assert (again.step, found.phase, found.pruned) == (state.step, point.phase, point.pruned)
     for name in STATE:
         np.testing.assert_array_equal(getattr(again, name), getattr(state, name))
     for name in ("brick_index", "voxel_index", "environment"):
@@ -74,7 +77,7 @@ def test_cascades_of_another_tree_are_told(pruned: bool, change: Callable[[dict[
     tensors = {name: getattr(state, name) for name in STATE}
     tensors |= {"coordinates": voxel_coordinates(state.tree), "cascades": voxel_cascades(state.tree), "progress": np.array([state.step, pruned], np.int64)}
     tensors |= {"holes": np.zeros(3)} if pruned else {}
-    assert len(refinement._check(tensors, tree, STEPS)) == len(state.density)
+    assert len(checkpoint.check(tensors, tree, PHASES, STEPS)) == len(state.density)
     change(tensors)
     with pytest.raises(ValueError, match=r"voxels|cascades"):
-        refinement._check(tensors, tree, STEPS)
+        checkpoint.check(tensors, tree, PHASES, STEPS)
