@@ -2,195 +2,36 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
 import re
 from collections.abc import Callable
-from dataclasses import replace
-from functools import cache
-from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascade_grids
-from efficientnerf.asset.file.container import DTYPES
 from efficientnerf.asset.format import LAYOUTS, serialize
-from efficientnerf.asset.region import Region
-from efficientnerf.asset.tree import NerfTree
-from tests.efficientnerf.trees import LOW, random_cascades, random_tree
-
-SIMILARITY = {"scale": 0.5, "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "translation": [1, 2, 3]}
-ORBIT = {"centre": [0.0, 0.1, 0.2], "radius": 3.0, "elevation": 25.0, "forward_facing": False, "heading": 40.0}
-METADATA = {"world_from_capture": SIMILARITY, "orbit": ORBIT, "metric": True, "licence": "CC0-1.0", "provenance": {"tool": "a test"}}
-
-
-TENSORS = ("coarse.occupancy", *LAYOUTS["sparse"].tensors)
-
-
-def tiny(degree: int = 0, **more: Any) -> NerfTree:
-    return random_tree(1, shape=(2, 1, 2), brick=2, degree=degree, share=0.7, metadata=METADATA, **more)
-
-
-NESTED = ("nested-sparse", "nested-compact", "nested-full")
-
-
-def tiny_scene(degree: int = 0) -> NerfTree:
-    """Two cascades with an environment map and a region of some bricks."""
-    tree = random_cascades(6, count=2, brick=1, degree=degree, share=0.1, metadata=METADATA)
-    assert tree.environment is not None
-    region = Region(np.stack([LOW, LOW + 0.3]), 0.1, 0.05, np.arange(len(tree.voxel_index)) % 3 > 0)
-    return replace(tree, environment=tree.environment[:2, :4], region=region)
-
-
-@cache
-def blob(of: str = "sparse") -> bytes:
-    """The tiny file in one of the layouts, `nested-` ones among them; codes need harmonics to stand for."""
-    layout = of.removeprefix("nested-")
-    degree = 0 if layout == "sparse" else 1
-    return serialize(tiny(degree) if layout == of else tiny_scene(degree), layout)
-
-
-def parts(data: bytes) -> tuple[dict[str, Any], dict[str, Any], bytes]:
-    """Header without metadata, the metadata, the data."""
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    return header, json.loads(header.pop("__metadata__")["nerftree"]), data[8 + length :]
-
-
-def joined(header: dict[str, Any], meta: dict[str, Any] | str, data: bytes) -> bytes:
-    text = meta if isinstance(meta, str) else json.dumps(meta)
-    raw = json.dumps({"__metadata__": {"nerftree": text}, **header}).encode()
-    return len(raw).to_bytes(8, "little") + raw + data
-
-
-def with_tensor(name: str, values: np.ndarray, of: str = "sparse") -> bytes:
-    """The tiny file with one tensor replaced, digest and offsets put right."""
-    header, meta, data = parts(blob(of))
-    begin, end = header[name]["data_offsets"]
-    raw = values.tobytes()
-    for entry in header.values():
-        entry["data_offsets"] = [n + len(raw) - (end - begin) if n >= end else n for n in entry["data_offsets"]]
-    header[name] = {"dtype": header[name]["dtype"], "shape": list(values.shape), "data_offsets": [begin, begin + len(raw)]}
-    meta["sha256"][name] = hashlib.sha256(raw).hexdigest()
-    return joined(header, meta, data[:begin] + raw + data[end:])
-
-
-def tensor(name: str, of: str = "sparse") -> np.ndarray:
-    header, _, data = parts(blob(of))
-    begin, end = header[name]["data_offsets"]
-    return np.frombuffer(data[begin:end], DTYPES[header[name]["dtype"]]).reshape(header[name]["shape"]).copy()
-
-
-def meta_with(of: str = "sparse", **changes: Any) -> bytes:
-    header, meta, data = parts(blob(of))
-    return joined(header, {key: value for key, value in {**meta, **changes}.items() if value != "absent"}, data)
-
-
-def header_with(name: str, of: str = "sparse", **changes: Any) -> bytes:
-    header, meta, data = parts(blob(of))
-    header[name] = {key: value for key, value in {**header[name], **changes}.items() if value != "absent"}
-    return joined(header, meta, data)
-
-
-def replaced(old: bytes, new: bytes) -> bytes:
-    """The tiny file with its header text changed; the header's length follows."""
-    data = blob()
-    length = int.from_bytes(data[:8], "little")
-    raw = data[8 : 8 + length]
-    assert old in raw
-    raw = raw.replace(old, new, 1)
-    return len(raw).to_bytes(8, "little") + raw + data[8 + length :]
-
-
-def without(name: str, of: str = "sparse") -> bytes:
-    header, meta, data = parts(blob(of))
-    begin, end = header.pop(name)["data_offsets"]
-    for entry in header.values():
-        entry["data_offsets"] = [n - (end - begin) if n >= end else n for n in entry["data_offsets"]]
-    return joined(header, meta, data[:begin] + data[end:])
-
-
-def added(name: str, dtype: str = "F64", of: str = "sparse") -> bytes:
-    header, meta, data = parts(blob(of))
-    header[name] = {"dtype": dtype, "shape": [1], "data_offsets": [len(data), len(data) + 8]}
-    return joined(header, meta, data + bytes(8))
-
-
-def negative(name: str, of: str = "sparse") -> np.ndarray:
-    values = tensor(name, of)
-    values.reshape(-1)[0] = -1 if "density" in name else np.inf
-    return values
-
-
-def nan(name: str, of: str = "sparse") -> np.ndarray:
-    values = tensor(name, of)
-    values.reshape(-1)[-1] = np.nan
-    return values
-
-
-def flipped(name: str, bit: int) -> np.ndarray:
-    values = tensor(name)
-    values.reshape(-1)[-1] ^= np.array(1 << bit).astype(values.dtype)
-    return values
-
-
-def rotated(**changes: Any) -> bytes:
-    return meta_with(world_from_capture={**SIMILARITY, **changes})
-
-
-def reference(**changes: Any) -> bytes:
-    eye = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-    return meta_with(layout="ndc-sparse", ndc={"world_from_camera": eye, "focal": 400, "width": 504, "height": 378, "near": 1, **changes})
-
-
-def spiral(value: Any) -> bytes:
-    header, meta, data = parts(reference())
-    return joined(header, {**meta, "spiral": value}, data)
-
-
-def filled(cells: tuple[int, int, int], occupied: int, brick: int = 1) -> bytes:
-    """A sound file of `cells`, of which the first ones are `occupied` and store one voxel each."""
-    occupancy = np.zeros(-(-math.prod(cells) // 8), np.uint8)
-    occupancy[: occupied // 8] = 255
-    occupancy[occupied // 8 :][:1] |= (1 << occupied % 8) - 1
-    mask = np.zeros((occupied, -(-(brick**3) // 64)), "<u8")
-    mask[:, 0] = 1
-    density, sh = np.ones(occupied, "<f2"), np.zeros((occupied, 1, 3), "<f2")
-    _, meta, _ = parts(blob())
-    header: dict[str, Any] = {}
-    data = b""
-    for name, values in zip(TENSORS, (occupancy, mask, density, sh), strict=True):
-        raw = values.tobytes()
-        dtype = next(key for key, value in DTYPES.items() if value == values.dtype)
-        header[name] = {"dtype": dtype, "shape": list(values.shape), "data_offsets": [len(data), len(data) + len(raw)]}
-        meta["sha256"][name] = hashlib.sha256(raw).hexdigest()
-        data += raw
-    return joined(header, {**meta, "shape": list(cells), "brick": brick}, data)
-
-
-def cascade(**changes: Any) -> bytes:
-    """Two cascades, the outer of which is changed."""
-    _, meta, _ = parts(blob(NESTED[0]))
-    return meta_with(NESTED[0], cascades=[{key: value for key, value in {**meta["cascades"][0], **changes}.items() if value != "absent"}])
-
-
-def region(**changes: Any) -> bytes:
-    _, meta, _ = parts(blob(NESTED[0]))
-    return meta_with(NESTED[0], region={key: value for key, value in {**meta["region"], **changes}.items() if value != "absent"})
-
-
-def shells(count: int, cells: int) -> bytes:
-    """A file that claims so many cascades of `cells` along each side, nothing in any."""
-    header, meta, data = parts(blob(NESTED[0]))
-    low = [-cells / 2 * 0.1 * 2**n for n in range(count)]
-    meta |= {"shape": [cells] * 3, "voxel": 0.1, "bounds_min": [low[0]] * 3, "cascades": [{"shape": [cells] * 3, "bounds_min": [x] * 3} for x in low[1:]]}
-    return joined(header, meta, data)
-
-
-def orbiting(**changes: Any) -> bytes:
-    return meta_with(orbit={**ORBIT, **changes})
-
+from tests.efficientnerf.damaged import (
+    TENSORS,
+    added,
+    filled,
+    flipped,
+    header_with,
+    hollow,
+    joined,
+    meta_with,
+    nan,
+    negative,
+    orbiting,
+    overlapping,
+    reference,
+    replaced,
+    rotated,
+    spiral,
+    tensor,
+    tiny,
+    with_tensor,
+    without,
+    without_entry,
+)
+from tests.efficientnerf.hostile_scenes import SCENES
 
 HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     # container
@@ -338,75 +179,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a spiral without focus": (lambda: spiral({"focus": 0}), "'focus' is 0"),
     "a spiral of no width": (lambda: spiral({"tangents": [0, 1]}), "'tangents'"),
     "a spiral that ends behind its camera": (lambda: spiral({"far": -1}), "'far' is -1"),
-    # nested grids
-    "nested, no cascades": (lambda: meta_with(NESTED[0], cascades="absent"), "'cascades' is None; expected a list of at most 15 objects"),
-    "cascades of text": (lambda: meta_with(NESTED[0], cascades="two"), "'cascades' is two; expected a list"),
-    "cascades of numbers": (lambda: meta_with(NESTED[0], cascades=[2]), r"'cascades' is \[2\]; expected a list of at most 15 objects"),
-    "seventeen cascades": (lambda: shells(17, 4), "expected a list of at most 15 objects"),
-    "a cascade without shape": (lambda: cascade(shape="absent"), r"'shape' is None; expected 3 numbers .*\(cascade 1\)"),
-    "a cascade of fractional shape": (lambda: cascade(shape=[4, 4, 4.5]), r"expected whole numbers .*\(cascade 1\)"),
-    "a cascade of nothing": (lambda: cascade(shape=[4, 0, 4]), r"'shape' is \[4, 0, 4\]; expected 3 numbers from 1"),
-    "a cascade too large": (lambda: cascade(shape=[65536] * 3), r"a product of at most 1073741824 \(cascade 1\)"),
-    "cascades too large together": (lambda: shells(10, 512), "cascades of 1342177280 coarse cells; expected at most 1073741824 in all"),
-    "a cascade without corner": (lambda: cascade(bounds_min="absent"), r"'bounds_min' is None; expected 3 numbers .*\(cascade 1\)"),
-    "a cascade beyond what floats resolve": (lambda: cascade(bounds_min=[0, 0, 1e20]), "'bounds_min'"),
-    "a cascade off its cells": (lambda: cascade(bounds_min=[-0.95, 0, -1.3]), "the box of cascade 0 does not lie on faces of the coarse cells of cascade 1"),
-    "a cascade beside the one before": (lambda: cascade(bounds_min=[-0.5, 0, -1.3]), "cascade 1 does not enclose cascade 0"),
-    "a cascade that ends too early": (lambda: cascade(shape=[4, 4, 2]), "cascade 1 does not enclose cascade 0"),
-    "a cascade of an odd number of cells": (lambda: meta_with(NESTED[0], shape=[4, 4, 3]), "the box of cascade 0 does not lie on faces"),
-    "a cascade without cells": (lambda: without("coarse.occupancy.1", NESTED[0]), r"tensor 'coarse\.occupancy\.1' is missing"),
-    "cells of no cascade": (lambda: meta_with(NESTED[0], cascades=[]), r"unknown tensor 'coarse\.occupancy\.1'"),
-    "cells of a cascade in a layout of one grid": (lambda: added("coarse.occupancy.1"), r"unknown tensor 'coarse\.occupancy\.1'"),
-    "too few cells of a cascade": (
-        lambda: with_tensor("coarse.occupancy.1", np.zeros(7, "<u1"), NESTED[0]),
-        r"'coarse\.occupancy\.1' has shape \(7,\); expected \(8,\)",
-    ),
-    "a cell beyond a cascade's last": (lambda: beyond_the_last_cell(), r"'coarse\.occupancy\.1' has bits set beyond its 36 cells"),
-    "fewer cells than bricks in all cascades": (
-        lambda: with_tensor("coarse.occupancy.1", np.zeros(8, "<u1"), NESTED[0]),
-        "[0-9]+ occupied cells but [0-9]+ brick masks",
-    ),
-    "nested by its cascades alone": (lambda: meta_with(NESTED[0], layout="sparse"), "unknown tensor"),
-    "nested by its layout alone": (lambda: meta_with(layout="nested-sparse"), "'cascades' is None; expected a list"),
-    "nested in normalised device coordinates": (lambda: meta_with(NESTED[0], layout="nested-ndc-sparse"), "layout nested-ndc-sparse; this build reads"),
-    "normalised device coordinates that are nested": (lambda: meta_with(NESTED[0], layout="ndc-nested-sparse"), "layout ndc-nested-sparse; this build reads"),
-    "nested before nearest": (
-        lambda: meta_with(NESTED[0], layout="nested-nearest-sparse", lookup="nearest"),
-        "layout nested-nearest-sparse; this build reads",
-    ),
-    # environment map
-    "nested, no word of an environment": (lambda: meta_with(NESTED[0], environment="absent"), "'environment' is missing; expected the rows of the map or null"),
-    "an environment of no rows": (lambda: meta_with(NESTED[0], environment=0), "'environment' is 0; expected a whole number from 1 to 2048"),
-    "an environment of too many rows": (lambda: meta_with(NESTED[0], environment=2049), "'environment' is 2049"),
-    "an environment that is true": (lambda: meta_with(NESTED[0], environment=True), "'environment' is True"),
-    "an environment without a map": (lambda: without("environment", NESTED[0]), "tensor 'environment' is missing"),
-    "a map without an environment": (lambda: meta_with(NESTED[0], environment=None), "unknown tensor 'environment'"),
-    "a map in a layout of one grid": (lambda: added("environment"), "unknown tensor 'environment'"),
-    "a map of other rows": (lambda: meta_with(NESTED[0], environment=3), r"'environment' has shape \(2, 4, 3\); expected \(3, 6, 3\)"),
-    "a square map": (lambda: with_tensor("environment", np.zeros((2, 2, 3), "<u1"), NESTED[0]), r"has shape \(2, 2, 3\); expected \(2, 4, 3\)"),
-    "a map of halves": (lambda: header_with("environment", NESTED[0], dtype="I8"), "'environment' is I8; expected U8"),
-    # region
-    "a region of text": (lambda: meta_with(NESTED[0], region="front"), "'region' is front; expected an object"),
-    "a region that is null": (lambda: meta_with(format_version="1.4", region=None), "'region' is None; expected an object"),
-    "a region without bounds": (lambda: region(bounds="absent"), "'bounds' is None; expected two corners"),
-    "a region of one corner": (lambda: region(bounds=[[0, 0, 0]]), "expected two corners"),
-    "a region of short corners": (lambda: region(bounds=[[0, 0], [1, 1]]), "expected 3 numbers"),
-    "a region from its greatest corner": (lambda: region(bounds=[[0, 0, 0], [1, -1, 1]]), "expected the least corner, then the greatest"),
-    "a region without height": (lambda: region(bounds=[[0, 0, 0], [1, 1, 0]]), "expected the least corner, then the greatest"),
-    "a region beyond what floats resolve": (lambda: region(bounds=[[0, 0, 0], [1, 1, 1e20]]), "'bounds'"),
-    "a region of negative radius": (lambda: region(corner_radius=-0.1), "'corner_radius' is -0.1"),
-    "a region without fade": (lambda: region(fade="absent"), "'fade' is None"),
-    "a region of bricks, perhaps": (lambda: region(bricks=1), "'bricks' is 1; expected true or false"),
-    "a region without its bricks": (lambda: without("x.region.bricks", NESTED[0]), r"tensor 'x\.region\.bricks' is missing"),
-    "a region of other bricks": (
-        lambda: with_tensor("x.region.bricks", np.zeros(9, "<u1"), NESTED[0]),
-        r"'x\.region\.bricks' has shape \(9,\); expected \([0-9],\)",
-    ),
-    "a region of halves": (lambda: header_with("x.region.bricks", NESTED[0], dtype="I8"), r"'x\.region\.bricks' is I8; expected U8"),
-    "a brick beyond the last": (
-        lambda: with_tensor("x.region.bricks", tensor("x.region.bricks", NESTED[0]) | np.uint8(128), NESTED[0]),
-        r"'x\.region\.bricks' has bits set beyond its [0-9]+ bricks",
-    ),
+    **SCENES,
     # memory
     "nearly empty cascades": (lambda: hollow(), r"take [0-9]+ MB of memory; expected at most 8 times the size and 200 MB"),
     "one voxel in 2^27 cells": (lambda: filled((512, 512, 512), 1), r"16\.8 MB that take 805 MB of memory; expected at most 8 times the size and 200 MB"),
@@ -420,64 +193,3 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a brick of negative density": (lambda: with_tensor("brick.density", negative("brick.density", "full"), "full"), "densities must be finite"),
     "a brick's harmonic that is no number": (lambda: with_tensor("brick.sh", nan("brick.sh", "full"), "full"), "harmonics finite"),
 }
-
-
-def padded(data: bytes) -> bytes:
-    end = 8 + int.from_bytes(data[:8], "little")
-    return (end - 8 + 5).to_bytes(8, "little") + data[8:end] + b"     " + data[end:]
-
-
-def hollow() -> bytes:
-    """Three cascades of 400 cells along each side, all empty."""
-    bounds = np.stack([np.zeros(3), np.full(3, 400.0)])
-    grids = cascade_grids(bounds, 1.0, 1, 3)
-    header, meta, _ = parts(blob(NESTED[0]))
-    (shape, voxel, low), *outer = grids
-    meta |= {"shape": list(shape), "voxel": voxel, "bounds_min": low.tolist(), "region": "absent", "environment": None}
-    meta["cascades"] = [{"shape": list(cells), "bounds_min": corner.tolist()} for cells, _, corner in outer]
-    del meta["region"]
-    empty = np.zeros(400**3 // 8, np.uint8).tobytes()
-    data, entries = b"", {}
-    for n in range(3):
-        entries[f"coarse.occupancy.{n}" if n else "coarse.occupancy"] = {
-            "dtype": "U8",
-            "shape": [len(empty)],
-            "data_offsets": [len(data), len(data) + len(empty)],
-        }
-        data += empty
-    for name, shape_ in (("brick.mask", [0, 1]), ("voxel.density", [0]), ("voxel.sh", [0, 1, 3])):
-        entries[name] = {"dtype": header[name]["dtype"], "shape": shape_, "data_offsets": [len(data), len(data)]}
-    return joined(entries, meta, data)
-
-
-def beyond_the_last_cell() -> bytes:
-    """An outer cascade of 4 by 3 by 3 cells around an inner one of 4 by 2 by 2, and a bit more."""
-    tree = random_cascades(6, count=2, brick=1, share=0.1)
-    outer = replace(tree.outer[0], shape=(4, 3, 3), brick_index=tree.outer[0].brick_index[:, :3, :3])
-    inner = tree.brick_index[:, :2, :2]
-    kept = np.sort(np.concatenate([index[index >= 0] for index in (inner, outer.brick_index)]))
-    number = np.full(len(tree.voxel_index) + 1, -1, np.int32)
-    number[kept] = np.arange(len(kept))
-    smaller = replace(
-        tree, shape=(4, 2, 2), brick_index=number[inner], voxel_index=np.arange(len(kept), dtype=np.int32)[:, None],
-        density_values=tree.density_values[: len(kept)],
-        harmonics=tree.sh[: len(kept)],
-        outer=(replace(outer, brick_index=number[outer.brick_index]),),
-    )  # fmt: skip
-    header, meta, data = parts(serialize(smaller))
-    begin, end = header["coarse.occupancy.1"]["data_offsets"]
-    raw = data[begin : end - 1] + bytes([data[end - 1] | 128])
-    meta["sha256"]["coarse.occupancy.1"] = hashlib.sha256(raw).hexdigest()
-    return joined(header, meta, data[:begin] + raw + data[end:])
-
-
-def overlapping(of: str = "sparse") -> bytes:
-    header, meta, data = parts(blob(of))
-    header["x.a"] = {"dtype": "F64", "shape": [1], "data_offsets": [0, 8]}
-    return joined(header, meta, data)
-
-
-def without_entry(name: str, of: str = "sparse") -> bytes:
-    header, meta, data = parts(blob(of))
-    del header[name]
-    return joined(header, meta, data)

@@ -27,7 +27,8 @@ from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.rendering import render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from tests.efficientnerf import nerftree_reader
-from tests.efficientnerf.hostile import HOSTILE, METADATA, NESTED, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
+from tests.efficientnerf.damaged import METADATA, NESTED, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
+from tests.efficientnerf.hostile import HOSTILE
 from tests.efficientnerf.nerftree_reader import Tree
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, tensors
 
