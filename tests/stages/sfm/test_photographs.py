@@ -18,7 +18,6 @@ from PIL import Image
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput, StageFailed
-from stages.io import photo as reading
 from stages.io.capture import Capture
 from stages.sfm import mapping, matches
 from stages.sfm.colmap import num_threads, quiet_pycolmap
@@ -59,121 +58,6 @@ def ten(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path, Capt
     names = chosen()
     work = tmp_path_factory.mktemp("work")
     return names, work, find(STILL_LIFE, names, work)
-
-
-# ---------------------------------------------------------------------------------------------------------- reading upright
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation_is_undone(tmp_path: Path, orientation: int) -> None:
-    seen = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)
-    undo = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}  # Pillow's Transpose that turns the upright picture into the stored one
-    stored = Image.fromarray(seen)
-    if orientation > 1:
-        stored = stored.transpose(Image.Transpose(undo[orientation]))
-    exif = Image.Exif()
-    exif[274] = orientation
-    stored.save(tmp_path / "a.png", exif=exif)
-    photo = reading.read_photo(tmp_path / "a.png", 1600)
-    assert (photo.width, photo.height) == (30, 20)
-    np.testing.assert_array_equal(photo.rgb, seen)
-
-
-def test_focal_length_from_exif() -> None:
-    assert reading.focal_from_exif({41989: 50}, 3600, 2400) == pytest.approx(5000)
-    # 36 mm sensor, 3600 px across, 50 mm lens, the image scaled to a half since
-    assert reading.focal_from_exif({37386: 50.0, 41486: 100.0, 41488: 4, 40962: 3600}, 1800, 1200) == pytest.approx(2500)
-    assert reading.focal_from_exif({37386: 50.0, 41486: 1.0, 41488: 4}, 1800, 1200) is None  # a density that cannot be
-    assert reading.focal_from_exif({}, 1800, 1200) is None
-
-
-@pytest.mark.parametrize("size", [(4000, 3000), (4032, 3024), (3001, 1999), (1999, 3001), (5184, 3456), (1601, 37)])
-def test_working_size_keeps_the_aspect(size: tuple[int, int]) -> None:
-    w, h = reading.working_size(*size, 1600)
-    assert 1560 <= max(w, h) <= 1600
-    assert abs(w / h * size[1] / size[0] - 1) < (0.02 if min(size) < 100 else 2e-4)
-    assert reading.working_size(*size, 5184) == size
-
-
-def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
-    Image.fromarray(np.full((8, 8), 65535 // 2, np.uint16)).save(tmp_path / "deep.png")
-    assert abs(int(reading.read_photo(tmp_path / "deep.png", 100).rgb[0, 0, 0]) - 127) <= 1
-    rgba = np.full((8, 8, 4), 255, np.uint8)
-    rgba[:, :4, 3] = 0
-    Image.fromarray(rgba).save(tmp_path / "alpha.png")
-    opaque = reading.read_photo(tmp_path / "alpha.png", 100).opaque
-    assert opaque is not None
-    assert opaque[:, 4:].all()
-    assert not opaque[:, :4].any()
-
-
-@pytest.mark.parametrize(("masks", "masked"), [({}, True), ({"a.png": None}, False)])
-def test_what_is_transparent_may_count(masks: dict[str, Path | None], masked: bool, tmp_path: Path) -> None:
-    rgba = np.random.default_rng(0).integers(0, 256, (40, 60, 4), np.uint8)
-    rgba[..., 3] = np.where(np.arange(60) < 30, 0, 255)
-    Image.fromarray(rgba).save(tmp_path / "a.png")
-    quiet: dict[str, Any] = {"progress": lambda *_: None, "safe_point": lambda: None, "warn": lambda *_: None}
-    for _ in range(2):  # the second finds what the first left
-        images, _ = prepare_images(tmp_path, ["a.png"], max_side=60, features=100, seed=0, masks=masks, work=tmp_path / "work", **quiet)
-        assert len(images) == 1
-        assert (tmp_path / "work/masks" / f"{images[0].file}.png").exists() == masked
-
-
-def test_mask_must_fit(tmp_path: Path) -> None:
-    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
-    photo = reading.read_photo(tmp_path / "a.png", 20)
-    mask = np.zeros((60, 80), np.uint8)
-    mask[:, 40:] = 255
-    Image.fromarray(mask).save(tmp_path / "m.png")
-    np.testing.assert_array_equal(reading.read_mask_file(tmp_path / "m.png", photo), np.broadcast_to(np.arange(20) >= 10, (15, 20)))
-    Image.fromarray(mask[:, :50]).save(tmp_path / "m.png")
-    with pytest.raises(reading.UnreadableImage, match="50x60, the photograph 40x30"):
-        reading.read_mask_file(tmp_path / "m.png", photo)
-
-
-@pytest.mark.parametrize("size", [(40, 40), (40, 30)])
-@pytest.mark.parametrize("tagged", [False, True])
-@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_masks_are_turned_alike_for_features_and_for_working_images(tmp_path: Path, orientation: int, tagged: bool, size: tuple[int, int]) -> None:
-    from efficientnerf.geometry.cameras import Camera
-    from stages.io import working_images
-    from stages.io.capture import Photo
-
-    exif = Image.Exif()
-    exif[274] = orientation
-    Image.new("RGB", size).save(tmp_path / "a.png", exif=exif)
-    marked = np.zeros(size[::-1], np.uint8)
-    marked[2:8, 5:30] = 255
-    Image.fromarray(marked).save(tmp_path / "m.png", exif=exif if tagged else None)
-    photo = reading.read_photo(tmp_path / "a.png", 100)
-    for_features = reading.read_mask_file(tmp_path / "m.png", photo)
-    camera = Camera("a.png", photo.width, photo.height, "SIMPLE_PINHOLE", (40.0, 20.0, 20.0), np.eye(4))
-    written = working_images.write(Photo(camera, tmp_path / "a.png", tmp_path / "m.png"), tmp_path / "out", "a.png", max_side=100)
-    assert written.mask is not None
-    with Image.open(tmp_path / "out" / written.mask) as mask:
-        np.testing.assert_array_equal(np.asarray(mask) > 0, for_features)
-
-
-# ------------------------------------------------------------------------------------------------------------------- pairs
-
-
-def test_exhaustive_pairs_are_all_pairs_once() -> None:
-    blocks = matches.pairs_to_match(23, "exhaustive")
-    pairs = [pair for block in blocks for pair in block]
-    assert len(pairs) == len(set(pairs)) == 23 * 22 // 2
-    assert max(map(len, blocks)) <= matches.BLOCK_SIZE**2
-
-
-def test_sequential_pairs_reach_neighbours_and_close_loops() -> None:
-    pairs = {pair for block in matches.pairs_to_match(400, "sequential") for pair in block}
-    assert all((i, i + 1) in pairs for i in range(399))
-    assert any(i < 10 and j > 385 for i, j in pairs)
-    assert len(pairs) < 400 * 20
-    with pytest.raises(ValueError, match="matching"):
-        matches.pairs_to_match(3, "vocabulary")
-
-
-# ----------------------------------------------------------------------------------------------------------------- cameras
 
 
 def test_cameras_lie_where_the_photographs_were_taken(ten: tuple[list[str], Path, Capture]) -> None:
@@ -451,24 +335,6 @@ def test_lens_with_more_than_one_term_of_distortion(tmp_path: Path) -> None:
     assert np.sqrt((errors**2).mean()) < 0.002
 
 
-def test_masked_parts_give_no_features(tmp_path: Path) -> None:
-    names = chosen()[:3]
-    mask = np.zeros((360, 480), np.uint8)
-    mask[:, 240:] = 255
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
-    images, _ = prepare_images(
-        STILL_LIFE, names, max_side=240, features=500, seed=0, masks={names[1]: tmp_path / "mask.png"}, work=tmp_path / "w", warn=print, **quiet
-    )
-    open_database(tmp_path / "w", images, print)
-    matches.extract_features(tmp_path / "w", images, features=500, **quiet)
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(tmp_path / "w")) as database:
-        columns = [database.read_keypoints(i)[:, 0] for i in (1, 2, 3)]
-    assert columns[0].min() < 100
-    assert len(columns[1]) > 10
-    assert columns[1].min() >= 119
-
-
 def test_too_few_photographs_are_refused(tmp_path: Path) -> None:
     Image.new("RGB", (64, 48)).save(tmp_path / "a.jpg")
     (tmp_path / "b.jpg").write_bytes(b"no picture")
@@ -510,66 +376,6 @@ def test_one_thread_compares_descriptors(ten: tuple[list[str], Path, Capture], t
     )  # fmt: skip
     matches.match_pairs(tmp_path / "work", images, how="exhaustive", seed=0, progress=lambda *a, **k: None, safe_point=lambda: None)
     assert set(asked) == {1}
-
-
-TERMINATED = """
-import os, signal, sys
-from dataclasses import replace
-from pathlib import Path
-from pipeline.errors import PipelineError
-from pipeline.runner import run_stages
-from stages.sfm.colmap import quiet_pycolmap
-from tests.pipeline.toy import STAGES, make_run
-
-def work(job):
-    with quiet_pycolmap():
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-    job.safe_point()
-
-if sys.argv[1] == "none":
-    with quiet_pycolmap():
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-try:
-    run_stages(make_run(Path(sys.argv[1])), [replace(STAGES[0], run=work), *STAGES[1:]])
-except PipelineError as error:
-    sys.exit(error.exit_code)
-"""
-
-
-@pytest.mark.parametrize(("engine", "code"), [(True, 143), (False, -signal.SIGTERM)])
-def test_colmap_leaves_sigterm_as_it_was(tmp_path: Path, engine: bool, code: int) -> None:
-    command = [sys.executable, "-c", TERMINATED, str(tmp_path) if engine else "none"]
-    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stderr) == (code, "")
-
-
-WHILE_IMPORTING = """
-import os, signal, sys
-from stages.sfm.colmap import quiet_pycolmap
-
-sent = 0
-def answer(number, frame):
-    sys.exit(143 if sent > 1 else 1)
-
-def hook(event, arguments):
-    global sent
-    if event == "import" and str(arguments[0]).startswith("pycolmap"):
-        sent += 1
-        os.kill(os.getpid(), signal.SIGTERM)  # before COLMAP's library is loaded and again and again until it is
-
-signal.signal(signal.SIGTERM, answer)
-sys.addaudithook(hook)
-with quiet_pycolmap():
-    pass
-sys.exit(2)
-"""
-
-
-def test_sigterm_while_colmap_is_imported_is_answered_by_us() -> None:
-    done = subprocess.run([sys.executable, "-c", WHILE_IMPORTING], cwd=ROOT, check=False, capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stderr) == (143, "")
 
 
 def test_threads_are_those_allowed() -> None:

@@ -1,0 +1,103 @@
+"""Photographs read upright, with their masks and focal lengths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stages.io import photo as reading
+from stages.sfm.images import prepare_images
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_undone(tmp_path: Path, orientation: int) -> None:
+    seen = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)
+    undo = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}  # Pillow's Transpose that turns the upright picture into the stored one
+    stored = Image.fromarray(seen)
+    if orientation > 1:
+        stored = stored.transpose(Image.Transpose(undo[orientation]))
+    exif = Image.Exif()
+    exif[274] = orientation
+    stored.save(tmp_path / "a.png", exif=exif)
+    photo = reading.read_photo(tmp_path / "a.png", 1600)
+    assert (photo.width, photo.height) == (30, 20)
+    np.testing.assert_array_equal(photo.rgb, seen)
+
+
+def test_focal_length_from_exif() -> None:
+    assert reading.focal_from_exif({41989: 50}, 3600, 2400) == pytest.approx(5000)
+    # 36 mm sensor, 3600 px across, 50 mm lens, the image scaled to a half since
+    assert reading.focal_from_exif({37386: 50.0, 41486: 100.0, 41488: 4, 40962: 3600}, 1800, 1200) == pytest.approx(2500)
+    assert reading.focal_from_exif({37386: 50.0, 41486: 1.0, 41488: 4}, 1800, 1200) is None  # a density that cannot be
+    assert reading.focal_from_exif({}, 1800, 1200) is None
+
+
+@pytest.mark.parametrize("size", [(4000, 3000), (4032, 3024), (3001, 1999), (1999, 3001), (5184, 3456), (1601, 37)])
+def test_working_size_keeps_the_aspect(size: tuple[int, int]) -> None:
+    w, h = reading.working_size(*size, 1600)
+    assert 1560 <= max(w, h) <= 1600
+    assert abs(w / h * size[1] / size[0] - 1) < (0.02 if min(size) < 100 else 2e-4)
+    assert reading.working_size(*size, 5184) == size
+
+
+def test_sixteen_bits_and_alpha(tmp_path: Path) -> None:
+    Image.fromarray(np.full((8, 8), 65535 // 2, np.uint16)).save(tmp_path / "deep.png")
+    assert abs(int(reading.read_photo(tmp_path / "deep.png", 100).rgb[0, 0, 0]) - 127) <= 1
+    rgba = np.full((8, 8, 4), 255, np.uint8)
+    rgba[:, :4, 3] = 0
+    Image.fromarray(rgba).save(tmp_path / "alpha.png")
+    opaque = reading.read_photo(tmp_path / "alpha.png", 100).opaque
+    assert opaque is not None
+    assert opaque[:, 4:].all()
+    assert not opaque[:, :4].any()
+
+
+@pytest.mark.parametrize(("masks", "masked"), [({}, True), ({"a.png": None}, False)])
+def test_what_is_transparent_may_count(masks: dict[str, Path | None], masked: bool, tmp_path: Path) -> None:
+    rgba = np.random.default_rng(0).integers(0, 256, (40, 60, 4), np.uint8)
+    rgba[..., 3] = np.where(np.arange(60) < 30, 0, 255)
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    quiet: dict[str, Any] = {"progress": lambda *_: None, "safe_point": lambda: None, "warn": lambda *_: None}
+    for _ in range(2):  # the second finds what the first left
+        images, _ = prepare_images(tmp_path, ["a.png"], max_side=60, features=100, seed=0, masks=masks, work=tmp_path / "work", **quiet)
+        assert len(images) == 1
+        assert (tmp_path / "work/masks" / f"{images[0].file}.png").exists() == masked
+
+
+def test_mask_must_fit(tmp_path: Path) -> None:
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    photo = reading.read_photo(tmp_path / "a.png", 20)
+    mask = np.zeros((60, 80), np.uint8)
+    mask[:, 40:] = 255
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(reading.read_mask_file(tmp_path / "m.png", photo), np.broadcast_to(np.arange(20) >= 10, (15, 20)))
+    Image.fromarray(mask[:, :50]).save(tmp_path / "m.png")
+    with pytest.raises(reading.UnreadableImage, match="50x60, the photograph 40x30"):
+        reading.read_mask_file(tmp_path / "m.png", photo)
+
+
+@pytest.mark.parametrize("size", [(40, 40), (40, 30)])
+@pytest.mark.parametrize("tagged", [False, True])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_masks_are_turned_alike_for_features_and_for_working_images(tmp_path: Path, orientation: int, tagged: bool, size: tuple[int, int]) -> None:
+    from efficientnerf.geometry.cameras import Camera
+    from stages.io import working_images
+    from stages.io.capture import Photo
+
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.new("RGB", size).save(tmp_path / "a.png", exif=exif)
+    marked = np.zeros(size[::-1], np.uint8)
+    marked[2:8, 5:30] = 255
+    Image.fromarray(marked).save(tmp_path / "m.png", exif=exif if tagged else None)
+    photo = reading.read_photo(tmp_path / "a.png", 100)
+    for_features = reading.read_mask_file(tmp_path / "m.png", photo)
+    camera = Camera("a.png", photo.width, photo.height, "SIMPLE_PINHOLE", (40.0, 20.0, 20.0), np.eye(4))
+    written = working_images.write(Photo(camera, tmp_path / "a.png", tmp_path / "m.png"), tmp_path / "out", "a.png", max_side=100)
+    assert written.mask is not None
+    with Image.open(tmp_path / "out" / written.mask) as mask:
+        np.testing.assert_array_equal(np.asarray(mask) > 0, for_features)
