@@ -28,7 +28,8 @@ def test_children_hold_what_the_tree_has_at_their_centres(tree: NerfTree) -> Non
     fine = split_tree(tree, np.ones(len(tree.density_values), bool))
 
     assert len(fine.density_values) == 8 * len(tree.density_values)
-    assert fine.resolution == tuple(2 * n for n in tree.resolution) and np.allclose(fine.bounds_max, tree.bounds_max)
+    assert fine.resolution == tuple(2 * n for n in tree.resolution)
+    assert np.allclose(fine.bounds_max, tree.bounds_max)
     at = centres(fine)
     inner = np.ones(len(at), bool)
     if tree.outer:  # near the box that is cut out of a cascade, points belong to the one before
@@ -45,7 +46,8 @@ def test_voxels_that_are_not_chosen_have_no_children() -> None:
     fine = split_tree(tree, keep)
 
     parents = {tuple(p) for p in voxel_coordinates(tree)[keep]}
-    assert {tuple(p) for p in voxel_coordinates(fine) // 2} == parents and len(fine.density_values) == 8 * keep.sum()
+    assert {tuple(p) for p in voxel_coordinates(fine) // 2} == parents
+    assert len(fine.density_values) == 8 * keep.sum()
 
 
 def test_nearest_lookup_takes_the_values_of_the_parents() -> None:
@@ -75,7 +77,10 @@ def test_the_state_begins_anew_and_keeps_its_step() -> None:
     state.visits[:] = 5
     found = split(state, np.ones(len(tree.density_values), bool))
 
-    assert found.step == 12 and not found.visits.any() and not found.square_density.any() and not found.square_sh.any()
+    assert found.step == 12
+    assert not found.visits.any()
+    assert not found.square_density.any()
+    assert not found.square_sh.any()
     assert found.tree.voxel == tree.voxel / 2
 
 
@@ -83,4 +88,6 @@ def test_region_and_environment_stay() -> None:
     tree = random_cascades(3)
     fine = split_tree(replace(tree, metadata={"a": 1}), np.arange(len(tree.density_values)) % 2 == 0)
 
-    assert fine.environment is tree.environment and len(fine.outer) == len(tree.outer) and fine.metadata == {"a": 1}
+    assert fine.environment is tree.environment
+    assert len(fine.outer) == len(tree.outer)
+    assert fine.metadata == {"a": 1}
