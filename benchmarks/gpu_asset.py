@@ -18,6 +18,7 @@ from gpu_kernels import BOUNDS, ball, orbit
 
 from efficientnerf.asset import bake
 from efficientnerf.asset.refinement import fit
+from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render
@@ -63,7 +64,7 @@ def asset_rates(
     clock.lap("bake")
     targets = Targets(scene, WHITE).to(device)
     state = initial_state(tree, MAX_INITIAL_THICKNESS)
-    options: dict[str, Any] = {"steps": refine_steps, "rays": rays, "density_lr": 0.3, "sh_lr": 0.03, "lr_final_ratio": 0.3, "seed": 0}
+    options: dict[str, Any] = {"rays": rays, "density_lr": 0.3, "sh_lr": 0.03, "fall": exponential_fall(0.3, refine_steps), "seed": 0}
     for _ in fit.optimise(state, targets, until=refine_steps // 4, **options):
         pass
     clock.lap("refine_first_quarter")
@@ -71,7 +72,7 @@ def asset_rates(
         pass
     clock.lap("refine")
     steps_per_second = (refine_steps - refine_steps // 4) / clock.seconds["refine"]
-    waits = waits_of(state, targets, device, {**options, "steps": refine_steps + 32, "until": refine_steps + 32})
+    waits = waits_of(state, targets, device, {**options, "until": refine_steps + 32})
     clock.lap("waits")
     weights = fit.max_weights(state.result(), targets, pixels, 0)
     clock.lap("weights")

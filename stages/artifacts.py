@@ -75,6 +75,9 @@ class BakeOutputs(Outputs):
     stage = "bake"
     asset = Name("asset.nerftree")  # efficientnerf/asset/FORMAT.md
     report = Name("report.json")  # resolution, voxels, bytes, PSNR before and after the refinement
+    log = Name("log.jsonl")  # a line every few steps of the refinement
+    curve = Name("curve.png")  # PSNR over these steps
+    previews = Name("previews")  # renders of a validation view
 
 
 class EvaluateOutputs(Outputs):

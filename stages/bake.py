@@ -3,6 +3,9 @@
     asset.nerftree  see efficientnerf/asset/FORMAT.md
     report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the refinement; of a scene without a
                     constant background, which is baked whole (`stages.baking.whole_scene`): its cascades, and the share of the rays that end in holes
+    log.jsonl       a line every few steps of the refinement
+    curve.png       PSNR over these steps
+    previews/       renders of a validation view
 
 The scratch folder keeps what takes long: the visibility of the voxels or the field's samples, each block of baked values, and the state of the refinement.
 """
@@ -11,12 +14,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Fraction, NonNegative, PositiveInt, Seed, given, setting
+from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, PositiveInt, Seed, given, setting
 from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, needs_of
@@ -87,6 +91,10 @@ class BakeSettings:
         "Steps in which the baked values are refined on the training images; auto: five rays for each voxel, at least 320 steps, or 160 in unbounded scenes.",
         advanced=True,
     )
+    time_budget: Annotated[float, Meta(gt=0.0)] | Off = setting(
+        "off", "Time to bake and refine for, in place of a number of steps: they are timed, and as many are taken as fit; off: refine_steps.", unit="seconds",
+        advanced=True,
+    )
     refine_rays_per_batch: Annotated[int, Meta(ge=1, le=1 << 22)] = setting(32768, "Rays in a step of the refinement.", advanced=True)
     density_lr: NonNegative = setting(0.3, "Learning rate of the refinement for the logarithm of a voxel's optical thickness.", advanced=True)
     sh_lr: NonNegative = setting(0.03, "Learning rate of the refinement for the spherical harmonics.", advanced=True)
@@ -105,15 +113,16 @@ def run(job: Job) -> None:
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.resolution import budget_of
+    from stages.baking.timing import Stopwatch
     from stages.baking.values import baked_tree
-    from stages.baking.whole_scene import bounds_are_given, room_of
+    from stages.baking.whole_scene import bounds_are_given
     from stages.evaluation.views import constant_background
     from stages.io import scene
     from stages.io.field_file import load_renderer
     from stages.io.refined_cameras import load_scene
     from stages.training.data import pixels_of
 
-    settings: BakeSettings = job.settings
+    settings, stopwatch = job.settings, Stopwatch()
     use_all_cores()
     m = load_renderer(job.inputs["train"], job.device).model
     if m.settings.field == "nerf":
@@ -127,9 +136,8 @@ def run(job: Job) -> None:
     refuse_more_than_fits(job, m, views, pixels, plan, mib)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
-    tree, report = refined(
-        job, baked_tree(job, m, s, plan, metadata), _targets(s, pixels, plan), room_of(settings, m, plan.grids, mib, environment=whole), plan.samples
-    )
+    room = partial(_room, settings, m, plan, mib)
+    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), _targets(s, pixels, plan), room, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
     provenance = {**metadata["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": report["psnr_after"]}}
@@ -141,6 +149,15 @@ def run(job: Job) -> None:
     if whole:
         found |= {"cascades": np.bincount(voxel_cascades(tree), minlength=len(plan.grids)).tolist(), "voxel": tree.voxel}
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _room(settings: BakeSettings, m: Any, plan: Plan, mib: int, splits: int) -> int:
+    """How many voxels the asset holds on the plan's grids once they were split so often."""
+    from stages.baking.whole_scene import room_of
+
+    finer = 2**splits
+    grids = [((x * finer, y * finer, z * finer), voxel / finer, low) for (x, y, z), voxel, low in plan.grids]
+    return room_of(settings, m, grids, mib, environment=plan.samples is not None)
 
 
 def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: int, *, whole: bool) -> Plan:
@@ -180,4 +197,11 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
     return Targets(pixels, constant_background(s), plan.environment, reaches_infinity=plan.space.reaches_infinity)
 
 
-STAGE = Stage(name="bake", version=5, settings=BakeSettings, needs=needs_of(BakeInputs), run=run)
+STAGE = Stage(
+    name="bake",
+    version=6,
+    settings=BakeSettings,
+    needs=needs_of(BakeInputs),
+    run=run,
+    volatile=(BakeOutputs.log, BakeOutputs.curve, f"{BakeOutputs.previews}/*"),
+)

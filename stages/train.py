@@ -24,7 +24,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.cores import use_all_cores
-from stages.training.budget import UNKNOWN, Budget
+from stages.training.budget import UNKNOWN, Budget, training_budget
 from stages.training.checkpoints import Checkpoints
 from stages.training.data import count_pixels, depth_range, mask_uncovered_cells, pixels_of, sparse_depth_of, with_camera_refinement
 from stages.training.log import TrainLog
@@ -63,9 +63,9 @@ def run(job: Job) -> None:
     checkpoints = Checkpoints(job)
     spent = checkpoints.restore(t, settings.iterations if settings.time_budget == "off" else UNKNOWN)
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
-    previews = Previews(FieldRenderer(m, near, far), folder, s, job.work, given(settings.preview_every))
-    previews.draw(t.step)
-    budget = Budget(settings, job.work, spent, clock, job.warn) if settings.time_budget != "off" else None
+    previews = Previews(lambda camera: FieldRenderer(m, near, far).render(camera).colour, m.background, folder, s, job.work, given(settings.preview_every))
+    previews.draw_when_due(t.step)
+    budget = training_budget(settings, job.work, spent, clock, job.warn) if settings.time_budget != "off" else None
     if budget is not None:
         t.schedule = budget.schedule
 
@@ -76,7 +76,7 @@ def run(job: Job) -> None:
             follow_budget(job, t, budget)
         last = done.step == t.schedule.iterations
         goal = t.schedule.iterations if budget is None else budget.goal
-        psnr = previews.draw(done.step)
+        psnr = previews.draw_when_due(done.step)
         shown = log.record(done, goal, psnr, last=last) | previews.figures
         job.progress(min(done.step, goal), goal, "training", **shown)
         if psnr is not None:

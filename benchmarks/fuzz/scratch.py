@@ -169,14 +169,14 @@ def schedule_seeds() -> list[bytes]:
 
 
 def open_schedule(folder: Path) -> Opened:
-    from stages.training.budget import FILE, Budget
+    from stages.training.budget import FILE, training_budget
     from tests.efficientnerf.balls import settings
 
     chosen = settings(**QUICK, time_budget=10.0)
 
     def read(data: bytes) -> None:
         (folder / FILE).write_bytes(data)
-        budget = Budget(chosen, folder)
+        budget = training_budget(chosen, folder)
         budget.schedule.fraction(5)
         budget.after(5)
 
@@ -254,12 +254,13 @@ def _refinement() -> tuple[Any, Any]:
 
 
 def refinement_seeds() -> list[bytes]:
+    from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
     from pipeline.stage import Job
     from stages.baking import checkpoint
 
     with tempfile.TemporaryDirectory() as folder:
         job = Job(settings=None, out=Path(folder) / "out", work=Path(folder) / "work")
-        checkpoint.save(job, checkpoint.Point(_refinement()[1]))
+        checkpoint.save(job, checkpoint.Point(_refinement()[1], stated_schedule(PHASES, 2 * STEP)))
         return [(job.work / checkpoint.CHECKPOINT).read_bytes()]
 
 
@@ -280,7 +281,7 @@ def refinement_changed(rng: Random, data: bytes) -> bytes:
 
 def open_refinement(folder: Path) -> Opened:
     """The state that a refinement goes on from."""
-    from efficientnerf.asset.refinement.schedule import PHASES
+    from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
     from pipeline.stage import Job
     from stages.baking import checkpoint
 
@@ -289,7 +290,7 @@ def open_refinement(folder: Path) -> Opened:
 
     def read(data: bytes) -> None:
         (job.work / checkpoint.CHECKPOINT).write_bytes(data)
-        found = checkpoint.restored(job, tree, PHASES, 2 * STEP)
+        found = checkpoint.restored(job, tree, stated_schedule(PHASES, 2 * STEP))
         assert found is None or 0 <= found.state.step <= 2 * STEP, "a step out of range"
 
     return Opened(read)

@@ -1,6 +1,7 @@
-"""The checkpoint of a refinement in the bake's scratch folder: the state, the phase, and where its voxels lie.
+"""The checkpoint of a refinement in the bake's scratch folder: the state, how far it is, and where its voxels lie.
 
-What was baked gives the grids. A state's voxels are some of those that were baked: all of them before voxels are dropped for the first time.
+What was baked gives the grids. A state's voxels are some of those that were baked: all of them before voxels are dropped for the first time. After voxels were
+split they are descendants of these, on grids of twice the resolution, or four times.
 
 N voxels, n voxels of the state.
 """
@@ -8,18 +9,20 @@ N voxels, n voxels of the state.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import numpy as np
 
-from efficientnerf.asset.refinement.schedule import Phase, phase_ends
+from efficientnerf.asset.refinement.schedule import RefinementSchedule, count_splits, recorded_schedule
 from pipeline.files import atomic, exists, remove
 from pipeline.stage import Job
 from stages.baking.pruning import Pruned
 from stages.scratch import opened, unusable
+from stages.training.budget import schedule_state
 
 if TYPE_CHECKING:
     from efficientnerf.asset.refinement.state import RefinementState
@@ -28,17 +31,40 @@ if TYPE_CHECKING:
 CHECKPOINT = "refinement.safetensors"
 
 
+_Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e10)]
+
+
+class _About(msgspec.Struct, forbid_unknown_fields=True):
+    """What a checkpoint says of itself: `Point` without the state."""
+
+    step: Annotated[int, msgspec.Meta(ge=0, le=2**40)]
+    phase: Annotated[int, msgspec.Meta(ge=0, le=2**10)]
+    pruned: Pruned | None
+    schedule: list[dict[str, Any]]
+    seconds: _Seconds
+    began: _Seconds
+    allotted: _Seconds
+
+
 @dataclass
 class Point:
     """How far a refinement is.
 
-    phase   number of the one whose steps are taken; those before it are done, and what is done after each of them
-    pruned  what the last pruning dropped; None before the first
+    schedule  of the steps
+    phase     number of the one whose steps are taken; those before it are done, and what is done after each of them
+    pruned    what the last pruning dropped; None before the first
+    seconds   of the stage up to here
+    began     seconds at which the phase began
+    allotted  seconds that it may take, where there is a budget
     """
 
     state: RefinementState
+    schedule: RefinementSchedule
     phase: int = 0
     pruned: Pruned | None = None
+    seconds: float = 0.0
+    began: float = 0.0
+    allotted: float = 0.0
 
 
 def save(job: Job, point: Point) -> None:
@@ -55,11 +81,16 @@ def save(job: Job, point: Point) -> None:
     tensors["coordinates"] = voxel_coordinates(state.tree)
     if state.tree.outer:
         tensors["cascades"] = voxel_cascades(state.tree)
-    tensors["progress"] = np.array([state.step, point.phase], np.int64)
-    if point.pruned is not None:
-        tensors["holes"] = np.array([point.pruned.without, point.pruned.restored, point.pruned.voxels], np.float64)
+    tensors["about"] = about_of(point)
     with atomic(job.work / CHECKPOINT, durable=False) as temporary:
         save_file(tensors, str(temporary), metadata={"sha256": digest_of(tensors)})
+
+
+def about_of(point: Point) -> np.ndarray:
+    """What the checkpoint says of itself, as bytes of JSON."""
+    times = (point.seconds, point.began, point.allotted)
+    about = _About(point.state.step, point.phase, point.pruned, point.schedule.state(), *times)
+    return np.frombuffer(msgspec.json.encode(about), np.uint8)
 
 
 def digest_of(tensors: Mapping[str, np.ndarray]) -> str:
@@ -71,11 +102,12 @@ def digest_of(tensors: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def restored(job: Job, tree: NerfTree, phases: Sequence[Phase], steps: int) -> Point | None:
+def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | None = None) -> Point | None:
     """The last checkpoint of a refinement of this tree with these phases; None where there is none that fits, and one that does not is removed.
 
-    tree   as it was baked
-    steps  of all phases
+    tree    as it was baked
+    stated  the schedule
+    hold    of a phase whose number of steps follows from the time that they take; None: all of them are stated
     """
     from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
 
@@ -84,18 +116,18 @@ def restored(job: Job, tree: NerfTree, phases: Sequence[Phase], steps: int) -> P
         return None
     try:
         found = _read(path)
-        kept = check(found, tree, phases, steps)
-        step, phase = (int(x) for x in found["progress"])
-        without, again, voxels = found["holes"].tolist() if "holes" in found else (0.0, 0.0, 0)
-        fitted = _with_values(tree, kept, np.array(found["density"]), np.array(found["sh"]))
+        about, schedule, kept = check(found, tree, stated, hold)
+        splits = count_splits(stated.phases[: about.phase])
+        values = np.array(found["density"]), np.array(found["sh"])
+        fitted = _split_tree(tree, splits, found, *values) if splits else _with_values(tree, kept, *values)
         density, sh, visits = (np.array(found[name]) for name in MOMENTS)
-        state = RefinementState(fitted, density, sh, visits, step)
-    except (OSError, ValueError) as error:
+        state = RefinementState(fitted, density, sh, visits, about.step)
+    except (OSError, ValueError, RecursionError) as error:
         job.warn(unusable(path, error))
         remove(path)
         return None
     job.say(f"the refinement goes on from step {state.step}")
-    return Point(state, phase, Pruned(without, again, int(voxels)) if "holes" in found else None)
+    return Point(state, schedule, about.phase, about.pruned, about.seconds, about.began, about.allotted)
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
@@ -123,28 +155,75 @@ def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.n
     return replace(structure, density_values=density, harmonics=sh.reshape(len(sh), -1, 3))
 
 
-def check(found: Mapping[str, np.ndarray], tree: NerfTree, phases: Sequence[Phase], steps: int) -> np.ndarray:
-    """The places in the tree of the state's voxels. ValueError where the tensors are no state of a refinement of this tree, or a step in it is out of range."""
+def _split_tree(tree: NerfTree, splits: int, found: Mapping[str, np.ndarray], density: np.ndarray, sh: np.ndarray) -> NerfTree:
+    """A tree with the checkpoint's voxels on the grids of `tree`, which were split so often. ValueError where they are not in the order of a tree."""
+    from efficientnerf.asset.cascades import cascades_of, nested
+    from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
+
+    at, of, finer = found["coordinates"], _cascades(found), 2**splits
+    trees = []
+    for n, cascade in enumerate(cascades_of(tree)):
+        x, y, z = cascade.shape
+        here = of == n if tree.outer else slice(None)
+        trees.append(tree_from_voxels(
+            (x * finer, y * finer, z * finer), cascade.voxel / finer, cascade.bounds_min, at[here], density[here], sh[here].reshape(-1, sh.shape[1] // 3, 3),
+            brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup,
+        ))  # fmt: skip
+    made = replace(nested(trees, tree.environment), region=tree.region) if tree.outer else replace(trees[0], region=tree.region)
+    if (np.diff(of.astype(np.int16)) < 0).any() or not np.array_equal(voxel_coordinates(made), at):
+        raise ValueError("its voxels are not in their order")
+    return made
+
+
+def _cascades(found: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(n,) the cascade of each voxel."""
+    return found["cascades"] if "cascades" in found else np.zeros(len(found["coordinates"]), np.uint8)
+
+
+def check(
+    found: Mapping[str, np.ndarray], tree: NerfTree, stated: RefinementSchedule, hold: int | None = None
+) -> tuple[_About, RefinementSchedule, np.ndarray]:
+    """What the checkpoint says of itself; the schedule; and the places in the tree of the state's voxels, or of their ancestors. ValueError where the tensors
+    are no state of a refinement of this tree, or a step in it is out of range."""
     kinds = {"density": "float32", "sh": "float32", "square_density": "float32", "square_sh": "float32", "visits": "int32"}
     count = len(found["density"]) if "density" in found and found["density"].ndim else 0
-    shapes = dict.fromkeys(kinds, (count,)) | {"sh": (count, 3 * tree.harmonics_count), "coordinates": (count, 3), "progress": (2,), "cascades": (count,)}
-    kinds |= {"coordinates": "int32", "progress": "int64"} | ({"cascades": "uint8"} if tree.outer else {})
+    shapes = dict.fromkeys(kinds, (count,)) | {"sh": (count, 3 * tree.harmonics_count), "coordinates": (count, 3), "cascades": (count,)}
+    kinds |= {"coordinates": "int32"} | ({"cascades": "uint8"} if tree.outer else {})
     for name, kind in kinds.items():
         if name not in found or found[name].dtype != kind or found[name].shape != shapes[name]:
             raise ValueError(f"'{name}' is missing, or no {kind} {shapes[name]}")
-    step, phase = (int(x) for x in found["progress"])
-    if not 0 <= phase <= len(phases):
-        raise ValueError(f"step {step} of phase {phase}, of {len(phases)} phases")
-    pruned = any(before.after == "prune" for before in phases[:phase])
-    if pruned and ("holes" not in found or found["holes"].dtype != "float64" or found["holes"].shape != (3,) or not np.isfinite(found["holes"]).all()):
-        raise ValueError("'holes' is missing, or no three numbers")
-    low, high = [0, *phase_ends(phases, steps), steps][phase : phase + 2]
-    if not low <= step <= high:
-        raise ValueError(f"step {step} is not from {low} to {high}")
-    place = places(tree, found["coordinates"], found["cascades"] if tree.outer else np.zeros(count, np.uint8))
-    if not count or (np.diff(place) <= 0).any() or (count < len(tree.density_values) and not pruned):
+    if "about" not in found or found["about"].dtype != "uint8" or found["about"].ndim != 1 or len(found["about"]) > 2**20:
+        raise ValueError("'about' is missing, or no text")
+    about = msgspec.json.decode(found["about"].tobytes(), type=_About)
+    schedule = _schedule_of(about, stated, hold)
+    before = stated.phases[: about.phase]
+    splits = count_splits(before)
+    place = places(tree, found["coordinates"] >> splits, _cascades(found))
+    whole = splits == 0 and all(phase.after == "none" for phase in before)
+    if not count or (splits == 0 and (np.diff(place) <= 0).any()) or (count < len(tree.density_values) and whole):
         raise ValueError("its voxels are not those that were baked, in their order")
-    return place
+    return about, schedule, place
+
+
+def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) -> RefinementSchedule:
+    """The schedule that the checkpoint was written with; ValueError where it is none of this refinement, or the step is not one of the phase."""
+    phases = stated.phases
+    if about.phase > len(phases):
+        raise ValueError(f"step {about.step} of phase {about.phase}, of {len(phases)} phases")
+    if (about.pruned is None) == any(phase.after == "prune" for phase in phases[: about.phase]):
+        raise ValueError(f"what was dropped up to phase {about.phase} is not what is dropped there")
+    if hold is None:
+        schedule = stated
+        if about.schedule != stated.state():
+            raise ValueError(f"step {about.step} is of another number of steps")
+    else:
+        if len(about.schedule) != min(about.phase + 1, len(phases)):
+            raise ValueError(f"step {about.step} is not of the last phase that has begun")
+        schedule = recorded_schedule(phases, [schedule_state(one, hold) for one in about.schedule])
+    low, high = schedule.begin(about.phase), schedule.begin(about.phase + 1)
+    if not low <= about.step <= high:
+        raise ValueError(f"step {about.step} is not from {low} to {high}")
+    return schedule
 
 
 def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.ndarray:
@@ -169,3 +248,11 @@ def places(tree: NerfTree, coordinates: np.ndarray, cascades: np.ndarray) -> np.
     if not np.array_equal(ours[place], theirs):
         raise ValueError("its voxels are not those that were baked, in their order")
     return place
+
+
+def ancestors(baked: NerfTree, tree: NerfTree, splits: int) -> np.ndarray:
+    """(n,) the voxel of a baked tree that each voxel of `tree`, which was split so often, was or lies in."""
+    from efficientnerf.asset.cascades import voxel_cascades
+    from efficientnerf.asset.tree import voxel_coordinates
+
+    return places(baked, voxel_coordinates(tree) >> splits, voxel_cascades(tree))

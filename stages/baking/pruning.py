@@ -52,7 +52,7 @@ def prune(
     from efficientnerf.asset.refinement.state import subset_state
 
     state.to_host()
-    greatest = _greatest_weights(job, state, targets)
+    greatest = greatest_weights(job, state, targets)
     keep = heaviest(job, greatest, most)
     if not keep.any():
         return state, Pruned()
@@ -79,7 +79,7 @@ def prune(
     return subset_state(state, keep, tree), Pruned(pruned_share, find_holes(job, tree, samples)[1], int((restored & keep).sum()))
 
 
-def _greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.ndarray:
+def greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of many training pixels."""
     from efficientnerf.asset.refinement import fit
 

@@ -1,30 +1,42 @@
 """Refinement in the bake stage: the baked values are fitted to the training images, in phases (`efficientnerf.asset.refinement.schedule`).
 
-After the first half of the steps, which is taken with all voxels that were baked, the tree is rendered along many training rays and voxels are dropped
-(`stages.baking.pruning`): floaters have faded by then. The other half of the steps corrects for what is missing. An interrupted refinement goes on from its
-checkpoint (`stages.baking.checkpoint`).
+After a phase the tree is rendered along many training rays, and voxels that do not show are dropped (`stages.baking.pruning`): floaters have faded by then. Or
+those that show are split into voxels of half the side. The steps after that correct for what is missing. An interrupted refinement goes on from its checkpoint
+(`stages.baking.checkpoint`).
+
+With bake.time_budget the number of steps of a phase follows from the time that its first ones take, as in training (`stages.training.budget`).
 """
 
 from __future__ import annotations
 
 import math
-import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from efficientnerf.asset.refinement.schedule import PHASES, phase_ends
+import numpy as np
+
+from efficientnerf.asset.refinement.schedule import PHASES, RefinementSchedule, count_splits, stated_schedule
 from efficientnerf.settings import given
 from pipeline.stage import Job
-from stages.baking import checkpoint
+from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.baking import checkpoint, pruning
 from stages.baking.checkpoint import Point
 from stages.baking.holes import find_holes
-from stages.baking.pruning import Pruned, prune
+from stages.baking.log import RefinementLog
+from stages.baking.pruning import Pruned
+from stages.baking.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, Stopwatch, allotted, clock, timed_schedule
+from stages.training.budget import Budget
+from stages.training.log import draw_curve, psnr_of
+from stages.training.previews import Previews
 
 if TYPE_CHECKING:
     from efficientnerf.asset.field_samples import FieldSamples
     from efficientnerf.asset.refinement.targets import Targets
     from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Camera
     from stages.bake import BakeSettings
+    from stages.io.scene import Scene
 
 CHECKPOINT_SECONDS = 30.0
 ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
@@ -32,44 +44,198 @@ ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 MIN_STEPS, STEP_RAYS_PER_VOXEL, UNBOUNDED_STEPS = 320, 5, 160  # see `refinement_steps`
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
+Room = Callable[[int], int]  # voxels that the asset holds on its grids, which were split so often
 
-def refined(job: Job, tree: NerfTree, targets: Targets, most: int, samples: FieldSamples | None = None) -> tuple[NerfTree, dict[str, Any]]:
-    """The refined tree with at most `most` voxels, and the entries of the report.
+
+@dataclass(eq=False)
+class Refinement:
+    """A refinement that is going on.
+
+    budget   seconds of the stage up to the end of the last step, or None
+    samples  of the field, for whole scenes: what was dropped wrongly is restored by them
+    baked    of whole scenes the voxels as they were baked, without harmonics
+    """
+
+    job: Job
+    targets: Targets
+    room: Room
+    stopwatch: Stopwatch
+    point: Point
+    log: RefinementLog
+    budget: float | None
+    samples: FieldSamples | None = None
+    baked: NerfTree | None = None
+    written: float = field(default_factory=clock)
+
+    def run(self) -> NerfTree:
+        """Take all steps that are left; the tree after the last of them."""
+        point = self.point
+        phases = point.schedule.phases
+        if not point.schedule.each:
+            self._begin_phase()
+        while point.phase < len(phases):
+            self._take_steps()
+            after = phases[point.phase].after
+            if after == "prune":
+                self._prune()
+            point.phase += 1
+            self._begin_phase()
+            if after != "none":
+                self._save()
+        point.state.to_host()
+        return point.state.tree
+
+    def _begin_phase(self) -> None:
+        """Allot time to the phase, if there is a budget."""
+        point = self.point
+        phases = point.schedule.phases
+        if self.budget is None or point.phase == len(phases):
+            return
+        point.began = point.seconds = self.stopwatch.seconds
+        point.allotted = allotted(phases, point.phase, self.budget - point.began)
+        point.schedule = point.schedule.with_phase(point.phase, timed_schedule())
+
+    def _take_steps(self) -> None:
+        """Take the steps that are left of the phase, with checkpoints on the way and where it is stopped."""
+        from efficientnerf.asset.refinement import fit
+
+        settings, point, state, job = self.job.settings, self.point, self.point.state, self.job
+        begin, number = point.schedule.begin(point.phase), point.phase
+        spent = point.seconds - point.began
+        budget = None if self.budget is None else Budget(point.allotted, point.schedule.each[number], WARMUP, spent, clock)
+        phase, end = point.schedule.phases[number].name, point.schedule.begin(number + 1)
+        if state.step >= end:
+            return
+        ratio = given(settings.view_dependent_lr_ratio)
+        if ratio is None:
+            ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if state.tree.background is None else 1.0
+        run = fit.optimise(
+            state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
+            fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed, view_dependent_lr_ratio=ratio,
+        )  # fmt: skip
+        step_began = clock()
+        for error in run:
+            took = clock() - step_began
+            if budget is not None and budget.after(state.step - begin):
+                point.schedule = point.schedule.with_phase(number, budget.schedule)
+                end = point.schedule.begin(number + 1)
+                job.say(f"{budget.schedule.iterations} steps with {phase} fit into the budget")
+            fraction = point.schedule.fraction(state.step)
+            shown = self.log.record(state, phase, fraction, settings.refine_rays_per_batch, error, took, last=state.step == end)
+            self._report(fraction, phase, shown)
+            if clock() - self.written > CHECKPOINT_SECONDS:
+                self._save()
+            try:
+                job.safe_point()
+            except BaseException:
+                self._save()
+                raise
+            if state.step >= end:
+                break
+            step_began = clock()
+
+    def _report(self, fraction: float, phase: str, shown: dict[str, Any]) -> None:
+        """Progress: in steps, or in seconds where there is a budget."""
+        schedule, step = self.point.schedule, self.point.state.step
+        done, total = (step, schedule.begin(len(schedule.each))) if self.budget is None else (self.stopwatch.seconds, self.budget)
+        self.job.progress(min(done, total), total, f"refining {phase}", **shown)
+
+    def _save(self) -> None:
+        self.point.seconds = self.stopwatch.seconds
+        self.log.flush()
+        checkpoint.save(self.job, self.point)
+        self.written = clock()
+
+    def _prune(self) -> None:
+        point, splits = self.point, count_splits(self.point.schedule.phases[: self.point.phase])
+        baked = None if self.baked is None else self.baked.density_values[checkpoint.ancestors(self.baked, point.state.tree, splits)]
+        point.state, point.pruned = pruning.prune(self.job, point.state, self.targets, self.room(splits), self.samples, baked)
+
+
+def refined(
+    job: Job, s: Scene, tree: NerfTree, targets: Targets, room: Room, stopwatch: Stopwatch, samples: FieldSamples | None = None
+) -> tuple[NerfTree, dict[str, Any]]:
+    """The refined tree with at most as many voxels as there is room for, and the entries of the report; the log, the curve and the previews are written.
 
     samples  of the field, for whole scenes: what was dropped wrongly is restored by them
     """
     from efficientnerf.asset.refinement import fit
-    from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 
     settings = job.settings
-    steps = refinement_steps(settings, min(len(tree.density_values), most), tree.background is not None)
-    report: dict[str, Any] = {"steps": steps, "psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
+    splits = count_splits(PHASES)
+    most = min(len(tree.density_values) * 4**splits, room(splits))
+    steps, seconds = refinement_steps(settings, most, tree.background is not None), given(settings.time_budget)
+    report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets)
+    began = clock()
     before = fit.error(tree, targets, sample, settings.seed)
-    most_thick = MAX_INITIAL_THICKNESS if steps else math.inf
-    point = checkpoint.restored(job, tree, PHASES, steps) or Point(initial_state(tree, most_thick))
-    baked = None if samples is None or point.pruned is not None else initial_state(replace(tree, harmonics=tree.sh[:, :0]), most_thick).density
+    finish = clock() - began + FINISH_SECONDS_PER_VOXEL * most
+    schedule = stated_schedule(PHASES, steps) if seconds is None else RefinementSchedule(PHASES)
+    baked = None if samples is None else _without_harmonics(tree, capped=bool(steps))
+    point = _first_point(job, tree, schedule, stopwatch, timed=seconds is not None, capped=bool(steps))
+    log = RefinementLog(
+        job.work / BakeOutputs.log, point.state.step, point.schedule.fraction(point.state.step), stopwatch, _previews(job, s, point, targets), clock
+    )  # fmt: skip
+    if point.state.step == 0:
+        log.begin(point.state, PHASES[0].name, before)
     del tree  # the state has values of its own
-    for phase, end in list(zip(PHASES, phase_ends(PHASES, steps), strict=True))[point.phase :]:
-        _take_steps(job, point, targets, steps, end)
-        if phase.after == "prune":
-            point.state, point.pruned = prune(job, point.state, targets, most, samples, baked)
-        point.phase += 1
-        if phase.after != "none":
-            checkpoint.save(job, point)
-    point.state.to_host()
-    tree = point.state.tree
-    report["psnr_before"], report["psnr_after"] = _psnr(before), _psnr(fit.error(tree, targets, sample, settings.seed))
+    made = Refinement(job, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, samples, baked)
+    tree = made.run()
+    report |= {"steps": point.state.step, "schedule": point.schedule.state(), "time_budget": settings.time_budget}
+    report["psnr_before"], report["psnr_after"] = (round(psnr_of(error), 3) for error in (before, fit.error(tree, targets, sample, settings.seed)))
+    job.record("schedule", point.schedule.state())
     if samples is not None:
         report["holes"] = _holes(job, tree, samples, point.pruned or Pruned())
+    _publish(job, log)
     return tree, report
+
+
+def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, *, timed: bool, capped: bool) -> Point:
+    """Where an earlier attempt stopped, or else the beginning."""
+    from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
+
+    found = checkpoint.restored(job, tree, schedule, HOLD if timed else None)
+    if found is None:
+        return Point(initial_state(tree, MAX_INITIAL_THICKNESS if capped else math.inf), schedule)
+    stopwatch.set(found.seconds)
+    return found
+
+
+def _without_harmonics(tree: NerfTree, *, capped: bool) -> NerfTree:
+    """The tree with the densities that its refinement begins with, and without colours."""
+    from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
+
+    bare = replace(tree, harmonics=np.zeros((len(tree.density_values), 0, 3), np.float32))
+    return initial_state(bare, MAX_INITIAL_THICKNESS if capped else math.inf).tree
+
+
+def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
+    """Renders of the tree as it is at the time."""
+    from efficientnerf.asset.rendering import render
+
+    def seen(camera: Camera) -> np.ndarray:
+        tree = replace(point.state.tree)  # what a renderer makes of values is kept with a tree, and these change
+        return render(tree, camera, background=targets.background).colour
+
+    return Previews(seen, targets.background, job.inputs[PosesOutputs.stage], s, job.work)
+
+
+def _publish(job: Job, log: RefinementLog) -> None:
+    """The log, its curve and the previews."""
+    import shutil
+
+    outputs = BakeOutputs(job.out)
+    log.flush()
+    shutil.copyfile(log.path, outputs.log)
+    draw_curve(outputs.curve, log.path)
+    log.previews.publish(outputs.previews, job.warn)
 
 
 def _holes(job: Job, tree: NerfTree, samples: FieldSamples, pruned: Pruned) -> dict[str, Any]:
     """The entry of the report about holes, which is said too."""
     holes = {**pruned.report(), "refined": round(find_holes(job, tree, samples)[1], 6)}
-    job.say(f"holes, where the field is opaque and the asset is not: {holes['pruned']:.2%} of the rays after the first half of the refinement,"
+    job.say(f"holes, where the field is opaque and the asset is not: {holes['pruned']:.2%} of the rays after voxels were dropped,"
             f" {holes['restored']:.2%} with {pruned.voxels:,} voxels restored, {holes['refined']:.2%} at the end")  # fmt: skip
     return holes
 
@@ -93,39 +259,9 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
     return targets
 
 
-def _psnr(error: float) -> float:
-    return round(-10 * math.log10(max(error, 1e-10)), 3)
-
-
 def refinement_steps(settings: BakeSettings, voxels: int, constant_background: bool) -> int:
     """Steps of the refinement of so many voxels, of a scene with a constant background or without one."""
     if (stated := given(settings.refine_steps)) is not None:
         return stated
     steps = max(MIN_STEPS, math.ceil(STEP_RAYS_PER_VOXEL * voxels / settings.refine_rays_per_batch))
     return steps if constant_background else UNBOUNDED_STEPS
-
-
-def _take_steps(job: Job, point: Point, targets: Targets, steps: int, until: int) -> None:
-    """Take steps up to `until` of `steps`, with checkpoints on the way and where it is stopped."""
-    from efficientnerf.asset.refinement import fit
-
-    settings, state = job.settings, point.state
-    ratio = given(settings.view_dependent_lr_ratio)
-    written, smooth = time.monotonic(), 0.0
-    if ratio is None:
-        ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if state.tree.background is None else 1.0
-    run = fit.optimise(
-        state, targets, until=until, steps=steps, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
-        lr_final_ratio=settings.lr_final_ratio, seed=settings.seed, view_dependent_lr_ratio=ratio,
-    )  # fmt: skip
-    for error in run:
-        smooth = error if not smooth else 0.9 * smooth + 0.1 * error
-        job.progress(state.step, steps, "refining", psnr=round(_psnr(smooth), 2), voxels=len(state.density))
-        if time.monotonic() - written > CHECKPOINT_SECONDS:
-            checkpoint.save(job, point)
-            written = time.monotonic()
-        try:
-            job.safe_point()
-        except BaseException:
-            checkpoint.save(job, point)
-            raise

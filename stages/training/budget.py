@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 
@@ -46,42 +46,43 @@ def _fits(found: _State, hold: int) -> bool:
     return found.hold == hold and steps == sorted(steps) and (not found.aims or steps[-1] <= found.iterations)
 
 
+def schedule_state(found: object, hold: int) -> dict[str, Any]:
+    """A `Schedule.state` of a budget with this hold, of plain values that were read. ValueError where it is none."""
+    state = msgspec.convert(found, _State)
+    if not _fits(state, hold):
+        raise ValueError("no schedule of this run")
+    return dict(msgspec.to_builtins(state))
+
+
 @dataclass
 class Budget:
-    """The schedule of a run with `train.time_budget`.
+    """The schedule of steps that are to take so many seconds.
 
-    settings  as given; train.iterations is ignored
-    work      scratch folder, where the schedule is written down
-    spent     seconds that earlier attempts trained for
+    budget    seconds
+    schedule  to begin with, of UNKNOWN iterations and with a hold after which their number is set, or one that was written down
+    warmup    steps that are not timed
+    spent     seconds of it that earlier attempts took
     clock     seconds, monotonic
-    warn      is told of a schedule that can't be used
+    written   is given each schedule that is set
     """
 
-    settings: TrainSettings
-    work: Path
+    budget: float
+    schedule: Schedule
+    warmup: int
     spent: float = 0.0
     clock: Callable[[], float] = time.monotonic
-    warn: Warn = lambda text: None
-    budget: float = field(init=False)  # seconds
-    schedule: Schedule = field(init=False)
+    written: Callable[[Schedule], object] = lambda schedule: None
     started: float = field(init=False)
     timed: tuple[int, float] | None = field(init=False, default=None)  # step and seconds from which on steps are timed
     marks: list[float] = field(init=False)  # seconds at which the number is set again, those to come
 
     def __post_init__(self) -> None:
-        self.started, self.budget = self.clock(), given(self.settings.time_budget) or 0.0
-        hold = self.settings.occupancy_warmup_steps + TIMED
-        found = noted(self.work / FILE, _State, self.warn)
-        if found is not None and not _fits(found, hold):
-            self.warn(unusable(self.work / FILE, "no schedule of this run"))
-            found = None
-        # Of a schedule that is lost, the number of iterations is timed again.
-        self.schedule = schedule_of(self.settings, msgspec.to_builtins(found) if found else {"iterations": UNKNOWN, "hold": hold, "aims": []})
+        self.started = self.clock()
         self.marks = [fraction * self.budget for fraction in MARKS]
 
     @property
     def seconds(self) -> float:
-        """Trained for so far, earlier attempts included."""
+        """Of the budget so far, earlier attempts included."""
         return self.spent + self.clock() - self.started
 
     @property
@@ -97,7 +98,7 @@ class Budget:
     def after(self, step: int) -> bool:
         """To be called after each step; whether the schedule is another one now."""
         now = self.seconds
-        if self.timed is None and (self.known or step >= min(self.settings.occupancy_warmup_steps, self.schedule.hold - 1)):
+        if self.timed is None and (self.known or step >= min(self.warmup, self.schedule.hold - 1)):
             self.timed = step, now
         if not self._due(step, now):
             return False
@@ -109,7 +110,7 @@ class Budget:
             iterations += max(0, int(((1 - RESERVE) * self.budget - now) / max(each, 1e-6)))
         self.schedule = self.schedule.with_iterations(iterations, step) if self.known else replace(self.schedule, iterations=iterations)
         self.timed = step, now
-        note(self.work / FILE, self.schedule.state())
+        self.written(self.schedule)
         return True
 
     def _due(self, step: int, now: float) -> bool:
@@ -123,3 +124,24 @@ class Budget:
         if due:
             self.marks = self.marks[len(passed) :]
         return due
+
+
+def training_budget(
+    settings: TrainSettings, work: Path, spent: float = 0.0, clock: Callable[[], float] = time.monotonic, warn: Warn = lambda text: None
+) -> Budget:
+    """The budget of a run with `train.time_budget`.
+
+    settings  as given; train.iterations is ignored
+    work      scratch folder, where the schedule is written down
+    spent     seconds that earlier attempts trained for
+    warn      is told of a schedule that can't be used; the number of its iterations is timed again
+    """
+    path, warmup = work / FILE, settings.occupancy_warmup_steps
+    found = noted(path, _State, warn)
+    if found is not None and not _fits(found, warmup + TIMED):
+        warn(unusable(path, "no schedule of this run"))
+        found = None
+    state = msgspec.to_builtins(found) if found else {"iterations": UNKNOWN, "hold": warmup + TIMED, "aims": []}
+    return Budget(
+        given(settings.time_budget) or 0.0, schedule_of(settings, state), warmup, spent, clock, lambda schedule: note(path, schedule.state())
+    )  # fmt: skip

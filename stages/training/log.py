@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,9 +51,7 @@ class TrainLog:
         self.loss, self.fraction = 0.0, 0.0
         self.rates: dict[str, Any] = {}
         self.unwritten: list[str] = []
-        kept = [line for line in read_lines(path) if line["step"] <= step]
-        remove(path)  # a folder of that name could not be replaced
-        write_atomically(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode(), durable=False)
+        continue_log(path, step)
 
     @property
     def seconds(self) -> float:
@@ -112,15 +110,27 @@ class TrainLog:
 
     def draw_curve(self, path: Path) -> None:
         """PSNR over steps, of the training rays and of the previews."""
-        from stages.figures.plots import curve
+        draw_curve(path, self.path, map(json.loads, self.unwritten))
 
-        lines = [*read_lines(self.path), *map(json.loads, self.unwritten)]
-        series = {"training rays, running mean": ([x["step"] for x in lines], [x["psnr"] for x in lines])}
-        previews = [(x["step"], x["preview_psnr"]) for x in lines if x.get("preview_psnr") is not None]
-        if previews:
-            series["preview view"] = ([step for step, _ in previews], [psnr for _, psnr in previews])
-        with atomic(path, durable=False) as temporary:
-            curve(temporary, series, x_label="step", y_label="PSNR / dB")
+
+def continue_log(path: Path, step: int) -> None:
+    """Leave the lines of a log up to a step that is gone on from; an empty file where there is none yet."""
+    kept = [line for line in read_lines(path) if line["step"] <= step]
+    remove(path)  # a folder of that name could not be replaced
+    write_atomically(path, "".join(json.dumps(line, sort_keys=True) + "\n" for line in kept).encode(), durable=False)
+
+
+def draw_curve(path: Path, log: Path, more: Iterable[dict[str, Any]] = ()) -> None:
+    """Draw PSNR over steps, of the training rays and of the previews, of a log's lines and those that are not written yet."""
+    from stages.figures.plots import curve
+
+    lines = [*read_lines(log), *more]
+    series = {"training rays, running mean": ([x["step"] for x in lines], [x["psnr"] for x in lines])}
+    previews = [(x["step"], x["preview_psnr"]) for x in lines if x.get("preview_psnr") is not None]
+    if previews:
+        series["preview view"] = ([step for step, _ in previews], [psnr for _, psnr in previews])
+    with atomic(path, durable=False) as temporary:
+        curve(temporary, series, x_label="step", y_label="PSNR / dB")
 
 
 def psnr_of(loss: float) -> float:

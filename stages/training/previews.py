@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ from pipeline.text import printable
 from stages.scratch import Warn, digest_of, once
 
 if TYPE_CHECKING:
-    from efficientnerf.rendering.field_renderer import FieldRenderer
+    from efficientnerf.geometry.cameras import Camera
     from stages.io.scene import Scene, View
 
 SIDE = 200  # longest side of a preview, pixels
@@ -26,18 +27,26 @@ class Previews:
     psnr  of the last one; None before the first
     """
 
-    def __init__(self, renderer: FieldRenderer, poses: Path, s: Scene, work: Path, every: int | None) -> None:
+    def __init__(
+        self, render: Callable[[Camera], np.ndarray], background: tuple[float, float, float] | None, poses: Path, s: Scene, work: Path, every: int | None = None
+    ) -> None:
         """
-        poses  the folder of the scene
-        every  steps between previews; None: there are none
+        render      colours (H, W, 3) that a camera sees
+        background  constant colour behind the scene, or None
+        poses       the folder of the scene
+        every       steps after which a preview is due; None: none ever is
         """
-        self.renderer, self.poses, self.work, self.every = renderer, poses, work, every
+        self.render, self.background, self.poses, self.work, self.every = render, background, poses, work, every
         self.view = preview_view(s)
         self.figures: dict[str, float] = {}  # PSNR and SSIM of the last preview, the latter where it is large enough
 
-    def draw(self, step: int) -> float | None:
+    def draw_when_due(self, step: int) -> float | None:
         """Render where it is time after a step; the PSNR of the preview, None where none is drawn."""
-        if self.view is None or self.every is None or step == 0 or step % self.every:
+        return None if self.every is None or step == 0 or step % self.every else self.draw(step)
+
+    def draw(self, step: int) -> float | None:
+        """Render; the PSNR, None where there is no view to draw."""
+        if self.view is None:
             return None
         from efficientnerf.evaluation.metrics import WINDOW, psnr, ssim
         from stages.evaluation.views import ground_truth, subsample, subsample_camera
@@ -45,8 +54,8 @@ class Previews:
         from stages.io.png import write_png
 
         stride = max(1, math.ceil(max(self.view.camera.width, self.view.camera.height) / SIDE))
-        truth = subsample(ground_truth(self.poses, self.view, self.renderer.model.background).colour, stride)
-        render = np.clip(self.renderer.render(subsample_camera(self.view.camera, stride)).colour, 0, 1)
+        truth = subsample(ground_truth(self.poses, self.view, self.background).colour, stride)
+        render = np.clip(self.render(subsample_camera(self.view.camera, stride)), 0, 1)
         write_png(to_uint8(np.concatenate([truth, render], axis=1)), self.work / f"preview_{step:06d}.png")
         self.figures = {"preview_psnr": round(float(psnr(render, truth)), 2)}
         if min(render.shape[:2]) >= WINDOW:

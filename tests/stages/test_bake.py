@@ -17,7 +17,7 @@ import torch
 from efficientnerf.asset import bake as baking
 from efficientnerf.asset import format
 from efficientnerf.asset.file import serialisation
-from efficientnerf.asset.refinement.schedule import PHASES
+from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
 from efficientnerf.asset.rendering import render
 from efficientnerf.asset.tree import tree_from_voxels, voxel_coordinates
 from efficientnerf.rendering.compositing import activate
@@ -29,12 +29,14 @@ from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
 from stages.baking import checkpoint, memory, refinement, resolution
 from stages.evaluation.views import ground_truth
+from stages.figures import plots
 from stages.io.field_file import load_renderer, save_model
 from stages.io.scene import load
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
 from tests.stages.spoilers import SPOILERS
 
+TWELVE = stated_schedule(PHASES, 12)
 QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512)
 
 
@@ -50,6 +52,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baking, "POINTS_PER_BLOCK", 8192)
     monkeypatch.setattr(baking, "RAYS_PER_BLOCK", 512)
+    monkeypatch.setattr(plots, "curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
 def run(made: Job) -> str:
@@ -124,14 +127,15 @@ def stopped(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory, u
 @pytest.mark.parametrize("how", ["cut", "zero", "link"])
 def test_every_scratch_file_may_be_damaged(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], stopped: Path, how: str) -> None:
     shutil.copytree(stopped, tmp_path / "work")
-    assert {path.name.partition("_")[0] for path in stopped.iterdir()} == {"block", "visibility.json", "visibility", "refinement.safetensors"}
+    kinds = {path.name.partition("_")[0] for path in stopped.iterdir()}
+    assert kinds == {"block", "visibility.json", "visibility", "refinement.safetensors", "log.jsonl", "preview"}
     (tmp_path / "work" / ".block_000000_values.npy.123.part").write_bytes(b"half")
     for path in stopped.iterdir():
         SPOILERS[how](tmp_path / "work" / path.name)
     events: list[dict[str, Any]] = []
     assert run(job(tmp_path, QUICK, events=events, **inputs)) == undisturbed[0]
     warned = [event["text"].partition(" ")[0] for event in events if event["event"] == "warning"]
-    assert warned == ["visibility.json", "block_000000.json", "refinement.safetensors"]
+    assert set(warned) - {path.name for path in stopped.glob("preview_*.png")} == {"visibility.json", "block_000000.json", "refinement.safetensors"}
 
 
 @pytest.mark.parametrize("pattern", ["visibility_greatest.npy", "block_000001_values.npy"])
@@ -146,9 +150,16 @@ def test_an_array_that_is_zero_is_not_taken_for_whole(
     assert run(job(tmp_path, QUICK, **inputs)) == undisturbed[0]
 
 
-def step(value: int, pruned: int = 0) -> Callable[[dict[str, np.ndarray]], None]:
+def about(step: int, phase: int, **changes: Any) -> np.ndarray:
+    """What a checkpoint says of itself."""
+    pruned = {"without": 0.0, "restored": 0.0, "voxels": 0} if phase else None
+    said = {"step": step, "phase": phase, "pruned": pruned, "schedule": TWELVE.state(), "seconds": 0.0, "began": 0.0, "allotted": 0.0}
+    return np.frombuffer(json.dumps(said | changes).encode(), np.uint8)
+
+
+def said(step: int, phase: int = 0, **changes: Any) -> Callable[[dict[str, np.ndarray]], None]:
     def change(tensors: dict[str, np.ndarray]) -> None:
-        tensors["progress"] = np.array([value, pruned], np.int64)
+        tensors["about"] = about(step, phase, **changes)
 
     return change
 
@@ -161,10 +172,12 @@ def replaced(name: str, values: Callable[[np.ndarray], np.ndarray]) -> Callable[
 
 
 CHANGES: list[Callable[[dict[str, np.ndarray]], object]] = [
-    step(-1), step(10**9), step(3, 7), replaced("square_sh", lambda v: v[:-1]), replaced("visits", lambda v: v.astype(np.float32)),
+    said(-1), said(10**9), said(7), said(3, 1), said(3, 7), said(8, 1, pruned=None),
+    said(3, pruned=3), said(3, schedule=[]), said(3, more=1), said(3, seconds=-1.0),
+    replaced("square_sh", lambda v: v[:-1]), replaced("visits", lambda v: v.astype(np.float32)),
     replaced("coordinates", lambda v: v + 1), replaced("coordinates", lambda v: v - 1), replaced("coordinates", lambda v: v[::-1]),
     replaced("coordinates", lambda v: v[:1] + 0 * v), replaced("sh", lambda v: v[:, :-3]), replaced("density", lambda v: v[..., None]),
-    lambda tensors: tensors.pop("progress"),
+    lambda tensors: tensors.pop("about"), replaced("about", lambda v: v[:-1]), replaced("about", lambda v: v.astype(np.int8)),
 ]  # fmt: skip
 
 
@@ -177,12 +190,11 @@ def test_a_state_of_another_refinement_is_told(pruned: int, change: Callable[[di
     count = len(coordinates)
     tensors = {name: np.zeros(count, np.float32) for name in ("density", "square_density", "square_sh")}
     tensors |= {"sh": np.zeros((count, 3), np.float32), "visits": np.zeros(count, np.int32), "coordinates": coordinates}
-    tensors["progress"] = np.array([7 if pruned else 3, pruned], np.int64)
-    tensors |= {"holes": np.zeros(3)} if pruned else {}
-    checkpoint.check(tensors, tree, PHASES, 12)
+    tensors["about"] = about(7 if pruned else 3, pruned)
+    checkpoint.check(tensors, tree, TWELVE)
     change(tensors)
-    with pytest.raises(ValueError, match=r"step|voxels|missing|progress"):
-        checkpoint.check(tensors, tree, PHASES, 12)
+    with pytest.raises(ValueError, match=r"step|voxels|missing|dropped|\$|unknown field|truncated"):
+        checkpoint.check(tensors, tree, TWELVE)
 
 
 def test_a_refinement_that_does_not_fit_begins_again(inputs: dict[str, Path], tmp_path: Path, undisturbed: tuple[str, Job, int], stopped: Path) -> None:

@@ -6,7 +6,7 @@ Kernels: `efficientnerf.backends.triton.tree_gradients`. N voxels, K harmonics, 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -60,7 +60,7 @@ def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
 
 
 def optimise(
-    state: RefinementState, targets: Targets, *, until: int, steps: int, rays: int, density_lr: float, sh_lr: float, lr_final_ratio: float, seed: int,
+    state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
     view_dependent_lr_ratio: float,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
@@ -72,8 +72,8 @@ def optimise(
     while state.step < until:
         number = state.step + 1
         origins, directions, wanted = targets.draw(rays, step_rng(seed, number))
-        fall = lr_final_ratio ** (number / steps)
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, density_lr * fall, sh_lr * fall, view_dependent_lr_ratio)
+        factor = fall(number)
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, density_lr * factor, sh_lr * factor, view_dependent_lr_ratio)
         pending.append(to_host_async(loss.mean() / 3))
         state.step = number
         if error is None or len(pending) > LAG:

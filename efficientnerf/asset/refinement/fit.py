@@ -25,15 +25,15 @@ WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measur
 
 
 def optimise(
-    state: RefinementState, targets: Targets, *, until: int, steps: int, rays: int, density_lr: float, sh_lr: float, lr_final_ratio: float, seed: int,
+    state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
     view_dependent_lr_ratio: float = 1.0,
 ) -> Iterator[float]:  # fmt: skip
     """Take steps up to `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.
 
-    steps                    in all; learning rates fall exponentially, to `lr_final_ratio` of themselves at the last of them
     rays                     of a step
-    density_lr               of the logarithm of the optical thickness
-    sh_lr                    of the harmonics
+    density_lr               learning rate of the logarithm of the optical thickness
+    sh_lr                    learning rate of the harmonics
+    fall                     factor of the learning rates by a step's number (`efficientnerf.asset.refinement.schedule`)
     view_dependent_lr_ratio  factor of that for harmonics of degree 1 and above
     """
     if targets.on_device:
@@ -43,8 +43,7 @@ def optimise(
     else:
         steps_on = host.optimise
     yield from steps_on(
-        state, targets, until=until, steps=steps, rays=rays, density_lr=density_lr, sh_lr=sh_lr, lr_final_ratio=lr_final_ratio, seed=seed,
-        view_dependent_lr_ratio=view_dependent_lr_ratio,
+        state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
     )  # fmt: skip
 
 

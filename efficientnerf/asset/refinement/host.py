@@ -5,7 +5,7 @@ N voxels, K harmonics, R rays.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -31,7 +31,7 @@ def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tu
 
 
 def optimise(
-    state: RefinementState, targets: Targets, *, until: int, steps: int, rays: int, density_lr: float, sh_lr: float, lr_final_ratio: float, seed: int,
+    state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
     view_dependent_lr_ratio: float,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`."""
@@ -46,10 +46,10 @@ def optimise(
         origins, directions, wanted = targets.draw(rays, step_rng(seed, number))
         start, along, bases = in_voxels(state.tree, origins, directions)
         loss, counts = gradients.forward_backward(grid, start, along, bases, state.density, state.sh, wanted, records)
-        fall = lr_final_ratio ** (number / steps)
+        factor = fall(number)
         rmsprop_step(
             records, counts, bases, (state.density, state.sh), (by_density, by_sh), (state.square_density, state.square_sh), state.visits, stamp, number,
-            Hyperparameters(sides, cascades, density_lr * fall, rates * np.float32(fall), DECAY, EPSILON),
+            Hyperparameters(sides, cascades, density_lr * factor, rates * np.float32(factor), DECAY, EPSILON),
         )  # fmt: skip
         state.step = number
         yield float(loss.mean()) / 3

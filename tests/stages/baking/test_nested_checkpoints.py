@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.cascades import subset, voxel_cascades
-from efficientnerf.asset.refinement.schedule import PHASES
+from efficientnerf.asset.refinement.schedule import PHASES, stated_schedule
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state, subset_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from pipeline.stage import Job
@@ -19,7 +19,7 @@ from stages.baking.checkpoint import Point
 from stages.baking.pruning import Pruned
 from tests.efficientnerf.trees import random_cascades
 
-STEPS = 12
+SCHEDULE = stated_schedule(PHASES, 12)
 
 
 def job(folder: Path) -> Job:
@@ -44,9 +44,9 @@ def some_state(tree: NerfTree, pruned: bool) -> RefinementState:
 def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None:
     tree = random_cascades(3)
     state = some_state(tree, pruned)
-    point = Point(state, int(pruned), Pruned(0.25, 0.125, 7) if pruned else None)
+    point = Point(state, SCHEDULE, int(pruned), Pruned(0.25, 0.125, 7) if pruned else None)
     checkpoint.save(job(tmp_path), point)
-    found = checkpoint.restored(job(tmp_path), tree, PHASES, STEPS)
+    found = checkpoint.restored(job(tmp_path), tree, SCHEDULE)
     assert found is not None
     again = found.state
     assert (again.step, found.phase, found.pruned) == (state.step, point.phase, point.pruned)
@@ -74,10 +74,10 @@ CHANGES: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
 def test_cascades_of_another_tree_are_told(pruned: bool, change: Callable[[dict[str, np.ndarray]], Any]) -> None:
     tree = random_cascades(3)
     state = some_state(tree, pruned)
+    about = checkpoint.about_of(Point(state, SCHEDULE, int(pruned), Pruned() if pruned else None))
     tensors = {name: getattr(state, name) for name in STATE}
-    tensors |= {"coordinates": voxel_coordinates(state.tree), "cascades": voxel_cascades(state.tree), "progress": np.array([state.step, pruned], np.int64)}
-    tensors |= {"holes": np.zeros(3)} if pruned else {}
-    assert len(checkpoint.check(tensors, tree, PHASES, STEPS)) == len(state.density)
+    tensors |= {"coordinates": voxel_coordinates(state.tree), "cascades": voxel_cascades(state.tree), "about": about}
+    assert len(checkpoint.check(tensors, tree, SCHEDULE)[2]) == len(state.density)
     change(tensors)
     with pytest.raises(ValueError, match=r"voxels|cascades"):
-        checkpoint.check(tensors, tree, PHASES, STEPS)
+        checkpoint.check(tensors, tree, SCHEDULE)

@@ -19,7 +19,7 @@ from stages import train
 from stages.artifacts import TrainOutputs
 from stages.io.field_file import load_renderer, read_tensors, space_of
 from stages.io.scene import load, views_of
-from stages.training.budget import TIMED, UNKNOWN, Budget
+from stages.training.budget import TIMED, UNKNOWN, training_budget
 from stages.training.data import depth_range, pixels_of
 from stages.training.hash_resolution import with_auto_sizes
 from tests.efficientnerf.balls import settings
@@ -109,7 +109,7 @@ def test_a_budget_that_is_over_before_anything_is_timed_ends_the_training(scene:
 def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
     """The warm-up's steps are slower than those that follow, and say nothing about them."""
     now = [0.0]
-    budget = Budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 0.0, lambda: now[0])
+    budget = training_budget(settings(occupancy_warmup_steps=10, time_budget=100.0), tmp_path, 0.0, lambda: now[0])
     assert budget.schedule.iterations == UNKNOWN
     assert not budget.known
     for step in range(1, 100):
@@ -119,9 +119,9 @@ def test_steps_are_counted_from_those_after_the_warm_up(tmp_path: Path) -> None:
     assert step == 10 + TIMED
     assert budget.schedule.iterations == step + int((99 - 54) / 0.5)
     given = settings(occupancy_warmup_steps=10, time_budget=100.0)
-    assert Budget(given, tmp_path, 54.0, lambda: 0.0).schedule == budget.schedule
+    assert training_budget(given, tmp_path, 54.0, lambda: 0.0).schedule == budget.schedule
     (tmp_path / "schedule.json").write_text("{")
-    assert not Budget(given, tmp_path, 54.0, lambda: 0.0).known
+    assert not training_budget(given, tmp_path, 54.0, lambda: 0.0).known
 
 
 PACES: dict[str, Callable[[int], float]] = {
@@ -137,14 +137,14 @@ def test_steps_that_change_their_pace_end_on_time(tmp_path: Path, pace: Callable
     """Also where attempts are interrupted and go on from a checkpoint ten steps before."""
     times, step, spent, began = [0.0], 0, 0.0, 0.0
     given = settings(occupancy_warmup_steps=10, time_budget=120.0)
-    budget = Budget(given, tmp_path, 0.0, lambda: times[-1])
+    budget = training_budget(given, tmp_path, 0.0, lambda: times[-1])
     before_stop: set[int] = set()
     while step < budget.schedule.iterations:
         if step in stops and step not in before_stop:
             before_stop.add(step)
             step -= 10
             spent, began = spent + times[-1] - began, times[-1]
-            budget = Budget(given, tmp_path, spent, lambda: times[-1])
+            budget = training_budget(given, tmp_path, spent, lambda: times[-1])
         before = budget.schedule.fraction(step + 1)
         times.append(times[-1] + pace(step))
         step += 1
