@@ -27,15 +27,31 @@ class Hits:
     shape: np.ndarray
 
 
+def _near_balls(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """(M, R) whether a ray comes near the ball of each shape: in single precision, with room for its rounding."""
+    centres, radii = (np.array(part, np.float32) for part in zip(*(shape.ball for shape in shapes), strict=True))
+    o, d = origins.astype(np.float32), directions.astype(np.float32)
+    middle = centres @ d.T  # (M, R) where on the ray the ball is nearest
+    middle -= (o * d).sum(-1)
+    away = centres @ o.T  # (M, R) squared distance of its centre
+    away *= -2
+    away += (o**2).sum(-1)
+    away += (centres**2).sum(-1)[:, None]
+    largest = (radii**2 * 1.001 + 1e-5 * (1 + (centres**2).sum(-1) + (o**2).sum(-1).max(initial=0)))[:, None]
+    meets = away <= largest
+    meets |= middle > 0
+    middle *= middle
+    away -= middle
+    meets &= away <= largest
+    return meets
+
+
 def nearest(shapes: Sequence[Shape], origins: np.ndarray, directions: np.ndarray) -> Hits:
     """The first shape along each ray."""
     distance, found = np.full(len(origins), np.inf), np.full(len(origins), -1)
-    centres, radii = (np.array(part) for part in zip(*(shape.ball for shape in shapes), strict=True))
-    middle = (origins * directions).sum(-1, keepdims=True) - directions @ centres.T  # (R, M) minus the distance of each ball's nearest point
-    away = (origins**2).sum(-1, keepdims=True) - 2 * origins @ centres.T + (centres**2).sum(-1)  # (R, M) squared distance of its centre
-    meets = (away - middle**2 <= radii**2 * 1.001 + 1e-6) & ((middle < 0) | (away <= radii**2 * 1.001))
+    meets = _near_balls(shapes, origins, directions)
     for number, shape in enumerate(shapes):
-        here = np.flatnonzero(meets[:, number])
+        here = np.flatnonzero(meets[number])
         t = shape.hit(origins[here], directions[here])
         closer = t < distance[here]
         distance[here[closer]], found[here[closer]] = t[closer], number
