@@ -92,7 +92,8 @@ class BakeSettings:
         advanced=True,
     )
     time_budget: Annotated[float, Meta(gt=0.0)] | Off = setting(
-        "off", "Time to bake and refine for, in place of a number of steps: they are timed, and as many are taken as fit; off: refine_steps.", unit="seconds",
+        "off", "Time of the stage, in place of a number of steps: steps of the refinement are timed, and as many are taken as fit; off: refine_steps.",
+        unit="seconds",
         advanced=True,
     )
     refine_rays_per_batch: Annotated[int, Meta(ge=1, le=1 << 22)] = setting(32768, "Rays in a step of the refinement.", advanced=True)

@@ -48,7 +48,7 @@ def run(job: Job) -> None:
     from stages.training.hash_resolution import with_auto_sizes
 
     use_all_cores()
-    folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
+    began, folder, outputs = clock(), inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
     s = scene.load(folder)
     views = scene.views_of(s, "train")
     settings, space = with_camera_refinement(with_auto_sizes(job.settings, s, count_pixels(views)), s), field_file.space_of(s)
@@ -65,7 +65,7 @@ def run(job: Job) -> None:
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
     previews = Previews(lambda camera: FieldRenderer(m, near, far).render(camera).colour, m.background, folder, s, job.work, given(settings.preview_every))
     previews.draw_when_due(t.step)
-    budget = training_budget(settings, job.work, spent, clock, job.warn) if settings.time_budget != "off" else None
+    budget = training_budget(settings, job.work, spent + clock() - began, clock, job.warn) if settings.time_budget != "off" else None
     if budget is not None:
         t.schedule = budget.schedule
 

@@ -20,7 +20,7 @@ class TrainSettings:
 
     iterations: PositiveInt = setting(4000, "Optimisation steps.")
     time_budget: Annotated[float, Meta(gt=0.0)] | Off = setting(
-        "off", "Time to train for, in place of a number of steps: steps are timed, and as many are taken as fit; off: train.iterations steps.", unit="seconds"
+        "off", "Time of the stage, in place of a number of steps: steps are timed, and as many are taken as fit; off: train.iterations steps.", unit="seconds"
     )
     sample_batch_size: PositiveInt | Off = setting(
         65536, "Target number of samples in a step, from which the number of rays follows; off: always max_rays_per_batch rays.", advanced=True

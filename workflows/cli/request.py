@@ -13,6 +13,7 @@ from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit, limit_for, parse_size, size_text
 from pipeline.run import NAME, Run
 from workflows.asset import Workflow
+from workflows.budget import share_budget
 from workflows.cli.device import has_cuda
 from workflows.cli.resolve import Config, Settings, read_config, read_preset, seconds_of, table_of
 from workflows.cli.target import check_names, open_run, resume_command
@@ -29,6 +30,7 @@ class Options:
     sets: tuple[str, ...] = ()
     seed: int | None = None
     budget: str | None = None
+    target_mib: int | None = None
     device: str | None = None
     memory: str | None = None
     strict: bool = False
@@ -110,7 +112,10 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         if value is not None:
             settings.put("poses", name, [value], origin)
     if options.budget is not None:
-        settings.put("train", "time_budget", [seconds_of(options.budget)], f"--budget {options.budget}")
+        for stage, seconds in share_budget(seconds_of(options.budget)).items():
+            settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
+    if options.target_mib is not None:
+        settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib}")
     memory, limit = _memory(options.memory, standing, warnings)
     run = Run(
         path,

@@ -111,6 +111,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         split=split_of(found),
         poses=POSES,
         train=TRAIN,
+        bake=BAKE,
         evaluate=EVALUATE,
         turntable=TURNTABLE,
         mesh=MESH,
@@ -118,7 +119,8 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         views=_views(found),
         asset_report=_facts(folder, BAKE.report, damaged),
         mesh_report=_facts(folder, MESH.report, damaged),
-        previews=_previews(folder),
+        previews=_previews(folder, TRAIN.previews),
+        asset_previews=_previews(folder, BAKE.previews),
         cameras=_cameras(folder, damaged),
         damaged=damaged,
         stages=[_stage(each) for each in decisions],
@@ -150,11 +152,11 @@ def _size(path: Path) -> int | None:
     return status.st_size if stat.S_ISREG(status.st_mode) else None
 
 
-def _previews(folder: Path) -> list[Path]:
+def _previews(folder: Path, previews: Path) -> list[Path]:
     names: list[str] = []
     with suppress(OSError):
-        names = sorted(name for name in os.listdir(folder / TRAIN.previews) if name.endswith(".png"))
-    return [TRAIN.previews / name for name in names]
+        names = sorted(name for name in os.listdir(folder / previews) if name.endswith(".png"))
+    return [previews / name for name in names]
 
 
 def _read(path: Path, kind: type[Any], damaged: list[str]) -> Any:

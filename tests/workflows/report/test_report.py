@@ -89,12 +89,14 @@ def test_the_page_can_be_made_again(enerf: Enerf, toys: Path, tmp_path: Path) ->
 def test_it_points_only_to_what_is_there(tmp_path: Path) -> None:
     run = a_run(tmp_path / "run")
     assert links(page(run, [])) == []
-    for name in ("turntable/turntable.mp4", "turntable/frame_0000.png", "mesh/preview.png", "train/previews/preview 1.png", "bake/asset.nerftree"):
+    shown = {"turntable/turntable.mp4", "mesh/preview.png", "train/previews/preview 1.png"}
+    shown |= {"bake/previews/preview_000008.png", "bake/curve.png", "bake/asset.nerftree"}
+    for name in (*shown, "turntable/frame_0000.png"):
         (run.path / name).parent.mkdir(parents=True, exist_ok=True)
         (run.path / name).write_bytes(b"x")
     found = links(page(run, []))
     assert all((run.path / name).is_file() for name in found)
-    assert {"turntable/turntable.mp4", "mesh/preview.png", "train/previews/preview 1.png", "bake/asset.nerftree"} <= set(found)
+    assert shown <= set(found)
 
 
 def test_names_and_reasons_are_text_not_markup(tmp_path: Path) -> None:

@@ -1,0 +1,52 @@
+"""--budget is shared by the stages that train, and --target-mib is the asset's size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import UsageError
+from workflows.asset import WORKFLOW
+from workflows.budget import MIN_BAKE, MIN_TRAIN, TRAIN_SHARE, share_budget
+from workflows.cli.request import Options, plan_run
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.png").write_bytes(b"")
+    return tmp_path / "photos"
+
+
+@pytest.mark.parametrize("seconds", [0.5, 10.0, MIN_TRAIN + MIN_BAKE, 36.0, 60.0, 240.0, 600.0, 1e5])
+def test_both_parts_make_up_the_budget(seconds: float) -> None:
+    parts = share_budget(seconds)
+    assert sum(parts.values()) == pytest.approx(seconds)
+    assert min(parts.values()) > 0
+    if seconds >= MIN_TRAIN + MIN_BAKE:
+        assert parts["train"] >= MIN_TRAIN - 1e-9
+        assert parts["bake"] >= MIN_BAKE - 1e-9
+    if seconds >= 240:
+        assert parts["train"] == pytest.approx(TRAIN_SHARE * seconds)
+
+
+def test_longer_budgets_shorten_no_part() -> None:
+    parts = [share_budget(float(seconds)) for seconds in range(1, 300)]
+    for stage in ("train", "bake"):
+        times = [part[stage] for part in parts]
+        assert times == sorted(times)
+
+
+def test_options_become_settings_of_both_stages(source: Path, tmp_path: Path) -> None:
+    settings = plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny", budget="10m", target_mib=7)).run.settings
+    assert settings["train"]["time_budget"] + settings["bake"]["time_budget"] == pytest.approx(600)
+    assert settings["bake"]["max_mib"] == 7
+    unset = plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny")).run.settings
+    assert (unset["train"]["time_budget"], unset["bake"]["time_budget"], unset["bake"]["max_mib"]) == ("off", "off", "auto")
+
+
+@pytest.mark.parametrize(("options", "words"), [({"budget": "0s"}, r"--budget 0s: train\.time_budget"), ({"target_mib": 0}, r"--target-mib 0: bake\.max_mib")])
+def test_nothing_is_no_budget(source: Path, tmp_path: Path, options: dict[str, object], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny", **options))  # type: ignore[arg-type]
