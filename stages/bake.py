@@ -111,6 +111,7 @@ def run(job: Job) -> None:
     from efficientnerf.asset import format
     from efficientnerf.asset.cascades import voxel_cascades
     from efficientnerf.asset.components import foreground_bricks
+    from efficientnerf.asset.refinement import schedule
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.resolution import budget_of
@@ -131,14 +132,17 @@ def run(job: Job) -> None:
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
     mib, views = budget_of(s, given(settings.max_mib), whole=whole), scene.views_of(s, "train")
-    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, whole=whole))
-    plan = _plan(job, m, s, pixels, mib, whole=whole)
+    discretised = m.settings.discretise != "off" or settings.lookup == "nearest"
+    phases = schedule.phases_of(whole=whole, ndc=s.forward is not None, discretised=discretised)
+    splits = schedule.count_splits(phases)
+    pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole))
+    plan = _plan(job, m, s, pixels, mib, splits, whole=whole)
+    room = partial(_room, settings, m, plan, mib)
     _check(job, m, plan)
-    refuse_more_than_fits(job, m, views, pixels, plan, mib)
+    refuse_more_than_fits(job, m, views, pixels, plan, mib, splits, room)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
-    room = partial(_room, settings, m, plan, mib)
-    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), _targets(s, pixels, plan), room, stopwatch, plan.samples)
+    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), _targets(s, pixels, plan), phases, room, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
     provenance = {**metadata["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": report["psnr_after"]}}
@@ -161,19 +165,21 @@ def _room(settings: BakeSettings, m: Any, plan: Plan, mib: int, splits: int) -> 
     return room_of(settings, m, grids, mib, environment=plan.samples is not None)
 
 
-def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: int, *, whole: bool) -> Plan:
-    """The voxels to bake: cascades of a whole scene, or else one grid of what lies in the field's box."""
+def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: int, splits: int, *, whole: bool) -> Plan:
+    """The voxels to bake, which will be split so often: cascades of a whole scene, or else one grid of what lies in the field's box."""
     from efficientnerf.asset.bake import grid_of
     from stages.baking.plan import Plan
+    from stages.baking.resolution import baked_resolution
     from stages.baking.voxels import choose_voxels, voxel_space, with_min_views
     from stages.baking.whole_scene import choose_scene_voxels
 
     space = voxel_space(job, m)
     if whole:
-        return choose_scene_voxels(job, m, s, pixels, space, mib)
-    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib)
-    indices = with_min_views(m, s, indices, choice.resolution)
-    shape, voxel = grid_of(space.bounds, choice.resolution, job.settings.brick_size)
+        return choose_scene_voxels(job, m, s, pixels, space, mib, splits)
+    choice, visibility, indices = choose_voxels(job, m, s, pixels, space, mib, splits)
+    resolution = baked_resolution(choice.resolution, splits)
+    indices = with_min_views(m, s, indices, resolution)
+    shape, voxel = grid_of(space.bounds, resolution, job.settings.brick_size)
     return Plan(choice, space, [(shape, voxel, np.asarray(space.bounds[0], np.float64))], [indices], len(visibility.cells))
 
 

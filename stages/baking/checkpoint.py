@@ -210,7 +210,7 @@ def _schedule_of(about: _About, stated: RefinementSchedule, hold: int | None) ->
     phases = stated.phases
     if about.phase > len(phases):
         raise ValueError(f"step {about.step} of phase {about.phase}, of {len(phases)} phases")
-    if (about.pruned is None) == any(phase.after == "prune" for phase in phases[: about.phase]):
+    if (about.pruned is None) == any(phase.after != "none" for phase in phases[: about.phase]):
         raise ValueError(f"what was dropped up to phase {about.phase} is not what is dropped there")
     if hold is None:
         schedule = stated

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from pipeline.executors.memory import size_text
@@ -74,19 +74,20 @@ def needed(
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: int, *, whole: bool) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: int, *, splits: int, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
     """
     from efficientnerf.asset.file.serialisation import most_voxels
+    from stages.baking.pruning import most_children
     from stages.baking.voxels import MAX_OVERSHOOT
 
     settings, degree = job.settings, m.fine.degree
     channels = channels_of(job.inputs["poses"], views)
     finest, cells = _finest_cells(job, m, s, whole=whole)
-    room = MAX_OVERSHOOT * most_voxels(mib * 2**20, settings.layout, degree, (1, 1, 1), settings.brick_size)
-    voxels = min(room, cells * settings.brick_size**3)
+    room = most_voxels(mib * 2**20, settings.layout, degree, (1, 1, 1), settings.brick_size)
+    voxels = min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3)
 
     def at_most(count: int, *, stored: bool) -> Need:
         about: dict[str, Any] = {"cells": cells, "bricks": min(cells, count // 8), "voxels": count, "degree": degree, "whole": whole, "device": job.device}
@@ -119,13 +120,19 @@ def _finest_cells(job: Job, m: Any, s: Scene, *, whole: bool) -> tuple[int, int]
     return finest, cells if stated else min(cells, 2 * MAX_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
-def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: int) -> None:
+def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: int, splits: int, room: Callable[[int], int]) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
-    pixels  as they were placed
+    pixels        as they were placed
+    splits, room  how often voxels will be split, and how many there is room for then
     """
-    voxels, whole = plan.voxels, plan.samples is not None
-    about: dict[str, Any] = {"cells": plan.cells, "bricks": plan.bricks, "voxels": voxels, "degree": m.fine.degree, "whole": whole, "device": job.device}
+    from stages.baking.pruning import most_children
+
+    whole, voxels = plan.samples is not None, plan.voxels
+    if splits:
+        voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
+    bricks = -(-plan.bricks * voxels // max(plan.voxels, 1))
+    about: dict[str, Any] = {"cells": plan.cells * 8**splits, "bricks": bricks, "voxels": voxels, "degree": m.fine.degree, "whole": whole, "device": job.device}
     need = needed(job.settings, m.settings, views, pixels.images.shape[1], **about, stored=isinstance(pixels.images, PixelFile))
     harmonics = (m.fine.degree + 1) ** 2
     remedy = f"Lower bake.max_mib ({mib}) or bake.resolution ({plan.choice.resolution}): {voxels:,} voxels with {harmonics} harmonics are too many."

@@ -1,8 +1,8 @@
 """Refinement in the bake stage: the baked values are fitted to the training images, in phases (`efficientnerf.asset.refinement.schedule`).
 
-After a phase the tree is rendered along many training rays, and voxels that do not show are dropped (`stages.baking.pruning`): floaters have faded by then. Or
-those that show are split into voxels of half the side. The steps after that correct for what is missing. An interrupted refinement goes on from its checkpoint
-(`stages.baking.checkpoint`).
+After a phase the tree is rendered along many training rays, and voxels that do not show are dropped (`stages.baking.pruning`): floaters have faded by then.
+Those that are left may be split into voxels of half the side. The steps after that correct for what is missing. An interrupted refinement goes on from its
+checkpoint (`stages.baking.checkpoint`).
 
 With bake.time_budget the number of steps of a phase follows from the time that its first ones take, as in training (`stages.training.budget`).
 """
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from efficientnerf.asset.refinement.schedule import PHASES, RefinementSchedule, count_splits, stated_schedule
+from efficientnerf.asset.refinement.schedule import Phase, RefinementSchedule, count_splits, stated_schedule
 from efficientnerf.settings import given
 from pipeline.stage import Job
 from stages.artifacts import BakeOutputs, PosesOutputs
@@ -24,7 +24,7 @@ from stages.baking import checkpoint, pruning
 from stages.baking.checkpoint import Point
 from stages.baking.holes import find_holes
 from stages.baking.log import RefinementLog
-from stages.baking.pruning import Pruned
+from stages.baking.pruning import Pruned, most_children
 from stages.baking.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, Stopwatch, allotted, clock, timed_schedule
 from stages.training.budget import Budget
 from stages.training.log import draw_curve, psnr_of
@@ -76,8 +76,8 @@ class Refinement:
         while point.phase < len(phases):
             self._take_steps()
             after = phases[point.phase].after
-            if after == "prune":
-                self._prune()
+            if after != "none":
+                self._prune(split=after == "split")
             point.phase += 1
             self._begin_phase()
             if after != "none":
@@ -146,14 +146,21 @@ class Refinement:
         checkpoint.save(self.job, self.point)
         self.written = clock()
 
-    def _prune(self) -> None:
+    def _prune(self, *, split: bool) -> None:
+        """Drop voxels that do not show, and split the others."""
+        from efficientnerf.asset.refinement import splitting
+
         point, splits = self.point, count_splits(self.point.schedule.phases[: self.point.phase])
         baked = None if self.baked is None else self.baked.density_values[checkpoint.ancestors(self.baked, point.state.tree, splits)]
-        point.state, point.pruned = pruning.prune(self.job, point.state, self.targets, self.room(splits), self.samples, baked)
+        most = most_children(self.room(splits + 1)) // 8 if split else self.room(splits)
+        point.state, point.pruned = pruning.prune(self.job, point.state, self.targets, most, self.samples, baked)
+        if split:
+            point.state = splitting.split(point.state, np.ones(len(point.state.density), bool))
+            self.job.say(f"voxels are split: {len(point.state.density):,} with {max(point.state.tree.resolution)} along the longest side")
 
 
 def refined(
-    job: Job, s: Scene, tree: NerfTree, targets: Targets, room: Room, stopwatch: Stopwatch, samples: FieldSamples | None = None
+    job: Job, s: Scene, tree: NerfTree, targets: Targets, phases: tuple[Phase, ...], room: Room, stopwatch: Stopwatch, samples: FieldSamples | None = None
 ) -> tuple[NerfTree, dict[str, Any]]:
     """The refined tree with at most as many voxels as there is room for, and the entries of the report; the log, the curve and the previews are written.
 
@@ -162,23 +169,23 @@ def refined(
     from efficientnerf.asset.refinement import fit
 
     settings = job.settings
-    splits = count_splits(PHASES)
+    splits = count_splits(phases)
     most = min(len(tree.density_values) * 4**splits, room(splits))
     steps, seconds = refinement_steps(settings, most, tree.background is not None), given(settings.time_budget)
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
-    targets = targets_on_device(job, tree, targets)
+    targets = targets_on_device(job, tree, targets, splits, room)
     began = clock()
     before = fit.error(tree, targets, sample, settings.seed)
     finish = clock() - began + FINISH_SECONDS_PER_VOXEL * most
-    schedule = stated_schedule(PHASES, steps) if seconds is None else RefinementSchedule(PHASES)
+    schedule = stated_schedule(phases, steps) if seconds is None else RefinementSchedule(phases)
     baked = None if samples is None else _without_harmonics(tree, capped=bool(steps))
     point = _first_point(job, tree, schedule, stopwatch, timed=seconds is not None, capped=bool(steps))
     log = RefinementLog(
         job.work / BakeOutputs.log, point.state.step, point.schedule.fraction(point.state.step), stopwatch, _previews(job, s, point, targets), clock
     )  # fmt: skip
     if point.state.step == 0:
-        log.begin(point.state, PHASES[0].name, before)
+        log.begin(point.state, phases[0].name, before)
     del tree  # the state has values of its own
     made = Refinement(job, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, samples, baked)
     tree = made.run()
@@ -240,20 +247,27 @@ def _holes(job: Job, tree: NerfTree, samples: FieldSamples, pruned: Pruned) -> d
     return holes
 
 
-def targets_on_device(job: Job, tree: NerfTree, targets: Targets) -> Targets:
-    """The targets on the run's device, where the tree is then fitted; on the host where the device's memory is too small."""
+def targets_on_device(job: Job, tree: NerfTree, targets: Targets, splits: int = 0, room: Room | None = None) -> Targets:
+    """The targets on the run's device, where the tree is then fitted; on the host where the device's memory is too small.
+
+    splits, room  how often its voxels will be split, and how many there is room for then
+    """
     from efficientnerf.asset.cascades import cascades_of
     from stages.baking.memory import free_on_device, needed_on_device
 
-    cells = sum(cascade.brick_index.size for cascade in cascades_of(tree))
-    needed = needed_on_device(len(tree.density_values), tree.harmonics_count, len(tree.voxel_index), cells, tree.brick)
-    needed += len(tree.density_values) * bool(tree.outer)  # the cascade of each voxel
+    cells = sum(cascade.brick_index.size for cascade in cascades_of(tree)) * 8**splits
+    voxels = len(tree.density_values)
+    if splits and room is not None:
+        voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
+    bricks = -(-len(tree.voxel_index) * voxels // max(len(tree.density_values), 1))
+    needed = needed_on_device(voxels, tree.harmonics_count, bricks, cells, tree.brick)
+    needed += voxels * bool(tree.outer)  # the cascade of each voxel
     if targets.pixels.images is not None:
         needed += targets.pixels.images.nbytes
     if job.device == "cpu" or needed <= (free := free_on_device(job.device)):
         return targets.to(job.device)
     job.warn(
-        f"refining {len(tree.density_values):,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} are free there:"
+        f"refining {voxels:,} voxels needs about {needed / 2**30:.1f} GiB on the device; {free / 2**30:.1f} are free there:"
         " they are refined on the CPU, which takes longer (lower bake.max_mib or bake.resolution for the device)"
     )
     return targets

@@ -42,11 +42,11 @@ def voxel_space(job: Job, m: Any) -> Space:
     return space if depth == 1 else space.with_voxel_depth(depth)
 
 
-def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int) -> tuple[Choice, Visibility, np.ndarray]:
-    """The resolution, the visibility of voxels at it, and the coordinates (N, 3) of the voxels to bake."""
+def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
+    """The asset's resolution; the visibility of the voxels to bake, which will be split so often to have it, and their coordinates (N, 3)."""
     from efficientnerf.asset import bake
     from efficientnerf.asset.file import serialisation
-    from stages.baking.resolution import affordable_resolution
+    from stages.baking.resolution import affordable_resolution, baked_resolution
 
     settings: BakeSettings = job.settings
     bounds, brick = space.bounds, settings.brick_size
@@ -57,7 +57,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
 
     finest = choice = finest_choice(settings, m, s)
     if (given(settings.resolution) or given(m.settings.discretise)) is not None:
-        shape, voxel = bake.grid_of(bounds, choice.resolution, brick)
+        shape, voxel = bake.grid_of(bounds, baked_resolution(choice.resolution, splits), brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
         return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
 
@@ -78,10 +78,11 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
         return last
 
     choice = affordable_resolution(finest, lambda at: len(at_resolution(at)[2]), lambda at: int(OVERSHOOT * room(at)))
-    _, coarse, indices = at_resolution(choice.resolution)
+    baked = baked_resolution(choice.resolution, splits)
+    _, coarse, indices = at_resolution(baked)
     most = MAX_OVERSHOOT * room(choice.resolution)
     if len(indices) > most:
-        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, choice.resolution, brick)[0], most)
+        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, baked, brick)[0], most)
     return choice, coarse, indices
 
 

@@ -18,7 +18,8 @@ class Phase:
 
     name   of the phase, as it is shown
     share  of all steps, or of the time where there is a budget; the shares of all phases sum to 1
-    after  what is done to the tree after the last of its steps: "prune" drops voxels that do not show; "split" replaces those that show by their eight children
+    after  what is done to the tree after the last of its steps: "prune" drops voxels that do not show; "split" does too, and replaces those that are left by
+           their eight children, on a grid of twice the resolution
     """
 
     name: str
@@ -27,6 +28,16 @@ class Phase:
 
 
 PHASES = (Phase("all voxels", 0.5, "prune"), Phase("voxels that show", 0.5))
+
+
+def phases_of(*, whole: bool, ndc: bool, discretised: bool) -> tuple[Phase, ...]:
+    """The phases of a refinement.
+
+    whole        of a scene without a constant background
+    ndc          in normalised device coordinates
+    discretised  of a field that was trained on the asset's own voxels, which are not split
+    """
+    return PHASES
 
 
 def count_splits(phases: Sequence[Phase]) -> int:
