@@ -206,7 +206,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=6,
+    version=7,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

@@ -25,7 +25,7 @@ COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, a
 # its distance to the next one; of a brick's voxel: greatest weight, three times while they grow, and its number; of a training pixel that visibility is
 # measured on: its number, or of whole scenes the field's samples along its ray, twice while they are joined; of a ray of a refinement step: its records.
 VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 400, 5000
-MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.gradients
+MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.contributions
 
 
 def voxels_needed(voxels: int, harmonics: int) -> int:

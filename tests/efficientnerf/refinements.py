@@ -9,12 +9,14 @@ import numpy as np
 import torch
 
 from efficientnerf.asset.cascades import voxel_sides
-from efficientnerf.asset.refinement.host import in_voxels
+from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree import gradients as kernels
-from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
 from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.packets import cells_of
+from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import uniform_tree
 
@@ -42,15 +44,19 @@ def gradients_by_autograd(tree: NerfTree, origins: np.ndarray, directions: np.nd
 
 
 def gradients(
-    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets, dtype: Any = np.float64, stop: float = 0.0
-) -> tuple[np.ndarray, ...]:
-    """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels."""
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets, dtype: Any = np.float64, stop: float = 0.0, packet: int = 1,
+    min_weight: float = 0.0,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels, in packets of so many rays."""
     start, along, bases = in_voxels(tree, origins, directions)
     density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
-    records = SampleRecords(dtype)
-    loss, counts = kernels.forward_backward(tree_grid(tree), start, along, bases.astype(dtype), density, sh, seen, records, stop=stop)
+    first = packets_of(len(start), packet)
+    loss, records = kernels.forward_backward(
+        cells_of(tree_grid(tree)), first, start, along, packet_bases(bases.astype(dtype), first), density, sh, seen, RecordBuffer(dtype), stop=stop,
+        min_weight=min_weight,
+    )  # fmt: skip
     by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)
-    kernels.sum_gradients(records, counts, bases.astype(dtype), by_density, by_sh)
+    sum_gradients(records, by_density, by_sh)
     return loss, by_density, by_sh.reshape(tree.sh.shape)
 
 

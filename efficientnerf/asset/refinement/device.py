@@ -21,6 +21,7 @@ from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, LearningRates, Rays, device_grid
 from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.readback import LAG
 
 
@@ -61,17 +62,18 @@ def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float,
+    view_dependent_lr_ratio: float, patch_side: int,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
     assert isinstance(targets.pixels, DevicePixels)
     state.fetch()
     state.device_state = arrays = DeviceArrays(state, targets.pixels.device)
+    patches = PatchGrid(targets.host_pixels, patch_side)
     pending: deque[tuple[Tensor, Any]] = deque()
     error = None
     while state.step < until:
         number = state.step + 1
-        origins, directions, wanted = targets.draw(rays, step_rng(seed, number))
+        origins, directions, wanted = targets.of(patches.draw(rays, step_rng(seed, number)).pixels)
         factor = fall(number)
         loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, density_lr * factor, sh_lr * factor, view_dependent_lr_ratio)
         pending.append(to_host_async(loss.mean() / 3))

@@ -21,20 +21,22 @@ from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets
 from efficientnerf.asset.tree import NerfTree
 
+PATCH_SIDE = 4  # docs/experiments/tree-training-kernels.md
 WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measured the rays leave records
 
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float = 1.0,
+    view_dependent_lr_ratio: float = 1.0, patch_side: int = PATCH_SIDE,
 ) -> Iterator[float]:  # fmt: skip
     """Take steps up to `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.
 
-    rays                     of a step
+    rays                     of a step, about
     density_lr               learning rate of the logarithm of the optical thickness
     sh_lr                    learning rate of the harmonics
     fall                     factor of the learning rates by a step's number (`efficientnerf.asset.refinement.schedule`)
     view_dependent_lr_ratio  factor of that for harmonics of degree 1 and above
+    patch_side               pixels along a side of the patches that rays are drawn in
     """
     if targets.on_device:
         from efficientnerf.asset.refinement import device
@@ -44,6 +46,7 @@ def optimise(
         steps_on = host.optimise
     yield from steps_on(
         state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
+        patch_side=patch_side,
     )  # fmt: skip
 
 

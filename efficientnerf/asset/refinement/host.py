@@ -13,13 +13,17 @@ from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree import gradients
-from efficientnerf.backends.numba.tree.gradients import SampleRecords
-from efficientnerf.backends.numba.tree.rmsprop import Hyperparameters, rmsprop_step
+from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree_training import gradients
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.packets import cells_of
+from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, step
 from efficientnerf.rendering.harmonics import basis_numpy
+from efficientnerf.training.patches import PatchGrid
 
 DECAY, EPSILON = 0.99, 1e-10  # of RMSprop
+MAX_PACKET_ANGLE = 0.02  # radians across patches whose rays share harmonics; docs/experiments/tree-training-kernels.md
 
 
 def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -30,25 +34,34 @@ def in_voxels(tree: NerfTree, origins: np.ndarray, directions: np.ndarray) -> tu
     return start, np.ascontiguousarray(rays.directions, np.float64), bases
 
 
+def packet_bases(bases: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """(P, K) mean harmonics of packets of rays, whose own are (R, K); none of the packets is empty."""
+    mean = np.add.reduceat(bases, first[:-1], axis=0) / np.diff(first).astype(np.float32)[:, None]
+    return np.ascontiguousarray(mean, bases.dtype)
+
+
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float,
+    view_dependent_lr_ratio: float, patch_side: int,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`."""
-    grid, records = tree_grid(state.tree), SampleRecords()
-    by_density, by_sh = np.zeros_like(state.density), np.zeros_like(state.sh)
-    stamp = np.zeros(len(state.density), np.int32)
+    cells, buffer = cells_of(tree_grid(state.tree)), RecordBuffer()
+    patches = PatchGrid(targets.host_pixels, patch_side)
+    none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
+    moments = Moments(*none, state.square_density, state.square_sh, state.visits)
     sides, cascades = cascade_sides(state.tree), voxel_cascades(state.tree)
     rates = np.full(state.sh.shape[1], sh_lr, np.float32)
     rates[3:] *= view_dependent_lr_ratio
     while state.step < until:
         number = state.step + 1
-        origins, directions, wanted = targets.draw(rays, step_rng(seed, number))
+        drawn = patches.draw(rays, step_rng(seed, number))
+        origins, directions, wanted = targets.of(drawn.pixels)
         start, along, bases = in_voxels(state.tree, origins, directions)
-        loss, counts = gradients.forward_backward(grid, start, along, bases, state.density, state.sh, wanted, records)
+        first = drawn.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
+        loss, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), state.density, state.sh, wanted, buffer)
         factor = fall(number)
-        rmsprop_step(
-            records, counts, bases, (state.density, state.sh), (by_density, by_sh), (state.square_density, state.square_sh), state.visits, stamp, number,
+        step(
+            records, (state.density, state.sh), moments,
             Hyperparameters(sides, cascades, density_lr * factor, rates * np.float32(factor), DECAY, EPSILON),
         )  # fmt: skip
         state.step = number
@@ -57,18 +70,19 @@ def optimise(
 
 def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:
     """Sum of the losses of the rays of the bundles."""
-    grid, records, sh = tree_grid(tree), SampleRecords(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
+    cells, buffer, sh = cells_of(tree_grid(tree)), RecordBuffer(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
     total = 0.0
     for origins, directions, wanted in bundles:
-        loss, _ = gradients.forward_backward(grid, *in_voxels(tree, origins, directions), tree.density_values, sh, wanted, records)
+        start, along, bases = in_voxels(tree, origins, directions)
+        loss, _ = gradients.forward_backward(cells, packets_of(len(start)), start, along, bases, tree.density_values, sh, wanted, buffer)
         total += float(loss.sum())
     return total
 
 
 def max_weights(tree: NerfTree, bundles: Iterable[Bundle]) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to a ray of the bundles."""
-    grid, greatest = tree_grid(tree), np.zeros((gradients.contribution_shares(), len(tree.density_values)), np.float32)
+    grid, greatest = tree_grid(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
     for origins, directions, wanted in bundles:
         start, along, _ = in_voxels(tree, origins, directions)
-        gradients.max_contributions(grid, start, along, tree.density_values, wanted.transmittance, greatest)
+        contributions.max_contributions(grid, start, along, tree.density_values, wanted.transmittance, greatest)
     return greatest.max(axis=0)

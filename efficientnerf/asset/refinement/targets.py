@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from efficientnerf.backends.numba.tree.gradients import RayTargets
+from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.rendering import environment
 from efficientnerf.training.pixels import Pixels
 
@@ -48,6 +48,11 @@ class Targets:
     def on_device(self) -> bool:
         """Whether they were sent to a device, where trees are then fitted to them."""
         return not isinstance(self.pixels, Pixels)
+
+    @property
+    def host_pixels(self) -> Pixels:
+        """The pixels where they are chosen."""
+        return self.pixels if isinstance(self.pixels, Pixels) else self.pixels.pixels
 
     def to(self, device: str) -> Targets:
         """These targets on "cpu" or "cuda", the latter where its kernels can be built."""

@@ -1,4 +1,4 @@
-"""Loss gradients of a tree's values, and steps along them, on CUDA (Triton); `efficientnerf.backends.numba.tree.gradients` is the same on the CPU.
+"""Loss gradients of a tree's values, and steps along them, on CUDA (Triton); `efficientnerf.backends.numba.tree_training` is the same on the CPU.
 
 A ray is marched twice (`efficientnerf.backends.triton.tree_march`): first for its colour and final transmittance, then, with the gradients of its loss by
 these known, once more from the front; what lies behind a sample is its ray's colour less what was composited so far. Samples are not stored.
@@ -22,8 +22,8 @@ import triton.language as tl
 from torch import Tensor
 
 from efficientnerf.asset.cascades import voxel_cascades
-from efficientnerf.backends.numba.tree.gradients import RayTargets
-from efficientnerf.backends.numba.tree.rmsprop import MAX_THICKNESS, MIN_THICKNESS
+from efficientnerf.backends.numba.tree_training.gradients import RayTargets
+from efficientnerf.backends.numba.tree_training.steps import MAX_THICKNESS, MIN_THICKNESS
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import DeviceCascades, brick_arrays, device_cascades
@@ -267,7 +267,7 @@ def _rmsprop_step(  # type: ignore[no-untyped-def]
     voxels, number, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, min_thickness, max_thickness, max_visits,
     CASCADES: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """`efficientnerf.backends.numba.tree.rmsprop.rmsprop_step` from gradients as integers, of `unit` each."""
+    """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each."""
     v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     met = tl.load(stamp + v, v < voxels, other=-1) == number
     if tl.max(met.to(tl.int32), 0) > 0:
@@ -353,7 +353,7 @@ def rmsprop_step(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], squares: tuple[Tensor, Tensor], visits: Tensor, stamp: Tensor, *,
     number: int, rays: int, rates: LearningRates, decay: float, epsilon: float,
 ) -> None:  # fmt: skip
-    """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree.rmsprop.rmsprop_step`."""
+    """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree_training.steps.step`."""
     voxels = len(visits)
     _rmsprop_step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
         *values, *sums, *squares, visits, stamp, g.cascade_of, g.cascades.place, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel),

@@ -19,7 +19,7 @@ from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import ray_parts, render_reference, tree_density
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree import gradients as kernels
+from efficientnerf.backends.numba.tree import contributions as kernels
 from efficientnerf.backends.numba.tree.nearest import CAPACITY
 from efficientnerf.backends.numba.tree.nearest import render_rays as render_nearest
 from efficientnerf.backends.numba.tree.walk import tree_grid

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from efficientnerf.asset.cascades import cascade_sides, subset, voxel_cascades, voxel_sides
+from efficientnerf.asset.cascades import subset
 from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement import state
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
@@ -19,13 +19,16 @@ from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
-from efficientnerf.backends.numba.tree import gradients as kernels
-from efficientnerf.backends.numba.tree import rmsprop
-from efficientnerf.backends.numba.tree.gradients import RayTargets, SampleRecords
+from efficientnerf.backends.numba.tree.contributions import max_contributions
+from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.packets import cells_of
+from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
-from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
+from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
 
 
 @pytest.mark.parametrize(("brick", "degree", "opacity_weight"), [(1, 0, 0.0), (3, 1, 0.7), (4, 2, 0.0), (2, 3, 0.7)])
@@ -45,7 +48,7 @@ def test_float32_and_the_early_stop_change_little() -> None:
     tree = random_tree(3, brick=4, degree=2)
     rays = rays_at(tree, 500)
     exact = gradients(tree, *rays, seen_at_random(500, 0.3))
-    usual = gradients(tree, *rays, seen_at_random(500, 0.3, np.float32), np.float32, kernels.EARLY_STOP)
+    usual = gradients(tree, *rays, seen_at_random(500, 0.3, np.float32), np.float32, EARLY_STOP)
     for a, b in zip(exact, usual, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3 * np.abs(a).max())
 
@@ -55,23 +58,23 @@ def test_the_pictures_are_those_of_the_renderer() -> None:
     tree = random_tree(2, brick=4, degree=2, share=0.6)
     origins, directions = rays_at(tree, 400)
     black = RayTargets(*(np.zeros(shape, np.float32) for shape in ((400, 3), (400, 3))), np.ones(400, np.float32), np.zeros(400, np.float32), 0.0)
-    loss = gradients(tree, origins, directions, black, np.float32, kernels.EARLY_STOP)[0]
+    loss = gradients(tree, origins, directions, black, np.float32, EARLY_STOP)[0]
     np.testing.assert_allclose(loss, (render_rays(tree, origins, directions).colour ** 2).sum(axis=1), atol=2e-3)
 
 
 def test_records_grow_until_all_samples_fit() -> None:
     tree = uniform_tree((12, 12, 12), brick=2, sigma=0.05)
     origins, directions = rays_at(tree, 300)
-    records = SampleRecords()
-    records.capacity = 7
+    buffer = RecordBuffer()
+    buffer.capacity = 7
     start, along, bases = in_voxels(tree, origins, directions)
     o = initial_state(tree)
     seen = seen_at_random(300, 0.0, np.float32)
-    _, counts = kernels.forward_backward(tree_grid(tree), start, along, bases, o.density, o.sh, seen, records)
-    assert 7 < counts.max() <= records.capacity
+    _, records = kernels.forward_backward(cells_of(tree_grid(tree)), packets_of(300), start, along, bases, o.density, o.sh, seen, buffer)
+    assert 7 < (records.begin[:, -1] - records.begin[:, 0]).max() <= buffer.capacity
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
-    kernels.sum_gradients(records, counts, bases, by_density, by_sh)
-    expected = gradients(tree, origins, directions, seen, np.float32, kernels.EARLY_STOP)
+    sum_gradients(records, by_density, by_sh)
+    expected = gradients(tree, origins, directions, seen, np.float32, EARLY_STOP)
     np.testing.assert_array_equal(by_density, expected[1])
 
 
@@ -84,7 +87,7 @@ def fitted(tree: NerfTree, targets: Targets, steps: int, **more: Any) -> tuple[N
 
 def test_fog_becomes_the_ball_of_the_pictures() -> None:
     targets = Targets(pixels(10, 24), (1.0, 1.0, 1.0))
-    tree, errors = fitted(ball_tree(), targets, 80)
+    tree, errors = fitted(ball_tree(), targets, 80, patch_side=1)
     assert error(tree, targets, 2000, 0) < 0.05 * error(ball_tree(), targets, 2000, 0)
     assert len(errors) == 80
     assert density_at(tree, np.array([[0.6, -0.05, 0.0]]))[0] > 5
@@ -218,44 +221,11 @@ def test_greatest_weights_are_those_of_a_march_by_hand_in_any_number_of_parts() 
     for parts in (1, 3):
         into = np.zeros((parts, len(tree.density_values)), np.float32)
         for half in (slice(0, 25), slice(25, 40)):  # what is known is raised
-            kernels.max_contributions(tree_grid(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
+            max_contributions(tree_grid(tree), start[half], along[half], tree.density_values, gain[half], into, stop=0.0)
         found.append(into.max(axis=0))
     np.testing.assert_array_equal(*found)
     np.testing.assert_allclose(found[0], weights_by_hand(tree, origins, directions, gain), atol=1e-5)
     assert (found[0] > 0).mean() > 0.3
-
-
-@pytest.mark.parametrize("tree", [random_tree(4, brick=2, degree=1), random_cascades(4, brick=2)], ids=["one grid", "cascades"])
-def test_steps_are_those_of_the_formula(tree: NerfTree) -> None:
-    sides, cascades = voxel_sides(tree), voxel_cascades(tree)
-    o, records = initial_state(tree), SampleRecords()
-    sums, stamp = (np.zeros_like(o.density), np.zeros_like(o.sh)), np.zeros(len(o.density), np.int32)
-    rates = np.linspace(0.01, 0.02, o.sh.shape[1]).astype(np.float32)
-    density, sh = o.density.astype(np.float64), o.sh.astype(np.float64)
-    square_density, square_sh, visits = np.zeros(len(density)), np.zeros(len(density)), np.zeros(len(density))
-    for number in (1, 2, 3):
-        origins, directions = rays_at(tree, 100, seed=number)
-        seen = seen_at_random(100, 0.2, np.float32)
-        start, along, bases = in_voxels(tree, origins, directions)
-        _, by_density, by_sh = gradients(o.result(), origins, directions, seen, np.float32, kernels.EARLY_STOP)
-        _, counts = kernels.forward_backward(tree_grid(tree), start, along, bases, o.density, o.sh, seen, records)
-        hyperparameters = rmsprop.Hyperparameters(cascade_sides(tree), cascades, 0.1, rates, 0.9, 1e-12)
-        rmsprop.rmsprop_step(records, counts, bases, (o.density, o.sh), sums, (o.square_density, o.square_sh), o.visits, stamp, number, hyperparameters)
-        named = np.unique(records.index[np.concatenate([np.arange(c) + b * records.capacity for b, c in enumerate(counts)])])
-        met = np.isin(np.arange(len(density)), named)
-        visits += met
-        slope, flat = by_density * np.maximum(density, rmsprop.MIN_THICKNESS / sides), by_sh.reshape(sh.shape)
-        square_density = np.where(met, 0.9 * square_density + 0.1 * slope**2, square_density)
-        square_sh = np.where(met, 0.9 * square_sh + 0.1 * (flat**2).mean(axis=1), square_sh)
-        right = np.maximum(1 - 0.9**visits, 1e-30)
-        density = np.where(met, density * np.exp(-0.1 * slope / (np.sqrt(square_density / right) + 1e-12)), density)
-        sh = sh - met[:, None] * rates * flat / (np.sqrt(square_sh / right) + 1e-12)[:, None]
-        np.testing.assert_array_equal(o.visits, visits)
-        np.testing.assert_allclose(o.density, density, rtol=2e-3, atol=1e-5)
-        np.testing.assert_allclose(o.sh, sh, atol=2e-3)
-    assert len(np.unique(visits)) > 1  # some were not met by every bundle
-    assert not sums[0].any()
-    assert not sums[1].any()
 
 
 def test_what_hides_behind_an_opaque_wall_is_reached() -> None:
@@ -266,7 +236,7 @@ def test_what_hides_behind_an_opaque_wall_is_reached() -> None:
     errors = {}
     for thickest in (MAX_INITIAL_THICKNESS, np.inf):
         o = initial_state(wall, thickest)
-        *_, errors[thickest] = optimise(o, targets, until=30, rays=512, density_lr=0.3, sh_lr=0.05, fall=exponential_fall(0.1, 30), seed=1)
+        *_, errors[thickest] = optimise(o, targets, until=30, rays=512, density_lr=0.3, sh_lr=0.05, fall=exponential_fall(0.1, 30), seed=1, patch_side=1)
     assert errors[MAX_INITIAL_THICKNESS] < 0.75 * errors[np.inf]
 
 

@@ -15,7 +15,7 @@ from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.backends.numba.tree.gradients import RayTargets
+from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.pixels import Pixels

@@ -226,7 +226,7 @@ def walk(origin, direction, tree, stop, buffer):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _meeting(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untyped-def]
+def box_distances(ox, oy, oz, dx, dy, dz, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Distances at which a ray enters, 0 at least, and leaves the box of a grid of so many voxels; the second is not greater where it misses it."""
     ix = 1 / dx if dx != 0 else 1e30
     iy = 1 / dy if dy != 0 else 1e30
@@ -293,7 +293,7 @@ def walk_on(origin, direction, tree, stop, buffer, k, transmittance):  # type: i
     if tree.cascades > 1:
         return _walk_cascades(origin, direction, tree, stop, buffer, k, transmittance)
     ox, oy, oz, dx, dy, dz = origin[0], origin[1], origin[2], direction[0], direction[1], direction[2]
-    t0, t1 = _meeting(ox, oy, oz, dx, dy, dz, tree.nx * tree.brick, tree.ny * tree.brick, tree.nz * tree.brick)
+    t0, t1 = box_distances(ox, oy, oz, dx, dy, dz, tree.nx * tree.brick, tree.ny * tree.brick, tree.nz * tree.brick)
     if not t1 > t0:
         return 0, transmittance, -1
     return _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, tree, 1.0, stop, buffer, 0, k, transmittance)
@@ -301,15 +301,15 @@ def walk_on(origin, direction, tree, stop, buffer, k, transmittance):  # type: i
 
 @numba.njit(cache=True, error_model="numpy")
 def _cascade_meeting(origin, direction, tree, n):  # type: ignore[no-untyped-def]
-    """Distances at which a ray enters and leaves the box of cascade n, voxels of cascade 0, as `_meeting`."""
+    """Distances at which a ray enters and leaves the box of cascade n, voxels of cascade 0, as `box_distances`."""
     dx, dy, dz, brick = direction[0], direction[1], direction[2], tree.brick
     if n == 0:
-        return _meeting(origin[0], origin[1], origin[2], dx, dy, dz, tree.nx * brick, tree.ny * brick, tree.nz * brick)
+        return box_distances(origin[0], origin[1], origin[2], dx, dy, dz, tree.nx * brick, tree.ny * brick, tree.nz * brick)
     m = n - 1
     scale = tree.outer_scale[m]
     x, y, z = origin[0] - tree.outer_corner[3 * m], origin[1] - tree.outer_corner[3 * m + 1], origin[2] - tree.outer_corner[3 * m + 2]
     side = scale * brick
-    return _meeting(x, y, z, dx, dy, dz, tree.outer_shape[3 * m] * side, tree.outer_shape[3 * m + 1] * side, tree.outer_shape[3 * m + 2] * side)
+    return box_distances(x, y, z, dx, dy, dz, tree.outer_shape[3 * m] * side, tree.outer_shape[3 * m + 1] * side, tree.outer_shape[3 * m + 2] * side)
 
 
 PART = 2**32  # samples of a part of a ray, at most: `walk_on` of a nested tree goes on with PART times the part plus the sample in it

@@ -1,0 +1,330 @@
+"""Gradients of a tree's values on the CPU (numba, all cores), for its training.
+
+Rays come in packets (`efficientnerf.backends.numba.tree_training.packets`). A packet finds the samples of its rays, sums the harmonics of each voxel that
+these lie between, once, composites the rays, and goes back over the samples to sum gradients: four numbers for each voxel, by its density and by the arguments
+of the three sigmoids. Each voxel then leaves one record. The records of a chunk of packets are sorted into bins of neighbouring voxels. A second pass
+(`efficientnerf.backends.numba.tree_training.steps`) takes the bins one after the other and sums the records of a voxel in their order: there are no races, and
+results depend neither on timing nor on the number of threads.
+
+The harmonics of a packet are the mean of its rays': neighbouring pixels look the same way but for their distance over the focal length. A packet of one ray is
+exact, and so is one of parallel rays.
+
+The torch reference is `efficientnerf.asset.rendering.render_reference` and its autograd. Works in float32, and in float64 for tests.
+R rays, P packets, N voxels, K harmonics, M records, U chunks.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.tree.march import EARLY_STOP
+from efficientnerf.backends.numba.tree_training.packets import (
+    BLOCKS,
+    FIRST_BLOCKS,
+    FIRST_SAMPLES,
+    SAMPLES,
+    Cells,
+    clear,
+    packet_arrays,
+    packet_pointers,
+    tree_pointers,
+    walk_ray,
+)
+from efficientnerf.backends.numba.tree_training.tasks import take_next
+
+CHUNK = 32  # packets
+BIN_BITS = 15  # voxels of a bin, power of two
+
+
+class RayTargets(NamedTuple):
+    """Supervision of rays. With c and a the premultiplied colour and the opacity that the tree gives a ray, its loss is
+
+        sum over channels of (transmittance (c + (1 - a) background) - colour)^2  +  opacity_weight (a - opacity)^2
+
+    colour          (R, 3) of the photograph, less the colour of what lies in front of the box
+    background      (R, 3) colour of what lies behind the box
+    transmittance   (R,)   of what lies in front of the box
+    opacity         (R,)   of the photograph
+    opacity_weight  of the opacity's error
+
+    Arrays, or tensors of a device (`efficientnerf.backends.triton.tree_gradients`).
+    """
+
+    colour: Any
+    background: Any
+    transmittance: Any
+    opacity: Any
+    opacity_weight: float
+
+
+class Records(NamedTuple):
+    """What voxels got from packets.
+
+    numbers   (M, 2) int32 of the voxel, and of the packet
+    gradient  (M, 4) of the loss by the arguments of the sigmoids, and by density
+    begin     (U, bins + 1) int64: where the records of a chunk and bin begin, those of chunk u from u * capacity on
+    basis     (P, K) harmonics of the packets
+    """
+
+    numbers: np.ndarray
+    gradient: np.ndarray
+    begin: np.ndarray
+    basis: np.ndarray
+
+
+class RecordBuffer:
+    """Memory of records, enlarged where a batch needs more; reused. Numbers of type `dtype`."""
+
+    def __init__(self, dtype: type = np.float32) -> None:
+        self.dtype, self.capacity, self.chunks = dtype, 128 * CHUNK, 0
+        self._allocate()
+
+    def _allocate(self) -> None:
+        size = self.chunks * self.capacity
+        self.numbers: np.ndarray = np.empty((size, 2), np.int32)
+        self.gradient: np.ndarray = np.empty((size, 4), self.dtype)
+
+    def reserve(self, chunks: int, capacity: int = 0) -> None:
+        """Make room for so many chunks of so many records."""
+        if chunks > self.chunks or capacity > self.capacity:
+            self.chunks, self.capacity = max(chunks, self.chunks), max(capacity, self.capacity)
+            self._allocate()
+
+
+def packets_of(rays: int, side: int = 1) -> np.ndarray:
+    """First ray of each packet, and the end, of rays that come in packets of `side`."""
+    return np.append(np.arange(0, rays, side), rays).astype(np.int64)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _sigmoid(x):  # type: ignore[no-untyped-def]
+    return 1 / (1 + np.exp(-x))
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-def]
+    """Sums of the harmonics of the slots at which samples lie, along the packet's mean direction; returns how many of these hold a voxel."""
+    found = 0
+    for block in range(1, packet.state[BLOCKS]):
+        first, source = block * tree.cube, packet.owner[block] * tree.cube
+        for n in range(tree.cube):
+            if packet.met[first + n] == 0:
+                continue
+            at, voxel = 4 * (first + n), np.int64(tree.voxel_index[source + n])
+            for c in range(4):
+                packet.gradient[at + c] = 0
+            if voxel < 0:
+                for c in range(4):
+                    packet.colour[at + c] = 0
+                continue
+            found += 1
+            row = 3 * terms * voxel
+            red, green, blue = basis[0] * sh[row], basis[0] * sh[row + 1], basis[0] * sh[row + 2]
+            for k in range(1, terms):
+                red += basis[k] * sh[row + 3 * k]
+                green += basis[k] * sh[row + 3 * k + 1]
+                blue += basis[k] * sh[row + 3 * k + 2]
+            packet.colour[at], packet.colour[at + 1], packet.colour[at + 2], packet.colour[at + 3] = red, green, blue, 1
+    return found
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _shade(n, packet):  # type: ignore[no-untyped-def]
+    """Colour of a sample, sigmoids of what is interpolated between the corners that are stored; kept in `packet.shade`."""
+    colour, slots, weights = packet.colour, packet.slots, packet.weights
+    at = 4 * np.int64(slots[8 * n])
+    w = weights[8 * n]
+    red, green, blue, total = w * colour[at], w * colour[at + 1], w * colour[at + 2], w * colour[at + 3]
+    for corner in range(1, 8):
+        at = 4 * np.int64(slots[8 * n + corner])
+        w = weights[8 * n + corner]
+        red += w * colour[at]
+        green += w * colour[at + 1]
+        blue += w * colour[at + 2]
+        total += w * colour[at + 3]
+    inverse = 1 / total if total > 0 else 0 * total
+    r, g, b = _sigmoid(red * inverse), _sigmoid(green * inverse), _sigmoid(blue * inverse)
+    packet.shade[4 * n], packet.shade[4 * n + 1], packet.shade[4 * n + 2], packet.shade[4 * n + 3] = r, g, b, inverse
+    return r, g, b
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _add_gradient(n, red, green, blue, density, packet):  # type: ignore[no-untyped-def]
+    """Adds a sample's gradients to those of its eight slots."""
+    gradient, slots, weights = packet.gradient, packet.slots, packet.weights
+    for corner in range(8):
+        at = 4 * np.int64(slots[8 * n + corner])
+        w = weights[8 * n + corner]
+        a, b, c, d = gradient[at] + w * red, gradient[at + 1] + w * green, gradient[at + 2] + w * blue, gradient[at + 3] + w * density
+        gradient[at], gradient[at + 1], gradient[at + 2], gradient[at + 3] = a, b, c, d
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-untyped-def]
+    """Loss of a ray whose samples are `begin` to `end`, behind which so much light is left; adds its gradients to the slots."""
+    light, shade, kind = packet.light, packet.shade, targets.colour.dtype.type
+    red, green, blue = 0.0, 0.0, 0.0
+    for n in range(begin, end):
+        r, g, b = _shade(n, packet)
+        weight = light[3 * n] * light[3 * n + 1]
+        red += weight * r
+        green += weight * g
+        blue += weight * b
+    arriving = np.float64(targets.transmittance[ray])
+    behind = np.float64(targets.background[ray, 0]), np.float64(targets.background[ray, 1]), np.float64(targets.background[ray, 2])
+    by_red = arriving * (red + left * behind[0]) - targets.colour[ray, 0]
+    by_green = arriving * (green + left * behind[1]) - targets.colour[ray, 1]
+    by_blue = arriving * (blue + left * behind[2]) - targets.colour[ray, 2]
+    missing = 1 - left - np.float64(targets.opacity[ray])
+    loss = by_red * by_red + by_green * by_green + by_blue * by_blue + targets.opacity_weight * missing * missing
+    by_red, by_green, by_blue = 2 * arriving * by_red, 2 * arriving * by_green, 2 * arriving * by_blue
+    by_left = (2 * targets.opacity_weight * missing - by_red * behind[0] - by_green * behind[1] - by_blue * behind[2]) * left
+    # Back to front; red, green and blue become the colour behind the sample.
+    red, green, blue = 0.0, 0.0, 0.0
+    for n in range(end - 1, begin - 1, -1):
+        weight, after = light[3 * n] * light[3 * n + 1], light[3 * n + 1] * (1 - light[3 * n])
+        r, g, b, inverse = np.float64(shade[4 * n]), np.float64(shade[4 * n + 1]), np.float64(shade[4 * n + 2]), np.float64(shade[4 * n + 3])
+        by_depth = by_left + by_red * (after * r - red) + by_green * (after * g - green) + by_blue * (after * b - blue)
+        red += weight * r
+        green += weight * g
+        blue += weight * b
+        scale = weight * inverse
+        _add_gradient(
+            n, kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)), kind(by_blue * scale * b * (1 - b)),
+            kind(by_depth * light[3 * n + 2]), packet,
+        )  # fmt: skip
+    return loss
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _trace_packet(begin, end, origins, directions, targets, stop, min_weight, terms, basis, sh, tree, arrays, ends, left, loss):  # type: ignore[no-untyped-def]
+    """Losses of the rays of a packet and the gradients of its slots; returns how many voxels it met, or -1 where there is no room.
+
+    ends, left  (rays of the packet,) scratch
+    """
+    packet = packet_pointers(arrays)
+    clear(packet, tree)
+    for ray in range(begin, end):
+        left[ray - begin] = walk_ray(origins[ray], directions[ray], tree, stop, min_weight, packet)
+        if left[ray - begin] < 0:
+            return -1
+        ends[ray - begin] = packet.state[SAMPLES]
+    found = _fill_colours(basis, terms, sh, tree, packet)
+    at = 0
+    for ray in range(begin, end):
+        loss[ray] = _composite_ray(ray, at, ends[ray - begin], left[ray - begin], targets, packet)
+        at = ends[ray - begin]
+    return found
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _leave_records(number, written, tree, arrays, numbers, gradient, bins):  # type: ignore[no-untyped-def]
+    """Records of a packet's voxels from `written` on, counted by bins; returns their end."""
+    packet = packet_pointers(arrays)
+    for block in range(1, packet.state[BLOCKS]):
+        first, source = block * tree.cube, packet.owner[block] * tree.cube
+        for n in range(tree.cube):
+            if packet.met[first + n] == 0:
+                continue
+            v = tree.voxel_index[source + n]
+            if v < 0:
+                continue
+            numbers[written, 0], numbers[written, 1] = v, np.int32(number)
+            for c in range(4):
+                gradient[written, c] = packet.gradient[4 * (first + n) + c]
+            bins[(v >> BIN_BITS) + 1] += 1
+            written += 1
+    return written
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sort_records(written, numbers, gradient, begin, base, out_numbers, out_gradient, place):  # type: ignore[no-untyped-def]
+    """Puts records in order of their bins, and within these as they were, from `base` on; begin: counts by bins after a zero, afterwards where bins begin."""
+    begin[0] = base
+    for n in range(1, len(begin)):
+        begin[n] += begin[n - 1]
+    place[:] = begin[:-1]
+    for n in range(written):
+        v = numbers[n, 0]
+        to = place[v >> BIN_BITS]
+        place[v >> BIN_BITS] = to + 1
+        out_numbers[to, 0], out_numbers[to, 1] = v, numbers[n, 1]
+        for c in range(4):
+            out_gradient[to, c] = gradient[n, c]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _enlarged(values, count, room):  # type: ignore[no-untyped-def]
+    """The first `count` rows in an array of `room`."""
+    out = np.empty((room, values.shape[1]), values.dtype)
+    out[:count] = values[:count]
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _work(task, cells, first, origins, directions, bases, density, sh, targets, stop, min_weight, capacity, numbers, gradient, begin, counts, loss):  # type: ignore[no-untyped-def]
+    """Takes chunks until none is left. Chunk u writes its records from u * capacity on, and to counts[u] how many there are; more than `capacity`: none."""
+    packets, terms = len(first) - 1, bases.shape[1]
+    tree, flat = tree_pointers(cells, density), pointer(sh)
+    arrays = packet_arrays(FIRST_BLOCKS, FIRST_SAMPLES, tree.cube, density)
+    ends, left = np.empty(16, np.int64), np.empty(16, np.float64)
+    own_numbers, own_gradient = np.empty((128 * CHUNK, 2), np.int32), np.empty((128 * CHUNK, 4), density.dtype)
+    place = np.empty(begin.shape[1] - 1, np.int64)
+    chunk = take_next(pointer(task))
+    while chunk * CHUNK < packets:
+        written, bins = 0, begin[chunk]
+        bins[:] = 0
+        for number in range(chunk * CHUNK, min(packets, (chunk + 1) * CHUNK)):
+            a, b = first[number], first[number + 1]
+            if b - a > len(ends):
+                ends, left = np.empty(b - a, np.int64), np.empty(b - a, np.float64)
+            found = _trace_packet(a, b, origins, directions, targets, stop, min_weight, terms, bases[number], flat, tree, arrays, ends, left, loss)
+            while found < 0:
+                arrays = packet_arrays(2 * arrays.most, 2 * arrays.samples, tree.cube, density)
+                found = _trace_packet(a, b, origins, directions, targets, stop, min_weight, terms, bases[number], flat, tree, arrays, ends, left, loss)
+            if written + found > len(own_numbers):
+                room = 2 * (written + found)
+                own_numbers, own_gradient = _enlarged(own_numbers, written, room), _enlarged(own_gradient, written, room)
+            written = _leave_records(number, written, tree, arrays, own_numbers, own_gradient, bins)
+        counts[chunk] = written
+        if written <= capacity:
+            _sort_records(written, own_numbers, own_gradient, bins, chunk * capacity, numbers, gradient, place)
+        chunk = take_next(pointer(task))
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _forward_backward(  # type: ignore[no-untyped-def]
+    workers, task, cells, first, origins, directions, bases, density, sh, targets, stop, min_weight, capacity, numbers, gradient, begin, counts, loss
+):
+    for _ in numba.prange(workers):
+        _work(task, cells, first, origins, directions, bases, density, sh, targets, stop, min_weight, capacity, numbers, gradient, begin, counts, loss)
+
+
+def forward_backward(
+    cells: Cells, first: np.ndarray, origins: np.ndarray, directions: np.ndarray, bases: np.ndarray, density: np.ndarray, sh: np.ndarray, targets: RayTargets,
+    buffer: RecordBuffer, *, stop: float = EARLY_STOP, min_weight: float = 0.0,
+) -> tuple[np.ndarray, Records]:  # fmt: skip
+    """Loss (R,) of rays, voxel coordinates of cascade 0, and the gradients of its sum, as records in `buffer`.
+
+    first                (P + 1,) int64: first ray of each packet, and the end
+    origins, directions  (R, 3) float64
+    bases                (P, K) harmonics of the packets' directions
+    density, sh          (N,), (N, 3 K)
+    stop                 transmittance below which a ray ends
+    min_weight           samples that weigh less absorb light, and have neither a colour nor a gradient
+    """
+    chunks, bins = -(-(len(first) - 1) // CHUNK), (len(density) >> BIN_BITS) + 1
+    loss, counts, begin = np.zeros(len(origins)), np.zeros(chunks, np.int64), np.zeros((chunks, bins + 1), np.int64)
+    buffer.reserve(chunks)
+    while True:
+        _forward_backward(
+            min(numba.get_num_threads(), max(chunks, 1)), np.zeros(1, np.int64), cells, first, origins, directions, bases, density, sh, targets, stop,
+            min_weight, buffer.capacity, buffer.numbers, buffer.gradient, begin, counts, loss,
+        )  # fmt: skip
+        if not chunks or counts.max() <= buffer.capacity:
+            return loss, Records(buffer.numbers, buffer.gradient, begin, bases)
+        buffer.reserve(chunks, int(1.25 * counts.max()))

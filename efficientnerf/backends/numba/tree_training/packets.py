@@ -1,0 +1,363 @@
+"""Samples of a packet of rays (numba): where they lie between voxels, each brick that they meet held once in memory that is the packet's own.
+
+The rays of a packet should be neighbours, as those of a patch of pixels are: they meet the same voxels, which then are looked up, shaded and given gradients
+once. A packet of any rays is right, and slower. Samples lie as FORMAT.md says, section 6; in nested trees as `efficientnerf.asset.rendering.ray_parts` says.
+
+A *slot* is a voxel of a brick that the packet has met: slot `block * cube + place`, where block 0 stands for all bricks that are not stored. An *entry* is a
+coarse cell in which samples have the lowest of their eight voxels, with the blocks of the eight cells from there on.
+Coordinates of rays are in voxels of cascade 0. N stored voxels, B bricks, L cascades, C coarse cells of all cascades, S samples, K harmonics.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.tree.march import STEP
+from efficientnerf.backends.numba.tree.walk import TreeGrid, box_distances, most_samples
+
+FIRST_BLOCKS, FIRST_SAMPLES = 128, 1024  # that a packet has room for before it grows
+
+
+class Cells(NamedTuple):
+    """Structure of a tree, all cascades alike; see `TreeGrid`.
+
+    step_length  of STEP voxels of cascade 0, units of the frame
+    brick_index  (C,) int32, leap (C,) uint8
+    shape        (L, 3) int64 coarse cells
+    first        (L,) int64 where a cascade's cells begin
+    corner       (L, 3) float64, voxels of cascade 0
+    scale        (L,) float64 side of a voxel, voxels of cascade 0
+    """
+
+    brick: int
+    nearest: bool
+    step_length: float
+    voxel_index: np.ndarray
+    brick_index: np.ndarray
+    leap: np.ndarray
+    shape: np.ndarray
+    first: np.ndarray
+    corner: np.ndarray
+    scale: np.ndarray
+
+
+class TreePointers(NamedTuple):
+    """Cells with arrays as pointers, and the densities (N,); `cascades` L, `cube` voxels of a brick, `inverse` of the brick's side."""
+
+    brick: int
+    cube: int
+    inverse: float
+    nearest: bool
+    step_length: float
+    cascades: int
+    voxel_index: Any
+    brick_index: Any
+    leap: Any
+    shape: Any
+    first: Any
+    corner: Any
+    scale: Any
+    density: Any
+
+
+class PacketArrays(NamedTuple):
+    """Memory of a packet, arrays or pointers to them. `most` blocks and entries, `samples` samples; T slots, most times cube; H = 4 most.
+
+    state       (3,) int64 numbers of blocks, of entries and of samples in use
+    cell_table  (H,) int32 open addressing: entries by their cell, -1 free
+    cell_key    (most,) int64 cell of an entry, row
+    blocks      (most, 8) int32 first slots of the eight blocks of an entry
+    brick_table (H,) int32: blocks by their brick, -1 free
+    owner       (most,) int32 brick of a block
+    met         (T,) uint8 whether a sample lies at a slot
+    density     (T,) of the slots, 0 where no voxel is stored
+    colour      (T, 4) arguments of the sigmoids, and 1; zeros where no voxel is stored
+    gradient    (T, 4) by these and by density
+    slots       (S, 8) int32 of a sample
+    weights     (S, 8) of interpolation
+    light       (S, 3) float64 alpha, transmittance at which light arrives, length of the step in units of the frame
+    shade       (S, 4) colour, and one over the weights of the voxels that are stored
+    """
+
+    most: int
+    samples: int
+    state: Any
+    cell_table: Any
+    cell_key: Any
+    blocks: Any
+    brick_table: Any
+    owner: Any
+    met: Any
+    density: Any
+    colour: Any
+    gradient: Any
+    slots: Any
+    weights: Any
+    light: Any
+    shade: Any
+
+
+BLOCKS, ENTRIES, SAMPLES = 0, 1, 2  # in `PacketArrays.state`
+
+
+def cells_of(grid: TreeGrid) -> Cells:
+    """All cascades of a tree's structure in the same arrays."""
+    shape = np.concatenate([np.asarray([grid.brick_index.shape], np.int64), grid.outer_shape])
+    first = np.concatenate([np.zeros(1, np.int64), grid.brick_index.size + grid.outer_first])
+    several = len(grid.outer_first) > 0
+    index = np.concatenate([grid.brick_index.reshape(-1), grid.outer_brick_index]) if several else np.ascontiguousarray(grid.brick_index).reshape(-1)
+    leap = np.concatenate([grid.leap.reshape(-1), grid.outer_leap]) if several else np.ascontiguousarray(grid.leap).reshape(-1)
+    corner, scale = np.concatenate([np.zeros((1, 3)), grid.outer_corner]), np.concatenate([np.ones(1), grid.outer_scale])
+    return Cells(grid.brick, grid.nearest, grid.step_length, np.ascontiguousarray(grid.voxel_index), index, leap, shape, first, corner, scale)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def tree_pointers(cells, density):  # type: ignore[no-untyped-def]
+    """See `TreePointers`."""
+    return TreePointers(
+        cells.brick, cells.brick * cells.brick * cells.brick, 1.0 / cells.brick, cells.nearest, cells.step_length, len(cells.first), pointer(cells.voxel_index),
+        pointer(cells.brick_index), pointer(cells.leap), pointer(cells.shape), pointer(cells.first), pointer(cells.corner), pointer(cells.scale),
+        pointer(density),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, error_model="numpy")
+def packet_arrays(most, samples, cube, density):  # type: ignore[no-untyped-def]
+    """Memory with room for so many blocks and samples, nothing in use; numbers of the type of `density`."""
+    slots, kind = most * cube, density.dtype
+    arrays = PacketArrays(
+        most, samples, np.zeros(3, np.int64), np.full(4 * most, -1, np.int32), np.empty(most, np.int64), np.zeros((most, 8), np.int32),
+        np.full(4 * most, -1, np.int32), np.full(most, -1, np.int32), np.zeros(slots, np.uint8), np.zeros(slots, kind), np.zeros((slots, 4), kind),
+        np.zeros((slots, 4), kind), np.zeros((samples, 8), np.int32), np.zeros((samples, 8), kind), np.zeros((samples, 3), np.float64),
+        np.zeros((samples, 4), kind),
+    )  # fmt: skip
+    arrays.state[BLOCKS] = 1
+    return arrays
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def packet_pointers(a):  # type: ignore[no-untyped-def]
+    """The same with pointers."""
+    return PacketArrays(
+        a.most, a.samples, pointer(a.state), pointer(a.cell_table), pointer(a.cell_key), pointer(a.blocks), pointer(a.brick_table), pointer(a.owner),
+        pointer(a.met), pointer(a.density), pointer(a.colour), pointer(a.gradient), pointer(a.slots), pointer(a.weights), pointer(a.light), pointer(a.shade),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _hash(key, size):  # type: ignore[no-untyped-def]
+    """Where to look first in a table of `size`, a power of two."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(mixed >> np.uint64(40)) & (size - 1)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def clear(packet, tree):  # type: ignore[no-untyped-def]
+    """Take everything out of a packet's memory."""
+    for n in range(4 * packet.most):
+        packet.cell_table[n] = np.int32(-1)
+        packet.brick_table[n] = np.int32(-1)
+    for n in range(packet.state[BLOCKS] * tree.cube):
+        packet.met[n] = np.uint8(0)
+    packet.state[BLOCKS], packet.state[ENTRIES], packet.state[SAMPLES] = 1, 0, 0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _block(owner, tree, packet):  # type: ignore[no-untyped-def]
+    """The block of a brick, filled where it is new; -1 where there is no room."""
+    size = 4 * packet.most
+    at = _hash(owner, size)
+    while packet.brick_table[at] >= 0:
+        block = np.int64(packet.brick_table[at])
+        if packet.owner[block] == owner:
+            return block
+        at = (at + 1) & (size - 1)
+    block = packet.state[BLOCKS]
+    if block == packet.most:
+        return np.int64(-1)
+    packet.state[BLOCKS] = block + 1
+    packet.brick_table[at], packet.owner[block] = np.int32(block), np.int32(owner)
+    first, source = block * tree.cube, owner * tree.cube
+    for n in range(tree.cube):
+        voxel = np.int64(tree.voxel_index[source + n])
+        packet.density[first + n] = tree.density[max(voxel, 0)] if voxel >= 0 else 0
+    return block
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _entry(a, b, c, cascade, tree, packet):  # type: ignore[no-untyped-def]
+    """The entry of a coarse cell, from -1 on along each axis; made where it is new; -1 where there is no room."""
+    nx, ny, nz = tree.shape[3 * cascade], tree.shape[3 * cascade + 1], tree.shape[3 * cascade + 2]
+    key = ((np.int64(cascade) * 2**20 + a + 1) * 2**21 + b + 1) * 2**21 + c + 1
+    size = 4 * packet.most
+    at = _hash(key, size)
+    while packet.cell_table[at] >= 0:
+        entry = np.int64(packet.cell_table[at])
+        if packet.cell_key[entry] == key:
+            return entry
+        at = (at + 1) & (size - 1)
+    entry = packet.state[ENTRIES]
+    if entry == packet.most:
+        return np.int64(-1)
+    for n in range(8):
+        i, j, k = a + (n >> 2), b + ((n >> 1) & 1), c + (n & 1)
+        packet.blocks[8 * entry + n] = np.int32(0)
+        if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
+            owner = np.int64(tree.brick_index[tree.first[cascade] + (i * ny + j) * nz + k])
+            if owner >= 0:
+                block = _block(owner, tree, packet)
+                if block < 0:
+                    return np.int64(-1)
+                packet.blocks[8 * entry + n] = np.int32(block * tree.cube)
+    packet.state[ENTRIES] = entry + 1
+    packet.cell_table[at], packet.cell_key[entry] = np.int32(entry), key
+    return entry
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _along(x, brick, stride):  # type: ignore[no-untyped-def]
+    """Offsets of voxels x and x + 1 of a brick along an axis, and whether the second one lies in the next brick."""
+    beyond = x + 1 == brick
+    return x * stride, 0 if beyond else (x + 1) * stride, beyond
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _place(n, value, weight, at, packet):  # type: ignore[no-untyped-def]
+    """Slot and weight of corner n of the sample that begins at `at`; returns its share of the density."""
+    packet.slots[at + n] = np.int32(value)
+    packet.weights[at + n] = weight
+    return np.float64(weight) * packet.density[value]
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):  # type: ignore[no-untyped-def]
+    """Density between the voxel (x, y, z) of an entry's cell and the seven beyond it; slots and weights from `at` on."""
+    brick = tree.brick
+    x0, x1, bx = _along(x, brick, brick * brick)
+    y0, y1, by = _along(y, brick, brick)
+    z0, z1, bz = _along(z, brick, 1)
+    i, j, k = 8 * entry + (4 if bx else 0), 2 if by else 0, 1 if bz else 0
+    e = 8 * entry
+    gx, gy, gz = 1 - fx, 1 - fy, 1 - fz
+    a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
+    blocks = packet.blocks
+    sigma = _place(0, blocks[e] + x0 + y0 + z0, a * gz, at, packet)
+    sigma += _place(1, blocks[e + k] + x0 + y0 + z1, a * fz, at, packet)
+    sigma += _place(2, blocks[e + j] + x0 + y1 + z0, b * gz, at, packet)
+    sigma += _place(3, blocks[e + j + k] + x0 + y1 + z1, b * fz, at, packet)
+    sigma += _place(4, blocks[i] + x1 + y0 + z0, c * gz, at, packet)
+    sigma += _place(5, blocks[i + k] + x1 + y0 + z1, c * fz, at, packet)
+    sigma += _place(6, blocks[i + j] + x1 + y1 + z0, d * gz, at, packet)
+    sigma += _place(7, blocks[i + j + k] + x1 + y1 + z1, d * fz, at, packet)
+    return sigma
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, cascade, tree, stop, min_weight, transmittance, packet):  # type: ignore[no-untyped-def]
+    """Samples of a ray between two distances in one cascade, all in its voxels; returns the transmittance behind them, or -1 where there is no room."""
+    brick, inverse, first = tree.brick, tree.inverse, tree.first[cascade]
+    ny, nz = tree.shape[3 * cascade + 1], tree.shape[3 * cascade + 2]
+    sx, sy, sz = tree.shape[3 * cascade] * brick, ny * brick, nz * brick
+    length = tree.step_length * tree.scale[cascade]
+    ix = 1 / dx if dx != 0 else 1e30
+    iy = 1 / dy if dy != 0 else 1e30
+    iz = 1 / dz if dz != 0 else 1e30
+    last = int(np.floor(min((t1 - t0) / STEP, most_samples(sx, sy, sz)))) + 1
+    entry, ea, eb, ec = np.int64(-1), -2, -2, -2
+    count, k = packet.state[SAMPLES], 0
+    while k < last:
+        t = t0 + (k + 0.5) * STEP
+        if t >= t1:
+            break
+        u, v, w = ox + t * dx, oy + t * dy, oz + t * dz
+        if not (0 <= u < sx and 0 <= v < sy and 0 <= w < sz):  # by rounding, at a face
+            k += 1
+            continue
+        a, b, c = int((int(u) + 0.5) * inverse), int((int(v) + 0.5) * inverse), int((int(w) + 0.5) * inverse)
+        leap = int(tree.leap[first + (a * ny + b) * nz + c])
+        if leap > 0:
+            fx = ((a + leap) * brick - ox) * ix if dx > 0 else ((a - leap + 1) * brick - ox) * ix
+            fy = ((b + leap) * brick - oy) * iy if dy > 0 else ((b - leap + 1) * brick - oy) * iy
+            fz = ((c + leap) * brick - oz) * iz if dz > 0 else ((c - leap + 1) * brick - oz) * iz
+            if dx == 0:
+                fx = 1e30
+            if dy == 0:
+                fy = 1e30
+            if dz == 0:
+                fz = 1e30
+            k = max(k + 1, int(np.ceil((min(fx, fy, fz) - t0) / STEP - 0.5)))
+            continue
+        k += 1
+        x, y, z, fx, fy, fz = int(u), int(v), int(w), 0.0, 0.0, 0.0
+        if not tree.nearest:
+            x, y, z = int(u + 0.5) - 1, int(v + 0.5) - 1, int(w + 0.5) - 1
+            fx, fy, fz = u - 0.5 - x, v - 0.5 - y, w - 0.5 - z
+            a, b, c = int((x + brick + 0.5) * inverse) - 1, int((y + brick + 0.5) * inverse) - 1, int((z + brick + 0.5) * inverse) - 1
+        if a != ea or b != eb or c != ec:
+            entry, ea, eb, ec = _entry(a, b, c, cascade, tree, packet), a, b, c
+        if entry < 0 or count == packet.samples:
+            return -1.0
+        at = 8 * count
+        if tree.nearest:
+            sigma = _place(0, packet.blocks[8 * entry] + ((x - a * brick) * brick + y - b * brick) * brick + z - c * brick, 1.0, at, packet)
+            for n in range(1, 8):
+                packet.slots[at + n], packet.weights[at + n] = np.int32(0), 0
+        else:
+            sigma = _interpolated(entry, x - a * brick, y - b * brick, z - c * brick, fx, fy, fz, at, tree, packet)
+        if sigma > 0:
+            alpha = 1 - np.exp(-sigma * length)
+            if transmittance * alpha >= min_weight:
+                packet.light[3 * count], packet.light[3 * count + 1], packet.light[3 * count + 2] = alpha, transmittance, length
+                for n in range(8):
+                    packet.met[packet.slots[at + n]] = np.uint8(1)
+                count += 1
+            transmittance *= 1 - alpha
+            if transmittance < stop:
+                break
+    packet.state[SAMPLES] = count
+    return transmittance
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _cascade_distances(origin, direction, tree, n):  # type: ignore[no-untyped-def]
+    """Distances at which a ray enters and leaves the box of cascade n, voxels of cascade 0; see `box_distances`."""
+    x, y, z = origin[0] - tree.corner[3 * n], origin[1] - tree.corner[3 * n + 1], origin[2] - tree.corner[3 * n + 2]
+    side = tree.scale[n] * tree.brick
+    return box_distances(
+        x, y, z, direction[0], direction[1], direction[2], tree.shape[3 * n] * side, tree.shape[3 * n + 1] * side, tree.shape[3 * n + 2] * side
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def walk_ray(origin, direction, tree, stop, min_weight, packet):  # type: ignore[no-untyped-def]
+    """Adds the samples of a ray to a packet, those that have density and weigh at least `min_weight`; returns the transmittance behind all of them, or -1
+    where there is no room.
+
+    Part p of a ray through a nested tree lies in cascade |L - 1 - p|, before or behind the box that is cut out of that.
+    """
+    transmittance, outermost = 1.0, tree.cascades - 1
+    for part in range(2 * outermost + 1):
+        n = abs(outermost - part)
+        t0, t1 = _cascade_distances(origin, direction, tree, n)
+        if n == outermost and not t1 > t0:
+            return transmittance
+        if n > 0:
+            enter, leave = _cascade_distances(origin, direction, tree, n - 1)
+            if leave > enter and part < outermost:
+                t1 = enter
+            elif part > outermost:
+                t0 = leave if leave > enter else t1
+        if t1 > t0:
+            scale = tree.scale[n]
+            ox, oy, oz = origin[0] - tree.corner[3 * n], origin[1] - tree.corner[3 * n + 1], origin[2] - tree.corner[3 * n + 2]
+            transmittance = _walk_part(
+                ox / scale, oy / scale, oz / scale, direction[0], direction[1], direction[2], t0 / scale, t1 / scale, n, tree, stop, min_weight,
+                transmittance, packet,
+            )  # fmt: skip
+            if transmittance < stop:
+                return transmittance
+    return transmittance

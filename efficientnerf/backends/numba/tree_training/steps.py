@@ -1,0 +1,257 @@
+"""Optimiser steps on a tree's values, restricted to the voxels that rays met (numba, all cores).
+
+RMSprop, or Adam (Kingma and Ba 2015) where there is a momentum, with bias corrections by how often a voxel was met. The second moment of a voxel's harmonics is
+the mean of its coefficients'. Plenoxels (Fridovich-Keil et al. 2022) are optimised with RMSprop. N voxels, K harmonics, L cascades, B bricks.
+
+A step minimises the rays' losses and, of each voxel that they met, with tau its optical thickness and n over the voxels beyond its faces that are stored,
+
+    total_variation sum_n (log tau - log tau_n)^2 / 2  +  sparsity (1 - exp(-tau))  +  entropy H(1 - exp(-tau)),    H(a) = -a log a - (1 - a) log(1 - a)
+
+where tau_n are those before the step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
+from efficientnerf.backends.numba.tree_training.tasks import take_next
+
+MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
+MAX_VISITS = 60000
+
+
+class Hyperparameters(NamedTuple):
+    """Of a step.
+
+    sides            (L,) float64: sides of the voxels of each cascade, units of the frame
+    cascades         (N,) uint8: the cascade of each voxel
+    density_rate     learning rate of the logarithm of the optical thickness
+    sh_rates         (3 K,) float32 learning rates of the coefficients
+    decay            of the running mean of the squared gradient
+    momentum         of the running mean of the gradient; 0: RMSprop
+    total_variation  weights of the module's terms
+    sparsity
+    entropy
+    terms            coefficients that have gradients, of each channel: the first ones; those beyond stay as they are
+    """
+
+    sides: np.ndarray
+    cascades: np.ndarray
+    density_rate: float
+    sh_rates: np.ndarray
+    decay: float
+    epsilon: float
+    momentum: float = 0.0
+    total_variation: float = 0.0
+    sparsity: float = 0.0
+    entropy: float = 0.0
+    terms: int = 25
+
+
+class Moments(NamedTuple):
+    """Running means of the gradients by the logarithm of the optical thickness (N,) and by the coefficients (N, 3 K), without rows where there is no momentum;
+    of their squares (N,), (N,); and the number of steps that met a voxel (N,) int32."""
+
+    density: np.ndarray
+    sh: np.ndarray
+    square_density: np.ndarray
+    square_sh: np.ndarray
+    visits: np.ndarray
+
+
+class Neighbours(NamedTuple):
+    """Where voxels lie, for total variation; without rows where there is none.
+
+    density  (N,) before the step
+    place    (N,) int64 of a voxel in voxel_index
+    around   (B, 6) int32 bricks beyond the faces -x, x, -y, y, -z, z of a brick, -1 where none is stored
+    """
+
+    density: np.ndarray
+    place: np.ndarray
+    around: np.ndarray
+    voxel_index: np.ndarray
+    brick: int
+
+
+NO_NEIGHBOURS = Neighbours(np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros((0, 6), np.int32), np.zeros((0, 1), np.int32), 1)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _neighbour(place, face, neighbours):  # type: ignore[no-untyped-def]
+    """The voxel beyond a face of the one at a place, -1 where none is stored."""
+    brick = neighbours.brick
+    cube = brick * brick * brick
+    owner, at = place // cube, place % cube
+    stride = brick * brick if face < 2 else brick if face < 4 else 1
+    x = at // stride % brick
+    if face & 1:
+        if x + 1 < brick:
+            return neighbours.voxel_index[owner, at + stride]
+        other, at = neighbours.around[owner, face], at - (brick - 1) * stride
+    else:
+        if x > 0:
+            return neighbours.voxel_index[owner, at - stride]
+        other, at = neighbours.around[owner, face], at + (brick - 1) * stride
+    return neighbours.voxel_index[other, at] if other >= 0 else np.int32(-1)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _link(low, chunks, slab, records, head, following):  # type: ignore[no-untyped-def]
+    """Lists of the records of each voxel of a bin, in their order: head[v - low], and following[n], where n counts the records of the bin."""
+    number = 0
+    for chunk in range(chunks):
+        number += records.begin[chunk, slab + 1] - records.begin[chunk, slab]
+    if number > len(following):
+        return number
+    for chunk in range(chunks - 1, -1, -1):
+        for at in range(records.begin[chunk, slab + 1] - 1, records.begin[chunk, slab] - 1, -1):
+            number -= 1
+            v = records.numbers[at, 0] - low
+            following[number, 0], following[number, 1] = at, head[v]
+            head[v] = number
+    return 0
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _gather(number, terms, records, following, gradient):  # type: ignore[no-untyped-def]
+    """Sum of the records of a list into `gradient` (3 terms,); returns that by density."""
+    by_density = 0.0
+    gradient[: 3 * terms] = 0
+    while number >= 0:
+        at = following[number, 0]
+        red, green, blue = records.gradient[at, 0], records.gradient[at, 1], records.gradient[at, 2]
+        by_density += records.gradient[at, 3]
+        basis = records.basis[records.numbers[at, 1]]
+        for k in range(terms):
+            gradient[3 * k] += basis[k] * red
+            gradient[3 * k + 1] += basis[k] * green
+            gradient[3 * k + 2] += basis[k] * blue
+        number = following[number, 1]
+    return by_density
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _regularised(v, slope, thickness, voxel, neighbours, h):  # type: ignore[no-untyped-def]
+    """The gradient by the logarithm of a voxel's optical thickness with those of the regularisers."""
+    if h.total_variation > 0:
+        place, here = neighbours.place[v], np.log(thickness)
+        for face in range(6):
+            other = _neighbour(place, face, neighbours)
+            if other >= 0:
+                slope += h.total_variation * (here - np.log(max(neighbours.density[other] * voxel, MIN_THICKNESS)))
+    if h.sparsity > 0:
+        slope += h.sparsity * thickness * np.exp(-thickness)
+    if h.entropy > 0:
+        left = np.exp(-thickness)
+        slope += h.entropy * thickness * left * -(np.log(max(1 - left, 1e-30)) + thickness)
+    return slope
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _update(v, by_density, gradient, terms, density, sh, moments, neighbours, h):  # type: ignore[no-untyped-def]
+    """A step of one voxel."""
+    decay, epsilon, momentum, visits = h.decay, h.epsilon, h.momentum, moments.visits
+    visits[v] = min(visits[v] + 1, MAX_VISITS)
+    correction, voxel = 1 / (1 - decay ** float(visits[v])), h.sides[h.cascades[v]]
+    # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
+    thickness = max(density[v] * voxel, MIN_THICKNESS)
+    slope = _regularised(v, by_density / voxel * thickness, thickness, voxel, neighbours, h)
+    square = decay * moments.square_density[v] + (1 - decay) * slope * slope
+    moments.square_density[v] = square
+    ahead = 1.0
+    if momentum > 0:
+        ahead = 1 / (1 - momentum ** float(visits[v]))
+        slope = momentum * moments.density[v] + (1 - momentum) * slope
+        moments.density[v] = slope
+    change = h.density_rate * ahead * slope / (np.sqrt(square * correction) + epsilon)
+    density[v] = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel
+    values, rates, mean = sh[v], h.sh_rates, gradient.dtype.type(0)
+    for j in range(3 * terms):
+        mean += gradient[j] * gradient[j]
+    square = decay * moments.square_sh[v] + (1 - decay) * mean / (3 * terms)
+    moments.square_sh[v] = square
+    scale = gradient.dtype.type(ahead / (np.sqrt(square * correction) + epsilon))
+    if momentum > 0:
+        running, old, new = moments.sh[v], gradient.dtype.type(momentum), gradient.dtype.type(1 - momentum)
+        for j in range(3 * terms):
+            running[j] = old * running[j] + new * gradient[j]
+            values[j] -= scale * rates[j] * running[j]
+    else:
+        for j in range(3 * terms):
+            values[j] -= scale * rates[j] * gradient[j]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _link_all(low, slab, records, head, following):  # type: ignore[no-untyped-def]
+    """`_link` with as much room as it needs: `following`, or a larger one."""
+    more = _link(low, records.begin.shape[0], slab, records, head, following)
+    if more > 0:
+        following = np.empty((2 * more, 2), np.int64)
+        _link(low, records.begin.shape[0], slab, records, head, following)
+    return following
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _step_bins(task, records, density, sh, moments, neighbours, hyperparameters):  # type: ignore[no-untyped-def]
+    """Takes bins until none is left."""
+    bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
+    terms = min(hyperparameters.terms, sh.shape[1] // 3)
+    head, following, gradient = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64), np.empty(sh.shape[1], sh.dtype)
+    slab = take_next(pointer(task))
+    while slab < bins:
+        low = slab << BIN_BITS
+        following = _link_all(low, slab, records, head, following)
+        for v in range(low, min(len(density), low + size)):
+            number = head[v - low]
+            if number >= 0:
+                head[v - low] = -1
+                by_density = _gather(number, terms, records, following, gradient)
+                _update(v, by_density, gradient, terms, density, sh, moments, neighbours, hyperparameters)
+        slab = take_next(pointer(task))
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _step(workers, task, records, density, sh, moments, neighbours, hyperparameters):  # type: ignore[no-untyped-def]
+    for _ in numba.prange(workers):
+        _step_bins(task, records, density, sh, moments, neighbours, hyperparameters)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sum_gradients(records, grad_density, grad_sh):  # type: ignore[no-untyped-def]
+    bins, terms, size = records.begin.shape[1] - 1, grad_sh.shape[1] // 3, 1 << BIN_BITS
+    head, following, gradient = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64), np.empty(grad_sh.shape[1], grad_sh.dtype)
+    for slab in range(bins):
+        low = slab << BIN_BITS
+        following = _link_all(low, slab, records, head, following)
+        for v in range(low, min(len(grad_density), low + size)):
+            number = head[v - low]
+            if number >= 0:
+                head[v - low] = -1
+                grad_density[v] += _gather(number, terms, records, following, gradient)
+                grad_sh[v] += gradient
+
+
+def step(
+    records: Records, values: tuple[np.ndarray, np.ndarray], moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS
+) -> None:
+    """A step for the voxels that the records name; the others stay.
+
+        s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
+        p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
+
+    values  density (N,) and sh (N, 3 K), updated in place
+    """
+    if hyperparameters.total_variation > 0:
+        np.copyto(neighbours.density, values[0])
+    _step(min(numba.get_num_threads(), records.begin.shape[1] - 1), np.zeros(1, np.int64), records, *values, moments, neighbours, hyperparameters)
+
+
+def sum_gradients(records: Records, grad_density: np.ndarray, grad_sh: np.ndarray) -> None:
+    """Add the gradients of the summed loss with respect to density (N,) and sh (N, 3 K)."""
+    _sum_gradients(records, grad_density, grad_sh)

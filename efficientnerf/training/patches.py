@@ -1,0 +1,69 @@
+"""Patches of neighbouring pixels, whose rays meet the same voxels. T tiles, P patches, R pixels."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from efficientnerf.training.pixels import Pixels
+
+
+class Patches(NamedTuple):
+    """Drawn patches: pixels (R,) of all, the first pixel of each in these (P + 1,), and its tile (P,)."""
+
+    pixels: np.ndarray
+    first: np.ndarray
+    tile: np.ndarray
+
+
+class PatchGrid:
+    """All views in tiles of `side` pixels, by which patches are drawn: a tile, then one of the side^2 patches whose lowest corner is in it.
+
+    tiles of view v  from first[v] on, rows[v] times columns[v]
+    mean_pixels      of a patch that may be used
+    angle            across a patch, radians, about
+
+    What lies beyond the image, or is masked, is left out of a patch. So every pixel that may be used is as probable as any other where all tiles are.
+    """
+
+    def __init__(self, pixels: Pixels, side: int) -> None:
+        self.pixels, self.side = pixels, side
+        self.rows, self.columns = ((sides + side - 2) // side + 1 for sides in (pixels.height, pixels.width))
+        self.first = np.concatenate([[0], np.cumsum(self.rows * self.columns)]).astype(np.int64)
+        usable = len(pixels) if pixels.usable is None else int(np.unpackbits(pixels.usable, count=len(pixels)).sum())
+        self.mean_pixels = usable / len(self)
+        left, right = (pixels.lens + np.maximum(pixels.knots // 2 - back, 0) for back in (1, 0))
+        self.angle = float(side * np.linalg.norm(pixels.lookup[right] - pixels.lookup[left], axis=1).max() / pixels.stride)
+
+    def __len__(self) -> int:
+        """T."""
+        return int(self.first[-1])
+
+    def draw(self, count: int, rng: np.random.Generator, cumulative: np.ndarray | None = None) -> Patches:
+        """Patches of about `count` pixels, at least one, with replacement; none is empty.
+
+        cumulative  (T,) sums of the tiles' probabilities, to one at the last; None: all are alike
+        """
+        while True:
+            patches = max(1, round(count / self.mean_pixels))
+            tile = rng.integers(len(self), size=patches) if cumulative is None else np.searchsorted(cumulative, rng.random(patches), side="right")
+            drawn = self._patches(np.minimum(tile, len(self) - 1), rng.integers(self.side, size=(2, patches)))
+            if len(drawn.tile):
+                return drawn
+
+    def _patches(self, tile: np.ndarray, back: np.ndarray) -> Patches:
+        """The patches that begin so many rows and columns (2, P) before the corner of their tile."""
+        view = np.searchsorted(self.first, tile, side="right") - 1
+        row, column = np.divmod(tile - self.first[view], self.columns[view])
+        step = np.arange(self.side)
+        y = (self.side * row - back[0])[:, None, None] + step[:, None]  # (P, side, 1)
+        x = (self.side * column - back[1])[:, None, None] + step  # (P, 1, side)
+        width, height = self.pixels.width[view][:, None, None], self.pixels.height[view][:, None, None]
+        index = self.pixels.offsets[view][:, None, None] + y * width + x  # (P, side, side)
+        there = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        if self.pixels.usable is not None:
+            there &= self.pixels.usable_at(np.where(there, index, 0).reshape(-1)).reshape(there.shape)
+        sizes = there.sum(axis=(1, 2))
+        some = sizes > 0
+        return Patches(index[there], np.concatenate([[0], np.cumsum(sizes[some])]).astype(np.int64), tile[some])

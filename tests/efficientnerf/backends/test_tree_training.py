@@ -1,0 +1,153 @@
+"""Training of a tree in packets of rays: gradients against autograd whatever the packets, steps and regularisers against their formulas, the same bytes on
+any number of threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
+from efficientnerf.asset.refinement.host import in_voxels, packet_bases
+from efficientnerf.asset.refinement.state import RefinementState, initial_state
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree.march import EARLY_STOP
+from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
+from efficientnerf.backends.numba.tree_training.packets import cells_of
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, Hyperparameters, Moments, step, sum_gradients
+from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
+
+# brick, degree, lookup
+TREES = [(1, 0, "trilinear"), (2, 4, "trilinear"), (4, 2, "trilinear"), (5, 1, "nearest")]
+
+
+def parallel_rays(tree: NerfTree, count: int, packet: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of which each packet's go the same way, from near one another."""
+    origins, directions = nested_rays(tree, count) if tree.outer else rays_at(tree, count)
+    lead = np.arange(count) // packet * packet
+    beside = np.random.default_rng(1).uniform(-3, 3, (count, 3)) * tree.voxel
+    return origins[lead] + beside, directions[lead]
+
+
+@pytest.mark.parametrize(("brick", "degree", "lookup"), TREES)
+@pytest.mark.parametrize("whole", [False, True])
+def test_packets_of_parallel_rays_have_the_gradients_of_autograd(brick: int, degree: int, lookup: str, *, whole: bool) -> None:
+    tree = random_cascades(1, brick=brick, degree=degree, lookup=lookup) if whole else random_tree(2, brick=brick, degree=degree, lookup=lookup)
+    origins, directions = parallel_rays(tree, 150, 16)
+    seen = seen_at_random(150, 0.7)
+    loss, *found = gradients(tree, origins, directions, seen, packet=16)
+    wanted, *wanted_by = gradients_by_autograd(replace(tree, environment=None), origins, directions, seen)
+    np.testing.assert_allclose(loss, wanted, atol=3e-6)
+    for ours, theirs in zip(found, wanted_by, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=2e-5 * np.abs(theirs).max())
+    assert (found[0] != 0).mean() > 0.03
+
+
+def test_a_packet_grows_until_all_its_rays_fit() -> None:
+    """All rays of a large tree in one packet: many times the blocks and samples that it begins with."""
+    tree = random_tree(3, shape=(7, 7, 7), brick=2, degree=0, share=0.9, sigma=0.5)
+    origins, directions = rays_at(tree, 600)
+    seen = seen_at_random(600, 0.2)
+    one, all_at_once = gradients(tree, origins, directions, seen), gradients(tree, origins, directions, seen, packet=600)
+    for a, b in zip(one, all_at_once, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12 * np.abs(a).max())
+    assert (one[1] != 0).sum() > 2 * kernels.FIRST_BLOCKS
+
+
+def test_light_samples_absorb_and_have_no_gradient() -> None:
+    tree = random_tree(5, brick=3, degree=1)
+    origins, directions = rays_at(tree, 100)
+    seen = seen_at_random(100, 0.5)
+    _, by_density, _ = gradients(tree, origins, directions, seen)
+    loss, none, no_sh = gradients(tree, origins, directions, seen, min_weight=2.0)
+    assert (by_density != 0).any()
+    assert not none.any()
+    assert not no_sh.any()
+    black = replace(tree, harmonics=np.full_like(tree.sh, -1e4 / 3) * (np.arange(4) == 0)[:, None])
+    np.testing.assert_allclose(loss, gradients(black, origins, directions, seen)[0], atol=1e-9)
+
+
+def records_of(tree: NerfTree, state: RefinementState, seed: int, packet: int = 4) -> Records:
+    origins, directions = rays_at(tree, 100, seed=seed)
+    seen = seen_at_random(100, 0.2, np.float32)
+    start, along, bases = in_voxels(tree, origins, directions)
+    first = packets_of(100, packet)
+    cells, basis = cells_of(tree_grid(tree)), packet_bases(bases, first)
+    return kernels.forward_backward(cells, first, start, along, basis, state.density, state.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
+
+
+def empty_moments(state: RefinementState, *, adam: bool) -> Moments:
+    count, width = state.sh.shape if adam else (0, state.sh.shape[1])
+    return Moments(np.zeros(count, np.float32), np.zeros((count, width), np.float32), state.square_density, state.square_sh, state.visits)
+
+
+GRIDS: list[Callable[[], NerfTree]] = [lambda: random_tree(4, brick=2, degree=1), lambda: random_cascades(4, brick=2)]
+
+
+@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
+@pytest.mark.parametrize(("momentum", "terms"), [(0.0, 4), (0.8, 4), (0.8, 1)])
+def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: float, terms: int) -> None:
+    tree = made()
+    sides, o = voxel_sides(tree), initial_state(tree)
+    rates = np.linspace(0.01, 0.02, o.sh.shape[1]).astype(np.float32)
+    moments, count, width = empty_moments(o, adam=momentum > 0), len(o.density), 3 * terms
+    density, sh = o.density.astype(np.float64), o.sh.astype(np.float64)
+    square_density, square_sh, visits, m_density, m_sh = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((count, width))
+    for number in (1, 2, 3):
+        records = records_of(tree, o, number)
+        by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
+        sum_gradients(records, by_density, by_sh)
+        rule = Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, rates, 0.9, 1e-12, momentum, terms=terms)
+        step(records, (o.density, o.sh), moments, rule)
+        met = np.zeros(count, bool)
+        for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
+            met[records.numbers[begin:end, 0]] = True
+        visits += met
+        slope, flat = by_density * np.maximum(density, MIN_THICKNESS / sides), by_sh[:, :width]
+        square_density = np.where(met, 0.9 * square_density + 0.1 * slope**2, square_density)
+        square_sh = np.where(met, 0.9 * square_sh + 0.1 * (flat**2).mean(axis=1), square_sh)
+        m_density = np.where(met, momentum * m_density + (1 - momentum) * slope, m_density)
+        m_sh = np.where(met[:, None], momentum * m_sh + (1 - momentum) * flat, m_sh)
+        right, ahead = np.maximum(1 - 0.9**visits, 1e-30), np.maximum(1 - momentum**visits, 1e-30) if momentum else 1.0
+        density = np.where(met, density * np.exp(-0.1 * m_density / ahead / (np.sqrt(square_density / right) + 1e-12)), density)
+        sh[:, :width] -= met[:, None] * rates[:width] * m_sh / ((np.sqrt(square_sh / right) + 1e-12) * ahead)[:, None]
+        np.testing.assert_array_equal(o.visits, visits)
+        np.testing.assert_allclose(o.density, density, rtol=2e-3, atol=1e-5)
+        np.testing.assert_allclose(o.sh, sh, atol=2e-3)
+    assert len(np.unique(visits)) > 1  # some were not met by every bundle
+    np.testing.assert_array_equal(o.sh[:, width:], tree.sh.reshape(count, -1)[:, width:])
+
+
+def test_the_same_bytes_on_any_number_of_threads() -> None:
+    tree, found = random_cascades(3, cells=8, brick=2, degree=2), []
+    threads = numba.get_num_threads()
+    origins, directions = nested_rays(tree, 1500)
+    seen = seen_at_random(1500, 0.2, np.float32)
+    start, along, bases = in_voxels(tree, origins, directions)
+    first = packets_of(1500, 7)
+    try:
+        for count in (1, threads):
+            numba.set_num_threads(count)
+            o = initial_state(tree)
+            moments = empty_moments(o, adam=True)
+            for _ in range(2):
+                loss, records = kernels.forward_backward(
+                    cells_of(tree_grid(tree)), first, start, along, packet_bases(bases, first), o.density, o.sh, seen, RecordBuffer()
+                )
+                step(records, (o.density, o.sh), moments, rule_of(tree, o, momentum=0.9))
+            found.append((loss, o.density, o.sh, *moments))
+    finally:
+        numba.set_num_threads(threads)
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def rule_of(tree: NerfTree, state: RefinementState, **more: Any) -> Hyperparameters:
+    return Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, np.full(state.sh.shape[1], 0.01, np.float32), 0.9, 1e-12, **more)
