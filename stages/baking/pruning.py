@@ -85,19 +85,23 @@ def prune(
     return subset_state(state, keep, tree), Pruned(pruned_share, find_holes(job, tree, samples)[1], int((restored & keep).sum()))
 
 
+def count_rays(job: Job, ndc: bool, voxels: int, targets: Targets) -> int:
+    """Training rays that are rendered to see which of so many voxels show."""
+    per_voxel = NDC_RAYS_PER_VOXEL if ndc else RAYS_PER_VOXEL
+    return min(max(job.settings.visibility_rays, int(per_voxel * voxels)), 4 * len(targets.pixels))
+
+
 def greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.ndarray:
     """(N,) the greatest contribution of each voxel to one of many training pixels."""
     from efficientnerf.asset.refinement import fit
 
-    settings = job.settings
-    per_voxel = RAYS_PER_VOXEL if state.tree.ndc is None else NDC_RAYS_PER_VOXEL
-    count = min(max(settings.visibility_rays, int(per_voxel * len(state.density))), 4 * len(targets.pixels))
+    count = count_rays(job, state.tree.ndc is not None, len(state.density), targets)
 
     def progress(done: int, total: int) -> None:
         job.progress(done, total, "rendering for voxel weights")
         job.safe_point()
 
-    return fit.max_weights(state.tree, targets, count, settings.seed, progress)
+    return fit.max_weights(state.tree, targets, count, job.settings.seed, progress)
 
 
 def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from stages.baking.checkpoint import Point
 from stages.baking.holes import find_holes
 from stages.baking.log import RefinementLog
 from stages.baking.pruning import Pruned, most_children
-from stages.baking.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, Stopwatch, allotted, clock, timed_schedule
+from stages.baking.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, timed_schedule
 from stages.training.budget import Budget
 from stages.training.log import draw_curve, psnr_of
 from stages.training.previews import Previews
@@ -52,6 +52,7 @@ class Refinement:
     """A refinement that is going on.
 
     budget   seconds of the stage up to the end of the last step, or None
+    per_ray  seconds that measuring the error of a ray took
     samples  of the field, for whole scenes: what was dropped wrongly is restored by them
     baked    of whole scenes the voxels as they were baked, without harmonics
     """
@@ -63,6 +64,7 @@ class Refinement:
     point: Point
     log: RefinementLog
     budget: float | None
+    per_ray: float = 0.0
     samples: FieldSamples | None = None
     baked: NerfTree | None = None
     written: float = field(default_factory=clock)
@@ -92,8 +94,20 @@ class Refinement:
         if self.budget is None or point.phase == len(phases):
             return
         point.began = point.seconds = self.stopwatch.seconds
-        point.allotted = allotted(phases, point.phase, self.budget - point.began)
+        point.allotted = allotted(phases, point.phase, self.budget - point.began - self._operations_left())
         point.schedule = point.schedule.with_phase(point.phase, timed_schedule())
+
+    def _operations_left(self) -> float:
+        """About how many seconds will go into which voxels show."""
+        state, phases = self.point.state, self.point.schedule.phases
+        voxels, rays = len(state.density), 0
+        for number, phase in enumerate(phases[self.point.phase :], self.point.phase):
+            if phase.after == "none":
+                continue
+            rays += pruning.count_rays(self.job, state.tree.ndc is not None, voxels, self.targets)
+            room = self.room(count_splits(phases[: number + 1]))
+            voxels = min(8 * voxels, most_children(room)) if phase.after == "split" else min(voxels, room)
+        return rays * self.per_ray * WEIGHT_SECONDS
 
     def _take_steps(self) -> None:
         """Take the steps that are left of the phase, with checkpoints on the way and where it is stopped."""
@@ -177,7 +191,8 @@ def refined(
     targets = targets_on_device(job, tree, targets, splits, room)
     began = clock()
     before = fit.error(tree, targets, sample, settings.seed)
-    finish = clock() - began + FINISH_SECONDS_PER_VOXEL * most
+    measuring = clock() - began
+    finish = measuring + FINISH_SECONDS_PER_VOXEL * most
     schedule = stated_schedule(phases, steps) if seconds is None else RefinementSchedule(phases)
     baked = None if samples is None else _without_harmonics(tree, capped=bool(steps))
     point = _first_point(job, tree, schedule, stopwatch, timed=seconds is not None, capped=bool(steps))
@@ -187,7 +202,7 @@ def refined(
     if point.state.step == 0:
         log.begin(point.state, phases[0].name, before)
     del tree  # the state has values of its own
-    made = Refinement(job, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, samples, baked)
+    made = Refinement(job, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, measuring / sample, samples, baked)
     tree = made.run()
     report |= {"steps": point.state.step, "schedule": point.schedule.state(), "time_budget": settings.time_budget}
     report["psnr_before"], report["psnr_after"] = (round(psnr_of(error), 3) for error in (before, fit.error(tree, targets, sample, settings.seed)))

@@ -14,6 +14,7 @@ clock = time.monotonic
 # docs/experiments/refinement.md
 WARMUP, TIMED = 2, 8  # first steps of a phase that are not timed; those after them that are, before the number of its steps is set
 FINISH_SECONDS_PER_VOXEL = 3e-6  # that the palettes and the file take
+WEIGHT_SECONDS = 0.5  # that a ray takes which is rendered for voxel weights, over one whose error is measured
 HOLD = WARMUP + TIMED
 
 
