@@ -108,6 +108,9 @@ class BakeSettings:
 
 @compiling_kernels
 def run(job: Job) -> None:
+    from stages.baking.timing import Stopwatch
+
+    stopwatch = Stopwatch()
     from efficientnerf.asset import format
     from efficientnerf.asset.cascades import voxel_cascades
     from efficientnerf.asset.components import foreground_bricks
@@ -115,7 +118,6 @@ def run(job: Job) -> None:
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.resolution import budget_of
-    from stages.baking.timing import Stopwatch
     from stages.baking.values import baked_tree
     from stages.baking.whole_scene import bounds_are_given
     from stages.evaluation.views import constant_background
@@ -124,7 +126,7 @@ def run(job: Job) -> None:
     from stages.io.refined_cameras import load_scene
     from stages.training.data import pixels_of
 
-    settings, stopwatch = job.settings, Stopwatch()
+    settings: BakeSettings = job.settings
     use_all_cores()
     m = load_renderer(job.inputs["train"], job.device).model
     if m.settings.field == "nerf":

@@ -39,6 +39,7 @@ clock = time.monotonic
 
 @compiling_kernels
 def run(job: Job) -> None:
+    began = clock()
     from efficientnerf.model import model
     from efficientnerf.rendering.field_renderer import FieldRenderer
     from efficientnerf.training import loop
@@ -48,7 +49,7 @@ def run(job: Job) -> None:
     from stages.training.hash_resolution import with_auto_sizes
 
     use_all_cores()
-    began, folder, outputs = clock(), inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
+    folder, outputs = inputs_of(TrainInputs, job.inputs).poses.folder, TrainOutputs(job.out)
     s = scene.load(folder)
     views = scene.views_of(s, "train")
     settings, space = with_camera_refinement(with_auto_sizes(job.settings, s, count_pixels(views)), s), field_file.space_of(s)
@@ -65,9 +66,7 @@ def run(job: Job) -> None:
     log = TrainLog(job.work / TrainOutputs.log, t.step, spent, AsyncOccupancy(m.voxels), clock)
     previews = Previews(lambda camera: FieldRenderer(m, near, far).render(camera).colour, m.background, folder, s, job.work, given(settings.preview_every))
     previews.draw_when_due(t.step)
-    budget = training_budget(settings, job.work, spent + clock() - began, clock, job.warn) if settings.time_budget != "off" else None
-    if budget is not None:
-        t.schedule = budget.schedule
+    budget = begin_budget(job, t, spent + clock() - began)
 
     log.begin_step()
     for done in loop.train(t, pixels, sparse_depth_of(folder, s)):
@@ -98,6 +97,15 @@ def run(job: Job) -> None:
     shutil.copyfile(log.path, outputs.log)
     log.draw_curve(outputs.curve)
     previews.publish(outputs.previews, job.warn)
+
+
+def begin_budget(job: Job, t: Trainer, spent: float) -> Budget | None:
+    """The budget, so many seconds of which are spent, and its schedule for the trainer; None where there is none."""
+    if job.settings.time_budget == "off":
+        return None
+    budget = training_budget(t.model.settings, job.work, spent, clock, job.warn)
+    t.schedule = budget.schedule
+    return budget
 
 
 def follow_budget(job: Job, t: Trainer, budget: Budget) -> None:
