@@ -10,9 +10,16 @@ import os
 import signal
 import threading
 
+import pytest
+
 for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ[variable] = "1"
 
 # A test run that was started in the background inherits an ignored SIGINT, and would hand it on to the programs that the tests interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_thread() is threading.main_thread():
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that may take long begin first, so that no worker is left alone with one at the end."""
+    items.sort(key=lambda item: -max((mark.args[0] for mark in item.iter_markers("timeout")), default=0))

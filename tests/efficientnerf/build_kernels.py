@@ -2,7 +2,8 @@
 
     python -m tests.efficientnerf.build_kernels
 
-A line for each kernel as launched and each generation: name, constants, registers a thread, bytes of stack (what does not fit the registers).
+The first variant of a kernel is built for each generation, others for the last. A line for each: name, constants, registers a thread, bytes of stack
+(what does not fit the registers).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ TYPES = {
 }  # fmt: skip
 DUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 seen: set[str] = set()
+names: set[str] = set()
 
 
 def resources(cubin: bytes) -> tuple[int, int]:
@@ -57,7 +59,9 @@ def build(self: JITFunction, *args: Any, grid: Any, warmup: bool, num_warps: int
     if key in seen:
         return
     seen.add(key)
-    for generation in GENERATIONS:
+    generations = GENERATIONS[-1:] if self.__name__ in names else GENERATIONS
+    names.add(self.__name__)
+    for generation in generations:
         source = ASTSource(fn=self, signature=signature, constexprs=constants, attrs=attributes)
         made = triton.compile(source, target=GPUTarget("cuda", generation, 32), options={"num_warps": num_warps})
         registers, stack = resources(made.asm["cubin"])

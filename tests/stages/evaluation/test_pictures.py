@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.stage import Job
 from stages.io.scene import load
 from tests.fakes import WHITE, BallField
 from tests.stages.evaluation.balls import HEIGHT, TREE, WIDTH, figures_of, job_in, make_scene, measure, settings
@@ -68,18 +69,26 @@ def test_the_captured_path_is_a_video_of_the_asset(tmp_path: Path) -> None:
     assert sorted(path.name for path in job.out.iterdir()) == ["captured_path.mp4", "contact_sheet.png", "metrics.json"]
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Job]:
+    """Poses and a job that has been done, with its work folder."""
+    folder = tmp_path_factory.mktemp("whole")
+    poses = make_scene(folder / "poses", "tt")
+    job = job_in(folder, poses, settings(strips="on", captured_path_frames=2))
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job)
+    return poses, job
+
+
 @pytest.mark.parametrize("pattern", ["strip_*", "captured/frame_*"])
 @pytest.mark.parametrize("how", SPOILERS)
-def test_damaged_strips_and_frames_are_made_again(tmp_path: Path, how: str, pattern: str) -> None:
-    poses, chosen = make_scene(tmp_path / "poses", "tt"), settings(strips="on", captured_path_frames=2)
-    whole = job_in(tmp_path / "whole", poses, chosen)
-    measure(TREE, lambda: BallField(TREE, background=WHITE), whole)
-    shutil.copytree(whole.work, tmp_path / "work")
-    for path in sorted(whole.work.glob(pattern)):
-        SPOILERS[how](tmp_path / "work" / path.relative_to(whole.work))
-    job = job_in(tmp_path, poses, chosen)
+def test_damaged_strips_and_frames_are_made_again(whole: tuple[Path, Job], tmp_path: Path, how: str, pattern: str) -> None:
+    poses, undisturbed = whole
+    shutil.copytree(undisturbed.work, tmp_path / "work")
+    for path in sorted(undisturbed.work.glob(pattern)):
+        SPOILERS[how](tmp_path / "work" / path.relative_to(undisturbed.work))
+    job = job_in(tmp_path, poses, undisturbed.settings)
     measure(TREE, lambda: BallField(TREE, background=WHITE), job)
-    names = [path.name for path in sorted(whole.out.iterdir())]
+    names = [path.name for path in sorted(undisturbed.out.iterdir())]
     assert len(names) == 5
     for name in names:
-        assert (job.out / name).read_bytes() == (whole.out / name).read_bytes()
+        assert (job.out / name).read_bytes() == (undisturbed.out / name).read_bytes()

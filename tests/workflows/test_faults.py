@@ -1,0 +1,16 @@
+"""A short form of `make faults`, of real stages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.workflows.test_torture import torment
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_failing_operations_lose_nothing(tmp_path: Path) -> None:
+    result = torment(tmp_path, "benchmarks.torture.faults", "--sources", "blender", "--share", "50")
+    assert result["cases"] >= 20
