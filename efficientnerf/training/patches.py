@@ -40,6 +40,13 @@ class PatchGrid:
         """T."""
         return int(self.first[-1])
 
+    def centres(self, tile: np.ndarray) -> np.ndarray:
+        """The pixels at the middle of tiles, or where they reach beyond the image the last of a row or column."""
+        view = np.searchsorted(self.first, tile, side="right") - 1
+        row, column = np.divmod(tile - self.first[view], self.columns[view])
+        y, x = (np.minimum(at * self.side + self.side // 2, sides[view] - 1) for at, sides in ((row, self.pixels.height), (column, self.pixels.width)))
+        return self.pixels.offsets[view] + y * self.pixels.width[view] + x
+
     def draw(self, count: int, rng: np.random.Generator, cumulative: np.ndarray | None = None) -> Patches:
         """Patches of about `count` pixels, at least one, with replacement; none is empty.
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from efficientnerf.asset.refinement.host import DECAY, EPSILON
 from efficientnerf.asset.refinement.state import STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
+from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
@@ -69,11 +70,12 @@ def optimise(
     state.fetch()
     state.device_state = arrays = DeviceArrays(state, targets.pixels.device)
     patches = PatchGrid(targets.host_pixels, patch_side)
+    chances = probabilities(tiles_met(state.tree, patches))
     pending: deque[tuple[Tensor, Any]] = deque()
     error = None
     while state.step < until:
         number = state.step + 1
-        origins, directions, wanted = targets.of(patches.draw(rays, step_rng(seed, number)).pixels)
+        origins, directions, wanted = targets.of(patches.draw(rays, step_rng(seed, number), chances).pixels)
         factor = fall(number)
         loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, density_lr * factor, sh_lr * factor, view_dependent_lr_ratio)
         pending.append(to_host_async(loss.mean() / 3))

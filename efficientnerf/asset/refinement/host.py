@@ -12,6 +12,7 @@ import numpy as np
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
+from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.walk import tree_grid
@@ -47,6 +48,7 @@ def optimise(
     """See `efficientnerf.asset.refinement.fit.optimise`."""
     cells, buffer = cells_of(tree_grid(state.tree)), RecordBuffer()
     patches = PatchGrid(targets.host_pixels, patch_side)
+    chances = probabilities(tiles_met(state.tree, patches))
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
     moments = Moments(*none, state.square_density, state.square_sh, state.visits)
     sides, cascades = cascade_sides(state.tree), voxel_cascades(state.tree)
@@ -54,7 +56,7 @@ def optimise(
     rates[3:] *= view_dependent_lr_ratio
     while state.step < until:
         number = state.step + 1
-        drawn = patches.draw(rays, step_rng(seed, number))
+        drawn = patches.draw(rays, step_rng(seed, number), chances)
         origins, directions, wanted = targets.of(drawn.pixels)
         start, along, bases = in_voxels(state.tree, origins, directions)
         first = drawn.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
