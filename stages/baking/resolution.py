@@ -26,7 +26,8 @@ MAX_RESOLUTION = 1024
 MAX_MIB, SCENE_MAX_MIB = 24, 38
 # Of whole scenes: cascades at most; the share of what the field shows that may lie beyond the last one, in the environment map; coarse cells of all of them.
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
-NDC_BYTES, NDC_MAX_MIB = 36, 56  # in normalised device coordinates: bytes for each pixel of the box's face; MiB at most. docs/experiments/ndc.md
+# In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
+NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 36, 24, 56
 MIN_FILL = 0.93  # of the size that is used, at least
 MAX_TRIES = 4
 
@@ -85,11 +86,12 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
 
 def budget_of(s: Scene, given: int | None, *, whole: bool = False) -> int:
     """MiB that an asset may have: those given, or else MAX_MIB, or SCENE_MAX_MIB of a whole scene. In normalised device coordinates, where nothing is empty
-    and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, where that is more; at most NDC_MAX_MIB."""
+    and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. No asset is larger than its voxels are, of
+    which the finest have the width that pixels tell apart (`finest_resolution`)."""
     if given is not None or s.forward is None:
         return (SCENE_MAX_MIB if whole else MAX_MIB) if given is None else given
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
-    return int(np.clip(NDC_BYTES * across * down / 2**20, MAX_MIB, NDC_MAX_MIB))
+    return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
 
 
 def ndc_pixel(s: Scene, forward: ForwardFacing) -> float:

@@ -19,7 +19,7 @@ from stages import bake, train
 from stages.artifacts import BakeOutputs
 from stages.bake import BakeSettings
 from stages.baking.pruning import NDC_RAYS_PER_VOXEL
-from stages.baking.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, budget_of, finest_resolution, ndc_pixel
+from stages.baking.resolution import MAX_MIB, NDC_BYTES, NDC_MAX_MIB, NDC_MIN_MIB, budget_of, finest_resolution, ndc_pixel
 from stages.framing.forward_facing import detect_forward_facing
 from stages.io.field_file import load_renderer
 from stages.io.png import write_png
@@ -124,11 +124,11 @@ def test_a_space_of_deeper_voxels_has_the_same_grid_coordinates(inputs: dict[str
 
 def test_the_budget_follows_the_pixels_that_are_shown(tmp_path: Path) -> None:
     small, large, huge = (forward_facing(side) for side in (200, 1000, 4000))
-    assert budget_of(small, None) == MAX_MIB
+    assert budget_of(small, None) == NDC_MIN_MIB
     assert budget_of(huge, None) == NDC_MAX_MIB
     assert large.forward is not None
     across, down = (large.forward.bounds[1] - large.forward.bounds[0])[:2] / ndc_pixel(large, large.forward)
-    assert budget_of(large, None) == int(np.clip(NDC_BYTES * across * down / 2**20, MAX_MIB, NDC_MAX_MIB))
+    assert budget_of(large, None) == int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
     assert budget_of(huge, 7) == 7
     assert budget_of(load(poses(tmp_path)), None) == MAX_MIB
     assert finest_resolution(huge, None).resolution == 1024
