@@ -13,7 +13,8 @@ import numpy as np
 NUMBERS = [0, 1, -1, 2, 3, 7, 8, 16, 17, 63, 64, 65, 255, 256, 257, 2**16, 2**31, 2**32, 2**53, 2**63, 2**64, 10**30, 0.5, -0.0, 1e-30, 1e30, 1e300, 1e-320]
 TEXTS = [
     "", "sparse", "compact", "full", "ndc-sparse", "ndc-compact", "ndc-full", "nested-sparse", "nested-compact", "nearest-nested-sparse",
-    "U8", "U16", "U64", "F16", "F32", "F64", "1.0", "1.3", "1.4", "1.9", "2.0",
+    "packed", "nested-packed",
+    "U8", "U16", "U64", "F16", "F32", "F64", "1.0", "1.3", "1.4", "1.5", "1.9", "2.0",
     "x.a", "nerftree", "\ud7ff\0", "9" * 50,
 ]  # fmt: skip
 # Densities and harmonics that strain sums: halves and what lies between.

@@ -72,8 +72,10 @@ class BakeSettings:
         " scene without a constant background; 36 bytes for each pixel of a forward-facing capture, from 24 to 56.",
         unit="MiB",
     )
-    layout: Literal["compact", "small", "sparse"] = setting(
-        "compact", "How voxels are stored: codes of 8 bits (compact), a coarser palette of half the bytes (small), or 16-bit floats (sparse)."
+    layout: Literal["compact", "packed", "small", "sparse"] = setting(
+        "compact",
+        "How voxels are stored: codes of 8 bits (compact), the same entropy-coded (packed), a coarser palette of half the bytes (small), or 16-bit floats"
+        " (sparse).",
     )
     dilate: Annotated[int, Meta(ge=0, le=8)] = setting(1, "Voxels by which the visible ones are dilated.", advanced=True)
     min_component: Fraction = setting(

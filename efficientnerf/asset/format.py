@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from efficientnerf.asset.cascades import Cascade, brick_ranges, cascades_of, check_cascades
-from efficientnerf.asset.file import whole_scene
+from efficientnerf.asset.file import packed, whole_scene
 from efficientnerf.asset.file.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
 from efficientnerf.asset.file.layouts import LAYOUTS
 from efficientnerf.asset.file.memory import check_memory, needed
@@ -38,9 +38,8 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
     written = written_as(tree, layout)
     tensors = {whole_scene.occupancy_name(n): whole_scene.bits(cascade.brick_index >= 0) for n, cascade in enumerate(cascades_of(tree))} | written.tensors
     whole, more = _whole_scene(tree)
-    tensors |= more
     name, minor = layout_name(written.layout, ndc=tree.ndc is not None, nested="cascades" in whole, lookup=tree.lookup)
-    minor = max(minor or LAYOUTS[written.layout].minor, 0 if tree.region is None else whole_scene.MINOR)
+    minor = max(minor, LAYOUTS[written.layout].minor, 0 if tree.region is None else whole_scene.MINOR)
     meta = {
         **{key: value for key, value in tree.metadata.items() if key not in STRUCTURE},
         "format": "nerftree",
@@ -58,8 +57,13 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
         "background": None if tree.background is None else [float(x) for x in tree.background],
         **written.metadata,
         **whole,
-        "sha256": {name: hashlib.sha256(value.tobytes()).hexdigest() for name, value in tensors.items()},
     }
+    shapes, types = {name: value.shape for name, value in tensors.items()}, {name: value.dtype for name, value in tensors.items()}
+    if written.layout == "packed":
+        tensors, entry = packed.packed(meta, tensors)
+        meta |= entry
+    tensors |= more
+    meta["sha256"] = {name: hashlib.sha256(value.tobytes()).hexdigest() for name, value in tensors.items()}
     try:
         text = json.dumps(meta, sort_keys=True, separators=(",", ":"), allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -67,8 +71,7 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
     if whole:
         whole_scene.check_whole_scene("the tree can't be saved", meta)
     data: bytes = save_tensors(tensors, metadata={METADATA_KEY: text})
-    shapes, types = {name: value.shape for name, value in tensors.items()}, {name: value.dtype for name, value in tensors.items()}
-    check_memory("the tree can't be saved", len(data), needed(written.layout, meta, shapes, types))
+    check_memory("the tree can't be saved", written.layout, len(data), needed(written.layout, meta, shapes, types))
     return data
 
 
@@ -113,9 +116,10 @@ def save(tree: NerfTree, path: str | Path, layout: str | None = None) -> None:
 
 def _tensors_of(meta: dict[str, Any]) -> dict[str, tuple[str, ...]]:
     """Tensors that a file of these metadata, which are checked, has, and the types that each may have."""
+    layout = LAYOUTS[layout_of(meta)]
     return {
-        **{whole_scene.occupancy_name(n): ("U8",) for n in range(len(whole_scene.grids_of(meta)))},
-        **LAYOUTS[layout_of(meta)].tensors,
+        **({} if layout.unpacked else {whole_scene.occupancy_name(n): ("U8",) for n in range(len(whole_scene.grids_of(meta)))}),
+        **layout.tensors,
         **({whole_scene.ENVIRONMENT: ("U8",)} if whole_scene.environment_rows(meta) else {}),
         **({whole_scene.REGION: ("U8",)} if whole_scene.names_bricks(meta) else {}),
     }
@@ -143,18 +147,30 @@ def _open(path: str | Path) -> Header:
         if header.tensors[tensor][0] not in allowed:
             raise FormatError(f"{name}: tensor '{tensor}' is {header.tensors[tensor][0][:20]}; expected {' or '.join(allowed)}")
     shapes = {tensor: header.tensors[tensor][1] for tensor in types}
+    held, kinds = _held(header)
     rows = whole_scene.environment_rows(meta)
     expected = {
         **{whole_scene.occupancy_name(n): (math.ceil(math.prod(grid.shape) / 8),) for n, grid in enumerate(whole_scene.grids_of(meta))},
         **layout.expected(name, meta, shapes),
         whole_scene.ENVIRONMENT: (rows, 2 * rows, 3),
-        whole_scene.REGION: (math.ceil(_bricks(shapes) / 8),),
+        whole_scene.REGION: (math.ceil(_bricks(held) / 8),),
     }
     for tensor, shape in shapes.items():
         if shape != expected[tensor]:
             raise FormatError(f"{name}: tensor '{tensor}' has shape {shape}; expected {expected[tensor]}")
-    check_memory(name, header.size, needed(layout_of(meta), meta, shapes, {tensor: DTYPES[header.tensors[tensor][0]] for tensor in types}))
+    check_memory(name, layout_of(meta), header.size, needed(layout_of(meta), meta, held, kinds))
     return header
+
+
+def _held(header: Header) -> tuple[dict[str, tuple[int, ...]], dict[str, np.dtype[Any]]]:
+    """Shapes and types of a file's tensors, and of those that they are unpacked to where they are entropy-coded."""
+    layout = LAYOUTS[layout_of(header.meta)]
+    types = _tensors_of(header.meta)
+    shapes, kinds = layout.claimed(header.name, header.meta) if layout.claimed else ({}, {})
+    return {**{tensor: header.tensors[tensor][1] for tensor in types}, **shapes}, {
+        **{tensor: DTYPES[header.tensors[tensor][0]] for tensor in types},
+        **kinds,
+    }
 
 
 def load(path: str | Path) -> NerfTree:
@@ -166,6 +182,8 @@ def load(path: str | Path) -> NerfTree:
     name, meta = header.name, header.meta
     layout = LAYOUTS[layout_of(meta)]
     raw = {tensor: header.read_verified(tensor) for tensor in _tensors_of(meta)}
+    if layout.unpacked is not None:
+        raw = layout.unpacked(name, meta, raw)
     cascades, bricks = _cascades(name, meta, raw), len(raw["brick.mask" if "brick.mask" in raw else "brick.density"])
     owned = sum(int(np.count_nonzero(cascade.brick_index >= 0)) for cascade in cascades)
     if owned != bricks:
@@ -227,21 +245,21 @@ def contents(path: str | Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]
 def describe(path: str | Path) -> dict[str, Any]:
     """The metadata of an asset file, from its header alone."""
     header = _open(path)
-    meta, shapes = header.meta, {name: entry[1] for name, entry in header.tensors.items()}
+    meta, shapes = header.meta, _held(header)[0]
     shape, brick, voxel = [int(n) for n in meta["shape"]], int(meta["brick"]), float(meta["voxel"])
     resolution = [n * brick for n in shape]
     low = [float(x) for x in meta["bounds_min"]]
     full = layout_of(meta) == "full"
     voxels = math.prod(shapes["brick.density"]) if full else shapes["voxel.density"][0]
     sizes = {name: end - begin for name, (_, _, begin, end) in sorted(header.tensors.items())}
-    per_voxel = sum(size for name, size in sizes.items() if name.startswith("brick." if full else "voxel."))
+    per_voxel = sum(size for name, size in sizes.items() if name.startswith("brick." if full else ("voxel.", "packed.")))
     facts = {
         "format": "nerftree",
         "format_version": meta["format_version"],
         "layout": meta["layout"],
         "bytes": header.size,
         "bytes_per_part": {"header": header.start, **sizes},
-        "bytes_per_voxel": per_voxel // voxels if voxels else 0,
+        "bytes_per_voxel": (round(per_voxel / voxels, 2) if layout_of(meta) == "packed" else per_voxel // voxels) if voxels else 0,
         "coarse_cells": shape,
         "brick": brick,
         "resolution": resolution,
@@ -250,7 +268,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "voxel_side": voxel,
         "sh_degree": meta["sh_degree"],
         **({"values": header.tensors["brick.sh"][0]} if full else {}),
-        **({"sh_groups": meta["sh_groups"], "palette": shapes["sh.palette"][0]} if layout_of(meta) == "compact" else {}),
+        **({"sh_groups": meta["sh_groups"], "palette": shapes["sh.palette"][0]} if layout_of(meta) in ("compact", "packed") else {}),
         "bounds": {"min": low, "max": [a + n * voxel for a, n in zip(low, resolution, strict=True)]},
         "background": meta["background"],
         "lookup": lookup_of(header.name, meta),

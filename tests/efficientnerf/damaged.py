@@ -22,7 +22,7 @@ SIMILARITY = {"scale": 0.5, "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "tra
 ORBIT = {"centre": [0.0, 0.1, 0.2], "radius": 3.0, "elevation": 25.0, "forward_facing": False, "heading": 40.0}
 METADATA = {"world_from_capture": SIMILARITY, "orbit": ORBIT, "metric": True, "licence": "CC0-1.0", "provenance": {"tool": "a test"}}
 TENSORS = ("coarse.occupancy", *LAYOUTS["sparse"].tensors)
-NESTED = ("nested-sparse", "nested-compact", "nested-full")
+NESTED = ("nested-sparse", "nested-compact", "nested-packed", "nested-full")
 
 
 def tiny(degree: int = 0, **more: Any) -> NerfTree:

@@ -31,6 +31,7 @@ from tests.efficientnerf.damaged import (
     without,
     without_entry,
 )
+from tests.efficientnerf.hostile_packed import PACKED
 from tests.efficientnerf.hostile_scenes import SCENES
 
 HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
@@ -68,7 +69,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "no version": (lambda: meta_with(format_version="absent"), "expected MAJOR.MINOR"),
     "a strange version": (lambda: meta_with(format_version="1.٠"), "expected MAJOR.MINOR"),
     "a version that is a number": (lambda: meta_with(format_version=1), "expected MAJOR.MINOR"),
-    "another layout": (lambda: meta_with(layout="octree"), "layout octree; this build reads sparse, compact, full. Upgrade"),
+    "another layout": (lambda: meta_with(layout="octree"), "layout octree; this build reads sparse, compact, packed, full. Upgrade"),
     "other harmonics": (lambda: meta_with(sh_convention="complex"), "harmonics complex"),
     "another colour space": (lambda: meta_with(colour_space="linear"), "expected real-orthonormal-plenoctree in srgb-sigmoid"),
     "no shape": (lambda: meta_with(shape="absent"), "'shape' is None; expected 3 numbers"),
@@ -180,6 +181,7 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "a spiral of no width": (lambda: spiral({"tangents": [0, 1]}), "'tangents'"),
     "a spiral that ends behind its camera": (lambda: spiral({"far": -1}), "'far' is -1"),
     **SCENES,
+    **PACKED,
     # memory
     "nearly empty cascades": (lambda: hollow(), r"take [0-9]+ MB of memory; expected at most 8 times the size and 200 MB"),
     "one voxel in 2^27 cells": (lambda: filled((512, 512, 512), 1), r"16\.8 MB that take 805 MB of memory; expected at most 8 times the size and 200 MB"),

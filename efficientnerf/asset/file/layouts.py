@@ -2,6 +2,7 @@
 
     sparse   the stored voxels, halves                                            2 + 6 K bytes a voxel
     compact  the stored voxels, codes into tables and palettes                    4 + G (or 2 G) bytes a voxel
+    packed   the same, entropy-coded                                              about half
     full     the paper's plain layout: all voxels of each brick, halves or floats
 
 B bricks, N stored voxels, K harmonics, G groups of them, T entries of a table, P of a palette.
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.asset.file import packed
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.rendering.harmonics import harmonics_count
@@ -30,10 +32,12 @@ class Layout:
     """The tensors of one layout, and how they are read.
 
     minor    the format 1.x that brought it
-    tensors  names beside `coarse.occupancy`, and the types that each may have
+    tensors  names beside `coarse.occupancy` (which entropy-coded layouts do not have), and the types that each may have
     expected shapes that the tensors must have, from the metadata and the shapes they do have
     stored   which voxels of each brick are stored, (B, b^3) bool
     values   density (N,) float32 and harmonics of the stored voxels; anything wrong in them is a FormatError
+    unpacked  of an entropy-coded layout the tensors that `stored` and `values` read, those of `coarse.occupancy` among them
+    claimed  of such a layout the shapes and types that the metadata claim for these
     """
 
     minor: int
@@ -41,6 +45,8 @@ class Layout:
     expected: Callable[[str, dict[str, Any], dict[str, Shape]], dict[str, Shape]]
     stored: Callable[[str, dict[str, Any], Tensors], np.ndarray]
     values: Callable[[str, dict[str, Any], Tensors, int], tuple[np.ndarray, np.ndarray | PaletteHarmonics]]
+    unpacked: Callable[[str, dict[str, Any], Tensors], Tensors] | None = None
+    claimed: Callable[[str, dict[str, Any]], tuple[dict[str, Shape], dict[str, np.dtype[Any]]]] | None = None
 
 
 def _voxels_of(meta: dict[str, Any]) -> int:
@@ -108,20 +114,18 @@ def _groups_of(name: str, meta: dict[str, Any]) -> tuple[int, ...]:
 def _compact_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
     count = found["voxel.density"][0] if len(found["voxel.density"]) == 1 else -1
     groups = _groups_of(name, meta)
+    codes = {"brick.mask": _mask_shape(meta, found), "voxel.density": (count,), "voxel.base": (count, 3), "voxel.sh": (count, len(groups))}
+    return codes | _table_shapes(name, meta, found)
+
+
+def _table_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
     most = {"density.table": 256, "base.table": 256, "sh.palette": 65536}
     length = {table: _first(found[table]) for table in most}
     for table, limit in most.items():
         if length[table] > limit:
             raise FormatError(f"{name}: tensor '{table}' has {length[table]} entries; expected at most {limit}")
-    return {
-        "brick.mask": _mask_shape(meta, found),
-        "voxel.density": (count,),
-        "density.table": (length["density.table"],),
-        "voxel.base": (count, 3),
-        "base.table": (length["base.table"], 3),
-        "voxel.sh": (count, len(groups)),
-        "sh.palette": (length["sh.palette"], _harmonics_of(meta) - 1, 3),
-    }
+    above = _harmonics_of(meta) - 1
+    return {"density.table": (length["density.table"],), "base.table": (length["base.table"], 3), "sh.palette": (length["sh.palette"], above, 3)}
 
 
 def _compact_values(name: str, meta: dict[str, Any], raw: Tensors, count: int) -> tuple[np.ndarray, PaletteHarmonics]:
@@ -132,6 +136,18 @@ def _compact_values(name: str, meta: dict[str, Any], raw: Tensors, count: int) -
     table, base, palette = (raw[key].astype(np.float32) for key in ("density.table", "base.table", "sh.palette"))
     _sound(name, table, base, palette)
     return table[raw["voxel.density"]], PaletteHarmonics(raw["voxel.base"], base, raw["voxel.sh"], palette, _groups_of(name, meta))
+
+
+# packed
+
+
+def _packed_shapes(name: str, meta: dict[str, Any], found: dict[str, Shape]) -> dict[str, Shape]:
+    _claimed(name, meta)
+    return {stream: (_first(found[stream]),) for stream in packed.STREAMS} | _table_shapes(name, meta, found)
+
+
+def _claimed(name: str, meta: dict[str, Any]) -> tuple[dict[str, Shape], dict[str, np.dtype[Any]]]:
+    return packed.claimed(name, meta, len(_groups_of(name, meta)))
 
 
 # full
@@ -162,6 +178,11 @@ LAYOUTS = {
             "density.table": ("F32",), "base.table": ("F32",), "sh.palette": ("F16",),
         },
         _compact_shapes, _masked, _compact_values,
+    ),
+    "packed": Layout(
+        packed.MINOR,
+        {**dict.fromkeys(packed.STREAMS, ("U8",)), "density.table": ("F32",), "base.table": ("F32",), "sh.palette": ("F16",)},
+        _packed_shapes, _masked, _compact_values, packed.unpacked, _claimed,
     ),
     "full": Layout(1, {"brick.density": ("F16", "F32"), "brick.sh": ("F16", "F32")}, _full_shapes, _full_stored, _full_values),
 }  # fmt: skip

@@ -1,6 +1,6 @@
 """Memory that an asset takes, from its header: the rule of FORMAT.md, section 10, which keeps it in proportion to the file's size.
 
-A bit of a file may stand for four bytes of an index, and a stranger's file may have little else.
+A bit of a file may stand for four bytes of an index, and a stranger's file may have little else; of an entropy-coded one for whatever its metadata claim.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.whole_scene import environment_rows, grids_of
 from efficientnerf.rendering.harmonics import harmonics_count
 
-TIMES, BESIDES = 8, 200_000_000  # of the file's size, and bytes
+TIMES, PACKED_TIMES, BESIDES = 8, 24, 200_000_000  # of the file's size, of an entropy-coded one's, and bytes
 CELL = 6  # its brick, how far a ray may leap from it, and whether it is full
 BRICK, SLOT = 72, 5  # where it lies, and which of its voxels are stored; for each of its voxels which of the stored ones it is
 VOXEL = 20  # its density, and its colour for a view
+NEIGHBOURS = 12  # three of them, while it is unpacked
 ENVIRONMENT = 24  # a pair of texels of an environment map as floats
 PALETTE = 28  # a coefficient of a palette as a float, in two orders of the axes, one of them padded
 
@@ -26,23 +27,24 @@ def needed(layout: str, meta: dict[str, Any], shapes: dict[str, tuple[int, ...]]
     """Bytes of FORMAT.md, section 10.
 
     layout  without its prefixes
-    shapes, types  of the layout's tensors
+    shapes, types  of the layout's tensors, or of those that it is unpacked to
     """
     cube, coefficients = int(meta["brick"]) ** 3, 3 * harmonics_count(int(meta["sh_degree"]))
     bricks = shapes["brick.density" if layout == "full" else "brick.mask"][0]
     voxels = bricks * cube if layout == "full" else shapes["voxel.density"][0]
     cells = sum(math.prod(grid.shape) for grid in grids_of(meta))
     total = CELL * cells + (BRICK + SLOT * cube) * bricks + ENVIRONMENT * environment_rows(meta) ** 2
-    if layout != "compact":
+    if layout not in ("compact", "packed"):
         return total + (VOXEL + 4 * coefficients) * voxels
-    each = VOXEL + 3 + shapes["voxel.sh"][1] * types["voxel.sh"].itemsize
+    each = VOXEL + (NEIGHBOURS if layout == "packed" else 0) + 3 + shapes["voxel.sh"][1] * types["voxel.sh"].itemsize
     if str(meta["layout"]).startswith("nearest-"):
         each += 4 * coefficients
     return total + each * voxels + PALETTE * math.prod(shapes["sh.palette"][:2])
 
 
-def check_memory(name: str, size: int, needed_bytes: int) -> None:
+def check_memory(name: str, layout: str, size: int, needed_bytes: int) -> None:
     """Raises FormatError where a file of `size` bytes needs more than the rule allows."""
-    if needed_bytes > TIMES * size + BESIDES:
-        found = f"{size / 1e6:.1f} MB that take {needed_bytes / 1e6:.0f} MB of memory; expected at most {TIMES} times the size and {BESIDES / 1e6:.0f} MB"
+    times = PACKED_TIMES if layout == "packed" else TIMES
+    if needed_bytes > times * size + BESIDES:
+        found = f"{size / 1e6:.1f} MB that take {needed_bytes / 1e6:.0f} MB of memory; expected at most {times} times the size and {BESIDES / 1e6:.0f} MB"
         raise FormatError(f"{name}: {found}. Its cells or bricks are nearly all empty: bake it with other bricks (bake.brick_size), or do not trust it.")

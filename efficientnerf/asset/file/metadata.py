@@ -19,7 +19,7 @@ NDC_MINOR = 2  # the version that brought them
 NEAREST_MINOR = 3
 STRUCTURE = {
     "format", "format_version", "layout", "shape", "brick", "voxel", "bounds_min", "sh_degree", "sh_convention", "sh_groups", "colour_space",
-    "background", "sha256", "ndc", "lookup", "cascades", "environment", "region",
+    "background", "sha256", "ndc", "lookup", "cascades", "environment", "region", "packed",
 }  # fmt: skip
 
 

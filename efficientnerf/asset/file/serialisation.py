@@ -1,6 +1,7 @@
 """A tree as the tensors of a layout. WRITERS has them by name:
 
     compact  the file layout `compact`, a code of eight bits per harmonic       12 bytes a voxel of degree 2
+    packed   the file layout `packed`: the same or fewer codes, entropy-coded    3 to 7
     small    the same layout, one code of 16 bits for all harmonics              6
     sparse   halves                                                             56
     full     all voxels of each brick, halves; full32: floats
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,9 @@ def written_as(tree: NerfTree, writer: str | None) -> Written:
 
 
 def bytes_per_voxel(writer: str, degree: int) -> int:
-    """Of a stored voxel in `compact`, `small` or `sparse`, without the masks of the bricks."""
+    """Of a stored voxel in `compact`, `small` or `sparse`, without the masks of the bricks; at most so many in `packed`."""
     harmonics = harmonics_count(degree)
-    return {"compact": 4 + (harmonics - 1), "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
+    return {"compact": 4 + (harmonics - 1), "packed": 4 + (harmonics - 1), "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
 
 
 def most_voxels(
@@ -60,7 +61,7 @@ def most_voxels(
     shape        coarse cells of the grid; `outer` those of the cascades around it
     environment  rows of the environment map, 0 without one
     """
-    palette = {"compact": 256, "small": SMALL_ENTRIES, "sparse": 0}[writer] * (harmonics_count(degree) - 1) * 6
+    palette = {"compact": 256, "packed": 256, "small": SMALL_ENTRIES, "sparse": 0}[writer] * (harmonics_count(degree) - 1) * 6
     fixed = 2**14 + sum(math.prod(cells) // 8 for cells in (shape, *outer)) + palette + 6 * environment**2
     mask = 8 * math.ceil(brick**3 / 64) / max(1.0, brick**3 / 4)
     return max(0, int((size - fixed) / (bytes_per_voxel(writer, degree) + mask)))
@@ -139,6 +140,13 @@ def _compact(tree: NerfTree) -> Written:
     return _coded(tree if kept else compacted(_checked(tree)))
 
 
+def _packed(tree: NerfTree) -> Written:
+    """Codes as they are, whatever their groups; `format.serialize` codes them."""
+    from efficientnerf.asset.quantisation import compacted
+
+    return replace(_coded(tree if isinstance(tree.harmonics, PaletteHarmonics) else compacted(_checked(tree))), layout="packed")
+
+
 def _small(tree: NerfTree) -> Written:
     from efficientnerf.asset.quantisation import compacted
 
@@ -182,6 +190,7 @@ def _full(tree: NerfTree, dtype: str = "<f2") -> Written:
 
 WRITERS: dict[str, Callable[[NerfTree], Written]] = {
     "compact": _compact,
+    "packed": _packed,
     "small": _small,
     "sparse": _sparse,
     "full": _full,

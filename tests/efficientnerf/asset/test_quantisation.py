@@ -137,7 +137,7 @@ def test_groups_must_hold_all_harmonics() -> None:
 # Layouts
 
 
-@pytest.mark.parametrize(("layout", "most"), [("compact", 0.003), ("small", 0.01), ("sparse", 0.0005), ("full", 0.003), ("full32", 0.003)])
+@pytest.mark.parametrize(("layout", "most"), [("compact", 0.003), ("packed", 0.003), ("small", 0.01), ("sparse", 0.0005), ("full", 0.003), ("full32", 0.003)])
 def test_a_layout_shows_the_same(tmp_path: Path, layout: str, most: float) -> None:
     tree = smooth_tree()
     save(tree, tmp_path / "a.nerftree", layout)
@@ -209,5 +209,5 @@ def test_trees_of_nothing_have_every_layout(tmp_path: Path, layout: str) -> None
 
 
 def test_an_unknown_layout_is_refused() -> None:
-    with pytest.raises(ValueError, match="layout 'zip'; expected one of compact, small, sparse, full, full32"):
+    with pytest.raises(ValueError, match="layout 'zip'; expected one of compact, packed, small, sparse, full, full32"):
         serialize(random_tree(0), "zip")

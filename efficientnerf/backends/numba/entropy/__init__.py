@@ -1,0 +1,1 @@
+"""Entropy coding of the asset layout `packed` (efficientnerf/asset/FORMAT.md, section 14)."""
