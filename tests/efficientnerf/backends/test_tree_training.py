@@ -14,13 +14,13 @@ import pytest
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import RefinementState, initial_state
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, Hyperparameters, Moments, step, sum_gradients
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, Hyperparameters, Moments, neighbours_of, step, sum_gradients
 from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
@@ -151,3 +151,60 @@ def test_the_same_bytes_on_any_number_of_threads() -> None:
 
 def rule_of(tree: NerfTree, state: RefinementState, **more: Any) -> Hyperparameters:
     return Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, np.full(state.sh.shape[1], 0.01, np.float32), 0.9, 1e-12, **more)
+
+
+def penalty(tree: NerfTree, log_thickness: np.ndarray, old: np.ndarray, met: np.ndarray, kind: str) -> float:
+    """The term of weight one, over the voxels that were met, by the formula of the module; the neighbours' thickness is the old one."""
+    thickness = np.exp(log_thickness)
+    alpha = 1 - np.exp(-thickness[met])
+    if kind == "sparsity":
+        return float(alpha.sum())
+    if kind == "entropy":
+        return float(-(alpha * np.log(alpha) + (1 - alpha) * np.log(1 - alpha)).sum())
+    at = np.concatenate([voxel_coordinates(tree), voxel_cascades(tree)[:, None]], axis=1)
+    number = {tuple(place): n for n, place in enumerate(at.tolist())}
+    total = 0.0
+    for v in np.flatnonzero(met):
+        for axis in range(3):
+            for step_by in (-1, 1):
+                beside = at[v].copy()
+                beside[axis] += step_by
+                n = number.get(tuple(beside.tolist()))
+                total += 0.0 if n is None else (log_thickness[v] - old[n]) ** 2 / 2
+    return total
+
+
+@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
+@pytest.mark.parametrize("kind", ["total_variation", "sparsity", "entropy"])
+def test_regularisers_are_slopes_of_their_terms(made: Callable[[], NerfTree], kind: str) -> None:
+    """RMSprop's first mean of squares, less the rays' part, is that of the term's differences."""
+    tree = made()
+    o = initial_state(replace(tree, density_values=np.random.default_rng(0).uniform(1, 30, len(tree.density_values)).astype(np.float32)))
+    records = records_of(tree, o, 1)
+    by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
+    sum_gradients(records, by_density, by_sh)
+    old = np.log(o.density.astype(np.float64) * voxel_sides(tree))
+    slope = by_density.astype(np.float64) * o.density
+    neighbours = neighbours_of(cells_of(tree_grid(tree)), len(o.density))
+    step(records, (o.density, o.sh), empty_moments(o, adam=False), rule_of(tree, o, **{kind: 0.7}), neighbours)
+    met = o.visits > 0
+    assert 10 < met.sum() < len(met)
+    for v in np.random.default_rng(1).choice(np.flatnonzero(met), 12, replace=False):
+        ends = []
+        for side in (1e-5, -1e-5):
+            moved = old.copy()
+            moved[v] += side
+            ends.append(penalty(tree, moved, old, np.arange(len(met)) == v, kind))
+        wanted = slope[v] + 0.7 * (ends[0] - ends[1]) / 2e-5
+        assert np.sqrt(o.square_density[v] / 0.1) == pytest.approx(abs(wanted), rel=2e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
+def test_total_variation_smooths_what_was_met_alone(made: Callable[[], NerfTree]) -> None:
+    tree = made()
+    o = initial_state(tree)
+    before = o.density.copy()
+    step(records_of(tree, o, 2), (o.density, o.sh), empty_moments(o, adam=False), rule_of(tree, o, total_variation=1e6),
+         neighbours_of(cells_of(tree_grid(tree)), len(o.density)))  # fmt: skip
+    np.testing.assert_array_equal(o.density[o.visits == 0], before[o.visits == 0])
+    assert (o.density != before)[o.visits > 0].mean() > 0.8

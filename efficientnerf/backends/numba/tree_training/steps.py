@@ -12,6 +12,7 @@ where tau_n are those before the step.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +20,12 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
-from efficientnerf.backends.numba.tree_training.tasks import take_next
+from efficientnerf.backends.numba.tree_training.packets import Cells
+from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
 
 MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
 MAX_VISITS = 60000
+AHEAD = 8  # voxels whose values are fetched before their turn
 
 
 class Hyperparameters(NamedTuple):
@@ -33,6 +36,7 @@ class Hyperparameters(NamedTuple):
     density_rate     learning rate of the logarithm of the optical thickness
     sh_rates         (3 K,) float32 learning rates of the coefficients
     decay            of the running mean of the squared gradient
+    epsilon          added to its root
     momentum         of the running mean of the gradient; 0: RMSprop
     total_variation  weights of the module's terms
     sparsity
@@ -51,6 +55,15 @@ class Hyperparameters(NamedTuple):
     sparsity: float = 0.0
     entropy: float = 0.0
     terms: int = 25
+
+
+@functools.lru_cache(maxsize=8)
+def corrections(decay: float) -> np.ndarray:
+    """1 / (1 - decay^n) float32 for n from 0 on, as far as it differs from one and visits are counted; the first is one."""
+    powers = decay ** np.arange(MAX_VISITS + 1, dtype=np.float64)
+    powers[0] = 0
+    table = (1 / (1 - powers)).astype(np.float32)
+    return table[: int((table != 1).nonzero()[0].max(initial=0)) + 2]
 
 
 class Moments(NamedTuple):
@@ -77,6 +90,23 @@ class Neighbours(NamedTuple):
     around: np.ndarray
     voxel_index: np.ndarray
     brick: int
+
+
+def neighbours_of(cells: Cells, voxels: int) -> Neighbours:
+    """Where the voxels of a tree lie, `voxels` in number. Those of different cascades are no neighbours."""
+    cube = cells.brick**3
+    owner, local = np.nonzero(cells.voxel_index >= 0)
+    place = np.zeros(voxels, np.int64)
+    place[cells.voxel_index[owner, local]] = owner * cube + local
+    around = np.full((len(cells.voxel_index), 6), -1, np.int32)
+    for shape, first in zip(cells.shape.tolist(), cells.first.tolist(), strict=True):
+        index = cells.brick_index[first : first + int(np.prod(shape))].reshape(shape)
+        padded = np.pad(index, 1, constant_values=-1)
+        for face in range(6):
+            shift = [slice(1, -1)] * 3
+            shift[face // 2] = slice(2, None) if face % 2 else slice(None, -2)
+            around[index[index >= 0], face] = padded[tuple(shift)][index >= 0]
+    return Neighbours(np.zeros(voxels, np.float32), place, around, cells.voxel_index, cells.brick)
 
 
 NO_NEIGHBOURS = Neighbours(np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros((0, 6), np.int32), np.zeros((0, 1), np.int32), 1)
@@ -154,11 +184,12 @@ def _regularised(v, slope, thickness, voxel, neighbours, h):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def _update(v, by_density, gradient, terms, density, sh, moments, neighbours, h):  # type: ignore[no-untyped-def]
-    """A step of one voxel."""
-    decay, epsilon, momentum, visits = h.decay, h.epsilon, h.momentum, moments.visits
-    visits[v] = min(visits[v] + 1, MAX_VISITS)
-    correction, voxel = 1 / (1 - decay ** float(visits[v])), h.sides[h.cascades[v]]
+def _update(v, by_density, gradient, terms, density, sh, moments, neighbours, h, of_square, of_mean):  # type: ignore[no-untyped-def]
+    """A step of one voxel; of_square, of_mean: `corrections` of the moments."""
+    decay, epsilon, momentum = h.decay, h.epsilon, h.momentum
+    visits = min(moments.visits[v] + 1, MAX_VISITS)
+    moments.visits[v] = visits
+    correction, voxel = np.float64(of_square[min(visits, len(of_square) - 1)]), h.sides[h.cascades[v]]
     # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
     thickness = max(density[v] * voxel, MIN_THICKNESS)
     slope = _regularised(v, by_density / voxel * thickness, thickness, voxel, neighbours, h)
@@ -166,7 +197,7 @@ def _update(v, by_density, gradient, terms, density, sh, moments, neighbours, h)
     moments.square_density[v] = square
     ahead = 1.0
     if momentum > 0:
-        ahead = 1 / (1 - momentum ** float(visits[v]))
+        ahead = np.float64(of_mean[min(visits, len(of_mean) - 1)])
         slope = momentum * moments.density[v] + (1 - momentum) * slope
         moments.density[v] = slope
     change = h.density_rate * ahead * slope / (np.sqrt(square * correction) + epsilon)
@@ -197,29 +228,47 @@ def _link_all(low, slab, records, head, following):  # type: ignore[no-untyped-d
     return following
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _fetch(v, density, sh, moments):  # type: ignore[no-untyped-def]
+    """Bring what a step of a voxel reads into the caches."""
+    width = sh.shape[1]
+    prefetch(pointer(density), v)
+    prefetch(pointer(moments.square_density), v)
+    prefetch(pointer(moments.square_sh), v)
+    prefetch(pointer(moments.visits), v)
+    for j in range(0, width, 16):
+        prefetch(pointer(sh), v * width + j)
+    prefetch(pointer(sh), v * width + width - 1)
+
+
 @numba.njit(cache=True, error_model="numpy")
-def _step_bins(task, records, density, sh, moments, neighbours, hyperparameters):  # type: ignore[no-untyped-def]
+def _step_bins(task, records, density, sh, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
     """Takes bins until none is left."""
     bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
-    terms = min(hyperparameters.terms, sh.shape[1] // 3)
+    terms, met = min(hyperparameters.terms, sh.shape[1] // 3), np.empty(size + 1, np.int64)
     head, following, gradient = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64), np.empty(sh.shape[1], sh.dtype)
     slab = take_next(pointer(task))
     while slab < bins:
         low = slab << BIN_BITS
         following = _link_all(low, slab, records, head, following)
-        for v in range(low, min(len(density), low + size)):
-            number = head[v - low]
-            if number >= 0:
-                head[v - low] = -1
-                by_density = _gather(number, terms, records, following, gradient)
-                _update(v, by_density, gradient, terms, density, sh, moments, neighbours, hyperparameters)
+        count = 0
+        for n in range(min(len(density) - low, size)):
+            met[count] = n
+            count += 1 if head[n] >= 0 else 0
+        for n in range(count):
+            v = low + met[n]
+            if n + AHEAD < count:
+                _fetch(low + met[n + AHEAD], density, sh, moments)
+            by_density = _gather(head[v - low], terms, records, following, gradient)
+            head[v - low] = -1
+            _update(v, by_density, gradient, terms, density, sh, moments, neighbours, hyperparameters, of_square, of_mean)
         slab = take_next(pointer(task))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _step(workers, task, records, density, sh, moments, neighbours, hyperparameters):  # type: ignore[no-untyped-def]
+def _step(workers, task, records, density, sh, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
-        _step_bins(task, records, density, sh, moments, neighbours, hyperparameters)
+        _step_bins(task, records, density, sh, moments, neighbours, hyperparameters, of_square, of_mean)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -249,7 +298,10 @@ def step(
     """
     if hyperparameters.total_variation > 0:
         np.copyto(neighbours.density, values[0])
-    _step(min(numba.get_num_threads(), records.begin.shape[1] - 1), np.zeros(1, np.int64), records, *values, moments, neighbours, hyperparameters)
+    _step(
+        min(numba.get_num_threads(), records.begin.shape[1] - 1), np.zeros(1, np.int64), records, *values, moments, neighbours, hyperparameters,
+        corrections(hyperparameters.decay), corrections(hyperparameters.momentum),
+    )  # fmt: skip
 
 
 def sum_gradients(records: Records, grad_density: np.ndarray, grad_sh: np.ndarray) -> None:
