@@ -60,6 +60,11 @@ class DevicePixels:
         """An array on the device; nothing waits for it."""
         return to_device(torch.from_numpy(np.ascontiguousarray(values)), self.device)
 
+    def rays(self, index: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
+        """`Pixels.rays` on the device."""
+        origins, directions, _, _, colours = self.bundle(index)
+        return origins, directions, colours
+
     def bundle(self, index: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """`Pixels.bundle` on the device."""
         at = self.to_device(index)

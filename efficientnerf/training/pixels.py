@@ -142,10 +142,18 @@ class Pixels:
     def bundle(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """origins (R, 3), directions (R, 3), near (R,), far (R,) distances along the rays, and colours (R, 3 or 4) in 0-1 of some pixels."""
         view = self.view_of(index)
+        origins, directions, colours = self._rays(index, view)
+        slant = np.einsum("ri,ri->r", directions, self.rotation[view, :, 2])
+        slant = np.maximum(slant, 1e-3)  # near and far are measured along the view axis
+        return origins, directions, self.near[view] / slant, self.far[view] / slant, colours
+
+    def rays(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """origins, directions and colours of `bundle`."""
+        return self._rays(index, self.view_of(index))
+
+    def _rays(self, index: np.ndarray, view: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         lookup, lens, knots, pixel, width, rotation, of = map(
             torch.from_numpy, (self.lookup, self.lens, self.knots, index - self.offsets[view], self.width, self.rotation, view)
         )
         directions = dispatch.ray_directions(lookup, lens, knots, self.stride, pixel, width, rotation, of).numpy()
-        slant = np.einsum("ri,ri->r", directions, self.rotation[view, :, 2])
-        slant = np.maximum(slant, 1e-3)  # near and far are measured along the view axis
-        return self.centre[view], directions, self.near[view] / slant, self.far[view] / slant, self.images[index].astype(np.float32) / np.float32(255)
+        return self.centre[view], directions, self.images[index].astype(np.float32) / np.float32(255)

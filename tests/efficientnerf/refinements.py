@@ -15,7 +15,7 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, packets_of
-from efficientnerf.backends.numba.tree_training.packets import cells_of
+from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import uniform_tree
@@ -50,9 +50,10 @@ def gradients(
     """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels, in packets of so many rays."""
     start, along, bases = in_voxels(tree, origins, directions)
     density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
-    first = packets_of(len(start), packet)
+    cells, first = cells_of(tree_grid(tree)), packets_of(len(start), packet)
+    dense = dense_densities(cells, voxel_places(cells, len(sh)), density)
     loss, records = kernels.forward_backward(
-        cells_of(tree_grid(tree)), first, start, along, packet_bases(bases.astype(dtype), first), density, sh, seen, RecordBuffer(dtype), stop=stop,
+        cells, first, start, along, packet_bases(bases.astype(dtype), first), dense, sh, seen, RecordBuffer(dtype), stop=stop,
         min_weight=min_weight,
     )  # fmt: skip
     by_density, by_sh = np.zeros_like(density), np.zeros_like(sh)

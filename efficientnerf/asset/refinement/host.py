@@ -18,8 +18,8 @@ from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
-from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, step
+from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
+from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.patches import PatchGrid
 
@@ -47,6 +47,7 @@ def optimise(
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`."""
     cells, buffer = cells_of(tree_grid(state.tree)), RecordBuffer()
+    values = values_of(cells, state.density, state.sh)
     patches = PatchGrid(targets.host_pixels, patch_side)
     chances = probabilities(tiles_met(state.tree, patches))
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
@@ -60,10 +61,10 @@ def optimise(
         origins, directions, wanted = targets.of(drawn.pixels)
         start, along, bases = in_voxels(state.tree, origins, directions)
         first = drawn.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
-        loss, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), state.density, state.sh, wanted, buffer)
+        loss, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer)
         factor = fall(number)
         step(
-            records, (state.density, state.sh), moments,
+            records, values, moments,
             Hyperparameters(sides, cascades, density_lr * factor, rates * np.float32(factor), DECAY, EPSILON),
         )  # fmt: skip
         state.step = number
@@ -73,10 +74,10 @@ def optimise(
 def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:
     """Sum of the losses of the rays of the bundles."""
     cells, buffer, sh = cells_of(tree_grid(tree)), RecordBuffer(), tree.sh.reshape(len(tree.sh), tree.harmonics_count * 3)
-    total = 0.0
+    dense, total = dense_densities(cells, voxel_places(cells, len(sh)), tree.density_values), 0.0
     for origins, directions, wanted in bundles:
         start, along, bases = in_voxels(tree, origins, directions)
-        loss, _ = gradients.forward_backward(cells, packets_of(len(start)), start, along, bases, tree.density_values, sh, wanted, buffer)
+        loss, _ = gradients.forward_backward(cells, packets_of(len(start)), start, along, bases, dense, sh, wanted, buffer)
         total += float(loss.sum())
     return total
 

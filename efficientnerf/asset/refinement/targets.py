@@ -81,8 +81,8 @@ class Targets:
 
     def of(self, index: np.ndarray, *, constant_background: bool = False) -> tuple[Any, Any, RayTargets]:
         """`draw` for pixels `index`."""
-        bundle: tuple[Any, ...] = self.pixels.bundle(index)
-        origins, directions, _, _, colour = bundle
+        bundle: tuple[Any, ...] = self.pixels.rays(index)
+        origins, directions, colour = bundle
         ones = colour[:, 0] * 0 + 1
         truth = colour[:, :3]
         if self.background is None:

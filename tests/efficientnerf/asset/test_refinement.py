@@ -24,7 +24,7 @@ from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, packets_of
-from efficientnerf.backends.numba.tree_training.packets import cells_of
+from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random
@@ -70,7 +70,9 @@ def test_records_grow_until_all_samples_fit() -> None:
     start, along, bases = in_voxels(tree, origins, directions)
     o = initial_state(tree)
     seen = seen_at_random(300, 0.0, np.float32)
-    _, records = kernels.forward_backward(cells_of(tree_grid(tree)), packets_of(300), start, along, bases, o.density, o.sh, seen, buffer)
+    cells = cells_of(tree_grid(tree))
+    dense = dense_densities(cells, voxel_places(cells, len(o.sh)), o.density)
+    _, records = kernels.forward_backward(cells, packets_of(300), start, along, bases, dense, o.sh, seen, buffer)
     assert 7 < (records.begin[:, -1] - records.begin[:, 0]).max() <= buffer.capacity
     by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
     sum_gradients(records, by_density, by_sh)

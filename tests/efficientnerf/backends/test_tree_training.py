@@ -20,7 +20,7 @@ from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, Hyperparameters, Moments, neighbours_of, step, sum_gradients
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, Hyperparameters, Moments, neighbours_of, step, sum_gradients, values_of
 from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
@@ -80,7 +80,8 @@ def records_of(tree: NerfTree, state: RefinementState, seed: int, packet: int = 
     start, along, bases = in_voxels(tree, origins, directions)
     first = packets_of(100, packet)
     cells, basis = cells_of(tree_grid(tree)), packet_bases(bases, first)
-    return kernels.forward_backward(cells, first, start, along, basis, state.density, state.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
+    values = values_of(cells, state.density, state.sh)
+    return kernels.forward_backward(cells, first, start, along, basis, values.dense, values.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
 
 
 def empty_moments(state: RefinementState, *, adam: bool) -> Moments:
@@ -105,7 +106,7 @@ def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: 
         by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
         sum_gradients(records, by_density, by_sh)
         rule = Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, rates, 0.9, 1e-12, momentum, terms=terms)
-        step(records, (o.density, o.sh), moments, rule)
+        step(records, values_of(cells_of(tree_grid(tree)), o.density, o.sh), moments, rule)
         met = np.zeros(count, bool)
         for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
             met[records.numbers[begin:end, 0]] = True
@@ -136,12 +137,13 @@ def test_the_same_bytes_on_any_number_of_threads() -> None:
         for count in (1, threads):
             numba.set_num_threads(count)
             o = initial_state(tree)
-            moments = empty_moments(o, adam=True)
+            moments, cells = empty_moments(o, adam=True), cells_of(tree_grid(tree))
+            values = values_of(cells, o.density, o.sh)
             for _ in range(2):
                 loss, records = kernels.forward_backward(
-                    cells_of(tree_grid(tree)), first, start, along, packet_bases(bases, first), o.density, o.sh, seen, RecordBuffer()
+                    cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer()
                 )
-                step(records, (o.density, o.sh), moments, rule_of(tree, o, momentum=0.9))
+                step(records, values, moments, rule_of(tree, o, momentum=0.9))
             found.append((loss, o.density, o.sh, *moments))
     finally:
         numba.set_num_threads(threads)
@@ -186,7 +188,9 @@ def test_regularisers_are_slopes_of_their_terms(made: Callable[[], NerfTree], ki
     old = np.log(o.density.astype(np.float64) * voxel_sides(tree))
     slope = by_density.astype(np.float64) * o.density
     neighbours = neighbours_of(cells_of(tree_grid(tree)), len(o.density))
-    step(records, (o.density, o.sh), empty_moments(o, adam=False), rule_of(tree, o, **{kind: 0.7}), neighbours)
+    values = values_of(cells_of(tree_grid(tree)), o.density, o.sh)
+    step(records, values, empty_moments(o, adam=False), rule_of(tree, o, **{kind: 0.7}), neighbours)
+    np.testing.assert_array_equal(values.dense[values.places], o.density)
     met = o.visits > 0
     assert 10 < met.sum() < len(met)
     for v in np.random.default_rng(1).choice(np.flatnonzero(met), 12, replace=False):
@@ -204,7 +208,8 @@ def test_total_variation_smooths_what_was_met_alone(made: Callable[[], NerfTree]
     tree = made()
     o = initial_state(tree)
     before = o.density.copy()
-    step(records_of(tree, o, 2), (o.density, o.sh), empty_moments(o, adam=False), rule_of(tree, o, total_variation=1e6),
+    values = values_of(cells_of(tree_grid(tree)), o.density, o.sh)
+    step(records_of(tree, o, 2), values, empty_moments(o, adam=False), rule_of(tree, o, total_variation=1e6),
          neighbours_of(cells_of(tree_grid(tree)), len(o.density)))  # fmt: skip
     np.testing.assert_array_equal(o.density[o.visits == 0], before[o.visits == 0])
     assert (o.density != before)[o.visits > 0].mean() > 0.8

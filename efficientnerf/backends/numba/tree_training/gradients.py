@@ -29,11 +29,13 @@ from efficientnerf.backends.numba.tree_training.packets import (
     SAMPLES,
     Cells,
     clear,
+    clear_distance,
     packet_arrays,
     packet_pointers,
     tree_pointers,
     walk_ray,
 )
+from efficientnerf.backends.numba.tree_training.scalars import cast_like, sigmoid
 from efficientnerf.backends.numba.tree_training.tasks import take_next
 
 CHUNK = 32  # packets
@@ -100,11 +102,6 @@ def packets_of(rays: int, side: int = 1) -> np.ndarray:
     return np.append(np.arange(0, rays, side), rays).astype(np.int64)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _sigmoid(x):  # type: ignore[no-untyped-def]
-    return 1 / (1 + np.exp(-x))
-
-
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-def]
     """Sums of the harmonics of the slots at which samples lie, along the packet's mean direction; returns how many of these hold a voxel."""
@@ -132,7 +129,7 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
     return found
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _shade(n, packet):  # type: ignore[no-untyped-def]
     """Colour of a sample, sigmoids of what is interpolated between the corners that are stored; kept in `packet.shade`."""
     colour, slots, weights = packet.colour, packet.slots, packet.weights
@@ -146,13 +143,13 @@ def _shade(n, packet):  # type: ignore[no-untyped-def]
         green += w * colour[at + 1]
         blue += w * colour[at + 2]
         total += w * colour[at + 3]
-    inverse = 1 / total if total > 0 else 0 * total
-    r, g, b = _sigmoid(red * inverse), _sigmoid(green * inverse), _sigmoid(blue * inverse)
+    inverse = cast_like(1, total) / total if total > 0 else 0 * total
+    r, g, b = sigmoid(red * inverse), sigmoid(green * inverse), sigmoid(blue * inverse)
     packet.shade[4 * n], packet.shade[4 * n + 1], packet.shade[4 * n + 2], packet.shade[4 * n + 3] = r, g, b, inverse
     return r, g, b
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _add_gradient(n, red, green, blue, density, packet):  # type: ignore[no-untyped-def]
     """Adds a sample's gradients to those of its eight slots."""
     gradient, slots, weights = packet.gradient, packet.slots, packet.weights
@@ -208,8 +205,9 @@ def _trace_packet(begin, end, origins, directions, targets, stop, min_weight, te
     """
     packet = packet_pointers(arrays)
     clear(packet, tree)
+    way = clear_distance(begin, end, origins, directions, tree)
     for ray in range(begin, end):
-        left[ray - begin] = walk_ray(origins[ray], directions[ray], tree, stop, min_weight, packet)
+        left[ray - begin] = walk_ray(origins[ray], directions[ray], way, tree, stop, min_weight, packet)
         if left[ray - begin] < 0:
             return -1
         ends[ray - begin] = packet.state[SAMPLES]
@@ -313,11 +311,12 @@ def forward_backward(
     first                (P + 1,) int64: first ray of each packet, and the end
     origins, directions  (R, 3) float64
     bases                (P, K) harmonics of the packets' directions
-    density, sh          (N,), (N, 3 K)
+    density              of `dense_densities`
+    sh                   (N, 3 K)
     stop                 transmittance below which a ray ends
     min_weight           samples that weigh less absorb light, and have neither a colour nor a gradient
     """
-    chunks, bins = -(-(len(first) - 1) // CHUNK), (len(density) >> BIN_BITS) + 1
+    chunks, bins = -(-(len(first) - 1) // CHUNK), (len(sh) >> BIN_BITS) + 1
     loss, counts, begin = np.zeros(len(origins)), np.zeros(chunks, np.int64), np.zeros((chunks, bins + 1), np.int64)
     buffer.reserve(chunks)
     while True:

@@ -3,6 +3,8 @@
 The rays of a packet should be neighbours, as those of a patch of pixels are: they meet the same voxels, which then are looked up, shaded and given gradients
 once. A packet of any rays is right, and slower. Samples lie as FORMAT.md says, section 6; in nested trees as `efficientnerf.asset.rendering.ray_parts` says.
 
+Functions that write through pointers are not inlined by numba, which may take what they write for dead; LLVM inlines them.
+
 A *slot* is a voxel of a brick that the packet has met: slot `block * cube + place`, where block 0 stands for all bricks that are not stored. An *entry* is a
 coarse cell in which samples have the lowest of their eight voxels, with the blocks of the eight cells from there on.
 Coordinates of rays are in voxels of cascade 0. N stored voxels, B bricks, L cascades, C coarse cells of all cascades, S samples, K harmonics.
@@ -18,8 +20,10 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import STEP
 from efficientnerf.backends.numba.tree.walk import TreeGrid, box_distances, most_samples
+from efficientnerf.backends.numba.tree_training.scalars import absorbed, cast_like
 
 FIRST_BLOCKS, FIRST_SAMPLES = 128, 1024  # that a packet has room for before it grows
+SLACK = 1e-3  # voxels by which a clear way ends early, so that no rounding makes it end late
 
 
 class Cells(NamedTuple):
@@ -46,13 +50,16 @@ class Cells(NamedTuple):
 
 
 class TreePointers(NamedTuple):
-    """Cells with arrays as pointers, and the densities (N,); `cascades` L, `cube` voxels of a brick, `inverse` of the brick's side."""
+    """Cells with arrays as pointers; `cascades` L, `cube` voxels of a brick, `inverse` of the brick's side, `absent` where densities of bricks that are not
+    stored begin, `one` in the densities' type, and `density` those of `dense_densities`."""
 
     brick: int
     cube: int
+    absent: int
     inverse: float
     nearest: bool
     step_length: float
+    one: Any
     cascades: int
     voxel_index: Any
     brick_index: Any
@@ -71,10 +78,10 @@ class PacketArrays(NamedTuple):
     cell_table  (H,) int32 open addressing: entries by their cell, -1 free
     cell_key    (most,) int64 cell of an entry, row
     blocks      (most, 8) int32 first slots of the eight blocks of an entry
+    sources     (most, 8) int64 where the densities of these begin
     brick_table (H,) int32: blocks by their brick, -1 free
     owner       (most,) int32 brick of a block
     met         (T,) uint8 whether a sample lies at a slot
-    density     (T,) of the slots, 0 where no voxel is stored
     colour      (T, 4) arguments of the sigmoids, and 1; zeros where no voxel is stored
     gradient    (T, 4) by these and by density
     slots       (S, 8) int32 of a sample
@@ -89,10 +96,10 @@ class PacketArrays(NamedTuple):
     cell_table: Any
     cell_key: Any
     blocks: Any
+    sources: Any
     brick_table: Any
     owner: Any
     met: Any
-    density: Any
     colour: Any
     gradient: Any
     slots: Any
@@ -115,13 +122,29 @@ def cells_of(grid: TreeGrid) -> Cells:
     return Cells(grid.brick, grid.nearest, grid.step_length, np.ascontiguousarray(grid.voxel_index), index, leap, shape, first, corner, scale)
 
 
+def voxel_places(cells: Cells, voxels: int) -> np.ndarray:
+    """(N,) int64: where each of so many voxels is in `Cells.voxel_index`, brick by brick."""
+    flat = cells.voxel_index.reshape(-1)
+    stored = np.flatnonzero(flat >= 0)
+    places = np.zeros(voxels, np.int64)
+    places[flat[stored]] = stored
+    return places
+
+
+def dense_densities(cells: Cells, places: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Densities of all voxels of all bricks, 0 where none is stored, with a brick of zeros at the end."""
+    dense = np.zeros(cells.voxel_index.size + cells.brick**3, density.dtype)
+    dense[places] = density
+    return dense
+
+
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def tree_pointers(cells, density):  # type: ignore[no-untyped-def]
     """See `TreePointers`."""
     return TreePointers(
-        cells.brick, cells.brick * cells.brick * cells.brick, 1.0 / cells.brick, cells.nearest, cells.step_length, len(cells.first), pointer(cells.voxel_index),
-        pointer(cells.brick_index), pointer(cells.leap), pointer(cells.shape), pointer(cells.first), pointer(cells.corner), pointer(cells.scale),
-        pointer(density),
+        cells.brick, cells.brick * cells.brick * cells.brick, cells.voxel_index.size, 1.0 / cells.brick, cells.nearest, cells.step_length,
+        density.dtype.type(1), len(cells.first), pointer(cells.voxel_index), pointer(cells.brick_index), pointer(cells.leap), pointer(cells.shape),
+        pointer(cells.first), pointer(cells.corner), pointer(cells.scale), pointer(density),
     )  # fmt: skip
 
 
@@ -131,7 +154,7 @@ def packet_arrays(most, samples, cube, density):  # type: ignore[no-untyped-def]
     slots, kind = most * cube, density.dtype
     arrays = PacketArrays(
         most, samples, np.zeros(3, np.int64), np.full(4 * most, -1, np.int32), np.empty(most, np.int64), np.zeros((most, 8), np.int32),
-        np.full(4 * most, -1, np.int32), np.full(most, -1, np.int32), np.zeros(slots, np.uint8), np.zeros(slots, kind), np.zeros((slots, 4), kind),
+        np.zeros((most, 8), np.int64), np.full(4 * most, -1, np.int32), np.full(most, -1, np.int32), np.zeros(slots, np.uint8), np.zeros((slots, 4), kind),
         np.zeros((slots, 4), kind), np.zeros((samples, 8), np.int32), np.zeros((samples, 8), kind), np.zeros((samples, 3), np.float64),
         np.zeros((samples, 4), kind),
     )  # fmt: skip
@@ -143,8 +166,8 @@ def packet_arrays(most, samples, cube, density):  # type: ignore[no-untyped-def]
 def packet_pointers(a):  # type: ignore[no-untyped-def]
     """The same with pointers."""
     return PacketArrays(
-        a.most, a.samples, pointer(a.state), pointer(a.cell_table), pointer(a.cell_key), pointer(a.blocks), pointer(a.brick_table), pointer(a.owner),
-        pointer(a.met), pointer(a.density), pointer(a.colour), pointer(a.gradient), pointer(a.slots), pointer(a.weights), pointer(a.light), pointer(a.shade),
+        a.most, a.samples, pointer(a.state), pointer(a.cell_table), pointer(a.cell_key), pointer(a.blocks), pointer(a.sources), pointer(a.brick_table),
+        pointer(a.owner), pointer(a.met), pointer(a.colour), pointer(a.gradient), pointer(a.slots), pointer(a.weights), pointer(a.light), pointer(a.shade),
     )  # fmt: skip
 
 
@@ -168,7 +191,7 @@ def clear(packet, tree):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def _block(owner, tree, packet):  # type: ignore[no-untyped-def]
-    """The block of a brick, filled where it is new; -1 where there is no room."""
+    """The block of a brick; -1 where there is no room."""
     size = 4 * packet.most
     at = _hash(owner, size)
     while packet.brick_table[at] >= 0:
@@ -181,10 +204,6 @@ def _block(owner, tree, packet):  # type: ignore[no-untyped-def]
         return np.int64(-1)
     packet.state[BLOCKS] = block + 1
     packet.brick_table[at], packet.owner[block] = np.int32(block), np.int32(owner)
-    first, source = block * tree.cube, owner * tree.cube
-    for n in range(tree.cube):
-        voxel = np.int64(tree.voxel_index[source + n])
-        packet.density[first + n] = tree.density[max(voxel, 0)] if voxel >= 0 else 0
     return block
 
 
@@ -205,14 +224,14 @@ def _entry(a, b, c, cascade, tree, packet):  # type: ignore[no-untyped-def]
         return np.int64(-1)
     for n in range(8):
         i, j, k = a + (n >> 2), b + ((n >> 1) & 1), c + (n & 1)
-        packet.blocks[8 * entry + n] = np.int32(0)
+        packet.blocks[8 * entry + n], packet.sources[8 * entry + n] = np.int32(0), tree.absent
         if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
             owner = np.int64(tree.brick_index[tree.first[cascade] + (i * ny + j) * nz + k])
             if owner >= 0:
                 block = _block(owner, tree, packet)
                 if block < 0:
                     return np.int64(-1)
-                packet.blocks[8 * entry + n] = np.int32(block * tree.cube)
+                packet.blocks[8 * entry + n], packet.sources[8 * entry + n] = np.int32(block * tree.cube), owner * tree.cube
     packet.state[ENTRIES] = entry + 1
     packet.cell_table[at], packet.cell_key[entry] = np.int32(entry), key
     return entry
@@ -225,40 +244,42 @@ def _along(x, brick, stride):  # type: ignore[no-untyped-def]
     return x * stride, 0 if beyond else (x + 1) * stride, beyond
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _place(n, value, weight, at, packet):  # type: ignore[no-untyped-def]
-    """Slot and weight of corner n of the sample that begins at `at`; returns its share of the density."""
-    packet.slots[at + n] = np.int32(value)
+@numba.njit(cache=True, error_model="numpy")
+def _place(n, entry, brick, offset, weight, at, tree, packet):  # type: ignore[no-untyped-def]
+    """Slot and weight of corner n of the sample that begins at `at`, in one of the eight bricks of an entry; returns its share of the density."""
+    packet.slots[at + n] = np.int32(packet.blocks[8 * entry + brick] + offset)
     packet.weights[at + n] = weight
-    return np.float64(weight) * packet.density[value]
+    return weight * tree.density[packet.sources[8 * entry + brick] + offset]
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):  # type: ignore[no-untyped-def]
     """Density between the voxel (x, y, z) of an entry's cell and the seven beyond it; slots and weights from `at` on."""
     brick = tree.brick
     x0, x1, bx = _along(x, brick, brick * brick)
     y0, y1, by = _along(y, brick, brick)
     z0, z1, bz = _along(z, brick, 1)
-    i, j, k = 8 * entry + (4 if bx else 0), 2 if by else 0, 1 if bz else 0
-    e = 8 * entry
-    gx, gy, gz = 1 - fx, 1 - fy, 1 - fz
+    i, j, k = 4 if bx else 0, 2 if by else 0, 1 if bz else 0
+    one = cast_like(1.0, fx)
+    gx, gy, gz = one - fx, one - fy, one - fz
     a, b, c, d = gx * gy, gx * fy, fx * gy, fx * fy
-    blocks = packet.blocks
-    sigma = _place(0, blocks[e] + x0 + y0 + z0, a * gz, at, packet)
-    sigma += _place(1, blocks[e + k] + x0 + y0 + z1, a * fz, at, packet)
-    sigma += _place(2, blocks[e + j] + x0 + y1 + z0, b * gz, at, packet)
-    sigma += _place(3, blocks[e + j + k] + x0 + y1 + z1, b * fz, at, packet)
-    sigma += _place(4, blocks[i] + x1 + y0 + z0, c * gz, at, packet)
-    sigma += _place(5, blocks[i + k] + x1 + y0 + z1, c * fz, at, packet)
-    sigma += _place(6, blocks[i + j] + x1 + y1 + z0, d * gz, at, packet)
-    sigma += _place(7, blocks[i + j + k] + x1 + y1 + z1, d * fz, at, packet)
+    sigma = _place(0, entry, 0, x0 + y0 + z0, a * gz, at, tree, packet)
+    sigma += _place(1, entry, k, x0 + y0 + z1, a * fz, at, tree, packet)
+    sigma += _place(2, entry, j, x0 + y1 + z0, b * gz, at, tree, packet)
+    sigma += _place(3, entry, j + k, x0 + y1 + z1, b * fz, at, tree, packet)
+    sigma += _place(4, entry, i, x1 + y0 + z0, c * gz, at, tree, packet)
+    sigma += _place(5, entry, i + k, x1 + y0 + z1, c * fz, at, tree, packet)
+    sigma += _place(6, entry, i + j, x1 + y1 + z0, d * gz, at, tree, packet)
+    sigma += _place(7, entry, i + j + k, x1 + y1 + z1, d * fz, at, tree, packet)
     return sigma
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, cascade, tree, stop, min_weight, transmittance, packet):  # type: ignore[no-untyped-def]
-    """Samples of a ray between two distances in one cascade, all in its voxels; returns the transmittance behind them, or -1 where there is no room."""
+def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, clear, cascade, tree, stop, min_weight, transmittance, packet):  # type: ignore[no-untyped-def]
+    """Samples of a ray between two distances in one cascade, all in its voxels; returns the transmittance behind them, or -1 where there is no room.
+
+    clear  distance before which the ray meets nothing
+    """
     brick, inverse, first = tree.brick, tree.inverse, tree.first[cascade]
     ny, nz = tree.shape[3 * cascade + 1], tree.shape[3 * cascade + 2]
     sx, sy, sz = tree.shape[3 * cascade] * brick, ny * brick, nz * brick
@@ -269,6 +290,8 @@ def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, cascade, tree, stop, min_weight, 
     last = int(np.floor(min((t1 - t0) / STEP, most_samples(sx, sy, sz)))) + 1
     entry, ea, eb, ec = np.int64(-1), -2, -2, -2
     count, k = packet.state[SAMPLES], 0
+    if clear > t0:
+        k = int(min((clear - t0) / STEP, float(last)))  # no later than the first sample behind it
     while k < last:
         t = t0 + (k + 0.5) * STEP
         if t >= t1:
@@ -303,13 +326,14 @@ def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, cascade, tree, stop, min_weight, 
             return -1.0
         at = 8 * count
         if tree.nearest:
-            sigma = _place(0, packet.blocks[8 * entry] + ((x - a * brick) * brick + y - b * brick) * brick + z - c * brick, 1.0, at, packet)
+            sigma = _place(0, entry, 0, ((x - a * brick) * brick + y - b * brick) * brick + z - c * brick, tree.one, at, tree, packet)
             for n in range(1, 8):
                 packet.slots[at + n], packet.weights[at + n] = np.int32(0), 0
         else:
-            sigma = _interpolated(entry, x - a * brick, y - b * brick, z - c * brick, fx, fy, fz, at, tree, packet)
+            gx, gy, gz = cast_like(fx, tree.one), cast_like(fy, tree.one), cast_like(fz, tree.one)
+            sigma = _interpolated(entry, x - a * brick, y - b * brick, z - c * brick, gx, gy, gz, at, tree, packet)
         if sigma > 0:
-            alpha = 1 - np.exp(-sigma * length)
+            alpha = np.float64(absorbed(cast_like(sigma * length, tree.one)))
             if transmittance * alpha >= min_weight:
                 packet.light[3 * count], packet.light[3 * count + 1], packet.light[3 * count + 2] = alpha, transmittance, length
                 for n in range(8):
@@ -333,9 +357,42 @@ def _cascade_distances(origin, direction, tree, n):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, error_model="numpy")
-def walk_ray(origin, direction, tree, stop, min_weight, packet):  # type: ignore[no-untyped-def]
+def clear_distance(begin, end, origins, directions, tree):  # type: ignore[no-untyped-def]
+    """Distance before which none of these rays meets an occupied cell: steps of the ray in their middle, less what they stray from it; of one cascade."""
+    if tree.cascades > 1 or end - begin < 2:
+        return 0.0
+    share = 1.0 / (end - begin)
+    ox = oy = oz = dx = dy = dz = 0.0
+    for ray in range(begin, end):
+        ox, oy, oz = ox + share * origins[ray, 0], oy + share * origins[ray, 1], oz + share * origins[ray, 2]
+        dx, dy, dz = dx + share * directions[ray, 0], dy + share * directions[ray, 1], dz + share * directions[ray, 2]
+    nx, ny, nz, brick = tree.shape[0], tree.shape[1], tree.shape[2], tree.brick
+    apart, spread, t, most = 0.0, 0.0, np.inf, 0.0
+    for ray in range(begin, end):
+        apart = max(apart, abs(origins[ray, 0] - ox), abs(origins[ray, 1] - oy), abs(origins[ray, 2] - oz))
+        spread = max(spread, abs(directions[ray, 0] - dx), abs(directions[ray, 1] - dy), abs(directions[ray, 2] - dz))
+        t0, t1 = _cascade_distances(origins[ray], directions[ray], tree, 0)
+        if t1 > t0:
+            t, most = min(t, t0), max(most, t1)
+    speed = max(abs(dx), abs(dy), abs(dz)) + spread
+    while t < most:
+        a = min(max(int((ox + t * dx) * tree.inverse), 0), nx - 1)
+        b = min(max(int((oy + t * dy) * tree.inverse), 0), ny - 1)
+        c = min(max(int((oz + t * dz) * tree.inverse), 0), nz - 1)
+        # All that is nearer than so many cells to this one is empty, along each axis.
+        ahead = ((int(tree.leap[(a * ny + b) * nz + c]) - 1) * brick - apart - t * spread) / speed - SLACK
+        if ahead < STEP:
+            return t
+        t += ahead
+    return most if most > 0 else np.inf
+
+
+@numba.njit(cache=True, error_model="numpy")
+def walk_ray(origin, direction, clear, tree, stop, min_weight, packet):  # type: ignore[no-untyped-def]
     """Adds the samples of a ray to a packet, those that have density and weigh at least `min_weight`; returns the transmittance behind all of them, or -1
     where there is no room.
+
+    clear  distance before which the ray meets nothing
 
     Part p of a ray through a nested tree lies in cascade |L - 1 - p|, before or behind the box that is cut out of that.
     """
@@ -355,7 +412,7 @@ def walk_ray(origin, direction, tree, stop, min_weight, packet):  # type: ignore
             scale = tree.scale[n]
             ox, oy, oz = origin[0] - tree.corner[3 * n], origin[1] - tree.corner[3 * n + 1], origin[2] - tree.corner[3 * n + 2]
             transmittance = _walk_part(
-                ox / scale, oy / scale, oz / scale, direction[0], direction[1], direction[2], t0 / scale, t1 / scale, n, tree, stop, min_weight,
+                ox / scale, oy / scale, oz / scale, direction[0], direction[1], direction[2], t0 / scale, t1 / scale, clear / scale, n, tree, stop, min_weight,
                 transmittance, packet,
             )  # fmt: skip
             if transmittance < stop:

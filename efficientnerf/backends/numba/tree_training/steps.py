@@ -20,7 +20,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
-from efficientnerf.backends.numba.tree_training.packets import Cells
+from efficientnerf.backends.numba.tree_training.packets import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
 
 MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
@@ -77,27 +77,42 @@ class Moments(NamedTuple):
     visits: np.ndarray
 
 
+class Values(NamedTuple):
+    """What is fitted.
+
+    density  (N,)
+    sh       (N, 3 K)
+    places   (N,) int64 of `voxel_places`
+    dense    the same densities, of `dense_densities`
+    """
+
+    density: np.ndarray
+    sh: np.ndarray
+    places: np.ndarray
+    dense: np.ndarray
+
+
+def values_of(cells: Cells, density: np.ndarray, sh: np.ndarray) -> Values:
+    """The values of a tree, which steps change in place."""
+    places = voxel_places(cells, len(density))
+    return Values(density, sh, places, dense_densities(cells, places, density))
+
+
 class Neighbours(NamedTuple):
-    """Where voxels lie, for total variation; without rows where there is none.
+    """Bricks beside bricks, for total variation; without rows where there is none.
 
     density  (N,) before the step
-    place    (N,) int64 of a voxel in voxel_index
     around   (B, 6) int32 bricks beyond the faces -x, x, -y, y, -z, z of a brick, -1 where none is stored
     """
 
     density: np.ndarray
-    place: np.ndarray
     around: np.ndarray
     voxel_index: np.ndarray
     brick: int
 
 
 def neighbours_of(cells: Cells, voxels: int) -> Neighbours:
-    """Where the voxels of a tree lie, `voxels` in number. Those of different cascades are no neighbours."""
-    cube = cells.brick**3
-    owner, local = np.nonzero(cells.voxel_index >= 0)
-    place = np.zeros(voxels, np.int64)
-    place[cells.voxel_index[owner, local]] = owner * cube + local
+    """Of a tree of so many voxels. Those of different cascades are no neighbours."""
     around = np.full((len(cells.voxel_index), 6), -1, np.int32)
     for shape, first in zip(cells.shape.tolist(), cells.first.tolist(), strict=True):
         index = cells.brick_index[first : first + int(np.prod(shape))].reshape(shape)
@@ -106,10 +121,10 @@ def neighbours_of(cells: Cells, voxels: int) -> Neighbours:
             shift = [slice(1, -1)] * 3
             shift[face // 2] = slice(2, None) if face % 2 else slice(None, -2)
             around[index[index >= 0], face] = padded[tuple(shift)][index >= 0]
-    return Neighbours(np.zeros(voxels, np.float32), place, around, cells.voxel_index, cells.brick)
+    return Neighbours(np.zeros(voxels, np.float32), around, cells.voxel_index, cells.brick)
 
 
-NO_NEIGHBOURS = Neighbours(np.zeros(0, np.float32), np.zeros(0, np.int64), np.zeros((0, 6), np.int32), np.zeros((0, 1), np.int32), 1)
+NO_NEIGHBOURS = Neighbours(np.zeros(0, np.float32), np.zeros((0, 6), np.int32), np.zeros((0, 1), np.int32), 1)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -167,10 +182,10 @@ def _gather(number, terms, records, following, gradient):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _regularised(v, slope, thickness, voxel, neighbours, h):  # type: ignore[no-untyped-def]
+def _regularised(place, slope, thickness, voxel, neighbours, h):  # type: ignore[no-untyped-def]
     """The gradient by the logarithm of a voxel's optical thickness with those of the regularisers."""
     if h.total_variation > 0:
-        place, here = neighbours.place[v], np.log(thickness)
+        here = np.log(thickness)
         for face in range(6):
             other = _neighbour(place, face, neighbours)
             if other >= 0:
@@ -184,15 +199,15 @@ def _regularised(v, slope, thickness, voxel, neighbours, h):  # type: ignore[no-
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def _update(v, by_density, gradient, terms, density, sh, moments, neighbours, h, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _update(v, by_density, gradient, terms, values, moments, neighbours, h, of_square, of_mean):  # type: ignore[no-untyped-def]
     """A step of one voxel; of_square, of_mean: `corrections` of the moments."""
     decay, epsilon, momentum = h.decay, h.epsilon, h.momentum
     visits = min(moments.visits[v] + 1, MAX_VISITS)
     moments.visits[v] = visits
     correction, voxel = np.float64(of_square[min(visits, len(of_square) - 1)]), h.sides[h.cascades[v]]
     # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
-    thickness = max(density[v] * voxel, MIN_THICKNESS)
-    slope = _regularised(v, by_density / voxel * thickness, thickness, voxel, neighbours, h)
+    thickness = max(values.density[v] * voxel, MIN_THICKNESS)
+    slope = _regularised(values.places[v], by_density / voxel * thickness, thickness, voxel, neighbours, h)
     square = decay * moments.square_density[v] + (1 - decay) * slope * slope
     moments.square_density[v] = square
     ahead = 1.0
@@ -201,8 +216,9 @@ def _update(v, by_density, gradient, terms, density, sh, moments, neighbours, h,
         slope = momentum * moments.density[v] + (1 - momentum) * slope
         moments.density[v] = slope
     change = h.density_rate * ahead * slope / (np.sqrt(square * correction) + epsilon)
-    density[v] = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel
-    values, rates, mean = sh[v], h.sh_rates, gradient.dtype.type(0)
+    new_density = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel
+    values.density[v] = values.dense[values.places[v]] = new_density
+    row, rates, mean = values.sh[v], h.sh_rates, gradient.dtype.type(0)
     for j in range(3 * terms):
         mean += gradient[j] * gradient[j]
     square = decay * moments.square_sh[v] + (1 - decay) * mean / (3 * terms)
@@ -212,10 +228,10 @@ def _update(v, by_density, gradient, terms, density, sh, moments, neighbours, h,
         running, old, new = moments.sh[v], gradient.dtype.type(momentum), gradient.dtype.type(1 - momentum)
         for j in range(3 * terms):
             running[j] = old * running[j] + new * gradient[j]
-            values[j] -= scale * rates[j] * running[j]
+            row[j] -= scale * rates[j] * running[j]
     else:
         for j in range(3 * terms):
-            values[j] -= scale * rates[j] * gradient[j]
+            row[j] -= scale * rates[j] * gradient[j]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -228,47 +244,47 @@ def _link_all(low, slab, records, head, following):  # type: ignore[no-untyped-d
     return following
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _fetch(v, density, sh, moments):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, error_model="numpy")
+def _fetch(v, values, moments):  # type: ignore[no-untyped-def]
     """Bring what a step of a voxel reads into the caches."""
-    width = sh.shape[1]
-    prefetch(pointer(density), v)
+    width = values.sh.shape[1]
+    prefetch(pointer(values.density), v)
     prefetch(pointer(moments.square_density), v)
     prefetch(pointer(moments.square_sh), v)
     prefetch(pointer(moments.visits), v)
     for j in range(0, width, 16):
-        prefetch(pointer(sh), v * width + j)
-    prefetch(pointer(sh), v * width + width - 1)
+        prefetch(pointer(values.sh), v * width + j)
+    prefetch(pointer(values.sh), v * width + width - 1)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_bins(task, records, density, sh, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _step_bins(task, records, values, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
     """Takes bins until none is left."""
     bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
-    terms, met = min(hyperparameters.terms, sh.shape[1] // 3), np.empty(size + 1, np.int64)
-    head, following, gradient = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64), np.empty(sh.shape[1], sh.dtype)
+    terms, met = min(hyperparameters.terms, values.sh.shape[1] // 3), np.empty(size + 1, np.int64)
+    head, following, gradient = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64), np.empty(values.sh.shape[1], values.sh.dtype)
     slab = take_next(pointer(task))
     while slab < bins:
         low = slab << BIN_BITS
         following = _link_all(low, slab, records, head, following)
         count = 0
-        for n in range(min(len(density) - low, size)):
+        for n in range(min(len(values.density) - low, size)):
             met[count] = n
             count += 1 if head[n] >= 0 else 0
         for n in range(count):
             v = low + met[n]
             if n + AHEAD < count:
-                _fetch(low + met[n + AHEAD], density, sh, moments)
+                _fetch(low + met[n + AHEAD], values, moments)
             by_density = _gather(head[v - low], terms, records, following, gradient)
             head[v - low] = -1
-            _update(v, by_density, gradient, terms, density, sh, moments, neighbours, hyperparameters, of_square, of_mean)
+            _update(v, by_density, gradient, terms, values, moments, neighbours, hyperparameters, of_square, of_mean)
         slab = take_next(pointer(task))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _step(workers, task, records, density, sh, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _step(workers, task, records, values, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
-        _step_bins(task, records, density, sh, moments, neighbours, hyperparameters, of_square, of_mean)
+        _step_bins(task, records, values, moments, neighbours, hyperparameters, of_square, of_mean)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -287,19 +303,17 @@ def _sum_gradients(records, grad_density, grad_sh):  # type: ignore[no-untyped-d
 
 
 def step(
-    records: Records, values: tuple[np.ndarray, np.ndarray], moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS
+    records: Records, values: Values, moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS
 ) -> None:
     """A step for the voxels that the records name; the others stay.
 
         s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
         p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
-
-    values  density (N,) and sh (N, 3 K), updated in place
     """
     if hyperparameters.total_variation > 0:
-        np.copyto(neighbours.density, values[0])
+        np.copyto(neighbours.density, values.density)
     _step(
-        min(numba.get_num_threads(), records.begin.shape[1] - 1), np.zeros(1, np.int64), records, *values, moments, neighbours, hyperparameters,
+        min(numba.get_num_threads(), records.begin.shape[1] - 1), np.zeros(1, np.int64), records, values, moments, neighbours, hyperparameters,
         corrections(hyperparameters.decay), corrections(hyperparameters.momentum),
     )  # fmt: skip
 
