@@ -5,9 +5,9 @@
 RUN is a folder in which `bake` is done, of an object with alpha or a forward-facing scene. Steps are those of the refinement, from the baked asset, on all
 tiles of the images that its rays may meet. Each figure is the least of several steps. Busy: processor time over elapsed time and threads.
 
-The floor counts cache lines. Forward and backward must read each brick that a packet meets, 4 bytes a voxel, and the harmonics of each voxel that it meets, and write
-and read its record; a step must read and write the harmonics and four more numbers of each voxel, once. `line_rate` is how many lines of a table as large as the
-harmonics are read a second in random order. Each number of threads is measured in a process of its own.
+The floor counts cache lines. Forward and backward must read density and harmonics of each voxel that a packet meets, and write, sort and read
+its record; a step must read and write the harmonics and four more numbers of each voxel, once. `line_rate` is how many lines of a table as large as
+the harmonics are read a second in random order. Each number of threads is measured in a process of its own.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from efficientnerf.asset.refinement import host
+from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets
 from efficientnerf.asset.tree import NerfTree
@@ -27,7 +28,7 @@ WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measur
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float = 1.0, patch_side: int = PATCH_SIDE,
+    view_dependent_lr_ratio: float = 1.0, patch_side: int = PATCH_SIDE, rule: Rule = PLAIN,
 ) -> Iterator[float]:  # fmt: skip
     """Take steps up to `until`, yielding the mean squared error of a channel after each step; on a device, that of some steps before.
 
@@ -37,16 +38,20 @@ def optimise(
     fall                     factor of the learning rates by a step's number (`efficientnerf.asset.refinement.schedule`)
     view_dependent_lr_ratio  factor of that for harmonics of degree 1 and above
     patch_side               pixels along a side of the patches that rays are drawn in
+    rule                     what is minimised besides; ValueError on a device that has no kernels for it
     """
     if targets.on_device:
         from efficientnerf.asset.refinement import device
 
-        steps_on = device.optimise
-    else:
-        steps_on = host.optimise
-    yield from steps_on(
+        rule.refuse_on_device()
+        yield from device.optimise(
+            state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
+            patch_side=patch_side,
+        )  # fmt: skip
+        return
+    yield from host.optimise(
         state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
-        patch_side=patch_side,
+        patch_side=patch_side, rule=rule,
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
+from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
@@ -19,7 +20,7 @@ from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, step, values_of
+from efficientnerf.backends.numba.tree_training.steps import NO_NEIGHBOURS, Hyperparameters, Moments, neighbours_of, step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.patches import PatchGrid
 
@@ -43,7 +44,7 @@ def packet_bases(bases: np.ndarray, first: np.ndarray) -> np.ndarray:
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float, patch_side: int,
+    view_dependent_lr_ratio: float, patch_side: int, rule: Rule = PLAIN,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`."""
     cells, buffer = cells_of(tree_grid(state.tree)), RecordBuffer()
@@ -52,6 +53,7 @@ def optimise(
     chances = probabilities(tiles_met(state.tree, patches))
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
     moments = Moments(*none, state.square_density, state.square_sh, state.visits)
+    neighbours = neighbours_of(cells, len(state.density)) if rule.total_variation > 0 else NO_NEIGHBOURS
     sides, cascades = cascade_sides(state.tree), voxel_cascades(state.tree)
     rates = np.full(state.sh.shape[1], sh_lr, np.float32)
     rates[3:] *= view_dependent_lr_ratio
@@ -61,12 +63,15 @@ def optimise(
         origins, directions, wanted = targets.of(drawn.pixels)
         start, along, bases = in_voxels(state.tree, origins, directions)
         first = drawn.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
-        loss, records = gradients.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer)
+        loss, records = gradients.forward_backward(
+            cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer, min_weight=rule.min_weight
+        )
         factor = fall(number)
-        step(
-            records, values, moments,
-            Hyperparameters(sides, cascades, density_lr * factor, rates * np.float32(factor), DECAY, EPSILON),
+        hyperparameters = Hyperparameters(
+            sides, cascades, density_lr * factor, rates * np.float32(factor), DECAY, EPSILON, total_variation=rule.total_variation, sparsity=rule.sparsity,
+            entropy=rule.entropy, terms=rule.terms(number, len(rates) // 3),
         )  # fmt: skip
+        step(records, values, moments, hyperparameters, neighbours)
         state.step = number
         yield float(loss.mean()) / 3
 

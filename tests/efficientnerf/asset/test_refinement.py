@@ -14,6 +14,7 @@ from efficientnerf.asset.queries import density_at
 from efficientnerf.asset.refinement import state
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.host import in_voxels
+from efficientnerf.asset.refinement.rule import Rule
 from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 from efficientnerf.asset.refinement.targets import Targets
@@ -105,6 +106,29 @@ def test_no_share_for_what_depends_on_the_direction_leaves_it_alone() -> None:
     np.testing.assert_array_equal(fixed.sh[:, 1:], tree.sh[:, 1:])
     assert (fixed.sh[:, 0] != tree.sh[:, 0]).any()
     assert (free.sh[:, 1:] != tree.sh[:, 1:]).any()
+
+
+def test_harmonics_of_degrees_that_wait_stay_as_they_are() -> None:
+    targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
+    tree = ball_tree(12)
+    waiting, _ = fitted(tree, targets, 3, rule=Rule(degree=lambda step: 0))
+    at_the_end, _ = fitted(tree, targets, 3, rule=Rule(degree=lambda step: 0 if step < 3 else 1))
+    np.testing.assert_array_equal(waiting.sh[:, 1:], tree.sh[:, 1:])
+    assert (waiting.sh[:, 0] != tree.sh[:, 0]).any()
+    assert (at_the_end.sh[:, 1:] != tree.sh[:, 1:]).any()
+
+
+def test_neighbours_become_alike_where_variation_weighs() -> None:
+    targets = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
+    noisy = replace(ball_tree(12), density_values=np.random.default_rng(0).uniform(0.1, 5, 12**3).astype(np.float32))
+    rough, smooth = ([fitted(noisy, targets, 20, rule=Rule(total_variation=w))[0] for w in (0.0, 10.0)])
+
+    def variation(tree: NerfTree) -> float:
+        grid = np.zeros(tree.resolution)
+        grid[tuple(voxel_coordinates(tree).T)] = np.log(tree.density_values)
+        return sum(float(np.abs(np.diff(grid, axis=axis)).mean()) for axis in range(3))
+
+    assert variation(smooth) < 0.6 * variation(rough)
 
 
 def test_photographs_are_compared_over_the_environment() -> None:

@@ -11,6 +11,7 @@ import torch
 
 from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
+from efficientnerf.asset.refinement.rule import Rule
 from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
@@ -136,6 +137,13 @@ def test_steps_are_those_of_the_cpu(tree: NerfTree) -> None:
     assert errors[0] == pytest.approx(wanted[0], rel=1e-5)
     assert errors == [errors[0]] * 4  # nothing later has arrived
     assert error(ours.result(), on_device, 500, 0) == pytest.approx(error(theirs.result(), on_host, 500, 0), rel=1e-2)
+
+
+@pytest.mark.parametrize("more", [{"total_variation": 0.1}, {"sparsity": 0.1}, {"entropy": 0.1}, {"min_weight": 1e-4}, {"degree": lambda step: 0}])
+def test_rules_without_kernels_are_refused_by_name(more: dict[str, Any]) -> None:
+    targets = Targets(pixels(2, 8), (1.0, 1.0, 1.0)).sent(DEVICE)
+    with pytest.raises(ValueError, match=next(iter(more))):
+        next(optimise(initial_state(ball_tree(8)), targets, until=1, rays=8, density_lr=0.3, sh_lr=0.05, fall=lambda _: 1.0, seed=1, rule=Rule(**more)))
 
 
 def test_interrupted_or_not_the_bytes_are_the_same() -> None:

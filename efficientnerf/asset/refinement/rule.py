@@ -1,0 +1,37 @@
+"""What steps of tree training minimise besides the losses of rays, and which harmonics they move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True)
+class Rule:
+    """The formulas are those of `efficientnerf.backends.numba.tree_training.steps`; a weight of 0 leaves a term out.
+
+    total_variation  weight of the squared differences between the logarithms of a voxel's and its neighbours' optical thickness
+    sparsity         weight of the sum of the opacities of voxels
+    entropy          weight of the entropy of these opacities
+    min_weight       weight below which samples of a ray absorb, and have neither a colour nor a gradient
+    degree           highest degree of the harmonics that a step, by its number, moves; None: all
+    """
+
+    total_variation: float = 0.0
+    sparsity: float = 0.0
+    entropy: float = 0.0
+    min_weight: float = 0.0
+    degree: Callable[[int], int] | None = None
+
+    def refuse_on_device(self) -> None:
+        """ValueError where this is more than the kernels of a device do."""
+        stated = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+        if stated:
+            raise ValueError(f"{', '.join(stated)}: of trees that are trained on the CPU only. Leave it out, or train with --device cpu.")
+
+    def terms(self, step: int, most: int) -> int:
+        """Coefficients of a channel that a step moves, of so many."""
+        return most if self.degree is None else min(most, (self.degree(step) + 1) ** 2)
+
+
+PLAIN = Rule()
