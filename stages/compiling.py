@@ -1,11 +1,18 @@
-"""A stage that says when it waits for kernels to be compiled."""
+"""A stage that says when it waits for kernels to be compiled, which no time budget counts."""
 
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from pipeline.stage import Job
+
+if TYPE_CHECKING:
+    from efficientnerf.backends.kernel_cache import Compilation
+
+_compilations: list[Compilation] = []  # of the stages that ran in this process
 
 
 def compiling_kernels(run: Callable[[Job], None]) -> Callable[[Job], None]:
@@ -16,8 +23,14 @@ def compiling_kernels(run: Callable[[Job], None]) -> Callable[[Job], None]:
         from efficientnerf.backends.kernel_cache import compilation
 
         with compilation(lambda: job.say("compiling kernels, once")) as found:
+            _compilations.append(found)
             run(job)
         if found.functions:
             job.say(f"compiling kernels, once: {found.seconds:.0f} s", compile_seconds=found.seconds)
 
     return telling
+
+
+def clock() -> float:
+    """Seconds, monotonic, of a clock that stands still while a stage waits for kernels to be compiled."""
+    return time.monotonic() - sum(each.seconds for each in _compilations)

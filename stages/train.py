@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +21,7 @@ from efficientnerf.settings import given
 from efficientnerf.training.settings import TrainSettings
 from pipeline.stage import Job, Stage
 from stages.artifacts import TrainInputs, TrainOutputs, inputs_of, needs_of
-from stages.compiling import compiling_kernels
+from stages.compiling import clock, compiling_kernels
 from stages.cores import use_all_cores
 from stages.training.budget import UNKNOWN, Budget, training_budget
 from stages.training.checkpoints import Checkpoints
@@ -33,8 +32,6 @@ from stages.training.previews import Previews
 if TYPE_CHECKING:
     from efficientnerf.training.loop import Trainer
     from stages.io.scene import View
-
-clock = time.monotonic
 
 
 @compiling_kernels

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 from efficientnerf.asset.refinement.schedule import Phase
 from efficientnerf.training.schedule import Schedule
+from stages.compiling import clock
 from stages.training.budget import UNKNOWN
-
-clock = time.monotonic
 
 # docs/experiments/refinement.md
 WARMUP, TIMED = 2, 8  # first steps of a phase that are not timed; those after them that are, before the number of its steps is set

@@ -3,8 +3,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from efficientnerf.backends import kernel_cache
 from pipeline.stage import Job
+from stages import compiling
 from stages.compiling import compiling_kernels
 from tests.stages.balls import job
 
@@ -32,3 +35,24 @@ def test_a_stage_that_finds_its_kernels_says_nothing(tmp_path: Path) -> None:
     events: list[dict[str, Any]] = []
     compiling_kernels(lambda job: None)(job(tmp_path, None, events=events))
     assert events == []
+
+
+def test_the_clock_of_a_budget_stands_still_while_kernels_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, heard = [100.0], []
+    monkeypatch.setattr(compiling.time, "monotonic", lambda: now[0])
+
+    @compiling_kernels
+    def run(job: Job) -> None:
+        for compiled in (12.0, 0.0, 4.0):
+            now[0] += 1.0
+            if compiled:
+                kernel_cache.note_start()
+                now[0] += compiled
+                kernel_cache.note_end(compiled)
+            heard.append(compiling.clock())
+
+    began = compiling.clock()
+    run(job(tmp_path, None))
+    assert heard == pytest.approx([began + 1, began + 2, began + 3])
+    now[0] += 3.0
+    assert compiling.clock() == pytest.approx(began + 6)
