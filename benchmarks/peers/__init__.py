@@ -1,0 +1,1 @@
+"""Other projects' methods on the same scenes, views and pixels: `python -m benchmarks.peers --help`."""

@@ -1,0 +1,154 @@
+"""Rows of peers for the table of quality over minutes: trained on a CPU for as long as we train, measured on the same test views with the same metric.
+
+    python -m benchmarks.peers nerfacto --python ENVIRONMENT/bin/python --work FOLDER [--sets chair_800,object,gloss] [--minutes 1,5,10]
+                                        [--variants default,small] [--stride 8] [--threads 2] [--out benchmarks/results]
+
+A peer runs in an environment of its own (nerfacto: `pip install nerfstudio==1.1.5`) and reads a data set as Blender's, which made scenes are written as.
+What is behind its renders is white, as behind the test images; PSNR is of float images clipped to 0-1, then the mean over views: as ours. A peer takes
+minutes for what our renderer does in seconds, so only every stride-th row and column of each test view is rendered; SSIM needs whole images (--stride 1).
+Variants are the settings tried, so that a peer is tuned too: docs/experiments/peers.md. Writes peers.json; a row that is there is not measured again
+(--again). Then `python -m benchmarks.quality_over_minutes --minutes= ...` shows all rows together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.minutes import RESULTS, read_rows, same_row, with_row, write_rows
+from benchmarks.quality_over_minutes import DATA, PEERS, source_of
+
+SCRIPTS = {"nerfacto": Path(__file__).with_name("nerfacto.py")}
+# docs/experiments/peers.md
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "batch 1024": {"datamanager.train_num_rays_per_batch": 1024},
+    "small": {
+        "datamanager.train_num_rays_per_batch": 1024, "model.num_proposal_samples_per_ray": [96, 48], "model.num_nerf_samples_per_ray": 24,
+        "model.proposal_weights_anneal_max_num_iters": 200,
+    },
+    "smaller": {
+        "datamanager.train_num_rays_per_batch": 1024, "model.num_proposal_iterations": 1, "model.num_proposal_samples_per_ray": [96],
+        "model.proposal_net_args_list": [{"hidden_dim": 16, "log2_hashmap_size": 15, "num_levels": 5, "max_res": 128, "use_linear": False}],
+        "model.num_nerf_samples_per_ray": 24, "model.log2_hashmap_size": 17, "model.proposal_weights_anneal_max_num_iters": 200,
+    },
+}  # fmt: skip
+
+
+def as_blender(source: Path, folder: Path) -> Path:
+    """The data set with a transforms file for each split, as Blender's data sets have them; one that is so already is returned as it is.
+
+    Raises SystemExit for images without alpha and for cameras that this form cannot hold.
+    """
+    if (source / "transforms_test.json").exists():
+        return source
+    document = json.loads((source / "transforms.json").read_text(encoding="utf-8"))
+    if document["fl_x"] != document["fl_y"] or (document["cx"], document["cy"]) != (document["w"] / 2, document["h"] / 2):
+        raise SystemExit(f"{source}: its cameras are not those of a Blender data set: square pixels, centred")
+    frames = {frame["file_path"]: frame["transform_matrix"] for frame in document["frames"]}
+    folder.mkdir(parents=True, exist_ok=True)
+    for split in ("train", "test"):
+        angle = 2 * math.atan(document["w"] / 2 / document["fl_x"])
+        listed = [{"file_path": f"./{name.removesuffix('.png')}", "transform_matrix": frames[name]} for name in document[f"{split}_filenames"]]
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": listed}), encoding="utf-8")
+        for name in document[f"{split}_filenames"]:
+            (folder / name).parent.mkdir(exist_ok=True)
+            shutil.copyfile(source / name, folder / name)
+            if _pixels(folder / name).shape[2] != 4:
+                raise SystemExit(f"{source / name}: no alpha; what is behind it cannot be made white")
+    return folder
+
+
+def _pixels(path: Path) -> np.ndarray:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def truth_of(folder: Path, stride: int) -> list[np.ndarray]:
+    """The test images on white, of the pixels that were rendered: (H', W', 3) each, 0 to 1."""
+    from stages.evaluation.views import subsample
+
+    frames = json.loads((folder / "transforms_test.json").read_text(encoding="utf-8"))["frames"]
+    images = (_pixels(folder / f"{frame['file_path']}.png") / 255.0 for frame in frames)
+    return [subsample(pixels[..., :3] * pixels[..., 3:] + (1 - pixels[..., 3:]), stride) for pixels in images]
+
+
+def quality(renders: np.ndarray, truth: Sequence[np.ndarray], whole: bool) -> dict[str, Any]:
+    """Means over the views; SSIM of whole images alone."""
+    from efficientnerf.evaluation.metrics import psnr, ssim
+
+    if len(renders) != len(truth):
+        raise SystemExit(f"{len(renders)} views were rendered, {len(truth)} are there")
+    pairs = [(np.clip(np.asarray(image, np.float64), 0, 1), np.asarray(true, np.float64)) for image, true in zip(renders, truth, strict=True)]
+    found = {"psnr": math.fsum(psnr(*pair) for pair in pairs) / len(pairs), "views": len(pairs), "ssim": None}
+    if whole:
+        found["ssim"] = math.fsum(ssim(*pair) for pair in pairs) / len(pairs)
+    return found
+
+
+def row_of(named: Mapping[str, Any], data: Path, out: Path, given: argparse.Namespace) -> dict[str, Any]:
+    """Train and render in the peer's environment, and compare here."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    load = os.getloadavg()
+    command = [str(given.python), str(SCRIPTS[given.peer]), str(data), str(out), "--minutes", f"{named['minutes']:g}", "--stride", str(given.stride)]
+    command += ["--threads", str(given.threads)]
+    for name, value in VARIANTS[named["options"] or "default"].items():
+        command += ["--set", f"{name}={json.dumps(value)}"]
+    threads = {name: str(given.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    with open(out / "log.txt", "w", encoding="utf-8") as log:
+        done = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT, env=environment | threads, cwd=out, check=False)
+    if done.returncode != 0:
+        raise SystemExit(f"{given.peer}: exit code {done.returncode}; see {out / 'log.txt'}")
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    return {
+        **named, **quality(np.load(out / "renders.npy"), truth_of(data, given.stride), given.stride == 1), "stride": given.stride,
+        "megabytes": report["model_bytes"] / 1e6, "peak_mib": report["peak_mib"], "seconds": report["seconds"], "load": load,
+        "code": f"{given.peer} {report['versions'].get('nerfstudio', '')}".strip(),
+        **{key: report[key] for key in ("steps", "rays_per_second", "rendering_seconds", "threads", "settings", "versions")},
+    }  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("peer", choices=SCRIPTS)
+    parser.add_argument("--python", type=Path, required=True, help="the interpreter of the peer's environment")
+    parser.add_argument("--work", type=Path, required=True, help="folder for data sets, renders and logs")
+    parser.add_argument("--sets", default="chair_800")
+    parser.add_argument("--minutes", default="1,5,10")
+    parser.add_argument("--variants", default="default", help=f"with commas between: {', '.join(VARIANTS)}")
+    parser.add_argument("--stride", type=int, default=8)
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--scenes", type=Path, help="folder of made scenes; by default WORK/scenes")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--again", action="store_true", help="measure rows again that are there")
+    given = parser.parse_args(arguments)
+    path = given.out / PEERS
+    for name in given.sets.split(","):
+        source, _ = source_of(name, given.data, given.scenes or given.work / "scenes")
+        data = as_blender(source, given.work / "data" / name)
+        for minutes in sorted(float(word) for word in given.minutes.split(",")):
+            for variant in given.variants.split(","):
+                named = {"method": given.peer, "set": name, "minutes": minutes, "options": "" if variant == "default" else variant}
+                if not given.again and any(same_row(row, named) for row in read_rows(path)):
+                    continue
+                row = row_of(named, data.resolve(), (given.work / given.peer / f"{name}-{minutes:g}m-{variant.replace(' ', '-')}").resolve(), given)
+                write_rows(path, with_row(read_rows(path), row))
+                print(f"{given.peer} ({variant}), {name}, {minutes:g} min: {row['psnr']:.2f} dB, {row['rays_per_second']:,.0f} rays/s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
