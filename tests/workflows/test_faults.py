@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.workflows.test_torture import torment
+from tests.workflows.torment import torment
 
 
 @pytest.mark.slow

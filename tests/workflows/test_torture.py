@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,6 +17,7 @@ from benchmarks.torture.comparison import Expected, digests, names
 from benchmarks.torture.kills import Prepared, Rounds
 from benchmarks.torture.sources import Source
 from benchmarks.torture.trap import Armed, Trap
+from tests.workflows.torment import torment
 from tests.workflows.toys import TOYS
 from workflows.asset import Workflow
 
@@ -103,14 +103,6 @@ os.close(descriptor)
         seen.append([(operation.stage, operation.kind, Path(operation.path).name) for operation in trap.operations(armed.log or run)])
     assert seen[0] == seen[1]
     assert [kind for _, kind, _ in seen[0]] == ["mkdir", "open", "write", "rename", "read", "fsync", "unlink", "rmdir", "open", "write"]
-
-
-def torment(tmp_path: Path, module: str, *arguments: str) -> dict[str, Any]:
-    command = [sys.executable, "-m", module, *arguments, "--json", str(tmp_path / "result.json"), "--folder", str(tmp_path / "runs")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    found: dict[str, Any] = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
-    return found
 
 
 @pytest.mark.slow
