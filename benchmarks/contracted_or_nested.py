@@ -70,6 +70,51 @@ def place(contracted, u, size, out):  # type: ignore[no-untyped-def]
     return n, n
 
 
+@njit(inline="always")
+def squared_speed(contracted, u, direction, m, grid, part, facing, size):  # type: ignore[no-untyped-def]
+    """Squared voxels that a ray passes in a world unit at u, whose greatest coordinate is m."""
+    speed = 0.0
+    for i in range(3):
+        v = direction[i]
+        if not contracted:
+            v = v / 2.0**grid * size[i] / 2
+        elif part == 0:
+            v = v * size[i] / 4
+        elif i == part - 1:
+            v = v / (m * m) * size[i] / 4
+        else:
+            v = (v / m - u[i] * facing * direction[part - 1] / (m * m)) * size[i] / 4
+        speed += v * v
+    return speed
+
+
+@njit(inline="always")
+def blended(at, grid, size, index, density, sh, mixed, ahead):  # type: ignore[no-untyped-def]
+    """Trilinear density at voxel coordinates, and the sum of the weights of stored voxels; their harmonics in `mixed` (K, 3). `ahead` (3,) is scratch."""
+    sigma, total = 0.0, 0.0
+    mixed[:] = 0
+    for k in range(8):
+        weight, held = 1.0, True
+        for i in range(3):
+            low = math.floor(at[i] - 0.5)
+            f = at[i] - 0.5 - low
+            one = (k >> i) & 1
+            weight *= f if one else 1 - f
+            ahead[i] = low + one
+            held &= 0 <= ahead[i] < size[i]
+        if not held or weight <= 0:
+            continue
+        voxel = index[grid, int(ahead[0]), int(ahead[1]), int(ahead[2])]
+        if voxel < 0:
+            continue
+        sigma += weight * density[voxel]
+        total += weight
+        for j in range(sh.shape[1]):
+            for c in range(3):
+                mixed[j, c] += weight * sh[voxel, j, c]
+    return sigma, total
+
+
 @njit(parallel=True, fastmath=False)
 def march(contracted, size, index, blocks, density, sh, harmonics, origins, directions, half, near, colour, opacity, counts):  # type: ignore[no-untyped-def]
     """Colour (R, 3), opacity (R,), and counts (R, 3): steps, steps in blocks that are not empty, parts.
@@ -98,18 +143,7 @@ def march(contracted, size, index, blocks, density, sh, harmonics, origins, dire
             if part != was or facing != sign:
                 counts[r, 2] += 1
                 was, sign = part, facing
-            speed = 0.0  # voxels for each world unit
-            for i in range(3):
-                v = directions[r, i]
-                if not contracted:
-                    v = v / 2.0**grid * size[i] / 2
-                elif part == 0:
-                    v = v * size[i] / 4
-                elif i == part - 1:
-                    v = v / (m * m) * size[i] / 4
-                else:
-                    v = (v / m - u[i] * facing * directions[r, part - 1] / (m * m)) * size[i] / 4
-                speed += v * v
+            speed = squared_speed(contracted, u, directions[r], m, grid, part, facing, size)
             step = 0.5 / math.sqrt(speed)
             for i in range(3):
                 u[i] += 0.5 * step * directions[r, i]
@@ -122,27 +156,7 @@ def march(contracted, size, index, blocks, density, sh, harmonics, origins, dire
             if not inside or not blocks[grid, int(at[0]) // BLOCK, int(at[1]) // BLOCK, int(at[2]) // BLOCK]:
                 continue
             counts[r, 1] += 1
-            sigma, total = 0.0, 0.0
-            mixed[:] = 0
-            for k in range(8):
-                weight, held = 1.0, True
-                for i in range(3):
-                    low = math.floor(at[i] - 0.5)
-                    f = at[i] - 0.5 - low
-                    one = (k >> i) & 1
-                    weight *= f if one else 1 - f
-                    ahead[i] = low + one
-                    held &= 0 <= ahead[i] < size[i]
-                if not held or weight <= 0:
-                    continue
-                voxel = index[grid, int(ahead[0]), int(ahead[1]), int(ahead[2])]
-                if voxel < 0:
-                    continue
-                sigma += weight * density[voxel]
-                total += weight
-                for j in range(sh.shape[1]):
-                    for c in range(3):
-                        mixed[j, c] += weight * sh[voxel, j, c]
+            sigma, total = blended(at, grid, size, index, density, sh, mixed, ahead)
             if sigma <= 0:
                 continue
             m = max(abs(u[0]), abs(u[1]), abs(u[2]), 1.0)
