@@ -85,7 +85,7 @@ class BakeSettings:
         advanced=True,
     )
     samples_per_voxel: Annotated[int, Meta(ge=1, le=256)] = setting(
-        8, "Jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels.", advanced=True
+        2, "Jittered points averaged in a voxel; its centre alone where train.discretise has the same voxels.", advanced=True
     )
     seed: Seed = setting(0, "Seed of the jitter and of the rays of the refinement.", advanced=True)
     refine_steps: Count | Auto = setting(
@@ -100,11 +100,15 @@ class BakeSettings:
     )
     refine_rays_per_batch: Annotated[int, Meta(ge=1, le=1 << 22)] = setting(32768, "Rays in a step of the refinement.", advanced=True)
     density_lr: NonNegative = setting(0.3, "Learning rate of the refinement for the logarithm of a voxel's optical thickness.", advanced=True)
-    sh_lr: NonNegative = setting(0.03, "Learning rate of the refinement for the spherical harmonics.", advanced=True)
+    sh_lr: NonNegative = setting(0.1, "Learning rate of the refinement for the spherical harmonics.", advanced=True)
     view_dependent_lr_ratio: Fraction | Auto = setting(
         "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 1 for objects with alpha, 0.2 in unbounded scenes.", advanced=True
     )
-    lr_final_ratio: Fraction = setting(0.3, "Ratio to which the learning rates of the refinement fall exponentially.", advanced=True)
+    total_variation: NonNegative | Auto = setting(
+        "auto", "Weight of the total variation of the logarithm of the optical thickness between a voxel and those beside it; auto: by the kind of scene.",
+        advanced=True,
+    )
+    lr_final_ratio: Fraction = setting(0.1, "Ratio to which the learning rates of the refinement fall exponentially.", advanced=True)
     licence: str = setting("", "Licence text to write into the asset.")
 
 

@@ -42,6 +42,7 @@ CHECKPOINT_SECONDS = 30.0
 ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 # docs/experiments/refinement.md
 MIN_STEPS, STEP_RAYS_PER_VOXEL, UNBOUNDED_STEPS = 320, 5, 160  # see `refinement_steps`
+TOTAL_VARIATION, SCENE_TOTAL_VARIATION, NDC_TOTAL_VARIATION = 1e-5, 0.0, 0.0  # bake.total_variation: with a constant background, of whole scenes, in NDC
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
 Room = Callable[[int], int]  # voxels that the asset holds on its grids, which were split so often
@@ -112,6 +113,7 @@ class Refinement:
     def _take_steps(self) -> None:
         """Take the steps that are left of the phase, with checkpoints on the way and where it is stopped."""
         from efficientnerf.asset.refinement import fit
+        from efficientnerf.asset.refinement.rule import Rule
 
         settings, point, state, job = self.job.settings, self.point, self.point.state, self.job
         begin, number = point.schedule.begin(point.phase), point.phase
@@ -126,6 +128,7 @@ class Refinement:
         run = fit.optimise(
             state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
             fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed, view_dependent_lr_ratio=ratio,
+            rule=Rule(total_variation=total_variation(settings, state.tree)),
         )  # fmt: skip
         step_began = clock()
         for error in run:
@@ -286,6 +289,15 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets, splits: int = 
         " they are refined on the CPU, which takes longer (lower bake.max_mib or bake.resolution for the device)"
     )
     return targets
+
+
+def total_variation(settings: BakeSettings, tree: NerfTree) -> float:
+    """The weight of the total variation, bake.total_variation or that of the kind of scene."""
+    if (stated := given(settings.total_variation)) is not None:
+        return stated
+    if tree.ndc is not None:
+        return NDC_TOTAL_VARIATION
+    return TOTAL_VARIATION if tree.background is not None else SCENE_TOTAL_VARIATION
 
 
 def refinement_steps(settings: BakeSettings, voxels: int, constant_background: bool) -> int:

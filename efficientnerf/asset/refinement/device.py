@@ -13,11 +13,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.refinement.host import DECAY, EPSILON
+from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree_training.packets import cells_of
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, neighbours_of
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, LearningRates, Rays, device_grid
@@ -30,28 +35,63 @@ class DeviceArrays:
     """A state's arrays on a device, by name (`efficientnerf.asset.refinement.state.STATE`), and the sums of the gradients."""
 
     def __init__(self, state: RefinementState, device: torch.device) -> None:
+        self.beside: Tensor | None
         self.values: dict[str, Tensor] = {name: torch.from_numpy(np.ascontiguousarray(getattr(state, name))).to(device) for name in STATE}
         self.grid = device_grid(state.tree, device)
         count, width = state.sh.shape
         self.by_thickness = torch.zeros(count, dtype=torch.int64, device=device)
         self.by_sh = torch.zeros(count, width, dtype=torch.int64, device=device)
         self.stamp = torch.zeros(count, dtype=torch.int32, device=device)
+        self.tree, self.beside = state.tree, None  # the second (N, 6), where total variation is asked for
 
     def to_host(self) -> dict[str, np.ndarray]:
         """The arrays on the host."""
         return {name: values.cpu().numpy() for name, values in self.values.items()}
 
-    def step(self, number: int, rays: Rays, wanted: Any, density_lr: float, sh_lr: float, view_dependent_lr_ratio: float = 1.0) -> Tensor:
+    def add_total_variation(self, weight: float, number: int, scale: float) -> None:
+        """Add its gradient of the voxels that were met in step `number` to the sums, which hold `scale` to a one."""
+        if self.beside is None:
+            self.beside = torch.from_numpy(voxels_beside(self.tree)).to(self.stamp.device)
+            sides = np.full(len(self.stamp), self.tree.voxel, np.float32) if not self.tree.outer else voxel_sides(self.tree)
+            self.sides = torch.from_numpy(sides).to(self.stamp.device)
+        thickness = (self.values["density"] * self.sides).clamp(min=MIN_THICKNESS)
+        here = thickness.log()
+        slope = torch.zeros_like(here)
+        for face in range(6):
+            beyond = self.beside[:, face].long()
+            slope += torch.where(beyond >= 0, here - here[beyond.clamp(min=0)], 0)
+        slope *= weight * scale / thickness * (self.stamp == number)
+        self.by_thickness += slope.to(torch.int64)
+
+    def step(
+        self, number: int, rays: Rays, wanted: Any, density_lr: float, sh_lr: float, view_dependent_lr_ratio: float = 1.0, total_variation: float = 0.0
+    ) -> Tensor:
         """Losses (R,) of the rays before the step."""
         v, sums = self.values, (self.by_thickness, self.by_sh)
         outputs = tree_gradients.forward(self.grid, rays, v["density"], v["sh"])
         loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
         tree_gradients.backward(self.grid, rays, v["density"], v["sh"], outputs, (by[0], by[1]), sums, self.stamp, number)
+        if total_variation > 0:
+            self.add_total_variation(total_variation, number, tree_gradients.fixed_point_scale(len(loss)))
         tree_gradients.rmsprop_step(
             self.grid, (v["density"], v["sh"]), sums, (v["square_density"], v["square_sh"]), v["visits"], self.stamp,
             number=number, rays=len(loss), rates=LearningRates(density_lr, sh_lr, view_dependent_lr_ratio), decay=DECAY, epsilon=EPSILON,
         )  # fmt: skip
         return loss
+
+
+def voxels_beside(tree: NerfTree) -> np.ndarray:
+    """(N, 6) int32: the voxels beyond the faces -x, x, -y, y, -z, z of each, -1 where none is stored. Those of different cascades are not beside each other."""
+    around, b = neighbours_of(cells_of(tree_grid(tree)), 0).around, tree.brick
+    index = tree.voxel_index.reshape(-1, b, b, b)
+    found = np.full((len(tree.density_values), 6), -1, np.int32)
+    for face in range(6):
+        axis, upper = 1 + face // 2, face % 2
+        other = np.where((around[:, face] >= 0)[:, None, None, None], index[around[:, face]], -1)
+        joined = np.concatenate([index, other] if upper else [other, index], axis=axis)
+        beyond = np.take(joined, np.arange(b) + (1 if upper else b - 1), axis=axis)
+        found[index[index >= 0], face] = beyond[index >= 0]
+    return found
 
 
 def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
@@ -63,7 +103,7 @@ def rays_in_voxels(tree: NerfTree, origins: Tensor, directions: Tensor) -> Rays:
 
 def optimise(
     state: RefinementState, targets: Targets, *, until: int, rays: int, density_lr: float, sh_lr: float, fall: Callable[[int], float], seed: int,
-    view_dependent_lr_ratio: float, patch_side: int,
+    view_dependent_lr_ratio: float, patch_side: int, rule: Rule = PLAIN,
 ) -> Iterator[float]:  # fmt: skip
     """See `efficientnerf.asset.refinement.fit.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
     assert isinstance(targets.pixels, DevicePixels)
@@ -77,7 +117,8 @@ def optimise(
         number = state.step + 1
         origins, directions, wanted = targets.of(patches.draw(rays, step_rng(seed, number), chances).pixels)
         factor = fall(number)
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, density_lr * factor, sh_lr * factor, view_dependent_lr_ratio)
+        rates = density_lr * factor, sh_lr * factor, view_dependent_lr_ratio
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, *rates, rule.total_variation)
         pending.append(to_host_async(loss.mean() / 3))
         state.step = number
         if error is None or len(pending) > LAG:

@@ -46,7 +46,7 @@ def optimise(
         rule.refuse_on_device()
         yield from device.optimise(
             state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
-            patch_side=patch_side,
+            patch_side=patch_side, rule=rule,
         )  # fmt: skip
         return
     yield from host.optimise(

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
+from efficientnerf.asset.refinement.device import voxels_beside
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.rule import Rule
 from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.device_pixels import DevicePixels
@@ -102,12 +103,13 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
     assert (device_gradients(bare, origins, directions, seen_at_random(40, 0.0), DEVICE)[0] > 0).any()
 
 
-def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 4) -> tuple[RefinementState, list[float]]:
+def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 4, tv: float = 0.0) -> tuple[RefinementState, list[float]]:
     """Steps in one go, or in several with the state fetched in between, as a checkpoint does."""
     o = initial_state(tree)
     errors: list[float] = []
     for end in until:
-        errors += optimise(o, targets, until=end, rays=rays, density_lr=0.3, sh_lr=0.05, fall=exponential_fall(0.1, steps), seed=1, view_dependent_lr_ratio=0.5)
+        errors += optimise(o, targets, until=end, rays=rays, density_lr=0.3, sh_lr=0.05, fall=exponential_fall(0.1, steps), seed=1, view_dependent_lr_ratio=0.5,
+                           rule=Rule(total_variation=tv))  # fmt: skip
         o.fetch()
     return o, errors
 
@@ -120,15 +122,15 @@ def nested_balls() -> NerfTree:
     return replace(tree, harmonics=np.zeros((len(tree.density_values), 4, 3), np.float32))
 
 
-@pytest.mark.parametrize("tree", [ball_tree(8), nested_balls()], ids=["one grid", "cascades"])
-def test_steps_are_those_of_the_cpu(tree: NerfTree) -> None:
+@pytest.mark.parametrize(("tree", "tv"), [(ball_tree(8), 0.0), (nested_balls(), 0.03)], ids=["one grid", "cascades"])
+def test_steps_are_those_of_the_cpu(tree: NerfTree, tv: float) -> None:
     """From colours that are no pixel's: where an error is next to nothing its rounding would show, for steps are of one length."""
     tree = replace(tree, harmonics=np.random.default_rng(0).normal(size=tree.sh.shape).astype(np.float32))
     on_host = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     on_device = on_host.sent(DEVICE)
     assert on_device.on_device
-    ours, errors = fitted(on_device, tree, [4])
-    theirs, wanted = fitted(on_host, tree, [4])
+    ours, errors = fitted(on_device, tree, [4], tv=tv)
+    theirs, wanted = fitted(on_host, tree, [4], tv=tv)
     assert (ours.visits == theirs.visits).mean() > 0.99
     assert len(np.unique(theirs.visits)) > 2
     for name in ("density", "sh", "square_density", "square_sh"):
@@ -139,11 +141,21 @@ def test_steps_are_those_of_the_cpu(tree: NerfTree) -> None:
     assert error(ours.result(), on_device, 500, 0) == pytest.approx(error(theirs.result(), on_host, 500, 0), rel=1e-2)
 
 
-@pytest.mark.parametrize("more", [{"total_variation": 0.1}, {"sparsity": 0.1}, {"entropy": 0.1}, {"min_weight": 1e-4}, {"degree": lambda step: 0}])
+@pytest.mark.parametrize("more", [{"sparsity": 0.1}, {"entropy": 0.1}, {"min_weight": 1e-4}, {"degree": lambda step: 0}])
 def test_rules_without_kernels_are_refused_by_name(more: dict[str, Any]) -> None:
     targets = Targets(pixels(2, 8), (1.0, 1.0, 1.0)).sent(DEVICE)
     with pytest.raises(ValueError, match=next(iter(more))):
         next(optimise(initial_state(ball_tree(8)), targets, until=1, rays=8, density_lr=0.3, sh_lr=0.05, fall=lambda _: 1.0, seed=1, rule=Rule(**more)))
+
+
+@pytest.mark.parametrize("tree", [random_tree(2), random_tree(3, brick=1), nested_balls()], ids=["one", "bricks of one voxel", "cascades"])
+def test_voxels_beside_are_a_step_away(tree: NerfTree) -> None:
+    beside, at, cascades = voxels_beside(tree), voxel_coordinates(tree), voxel_cascades(tree)
+    place = {(int(of), *map(int, row)): n for n, (of, row) in enumerate(zip(cascades, at, strict=True))}
+    for face in range(6):
+        step = np.eye(3, dtype=int)[face // 2] * (1 if face % 2 else -1)
+        wanted = [place.get((int(of), *map(int, row + step)), -1) for of, row in zip(cascades, at, strict=True)]
+        np.testing.assert_array_equal(beside[:, face], wanted)
 
 
 def test_interrupted_or_not_the_bytes_are_the_same() -> None:
