@@ -68,8 +68,8 @@ class BakeSettings:
     weight_threshold: Fraction = setting(1e-3, "A voxel is kept where its weight in some pixel exceeds this.", advanced=True)
     max_mib: PositiveInt | Auto = setting(
         "auto",
-        "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 24; 38 of a"
-        " scene without a constant background; 36 bytes for each pixel of a forward-facing capture, from 24 to 56.",
+        "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
+        " 36 bytes for each pixel of a forward-facing capture, from 24 to 56. Smaller where voxels as fine as pixels resolve take less.",
         unit="MiB",
     )
     layout: Literal["compact", "packed", "small", "sparse"] = setting(
@@ -90,7 +90,7 @@ class BakeSettings:
     seed: Seed = setting(0, "Seed of the jitter and of the rays of the refinement.", advanced=True)
     refine_steps: Count | Auto = setting(
         "auto",
-        "Steps in which the baked values are refined on the training images; auto: five rays for each voxel, at least 320 steps, or 160 in unbounded scenes.",
+        "Steps in which the baked values are refined on the training images; auto: 15 rays for each voxel, 6 in unbounded scenes; at least 320 steps.",
         advanced=True,
     )
     time_budget: Annotated[float, Meta(gt=0.0)] | Off = setting(

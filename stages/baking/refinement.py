@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 CHECKPOINT_SECONDS = 30.0
 ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 # docs/experiments/refinement.md
-MIN_STEPS, STEP_RAYS_PER_VOXEL, UNBOUNDED_STEPS = 320, 5, 160  # see `refinement_steps`
+MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, 6  # see `refinement_steps`
 TOTAL_VARIATION, SCENE_TOTAL_VARIATION, NDC_TOTAL_VARIATION = 1e-5, 0.0, 0.0  # bake.total_variation: with a constant background, of whole scenes, in NDC
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
@@ -304,5 +304,5 @@ def refinement_steps(settings: BakeSettings, voxels: int, constant_background: b
     """Steps of the refinement of so many voxels, of a scene with a constant background or without one."""
     if (stated := given(settings.refine_steps)) is not None:
         return stated
-    steps = max(MIN_STEPS, math.ceil(STEP_RAYS_PER_VOXEL * voxels / settings.refine_rays_per_batch))
-    return steps if constant_background else UNBOUNDED_STEPS
+    per_voxel = STEP_RAYS_PER_VOXEL if constant_background else SCENE_STEP_RAYS_PER_VOXEL
+    return max(MIN_STEPS, math.ceil(per_voxel * voxels / settings.refine_rays_per_batch))

@@ -23,7 +23,7 @@ MIN_RESOLUTION = 32  # voxels along the longest side
 # normalised device coordinates (images hold noise that finer voxels would learn); voxels along the longest side, at most; MiB of an asset, at most
 VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
 MAX_RESOLUTION = 1024
-MAX_MIB, SCENE_MAX_MIB = 24, 38
+MAX_MIB, SCENE_MAX_MIB = 38, 38
 # Of whole scenes: cascades at most; the share of what the field shows that may lie beyond the last one, in the environment map; coarse cells of all of them.
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md

@@ -37,7 +37,7 @@ from tests.stages.balls import ORBIT, SIMILARITY, StopAt, job, poses
 from tests.stages.spoilers import SPOILERS
 
 TWELVE = stated_schedule(PHASES, 12)
-QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512)
+QUICK = BakeSettings(resolution=24, samples_per_voxel=4, licence="CC0-1.0", refine_steps=12, refine_rays_per_batch=512, lr_final_ratio=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +240,7 @@ def test_the_asset_is_enough_by_itself(inputs: dict[str, Path], undisturbed: tup
         "resolution": [24, 24, 24],
         "voxels_along_longest_side": 24,
         "resolution_decided_by": "bake.resolution",
-        "max_mib": 24,
+        "max_mib": 38,
         "voxels": len(tree.density_values),
         "bricks": len(tree.voxel_index),
         "bytes": (made.out / BakeOutputs.asset).stat().st_size,
@@ -313,14 +313,14 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
 
 def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
     chosen = BakeSettings(refine_rays_per_batch=1000)
-    assert [refinement.refinement_steps(chosen, voxels, True) for voxels in (1, 64_000, 64_001, 10**6)] == [320, 320, 321, 5000]
-    assert {refinement.refinement_steps(chosen, voxels, False) for voxels in (1, 10**7)} == {160}
+    assert [refinement.refinement_steps(chosen, voxels, True) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
+    assert [refinement.refinement_steps(chosen, voxels, False) for voxels in (1, 10**6)] == [320, 6000]
     asked = dataclasses.replace(chosen, refine_steps=7)
     assert {refinement.refinement_steps(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
-    made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=None, refine_rays_per_batch=64), **inputs)
+    made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=None, refine_rays_per_batch=256), **inputs)
     run(made)
     report = json.loads((made.out / "report.json").read_text())["optimisation"]
-    assert report["steps"] == max(320, -(-5 * report["voxels_baked"] // 64))
+    assert report["steps"] == max(320, -(-15 * report["voxels_baked"] // 256))
 
 
 @pytest.mark.parametrize("layout", ["compact", "sparse"])
