@@ -214,7 +214,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=7,
+    version=8,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,
