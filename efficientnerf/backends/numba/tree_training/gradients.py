@@ -27,6 +27,7 @@ from efficientnerf.backends.numba.tree_training.packets import (
     FIRST_BLOCKS,
     FIRST_SAMPLES,
     SAMPLES,
+    WORDS,
     Cells,
     clear,
     clear_distance,
@@ -36,7 +37,7 @@ from efficientnerf.backends.numba.tree_training.packets import (
     walk_ray,
 )
 from efficientnerf.backends.numba.tree_training.scalars import cast_like, sigmoid
-from efficientnerf.backends.numba.tree_training.tasks import take_next
+from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
 
 CHUNK = 32  # packets
 BIN_BITS = 15  # voxels of a bin, power of two
@@ -104,8 +105,8 @@ def packets_of(rays: int, side: int = 1) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-def]
-    """Sums of the harmonics of the slots at which samples lie, along the packet's mean direction; returns how many of these hold a voxel."""
-    found = 0
+    """Sums of the harmonics of the slots at which samples lie, along the packet's mean direction; returns how many of these hold a voxel, see `stored`."""
+    found, width = 0, 3 * terms
     for block in range(1, packet.state[BLOCKS]):
         first, source = block * tree.cube, packet.owner[block] * tree.cube
         for n in range(tree.cube):
@@ -114,22 +115,25 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
             at, voxel = 4 * (first + n), np.int64(tree.voxel_index[source + n])
             for c in range(4):
                 packet.gradient[at + c] = 0
-            if voxel < 0:
-                for c in range(4):
-                    packet.colour[at + c] = 0
-                continue
-            found += 1
-            row = 3 * terms * voxel
-            red, green, blue = basis[0] * sh[row], basis[0] * sh[row + 1], basis[0] * sh[row + 2]
-            for k in range(1, terms):
-                red += basis[k] * sh[row + 3 * k]
-                green += basis[k] * sh[row + 3 * k + 1]
-                blue += basis[k] * sh[row + 3 * k + 2]
-            packet.colour[at], packet.colour[at + 1], packet.colour[at + 2], packet.colour[at + 3] = red, green, blue, 1
+                packet.colour[at + c] = 0
+            if voxel >= 0:
+                packet.stored[2 * found], packet.stored[2 * found + 1] = np.int32(first + n), np.int32(voxel)
+                found += 1
+                for j in range(0, width, WORDS):
+                    prefetch(sh, width * voxel + j)
+                prefetch(sh, width * voxel + width - 1)
+    for n in range(found):
+        at, row = 4 * np.int64(packet.stored[2 * n]), width * np.int64(packet.stored[2 * n + 1])
+        red, green, blue = basis[0] * sh[row], basis[0] * sh[row + 1], basis[0] * sh[row + 2]
+        for k in range(1, terms):
+            red += basis[k] * sh[row + 3 * k]
+            green += basis[k] * sh[row + 3 * k + 1]
+            blue += basis[k] * sh[row + 3 * k + 2]
+        packet.colour[at], packet.colour[at + 1], packet.colour[at + 2], packet.colour[at + 3] = red, green, blue, 1
     return found
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _shade(n, packet):  # type: ignore[no-untyped-def]
     """Colour of a sample, sigmoids of what is interpolated between the corners that are stored; kept in `packet.shade`."""
     colour, slots, weights = packet.colour, packet.slots, packet.weights
@@ -149,7 +153,7 @@ def _shade(n, packet):  # type: ignore[no-untyped-def]
     return r, g, b
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _add_gradient(n, red, green, blue, density, packet):  # type: ignore[no-untyped-def]
     """Adds a sample's gradients to those of its eight slots."""
     gradient, slots, weights = packet.gradient, packet.slots, packet.weights
@@ -220,22 +224,16 @@ def _trace_packet(begin, end, origins, directions, targets, stop, min_weight, te
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _leave_records(number, written, tree, arrays, numbers, gradient, bins):  # type: ignore[no-untyped-def]
-    """Records of a packet's voxels from `written` on, counted by bins; returns their end."""
+def _leave_records(number, found, written, arrays, numbers, gradient, bins):  # type: ignore[no-untyped-def]
+    """Records of the voxels that a packet found, from `written` on, counted by bins; returns their end."""
     packet = packet_pointers(arrays)
-    for block in range(1, packet.state[BLOCKS]):
-        first, source = block * tree.cube, packet.owner[block] * tree.cube
-        for n in range(tree.cube):
-            if packet.met[first + n] == 0:
-                continue
-            v = tree.voxel_index[source + n]
-            if v < 0:
-                continue
-            numbers[written, 0], numbers[written, 1] = v, np.int32(number)
-            for c in range(4):
-                gradient[written, c] = packet.gradient[4 * (first + n) + c]
-            bins[(v >> BIN_BITS) + 1] += 1
-            written += 1
+    for n in range(found):
+        slot, v = 4 * np.int64(packet.stored[2 * n]), packet.stored[2 * n + 1]
+        numbers[written, 0], numbers[written, 1] = v, np.int32(number)
+        for c in range(4):
+            gradient[written, c] = packet.gradient[slot + c]
+        bins[(v >> BIN_BITS) + 1] += 1
+        written += 1
     return written
 
 
@@ -287,7 +285,7 @@ def _work(task, cells, first, origins, directions, bases, density, sh, targets, 
             if written + found > len(own_numbers):
                 room = 2 * (written + found)
                 own_numbers, own_gradient = _enlarged(own_numbers, written, room), _enlarged(own_gradient, written, room)
-            written = _leave_records(number, written, tree, arrays, own_numbers, own_gradient, bins)
+            written = _leave_records(number, found, written, arrays, own_numbers, own_gradient, bins)
         counts[chunk] = written
         if written <= capacity:
             _sort_records(written, own_numbers, own_gradient, bins, chunk * capacity, numbers, gradient, place)

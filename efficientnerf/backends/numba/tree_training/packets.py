@@ -21,8 +21,10 @@ from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.march import STEP
 from efficientnerf.backends.numba.tree.walk import TreeGrid, box_distances, most_samples
 from efficientnerf.backends.numba.tree_training.scalars import absorbed, cast_like
+from efficientnerf.backends.numba.tree_training.tasks import prefetch
 
 FIRST_BLOCKS, FIRST_SAMPLES = 128, 1024  # that a packet has room for before it grows
+WORDS = 16  # of 4 bytes in a cache line
 SLACK = 1e-3  # voxels by which a clear way ends early, so that no rounding makes it end late
 
 
@@ -84,6 +86,7 @@ class PacketArrays(NamedTuple):
     met         (T,) uint8 whether a sample lies at a slot
     colour      (T, 4) arguments of the sigmoids, and 1; zeros where no voxel is stored
     gradient    (T, 4) by these and by density
+    stored      (T, 2) int32 slots at which samples lie and a voxel is stored, and these voxels
     slots       (S, 8) int32 of a sample
     weights     (S, 8) of interpolation
     light       (S, 3) float64 alpha, transmittance at which light arrives, length of the step in units of the frame
@@ -102,6 +105,7 @@ class PacketArrays(NamedTuple):
     met: Any
     colour: Any
     gradient: Any
+    stored: Any
     slots: Any
     weights: Any
     light: Any
@@ -155,8 +159,8 @@ def packet_arrays(most, samples, cube, density):  # type: ignore[no-untyped-def]
     arrays = PacketArrays(
         most, samples, np.zeros(3, np.int64), np.full(4 * most, -1, np.int32), np.empty(most, np.int64), np.zeros((most, 8), np.int32),
         np.zeros((most, 8), np.int64), np.full(4 * most, -1, np.int32), np.full(most, -1, np.int32), np.zeros(slots, np.uint8), np.zeros((slots, 4), kind),
-        np.zeros((slots, 4), kind), np.zeros((samples, 8), np.int32), np.zeros((samples, 8), kind), np.zeros((samples, 3), np.float64),
-        np.zeros((samples, 4), kind),
+        np.zeros((slots, 4), kind), np.zeros((slots, 2), np.int32), np.zeros((samples, 8), np.int32), np.zeros((samples, 8), kind),
+        np.zeros((samples, 3), np.float64), np.zeros((samples, 4), kind),
     )  # fmt: skip
     arrays.state[BLOCKS] = 1
     return arrays
@@ -167,7 +171,8 @@ def packet_pointers(a):  # type: ignore[no-untyped-def]
     """The same with pointers."""
     return PacketArrays(
         a.most, a.samples, pointer(a.state), pointer(a.cell_table), pointer(a.cell_key), pointer(a.blocks), pointer(a.sources), pointer(a.brick_table),
-        pointer(a.owner), pointer(a.met), pointer(a.colour), pointer(a.gradient), pointer(a.slots), pointer(a.weights), pointer(a.light), pointer(a.shade),
+        pointer(a.owner), pointer(a.met), pointer(a.colour), pointer(a.gradient), pointer(a.stored),
+        pointer(a.slots), pointer(a.weights), pointer(a.light), pointer(a.shade),
     )  # fmt: skip
 
 
@@ -204,6 +209,9 @@ def _block(owner, tree, packet):  # type: ignore[no-untyped-def]
         return np.int64(-1)
     packet.state[BLOCKS] = block + 1
     packet.brick_table[at], packet.owner[block] = np.int32(block), np.int32(owner)
+    for n in range(0, tree.cube, WORDS):  # samples that come next are in it, and their voxels are asked for when the packet is shaded
+        prefetch(tree.density, owner * tree.cube + n)
+        prefetch(tree.voxel_index, owner * tree.cube + n)
     return block
 
 
@@ -244,7 +252,7 @@ def _along(x, brick, stride):  # type: ignore[no-untyped-def]
     return x * stride, 0 if beyond else (x + 1) * stride, beyond
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _place(n, entry, brick, offset, weight, at, tree, packet):  # type: ignore[no-untyped-def]
     """Slot and weight of corner n of the sample that begins at `at`, in one of the eight bricks of an entry; returns its share of the density."""
     packet.slots[at + n] = np.int32(packet.blocks[8 * entry + brick] + offset)
@@ -252,7 +260,7 @@ def _place(n, entry, brick, offset, weight, at, tree, packet):  # type: ignore[n
     return weight * tree.density[packet.sources[8 * entry + brick] + offset]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _interpolated(entry, x, y, z, fx, fy, fz, at, tree, packet):  # type: ignore[no-untyped-def]
     """Density between the voxel (x, y, z) of an entry's cell and the seven beyond it; slots and weights from `at` on."""
     brick = tree.brick

@@ -244,7 +244,7 @@ def _link_all(low, slab, records, head, following):  # type: ignore[no-untyped-d
     return following
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _fetch(v, values, moments):  # type: ignore[no-untyped-def]
     """Bring what a step of a voxel reads into the caches."""
     width = values.sh.shape[1]

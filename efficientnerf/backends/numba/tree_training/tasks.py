@@ -24,13 +24,13 @@ def take_next(typing_context: Any, counter: Any) -> Any:
 
 @intrinsic
 def prefetch(typing_context: Any, address: Any, index: Any) -> Any:
-    """Ask for the cache line of p[index] of a pointer, to be written."""
+    """Ask for the cache line of p[index] of a pointer."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         word, byte = ir.IntType(32), ir.IntType(8).as_pointer()
         function = builder.module.declare_intrinsic("llvm.prefetch", (byte,), ir.FunctionType(ir.VoidType(), [byte, word, word, word]))
         at = builder.bitcast(builder.gep(args[0], [args[1]]), byte)
-        builder.call(function, [at, ir.Constant(word, 1), ir.Constant(word, 3), ir.Constant(word, 1)])
+        builder.call(function, [at, ir.Constant(word, 0), ir.Constant(word, 3), ir.Constant(word, 1)])
         return context.get_dummy_value()
 
     return types.void(address, types.int64), codegen
