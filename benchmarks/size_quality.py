@@ -1,6 +1,6 @@
-"""Quality of an asset over its size: a run's field baked to several budgets, evaluated on test views.
+"""Quality of an asset over its size: a run's field baked to several budgets in several layouts, evaluated on test views.
 
-    python benchmarks/size_quality.py RUN [--sizes 8,16,32,64,128] [--out benchmarks/results] [--set STAGE.NAME=VALUE]
+    python benchmarks/size_quality.py RUN [--sizes 1,2,5,10,20,40] [--layouts compact,packed] [--out benchmarks/results] [--set STAGE.NAME=VALUE]
 
 RUN has to be trained; it is not changed. Each budget (bake.max_mib) is baked and evaluated in a copy beside it by the stages themselves, with the
 run's other settings. Writes size_quality_NAME.json, .md and .png; the network's PSNR is of the views that the evaluate stage rendered.
@@ -20,15 +20,16 @@ from stages.artifacts import BakeOutputs, EvaluateOutputs
 from workflows.paper.document import hardware, versions
 
 
-def row_of(run: Path, size: int, settings: dict[str, str]) -> dict[str, Any]:
+def row_of(run: Path, layout: str, size: int, settings: dict[str, str]) -> dict[str, Any]:
     """Bake to at most `size` MiB, evaluate, and read the figures."""
-    took = made(run, "bake", {**settings, "bake.max_mib": size})
+    took = made(run, "bake", {**settings, "bake.layout": layout, "bake.max_mib": size})
     made(run, "evaluate", {"evaluate.field_views": 1})
     report, metrics = read_json(BakeOutputs.of_run(run).report), read_json(EvaluateOutputs.of_run(run).metrics)
     stored = BakeOutputs.of_run(run).asset.stat().st_size / 2**20
     if stored > size:
         raise SystemExit(f"bake.max_mib={size}: the asset has {stored:.1f} MiB")
     return {
+        "layout": layout,
         "max_mib": size,
         "mib": stored,
         "voxels": report["voxels"],
@@ -41,12 +42,12 @@ def row_of(run: Path, size: int, settings: dict[str, str]) -> dict[str, Any]:
 
 
 def in_markdown(name: str, rows: list[dict[str, Any]], network: float | None) -> str:
-    columns = ("budget / MiB", "file / MiB", "voxels", "grid", "PSNR / dB", "SSIM", "baking / s")
+    columns = ("layout", "budget / MiB", "file / MiB", "voxels", "grid", "PSNR / dB", "SSIM", "baking / s")
     lines = [f"# Size and quality of the asset: {name}", "", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for row in rows:
         grid = " x ".join(str(n) for n in row["resolution"])
         figures = f"{row['psnr']:.2f} | {row['ssim']:.4f} | {row['baking']['seconds']:.0f}"
-        lines.append(f"| {row['max_mib']} | {row['mib']:.1f} | {row['voxels']:,} | {grid} | {figures} |")
+        lines.append(f"| {row['layout']} | {row['max_mib']} | {row['mib']:.2f} | {row['voxels']:,} | {grid} | {figures} |")
     lines += ["", f"PSNR over {rows[0]['views']} test views at full working size." + (f" The network: {network:.2f} dB." if network else "")]
     return "\n".join(lines) + "\n"
 
@@ -58,11 +59,14 @@ def plot(path: Path, rows: list[dict[str, Any]], network: float | None, name: st
     figure = Figure(figsize=(6, 4), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    axes.plot([row["mib"] for row in rows], [row["psnr"] for row in rows], "o-", label="asset")
+    for layout in dict.fromkeys(row["layout"] for row in rows):
+        chosen = [row for row in rows if row["layout"] == layout]
+        axes.plot([row["mib"] for row in chosen], [row["psnr"] for row in chosen], "o-", label=layout)
     if network:
         axes.axhline(network, color="grey", linestyle="--", label="network")
     axes.set_xscale("log", base=2)
-    axes.set_xticks([row["max_mib"] for row in rows], [str(row["max_mib"]) for row in rows])
+    budgets = sorted({row["max_mib"] for row in rows})
+    axes.set_xticks(budgets, [str(budget) for budget in budgets])
     axes.set(xlabel="asset file / MiB", ylabel="PSNR of test views / dB", title=name)
     axes.grid(alpha=0.3)
     axes.legend()
@@ -72,7 +76,8 @@ def plot(path: Path, rows: list[dict[str, Any]], network: float | None, name: st
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--sizes", default="8,16,32,64,128", help="budgets in MiB")
+    parser.add_argument("--sizes", default="1,2,5,10,20,40", help="budgets in MiB")
+    parser.add_argument("--layouts", default="compact,packed", help="values of bake.layout")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="STAGE.NAME=VALUE")
     given = parser.parse_args()
@@ -80,9 +85,10 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory(prefix="sizes-", dir=given.run.resolve().parent) as folder:
         work = linked_copy(given.run, Path(folder) / "run")
-        for size in sorted(int(word) for word in given.sizes.split(",")):
-            rows.append(row_of(work, size, settings))
-            print(f"{size:5} MiB: {rows[-1]['mib']:.1f} MiB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
+        sizes = sorted(int(word) for word in given.sizes.split(","))
+        for layout, size in ((layout, size) for layout in given.layouts.split(",") for size in sizes):
+            rows.append(row_of(work, layout, size, settings))
+            print(f"{layout} {size:5} MiB: {rows[-1]['mib']:.1f} MiB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
         measured = EvaluateOutputs.of_run(given.run).metrics  # of more than one view, where the run has been evaluated
         network = read_json(measured if measured.exists() else EvaluateOutputs.of_run(work).metrics)["network"]
     name = given.run.resolve().name

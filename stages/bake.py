@@ -69,7 +69,8 @@ class BakeSettings:
     max_mib: PositiveInt | Auto = setting(
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
-        " 36 bytes for each pixel of a forward-facing capture, from 24 to 56. Smaller where voxels as fine as pixels resolve take less.",
+        " 36 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed. Smaller where voxels as fine as pixels"
+        " resolve take less.",
         unit="MiB",
     )
     layout: Literal["compact", "packed", "small", "sparse"] = setting(
@@ -121,6 +122,7 @@ def run(job: Job) -> None:
     from efficientnerf.asset.cascades import voxel_cascades
     from efficientnerf.asset.components import foreground_bricks
     from efficientnerf.asset.refinement import schedule
+    from stages.baking.economy import packed_tree
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
     from stages.baking.resolution import budget_of
@@ -139,7 +141,7 @@ def run(job: Job) -> None:
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
-    mib, views = budget_of(s, given(settings.max_mib), whole=whole), scene.views_of(s, "train")
+    mib, views = budget_of(s, given(settings.max_mib), whole=whole, packed=settings.layout == "packed"), scene.views_of(s, "train")
     discretised = m.settings.discretise != "off" or settings.lookup == "nearest"
     phases = schedule.phases_of(whole=whole, ndc=s.forward is not None, discretised=discretised)
     splits = schedule.count_splits(phases)
@@ -150,12 +152,16 @@ def run(job: Job) -> None:
     refuse_more_than_fits(job, m, views, pixels, plan, mib, splits, room)
     metadata = metadata_of(s, settings, m)
     # The raw values have no name here: they are large, and not needed once the refinement has its own.
-    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), _targets(s, pixels, plan), phases, room, stopwatch, plan.samples)
+    targets = _targets(s, pixels, plan)
+    tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, phases, room, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
     provenance = {**metadata["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": report["psnr_after"]}}
     outputs = BakeOutputs(job.out)
-    format.save(tree.with_metadata(provenance=provenance), outputs.asset, settings.layout)
+    tree = tree.with_metadata(provenance=provenance)
+    if settings.layout == "packed":
+        tree = packed_tree(job, tree, targets, mib * 2**20)
+    format.save(tree, outputs.asset, settings.layout)
     found: dict[str, Any] = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index)}
     found |= {"bytes": outputs.asset.stat().st_size, "optimisation": report}
     found |= {"voxels_along_longest_side": plan.choice.resolution, "resolution_decided_by": plan.choice.why, "max_mib": mib}

@@ -100,6 +100,18 @@ def brick_ranges(tree: NerfTree) -> list[tuple[int, int]]:
     return ranges
 
 
+def bricks_of(tree: NerfTree) -> np.ndarray:
+    """(B,) numbers of the bricks in the order of files: cascade by cascade, in each in the order of their cells."""
+    owner = np.concatenate([cascade.brick_index.reshape(-1) for cascade in cascades_of(tree)])
+    return owner[owner >= 0]
+
+
+def order_of(tree: NerfTree) -> np.ndarray:
+    """Stored voxels in the order of files: brick by brick, in a brick by number."""
+    order = tree.voxel_index[bricks_of(tree)]
+    return order[order >= 0]
+
+
 def voxel_cascades(tree: NerfTree) -> np.ndarray:
     """(N,) uint8: the cascade of each stored voxel."""
     out = np.zeros(len(tree.density_values), np.uint8)

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.cascades import Cascade, brick_ranges, cascades_of, check_cascades
+from efficientnerf.asset.cascades import Cascade, brick_ranges, bricks_of, cascades_of, check_cascades
 from efficientnerf.asset.file import packed, whole_scene
 from efficientnerf.asset.file.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
 from efficientnerf.asset.file.layouts import LAYOUTS
 from efficientnerf.asset.file.memory import check_memory, needed
 from efficientnerf.asset.file.metadata import MAJOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of
-from efficientnerf.asset.file.serialisation import WRITERS, bricks_of, written_as
+from efficientnerf.asset.file.serialisation import WRITERS, written_as
 from efficientnerf.asset.tree import NerfTree
 
 __all__ = ["LAYOUTS", "WRITERS", "FormatError", "contents", "describe", "load", "save", "serialize"]

@@ -71,7 +71,7 @@ def quantised_harmonics(sh: np.ndarray, opacity: np.ndarray, entries: int, group
     if sum(groups) != sh.shape[1] - 1:
         raise ValueError(f"groups {groups} hold {sum(groups)} harmonics; expected {sh.shape[1] - 1}")
     sh = np.clip(sh, -LIMIT, LIMIT)
-    base, table = _base_codes(sh[:, 0])
+    base, table = base_codes(sh[:, 0])
     palette = np.zeros((0, sh.shape[1] - 1, 3), np.float32)
     codes = np.zeros((len(sh), len(groups)), np.uint16 if entries > ENTRIES else np.uint8)
     first = 0
@@ -85,7 +85,7 @@ def quantised_harmonics(sh: np.ndarray, opacity: np.ndarray, entries: int, group
     return PaletteHarmonics(base, table, codes, palette, groups)
 
 
-def _base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def base_codes(base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Codes (N, 3) uint8 and table (T, 3) float32 of the base colour's coefficients (N, 3).
 
     The levels are evenly spaced on a curve that is four parts the colour that a coefficient makes by itself and one part the coefficient:

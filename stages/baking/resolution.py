@@ -84,10 +84,12 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
 
 
-def budget_of(s: Scene, given: int | None, *, whole: bool = False) -> int:
+def budget_of(s: Scene, given: int | None, *, whole: bool = False, packed: bool = False) -> int:
     """MiB that an asset may have: those given, or else MAX_MIB, or SCENE_MAX_MIB of a whole scene. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
-    large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`)."""
+    large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
+    if given is None and packed:
+        return math.ceil(budget_of(s, None, whole=whole) / 3)
     if given is not None or s.forward is None:
         return (SCENE_MAX_MIB if whole else MAX_MIB) if given is None else given
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)

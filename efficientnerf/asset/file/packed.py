@@ -57,7 +57,7 @@ def packed(meta: dict[str, Any], tensors: Tensors) -> tuple[Tensors, dict[str, A
         out[stream] = streams.written(coder, families)
 
     cells = [booleans("tree", occupancy_name(n), tensors[occupancy_name(n)], math.prod(grid.shape), "cells") for n, grid in enumerate(grids_of(meta))]
-    grids = [_padded(one.reshape(grid.shape)) for one, grid in zip(cells, grids_of(meta), strict=True)]
+    grids = [padded(one.reshape(grid.shape)) for one, grid in zip(cells, grids_of(meta), strict=True)]
     cube = int(meta["brick"]) ** 3
     masks = tensors["brick.mask"]
     stored = np.unpackbits(masks.view(np.uint8).reshape(len(masks), 8 * masks.shape[1]), axis=1, bitorder="little", count=cube)
@@ -78,7 +78,7 @@ def unpacked(name: str, meta: dict[str, Any], raw: Tensors) -> Tensors:
 
     if voxels and not (len(raw["density.table"]) and len(raw["base.table"])):
         raise FormatError(f"{name}: {voxels} voxels, but a table without entries")
-    grids = [_padded(np.zeros(grid.shape, bool)) for grid in grids_of(meta)]
+    grids = [padded(np.zeros(grid.shape, bool)) for grid in grids_of(meta)]
     stored = np.zeros((bricks, int(meta["brick"]) ** 3), np.uint8)
     codes = {"voxel.density": np.zeros(voxels, np.uint8), "voxel.base": np.zeros((voxels, 3), np.uint8), "voxel.sh": np.zeros((voxels, groups), f"<u{width}")}
     _walk_all(meta, grids, stored, codes, raw, run, name)
@@ -90,7 +90,7 @@ def unpacked(name: str, meta: dict[str, Any], raw: Tensors) -> Tensors:
     return {**occupancy, "brick.mask": mask.view("<u8").reshape(bricks, words), **codes, **tables}
 
 
-def _padded(cells: np.ndarray) -> np.ndarray:
+def padded(cells: np.ndarray) -> np.ndarray:
     """Cells (X, Y, Z) as bytes behind a plane, a row and a column of zeros."""
     out = np.zeros([n + 1 for n in cells.shape], np.uint8)
     out[1:, 1:, 1:] = cells
@@ -127,12 +127,22 @@ def _walk_all(meta: dict[str, Any], grids: list[np.ndarray], stored: np.ndarray,
     voxels = int(np.count_nonzero(stored))
     if voxels != len(codes["voxel.density"]):
         raise FormatError(f"{name}: masks name {voxels} voxels but {len(codes['voxel.density'])} are stored")
-    neighbours = np.full((voxels, 3), -1, np.int32)
+    _walk_codes(codes, tables, neighbours_of(grids, stored, b), run)
+
+
+def neighbours_of(grids: list[np.ndarray], stored: np.ndarray, b: int) -> np.ndarray:
+    """(N, 3) int32: the voxels one step back along x, y and z, -1 where none is stored; numbers as in the file.
+
+    grids  cells of each cascade, `padded`; stored (B, b^3) uint8
+    """
+    from efficientnerf.backends.numba.entropy import walks
+
+    neighbours = np.full((int(np.count_nonzero(stored)), 3), -1, np.int32)
     index = np.where(stored, np.cumsum(stored, dtype=np.int32).reshape(stored.shape) - 1, -1).astype(np.int32)
-    for piece in _pieces(bricks):
+    before = _bricks_before(grids, len(stored))
+    for piece in _pieces(len(stored)):
         walks.find_neighbours(index, before, b, neighbours, piece.start, piece.stop)
-    del index
-    _walk_codes(codes, tables, neighbours, run)
+    return neighbours
 
 
 def _walk_codes(codes: Tensors, tables: Tensors, neighbours: np.ndarray, run: Run) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascades_of, voxel_sides
+from efficientnerf.asset.cascades import bricks_of, order_of, voxel_sides
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.layouts import LIMIT
 from efficientnerf.asset.palettes import PaletteHarmonics
@@ -26,6 +26,7 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.rendering.harmonics import harmonics_count
 
 SMALL_ENTRIES = 4096
+PACKED_BYTES = 3  # of a voxel, its share of the masks left out
 FILL_BLOCK = 2**21  # voxels times harmonics that are filled at once
 
 
@@ -48,9 +49,9 @@ def written_as(tree: NerfTree, writer: str | None) -> Written:
 
 
 def bytes_per_voxel(writer: str, degree: int) -> int:
-    """Of a stored voxel in `compact`, `small` or `sparse`, without the masks of the bricks; at most so many in `packed`."""
+    """Of a stored voxel, without the masks of the bricks; in `packed` what codes are chosen for (docs/experiments/packed.md)."""
     harmonics = harmonics_count(degree)
-    return {"compact": 4 + (harmonics - 1), "packed": 4 + (harmonics - 1), "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
+    return {"compact": 4 + (harmonics - 1), "packed": PACKED_BYTES, "small": 4 + (2 if degree else 0), "sparse": 2 + 6 * harmonics}[writer]
 
 
 def most_voxels(
@@ -62,21 +63,10 @@ def most_voxels(
     environment  rows of the environment map, 0 without one
     """
     palette = {"compact": 256, "packed": 256, "small": SMALL_ENTRIES, "sparse": 0}[writer] * (harmonics_count(degree) - 1) * 6
-    fixed = 2**14 + sum(math.prod(cells) // 8 for cells in (shape, *outer)) + palette + 6 * environment**2
-    mask = 8 * math.ceil(brick**3 / 64) / max(1.0, brick**3 / 4)
+    coded = writer == "packed"  # hardly any bits of cells and masks are left
+    fixed = 2**14 + sum(math.prod(cells) // (256 if coded else 8) for cells in (shape, *outer)) + palette + 6 * environment**2
+    mask = 0.0 if coded else 8 * math.ceil(brick**3 / 64) / max(1.0, brick**3 / 4)
     return max(0, int((size - fixed) / (bytes_per_voxel(writer, degree) + mask)))
-
-
-def order_of(tree: NerfTree) -> np.ndarray:
-    """Stored voxels in the order of the file: brick by brick, in a brick by number."""
-    order = _bricks(tree)
-    return order[order >= 0]
-
-
-def bricks_of(tree: NerfTree) -> np.ndarray:
-    """(B,) numbers of the bricks in the order of the file: cascade by cascade, in each in the order of their cells."""
-    owner = np.concatenate([cascade.brick_index.reshape(-1) for cascade in cascades_of(tree)])
-    return owner[owner >= 0]
 
 
 def _bricks(tree: NerfTree) -> np.ndarray:
@@ -141,7 +131,7 @@ def _compact(tree: NerfTree) -> Written:
 
 
 def _packed(tree: NerfTree) -> Written:
-    """Codes as they are, whatever their groups; `format.serialize` codes them."""
+    """Codes as they are, whatever their groups, and else those of `compact`; `format.serialize` codes them. Cheaper ones: `efficientnerf.asset.economy`."""
     from efficientnerf.asset.quantisation import compacted
 
     return replace(_coded(tree if isinstance(tree.harmonics, PaletteHarmonics) else compacted(_checked(tree))), layout="packed")

@@ -111,6 +111,17 @@ def _parsed(data: bytes, contexts: int, slots: int) -> tuple[np.ndarray, np.ndar
     return table, frequency, at
 
 
+def counts(coder: Coder, contexts: int) -> np.ndarray:
+    """How often (n, 256) each symbol of each context was recorded."""
+    from efficientnerf.backends.numba.entropy import rans
+
+    assert isinstance(coder, rans.Coder)
+    count, out = int(coder.state[rans.AT]), np.zeros((contexts, 256), np.int64)
+    for begin in range(0, count, PIECE):
+        rans.count_symbols(coder.symbols[begin : min(count, begin + PIECE)], coder.contexts[begin : min(count, begin + PIECE)], out)
+    return out
+
+
 def written(coder: Coder, families: list[tuple[int, int]]) -> np.ndarray:
     """The bytes of the tensor that hold what `coder` recorded.
 
@@ -121,10 +132,7 @@ def written(coder: Coder, families: list[tuple[int, int]]) -> np.ndarray:
     assert isinstance(coder, rans.Coder)
     count = int(coder.state[rans.AT])
     symbols, contexts = coder.symbols[:count], coder.contexts[:count]
-    counts = np.zeros((families[-1][1], 256), np.int64)
-    for begin in range(0, count, PIECE):
-        rans.count_symbols(symbols[begin : begin + PIECE], contexts[begin : begin + PIECE], counts)
-    table, frequency = _tables(counts, families)
+    table, frequency = _tables(counts(coder, families[-1][1]), families)
     symbol, shares = np.zeros((len(frequency), rans.SLOTS), np.uint8), np.zeros((len(frequency), 256), np.uint32)
     rans.fill_slots(frequency, shares, symbol)
     words = np.zeros(count + 2, np.uint16)  # a symbol takes 14 bits at most

@@ -151,12 +151,12 @@ def test_frequencies_have_the_sum_of_a_table_and_leave_out_nothing(counts: list[
 
 def test_neighbours_are_those_one_step_back() -> None:
     """By a dense grid: across bricks, and none across the edge of the grid."""
-    from efficientnerf.asset.file.packed import _bricks_before, _padded
+    from efficientnerf.asset.file.packed import _bricks_before, padded
     from efficientnerf.asset.tree import voxel_coordinates
 
     tree = random_tree(2, brick=3)
     stored = tree.voxel_index >= 0
-    before = _bricks_before([_padded(tree.brick_index >= 0)], len(stored))
+    before = _bricks_before([padded(tree.brick_index >= 0)], len(stored))
     found = np.full((len(tree.density_values), 3), -7, np.int32)
     walks.find_neighbours(tree.voxel_index, before, tree.brick, found, 0, len(stored))
     number = {tuple(at): n for n, at in enumerate(voxel_coordinates(tree).tolist())}
