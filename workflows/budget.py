@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-# docs/experiments/refinement.md
-TRAIN_SHARE = 0.4  # of the budget, for the stage train; the rest is bake's
+# docs/experiments/tree-training.md
+TRAIN_SHARE = 0.3  # of the budget, for the stage train; the rest is bake's
 MIN_TRAIN, MIN_BAKE = 15.0, 20.0  # seconds, of a budget that is large enough for both
 
 
