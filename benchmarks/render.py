@@ -95,8 +95,8 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
 
     work = np.concatenate([ray_statistics(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
     cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
-    # A cell is 4 bytes; a tested sample reads one density; an interpolated one the four numbers of eight voxels, colours among them.
-    read = 4 * cells + 4 * tested + 8 * 16 * mixed
+    # A cell is 4 bytes, and so is a mask; an interpolated sample reads four rows, and the four numbers of eight voxels, colours among them.
+    read = 4 * cells + 4 * tested + (4 * 8 + 8 * 16) * mixed
     return {
         "cells_per_ray": round(cells, 3),
         "samples_per_ray": round(tested, 3),
@@ -108,7 +108,7 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
 
 
 def memory(tree: Any, view: Any) -> dict[str, float]:
-    """Bytes in memory while rendering: the tree, its packed form, the threads' blocks, and the framebuffer."""
+    """Bytes in memory while rendering: the tree, its packed form, the colours of the view, and the framebuffer."""
     from efficientnerf.asset.rendering import render
     from efficientnerf.backends.numba.tree.packed import packed_of
     from efficientnerf.backends.numba.tree.rendering import scratch_bytes
@@ -119,7 +119,7 @@ def memory(tree: Any, view: Any) -> dict[str, float]:
     framebuffer = sum(part.nbytes for part in vars(rendering).values())
     total = own + packed_of(tree).nbytes + scratch_bytes(tree) + framebuffer
     each = round(total / max(1, len(tree.density_values)), 1)
-    return {"tree": own, "packed": packed_of(tree).nbytes, "blocks": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
+    return {"tree": own, "packed": packed_of(tree).nbytes, "view_colours": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
 
 
 def main() -> int:

@@ -183,7 +183,7 @@ def store4(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
 
 
 def store(out, n, value):  # type: ignore[no-untyped-def]
-    """out[n] = value, for kernels that work on scalars and on Float32x4; element n of the latter lies at 4 n."""
+    """out[n] = value, for kernels that work on scalars, on Float32x4 and on Float32x16; element n of those lies at 4 n and 16 n."""
     raise NotImplementedError("inside kernels only")
 
 
@@ -192,16 +192,20 @@ def _store(out, n, value):  # type: ignore[no-untyped-def]
     def scalar(out, n, value):  # type: ignore[no-untyped-def]
         out[n] = value
 
+    if value == float32x16:
+        return None  # `lanes` has that
     return (lambda out, n, value: store4(out, 4 * n, value)) if value == float32x4 else scalar
 
 
 def broadcast_like(value, other):  # type: ignore[no-untyped-def]
-    """The scalar `value`, or a Float32x4 of it where `other` is one."""
+    """The scalar `value`, or a Float32x4 or Float32x16 of it where `other` is one."""
     raise NotImplementedError("inside kernels only")
 
 
 @overload(broadcast_like)
 def _broadcast_like(value, other):  # type: ignore[no-untyped-def]
+    if other == float32x16:
+        return None
     return (lambda value, other: pack4(value, value, value, value)) if other == float32x4 else (lambda value, other: value)
 
 

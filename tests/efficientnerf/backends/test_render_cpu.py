@@ -11,13 +11,13 @@ import torch
 
 from efficientnerf.asset.queries import density_block, normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
 from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, sigmoid, split16, trilinear4, unpack4
-from efficientnerf.backends.numba.tree import blocks as cpu_blocks
 from efficientnerf.backends.numba.tree import march
-from efficientnerf.backends.numba.tree.blocks import Pool, fill_block
 from efficientnerf.backends.numba.tree.packed import packed_of
-from efficientnerf.backends.numba.tree.view_colours import View, compute_view_colours, packed_pointers, sh_basis
+from efficientnerf.backends.numba.tree.packets import lanes
+from efficientnerf.backends.numba.tree.packets.rows import pair_of
+from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, sh_basis
 from efficientnerf.geometry.cameras import Camera, rays, resized
 from efficientnerf.rendering.harmonics import basis_numpy
 from tests.efficientnerf.balls import pose
@@ -64,8 +64,8 @@ def powers(a, b, c, d):  # type: ignore[no-untyped-def]
 
 def test_the_kernels_exponential_and_logistic() -> None:
     x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 402), [0.0, np.inf]]).astype(np.float32)
-    np.testing.assert_allclose([march._exp2_neg(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
-    assert march._exp2_neg(np.float32(0)) == 1
+    np.testing.assert_allclose([march.exp2_neg(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
+    assert march.exp2_neg(np.float32(0)) == 1
     np.testing.assert_allclose([powers(*v) for v in x.reshape(-1, 4)], np.exp2(-x.astype(np.float64)).reshape(-1, 4), atol=2e-7)
     assert powers(*np.zeros(4, np.float32)) == (1, 1, 1, 1)
     y = np.concatenate([-x, x, np.linspace(-20, 20, 2000).astype(np.float32)])
@@ -102,50 +102,38 @@ def test_four_points_are_interpolated_over_the_stored_corners() -> None:
 
 
 @numba.njit
-def laid_out(packed, colours, brick, direction, nearest, degree, owners, kind, values):  # type: ignore[no-untyped-def]
-    """Blocks of some bricks, one after the other, as a thread lays them out: what they hold, and their kinds."""
-    blocks, size = values.shape
-    slot, owner, after = np.full(len(packed.cells), -1, np.int32), np.full(blocks, -1, np.int32), np.zeros(2, np.int64)
-    words, voxels, waiting = values.view(np.int32), np.zeros(size // 4, np.int32), np.full(4, blocks * size)
-    pool = Pool(
-        size, blocks, pointer(slot), pointer(owner), pointer(kind), pointer(after), pointer(values), pointer(words), pointer(colours), len(colours) - 1,
-        pointer(voxels), pointer(waiting),
-    )  # fmt: skip
-    grid, view = packed_pointers(packed, brick, 0), View(pointer(direction), 1.0, nearest, np.float32(2), degree)
-    for brick_number in owners:
-        fill_block(brick_number, grid, view, pool)
-    # They must outlive the pointers to them.
-    return slot[0] + owner[0] + after[0] + words[0, 0] + voxels[0] + waiting[0]
-
-
-def blocks_of(tree: NerfTree, centre: np.ndarray, nearest: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """(B, side, side, side, 4) and kinds (B,) of the blocks of all bricks, densities times 2."""
-    side, owners = tree.brick + 2, np.random.default_rng(0).permutation(len(tree.voxel_index))
-    values, kind = np.zeros((len(owners), 4 * side**3), np.float32), np.zeros(len(owners), np.uint8)
-    direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
-    colours[-1, 1:] = np.nan
-    compute_view_colours(0, len(packed_of(tree).cells), 0, packed_of(tree), tree.brick, direction, np.zeros(5), np.float32(2), tree.degree, colours)
-    laid_out(packed_of(tree), colours, tree.brick, direction, nearest, tree.degree, owners, kind, values)
-    back = np.argsort(owners)
-    return values[back].reshape(-1, side, side, side, 4), kind[back]
+def pairs(rows, side):  # type: ignore[no-untyped-def]
+    """(B, side, side, side - 1, 2): of each two neighbours along z the first that is stored, and which are."""
+    out = np.empty((len(rows), side, side, side - 1, 2), np.int64)
+    for row in range(len(rows) * side * side):
+        for k in range(side - 1):
+            out[row // (side * side), row // side % side, row % side, k] = pair_of(row, k, pointer(rows))
+    return out
 
 
 @pytest.mark.parametrize("brick", [1, 2, 3, 4, 5])
-def test_blocks_hold_a_brick_and_the_layer_around_it(brick: int) -> None:
-    tree = random_tree(brick, brick=brick, degree=2)
-    side = brick + 2
-    whole = 2 * density_block(tree, (-1, -1, -1), tuple(n + 1 for n in tree.resolution))  # type: ignore[arg-type]
-    values, kind = blocks_of(tree, np.zeros(3), nearest=np.inf)
-    assert (kind == cpu_blocks.VOXEL_INDICES).all()
-    for block, place, live in zip(values, packed_of(tree).cells, packed_of(tree).has_density, strict=True):
-        assert tree.brick_index[tuple(place)] >= 0
-        expected = whole[tuple(slice(a, a + side) for a in place * brick)]
-        density, stored = block[..., 0], block[..., 1].copy().view(np.int32)
-        assert np.array_equal(density, expected)
-        assert np.array_equal(2 * tree.density_values[stored[stored >= 0]], expected[stored >= 0])
-        assert not expected[stored < 0].any()
-        assert np.array_equal(stored[1:-1, 1:-1, 1:-1].reshape(-1), tree.voxel_index[tree.brick_index[tuple(place)]])
-        eight = np.stack([expected[i : i + side - 1, j : j + side - 1, k : k + side - 1] for i, j, k in np.ndindex(2, 2, 2)])
+def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int) -> None:
+    tree = random_tree(brick, brick=brick, degree=2, share=0.5)
+    packed, side = packed_of(tree), brick + 2
+    count = len(tree.density_values)
+    assert np.array_equal(np.sort(packed.voxel_of[:-1]), np.arange(count))
+    assert np.array_equal(packed.density[:-1], tree.density_values[packed.voxel_of[:-1]])
+    assert packed.density[-1] == 0
+    cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
+    found = pairs(packed.rows, side)
+    for table, live, place in zip(found, packed.has_density, packed.cells, strict=True):
+        at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
+        local = (at - 1) % brick @ [brick**2, brick, 1]
+        owner = cells[tuple(at.reshape(-1, 3).T)].reshape(local.shape)
+        voxel = np.where(owner >= 0, tree.voxel_index[owner, local], -1)
+        low, high = voxel[..., :-1], voxel[..., 1:]
+        assert np.array_equal(table[..., 1], (low >= 0) + 2 * (high >= 0))
+        first, second = packed.voxel_of[table[..., 0]], packed.voxel_of[np.minimum(table[..., 0] + 1, count)]
+        assert np.array_equal(first[low >= 0], low[low >= 0])
+        assert np.array_equal(first[(low < 0) & (high >= 0)], high[(low < 0) & (high >= 0)])
+        assert np.array_equal(second[(low >= 0) & (high >= 0)], high[(low >= 0) & (high >= 0)])
+        density = np.where(voxel >= 0, tree.density_values[voxel], 0)
+        eight = np.stack([density[i : i + side - 1, j : j + side - 1, k : k + side - 1] for i, j, k in np.ndindex(2, 2, 2)])
         bits = np.unpackbits(live.view(np.uint8), bitorder="little").astype(bool)
         assert np.array_equal(bits[: side**3].reshape(side, side, side)[:-1, :-1, :-1], (eight > 0).any(axis=0))
         assert bits.sum() == (eight > 0).any(axis=0).sum()
@@ -154,36 +142,59 @@ def test_blocks_hold_a_brick_and_the_layer_around_it(brick: int) -> None:
 @pytest.mark.parametrize("brick", [1, 2, 4, 5])
 @pytest.mark.parametrize("degree", range(5))
 @pytest.mark.parametrize("layout", ["floats", "codes"])
-def test_view_colours_of_blocks_are_the_sums_of_their_voxels_harmonics(brick: int, degree: int, layout: str) -> None:
+def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, layout: str) -> None:
     tree = random_tree(brick, brick=brick, degree=degree, share=0.5)
     if layout == "codes":
         tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
-    centre = np.array([-31.0, 12.5, 57.0])
-    values, kind = blocks_of(tree, centre)
-    assert (kind == cpu_blocks.VIEW_COLOURS).all()
-    side = brick + 2
-    cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
-    for block, place in zip(values, packed_of(tree).cells, strict=True):
-        at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
-        local = (at - 1) % brick @ [brick**2, brick, 1]
-        owner = cells[tuple(at.reshape(-1, 3).T)].reshape(local.shape)
-        stored = np.where(owner >= 0, tree.voxel_index[owner, local], -1)
-        assert np.array_equal(block[..., 0], np.where(stored >= 0, 2 * tree.density_values[stored], 0))
-        assert np.isnan(block[stored < 0][:, 1:]).all()
-        away = at[stored >= 0] - 0.5 - centre
-        basis = basis_numpy(away / np.linalg.norm(away, axis=1, keepdims=True), degree)
-        np.testing.assert_allclose(block[stored >= 0][:, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[stored[stored >= 0]]), atol=1e-4)
+    centre, packed = np.array([-31.0, 12.5, 57.0]), packed_of(tree)
+    direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
+    compute_view_colours(0, len(packed.cells), 0, packed, tree.brick, direction, np.zeros(5), np.float32(2), tree.degree, colours)
+    order = packed.voxel_of[:-1]
+    assert np.array_equal(colours[:-1, 0], 2 * tree.density_values[order])
+    away = voxel_coordinates(tree)[order] + 0.5 - centre
+    basis = basis_numpy(away / np.linalg.norm(away, axis=1, keepdims=True), degree)
+    np.testing.assert_allclose(colours[:-1, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[order]), atol=1e-4)
+    assert not colours[-1].any()
 
 
-def test_blocks_near_the_camera_hold_voxel_indices() -> None:
-    tree = random_tree(3, shape=(12, 12, 12), brick=4, degree=2, share=0.3)
-    centre = np.array([-20.0, 24.0, 24.0])
-    values, kind = blocks_of(tree, centre, nearest=40.0)
-    away = np.linalg.norm((packed_of(tree).cells + 0.5) * 4 - centre, axis=1)
-    assert np.array_equal(kind == cpu_blocks.VIEW_COLOURS, away >= 52)
-    assert 0.1 < (kind == cpu_blocks.VIEW_COLOURS).mean() < 0.9
-    voxels, _ = blocks_of(tree, centre, nearest=np.inf)
-    assert np.array_equal(values[kind == cpu_blocks.VOXEL_INDICES].view(np.int32), voxels[kind == cpu_blocks.VOXEL_INDICES].view(np.int32))
+@numba.njit(error_model="numpy")
+def in_lanes(floats, ints, bytes_, out):  # type: ignore[no-untyped-def]
+    """What operators on sixteen lanes make of two rows of `floats`."""
+    x, y = lanes.load16(pointer(floats), 0), lanes.load16(pointer(floats), 16)
+    less = (x < y) & (x > np.float32(0)) | ~(y >= np.float32(-1))
+    whole = lanes.to_int16(lanes.abs16(x) + lanes.ceil16(lanes.abs16(y)))
+    masked = (whole + 3) * whole - 1 & 255 | whole >> 1
+    values = (
+        lanes.select16(less, x * y + np.float32(2), lanes.floor16(x) - y), lanes.min16(x, y) / lanes.max16(x, np.float32(0.5)),
+        lanes.to_float16(masked + (1 << whole)), lanes.to_float16(lanes.popcount16(masked)), lanes.sqrt16(lanes.abs16(x)),
+        lanes.to_float16(lanes.gather16(pointer(ints), whole & 7)), lanes.to_float16(lanes.gather16(pointer(bytes_), whole & 7)),
+        lanes.gather16(pointer(floats), whole & 31), lanes.exp2_neg16(lanes.abs16(y)),
+    )  # fmt: skip
+    for n in range(9):
+        lanes.store16(pointer(out), 16 * n, values[n])
+    a, b, c, d = lanes.channels16(pointer(floats), 0)
+    lanes.store16(pointer(out), 144, a - b + c * d)
+    lanes.store_channels16(pointer(out), 160, a, b, c, d)
+    return lanes.bits_of(less), lanes.lowest_bit(lanes.bits_of(lanes.mask_of(40)))
+
+
+def test_operators_on_lanes_are_numpys() -> None:
+    rng = np.random.default_rng(0)
+    floats, out = rng.normal(0, 3, 64).astype(np.float32), np.zeros(224, np.float32)
+    ints, bytes_ = rng.integers(-(2**20), 2**20, 8).astype(np.int32), rng.integers(0, 256, 8).astype(np.uint8)
+    bits, lowest = in_lanes(floats, ints, bytes_, out)
+    x, y = floats[:16], floats[16:32]
+    less = (x < y) & (x > 0) | ~(y >= -1)
+    whole = (np.abs(x) + np.ceil(np.abs(y))).astype(np.int32)
+    masked = (whole + 3) * whole - 1 & 255 | whole >> 1
+    expected = [
+        np.where(less, x * y + 2, np.floor(x) - y), np.minimum(x, y) / np.maximum(x, 0.5), masked + (1 << whole), [bin(n).count("1") for n in masked],
+        np.sqrt(np.abs(x)), ints[whole & 7], bytes_[whole & 7], floats[whole & 31], np.exp2(-np.abs(y)),
+        floats[::4] - floats[1::4] + floats[2::4] * floats[3::4],
+    ]  # fmt: skip
+    np.testing.assert_allclose(out[:160].reshape(10, 16), np.array(expected, np.float32), rtol=1e-6, atol=1e-6)
+    assert np.array_equal(out[160:], floats)
+    assert (bits, lowest) == (int((less << np.arange(16)).sum()), 3)
 
 
 def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> None:
@@ -255,16 +266,13 @@ def test_images_match_the_torch_reference_from_near_and_far(degree: int, distanc
     assert (outputs.opacity > 0.9).mean() > 0.1
 
 
-def test_images_depend_neither_on_threads_nor_on_the_pools_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    from efficientnerf.backends.numba.tree import rendering
-
+def test_images_depend_not_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     tree = random_tree(5, shape=(9, 7, 8), brick=4, degree=2, share=0.6, sigma=100.0)
     packed_of(tree)  # made once, for both
     for distance in (40.0, 2000.0):
         camera = far_camera(tree, distance)
         usual = render(tree, camera, supersample=2)
         with monkeypatch.context() as patch:
-            patch.setattr(rendering, "POOL_BYTES", 1)
             patch.setattr("numba.get_num_threads", lambda: 3)
             other = render(tree, camera, supersample=2)
         for name in FIELDS:

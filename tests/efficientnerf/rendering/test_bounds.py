@@ -129,7 +129,7 @@ def test_images_in_pieces_are_those_at_once(monkeypatch: pytest.MonkeyPatch) -> 
 
     def in_small_pieces(*given: Any) -> bool:
         calls.append(len(given))
-        return bool(whole(*given[:10], 500, *given[11:]))
+        return bool(whole(*given[:9], 500, *given[10:]))
 
     whole = rendering.render_batch
     monkeypatch.setattr(rendering, "render_batch", in_small_pieces)

@@ -245,7 +245,7 @@ def test_a_uniform_medium_absorbs_by_the_length_of_the_path() -> None:
     np.testing.assert_allclose(found.depth[deep], np.log(2) / sigma, atol=0.45)
 
 
-def test_images_depend_neither_on_threads_nor_on_pools_nor_on_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     tree = random_cascades(5, count=4, brick=4, degree=2, share=0.5)
     packed_of(tree)
     camera, calls = camera_of(tree, distance=1.7), []
@@ -254,10 +254,9 @@ def test_images_depend_neither_on_threads_nor_on_pools_nor_on_pieces(monkeypatch
 
     def in_small_pieces(*given: Any) -> bool:
         calls.append(len(given))
-        return bool(whole(*given[:10], 500, *given[11:]))
+        return bool(whole(*given[:9], 500, *given[10:]))
 
     monkeypatch.setattr(rendering, "render_batch", in_small_pieces)
-    monkeypatch.setattr(rendering, "POOL_BYTES", 1)
     monkeypatch.setattr("numba.get_num_threads", lambda: 3)
     for expected, found in (
         (usual, render(tree, camera, supersample=2)),
@@ -284,7 +283,7 @@ def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, d
 @pytest.mark.parametrize("distance", [0.02, 0.8, 2.5])
 @pytest.mark.parametrize("focal", [8.0, 20.0, 200.0])
 def test_voxels_that_are_not_in_view_change_no_value(distance: float, focal: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their colours are not summed. All blocks hold colours of the view here, and so would show what was left out."""
+    """Their colours are not summed. All samples have colours of the view here, and so would show what was left out."""
     tree = random_cascades(8, count=3, cells=20, brick=2, degree=2, share=0.1)
     camera = camera_of(tree, distance=distance)
     camera = replace(camera, params=(focal, focal, *camera.params[2:]))

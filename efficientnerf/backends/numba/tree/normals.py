@@ -1,83 +1,73 @@
-"""Normals of packed trees at points inside blocks (numba)."""
+"""Normals of packed trees, sixteen at a time (numba)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.blocks import fill_block
-from efficientnerf.backends.numba.tree.march import has_density, trilinear_density
+from efficientnerf.backends.numba.tree.packets.lanes import (
+    broadcast16,
+    floor16,
+    gather16,
+    load16,
+    mask_of,
+    max16,
+    min16,
+    popcount16,
+    select16,
+    sqrt16,
+    store16,
+    to_int16,
+)
+from efficientnerf.backends.numba.tree.packets.layout import NORMAL_X, NORMAL_Y, NORMAL_Z
 
-_HALF, _ONE = np.float32(0.5), np.float32(1)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _density(u, v, w, grid, view, pool):  # type: ignore[no-untyped-def]
-    """Scaled density at a point, voxel coordinates, float32; 0 outside of the grid and in an empty cell."""
-    brick = grid.brick
-    if not (0 <= u < grid.nx * brick and 0 <= v < grid.ny * brick and 0 <= w < grid.nz * brick):
-        return np.float32(0)
-    per_brick = np.float32(1 / brick)
-    a, e, c = min(int(u * per_brick), grid.nx - 1), min(int(v * per_brick), grid.ny - 1), min(int(w * per_brick), grid.nz - 1)
-    owner = np.int64(grid.brick_index[(a * grid.ny + e) * grid.nz + c])
-    if owner < 0:
-        return np.float32(0)
-    x, y, z = u - np.float32(a * brick) + _HALF, v - np.float32(e * brick) + _HALF, w - np.float32(c * brick) + _HALF
-    i, j, k = int(x), int(y), int(z)
-    side = brick + 2
-    voxel = (i * side + j) * side + k
-    if not has_density(owner, voxel, grid):
-        return np.float32(0)
-    slot = np.int64(pool.slot_of[owner])
-    if slot < 0:
-        slot = fill_block(owner, grid, view, pool)
-    at = slot * pool.block_size + 4 * voxel
-    return trilinear_density(pool.values, at, 4 * side, 4 * side * side, x - np.float32(i), y - np.float32(j), z - np.float32(k))
+_HALF, _ONE, _NONE = np.float32(0.5), np.float32(1), np.float32(0)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _difference(x, stride, at, row, layer, fx, fy, fz, brick, pool):  # type: ignore[no-untyped-def]
-    """Central difference of the density over two voxels along the axis of a stride; NaN where a neighbour lies in another cell.
-
-    x               coordinate of the point in its block along that axis, voxels
-    at, fx, fy, fz  offset of the lowest of its eight voxels, and its fractions between them
-    """
-    difference = np.float32(np.nan)
-    if _ONE + _HALF <= x < np.float32(brick) - _HALF:
-        difference = trilinear_density(pool.values, at + stride, row, layer, fx, fy, fz) - trilinear_density(pool.values, at - stride, row, layer, fx, fy, fz)
-    return difference
+def _row_density(row, k, fz, gz, grid):  # type: ignore[no-untyped-def]
+    """Density between voxels k and k + 1 of rows, numbered over all bricks."""
+    mask = gather16(grid.rows, row * 2 + 1)
+    pair = (mask >> k) & 3
+    first = select16(pair == 0, grid.voxels, gather16(grid.rows, row * 2) + popcount16(mask & ((1 << k) - 1)))
+    low = gather16(grid.density, first) * select16(pair == 2, fz, gz)
+    return low + select16(pair == 3, gather16(grid.density, select16(pair == 3, first + 1, first)) * fz, _NONE)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def normal_into(u, v, w, grid, view, pool, out):  # type: ignore[no-untyped-def]
-    """Unit normal, down the density's gradient by central differences of one voxel, into `out`; zero where the density is flat."""
-    brick = grid.brick
-    side, per_brick = brick + 2, np.float32(1 / brick)
-    gx = gy = gz = np.float32(np.nan)
-    a, e, c = min(max(int(u * per_brick), 0), grid.nx - 1), min(max(int(v * per_brick), 0), grid.ny - 1), min(max(int(w * per_brick), 0), grid.nz - 1)
-    cell = (a * grid.ny + e) * grid.nz + c
-    if grid.leap[cell] == 0:
-        owner = np.int64(grid.brick_index[cell])
-        slot = np.int64(pool.slot_of[owner])
-        if slot < 0:
-            slot = fill_block(owner, grid, view, pool)
-        x, y, z = u - np.float32(a * brick) + _HALF, v - np.float32(e * brick) + _HALF, w - np.float32(c * brick) + _HALF
-        i, j, k = min(max(int(x), 0), brick), min(max(int(y), 0), brick), min(max(int(z), 0), brick)
-        fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-        row, layer = 4 * side, 4 * side * side
-        at = slot * pool.block_size + i * layer + j * row + 4 * k
-        gx = _difference(x, layer, at, row, layer, fx, fy, fz, brick, pool)
-        gy = _difference(y, row, at, row, layer, fx, fy, fz, brick, pool)
-        gz = _difference(z, 4, at, row, layer, fx, fy, fz, brick, pool)
-    # Across the faces of the cell lies another block, or an empty cell, whatever this block holds there.
-    if gx != gx:
-        gx = _density(u + _ONE, v, w, grid, view, pool) - _density(u - _ONE, v, w, grid, view, pool)
-    if gy != gy:
-        gy = _density(u, v + _ONE, w, grid, view, pool) - _density(u, v - _ONE, w, grid, view, pool)
-    if gz != gz:
-        gz = _density(u, v, w + _ONE, grid, view, pool) - _density(u, v, w - _ONE, grid, view, pool)
-    length = np.sqrt(gx * gx + gy * gy + gz * gz)
-    if length > 0:
-        out[0], out[1], out[2] = -gx / length, -gy / length, -gz / length
-    else:
-        out[0] = out[1] = out[2] = np.float32(0)
+def _densities(u, v, w, lanes, grid):  # type: ignore[no-untyped-def]
+    """Densities at points, voxel coordinates; 0 outside of the grid and in empty cells, and where `lanes` are not set."""
+    brick, width, per_brick = grid.brick, np.float32(grid.brick), np.float32(1 / grid.brick)
+    nx, ny, nz = np.float32(grid.nx), np.float32(grid.ny), np.float32(grid.nz)
+    inside = mask_of(lanes) & (u >= _NONE) & (v >= _NONE) & (w >= _NONE) & (u < nx * width) & (v < ny * width) & (w < nz * width)
+    a = min16(max16(floor16(u * per_brick), _NONE), nx - _ONE)
+    e = min16(max16(floor16(v * per_brick), _NONE), ny - _ONE)
+    c = min16(max16(floor16(w * per_brick), _NONE), nz - _ONE)
+    owner = gather16(grid.brick_index, select16(inside, (to_int16(a) * grid.ny + to_int16(e)) * grid.nz + to_int16(c), 0))
+    inside = inside & (owner >= 0)
+    x, y, z = u - a * width + _HALF, v - e * width + _HALF, w - c * width + _HALF
+    i, j, k = min16(floor16(x), width), min16(floor16(y), width), min16(floor16(z), width)
+    fx, fy, fz = x - i, y - j, z - k
+    gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
+    side = brick + 2
+    row, at = select16(inside, (owner * side + to_int16(i)) * side + to_int16(j), 0), select16(inside, to_int16(k), 0)
+    near = gy * _row_density(row, at, fz, gz, grid) + fy * _row_density(row + 1, at, fz, gz, grid)
+    far = gy * _row_density(row + side, at, fz, gz, grid) + fy * _row_density(row + side + 1, at, fz, gz, grid)
+    return select16(inside, gx * near + fx * far, _NONE)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def add_normals(lanes, x, y, z, grid, floats):  # type: ignore[no-untyped-def]
+    """Unit normals at points whose coordinates, voxels, are in `floats` at x, y and z, of the rays whose bits are set: down the density's gradient by central
+    differences of one voxel; zero where the density is flat."""
+    u, v, w = load16(floats, x), load16(floats, y), load16(floats, z)
+    gx = _densities(u - _ONE, v, w, lanes, grid) - _densities(u + _ONE, v, w, lanes, grid)
+    gy = _densities(u, v - _ONE, w, lanes, grid) - _densities(u, v + _ONE, w, lanes, grid)
+    gz = _densities(u, v, w - _ONE, lanes, grid) - _densities(u, v, w + _ONE, lanes, grid)
+    length = sqrt16(gx * gx + gy * gy + gz * gz)
+    some = length > _NONE
+    length = select16(some, length, broadcast16(_ONE))
+    some = some & mask_of(lanes)
+    store16(floats, NORMAL_X, select16(some, gx / length, load16(floats, NORMAL_X)))
+    store16(floats, NORMAL_Y, select16(some, gy / length, load16(floats, NORMAL_Y)))
+    store16(floats, NORMAL_Z, select16(some, gz / length, load16(floats, NORMAL_Z)))

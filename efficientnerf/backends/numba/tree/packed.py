@@ -1,7 +1,7 @@
 """The packed form of a tree for the marching kernel, beside the tree's own arrays: made once, a few bytes a voxel.
 
-To the kernel a brick is empty if neither its voxels nor those around it have density. Blocks of the others are laid out while an image is rendered, see
-`efficientnerf.backends.numba.tree.blocks`.
+To the kernel a brick is empty if neither its voxels nor those around it have density. Voxels have a packed order, in which those that are neighbours along z
+lie beside each other: see `efficientnerf.backends.numba.tree.packets.rows`.
 
 L cascades, C coarse cells of all of them, B bricks, N stored voxels, K harmonics, P entries of a palette; b = brick.
 """
@@ -9,18 +9,19 @@ L cascades, C coarse cells of all of them, B bricks, N stored voxels, K harmonic
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.tree.packets.rows import MOST_SIDE, fill_rows, order_voxels
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 SLOPE_VOXELS = 2**16  # voxels that `colour_slope` is estimated from
 FEWEST_PAIRS = 64  # of neighbours, for what they share to be estimated
+COLUMN_CELLS_PER_CALL = 2**22  # cells that one call of the kernel that orders voxels goes through
 VOXELS_PER_CALL = 2**23  # of bricks that one call of a kernel goes through, so that signals are answered between
 
 
@@ -33,11 +34,13 @@ class Packed(NamedTuple):
     leap          (C,) uint8: as `NerfTree.leap`, but bricks without density in or around them count as empty, and so do those in the box of the cascade before
     has_density   (B, W) int64 bit masks: bit n % 64 of word n // 64 is set where any of the eight voxels has density that begin at voxel
                   (i - 1, j - 1, k - 1) of the brick; n = (i (b + 2) + j) (b + 2) + k
-    stored_ranks  (B + 1, V, 2) int64: 64 voxels of a brick a word: which are stored, and the index of the first of them. A sixteenth of `voxel_index`, so that
-                  it stays in a cache while blocks are filled. The last brick stores none
+    rows          (B, (b + 2)^2, 2) int32: the first voxel, in the packed order, and the mask of the stored ones of the rows along z of a brick and of the layer
+                  around it
+    voxel_of      (N + 1,) int32: which stored voxel is n-th in the packed order; the last is none
     cells         (B, 3) int32: the coarse cell of a brick
     brick_index   (C,) int32: those of the cascades
-    voxel_index, density  the tree's own, with voxels in order; the harmonics likewise
+    voxel_index   the tree's own; the harmonics likewise
+    density       (N + 1,) float32, in the packed order; the last, of what is not stored, is 0
     sh            (N, K, 3) float32: the tree's own
     base, base_table, codes  as in PaletteHarmonics: the tree's own
     palette       (K - 1, P, 4) float32: the tree's, with a zero before red
@@ -50,7 +53,8 @@ class Packed(NamedTuple):
     places: np.ndarray
     leap: np.ndarray
     has_density: np.ndarray
-    stored_ranks: np.ndarray
+    rows: np.ndarray
+    voxel_of: np.ndarray
     cells: np.ndarray
     brick_index: np.ndarray
     voxel_index: np.ndarray
@@ -66,7 +70,8 @@ class Packed(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Of the arrays beside the tree's own, but for the smallest."""
-        return self.leap.nbytes + self.has_density.nbytes + self.stored_ranks.nbytes + self.cells.nbytes + self.palette.nbytes
+        own = self.leap, self.has_density, self.rows, self.voxel_of, self.cells, self.density, self.palette
+        return sum(array.nbytes for array in own)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -120,19 +125,6 @@ def brick_ranges(first: int, end: int, brick: int) -> Iterator[tuple[int, int]]:
     return ((begin, min(end, begin + each)) for begin in range(first, end, each))
 
 
-def _stored_ranks(voxel_index: np.ndarray) -> np.ndarray:
-    """`Packed.stored_ranks` of voxels in order."""
-    bricks, cube = voxel_index.shape
-    words = (cube + 63) // 64
-    bits = np.zeros((bricks + 1, 64 * words), bool)
-    bits[:bricks, :cube] = voxel_index >= 0
-    out = np.zeros((bricks + 1, words, 2), np.int64)
-    out[..., 0] = np.packbits(bits, axis=1, bitorder="little").view(np.int64)
-    count = bits.reshape(-1, 64).sum(axis=1)
-    out[..., 1] = (np.cumsum(count) - count).reshape(bricks + 1, words)
-    return out
-
-
 def _slope(coefficients: np.ndarray, degree: int) -> float:
     """Mean over voxels (N, K, 3) of the change of colour before the sigmoid per radian, see `Packed.colour_slope`."""
     from efficientnerf.rendering.harmonics import squared_slopes
@@ -160,20 +152,6 @@ def _colour_slope(tree: NerfTree, first: int, end: int) -> float:
         return slope
     apart = _slope((tree.coefficients(pairs[:, 0]) - tree.coefficients(pairs[:, 1])) / np.float32(2**0.5), tree.degree)
     return apart * min(1.0, apart / slope)  # docs/experiments/renderer.md
-
-
-def _in_order(tree: NerfTree) -> NerfTree:
-    """The tree with its voxels in the order of `voxel_index`; a copy unless they are, as in files and from `tree_from_voxels`."""
-    from efficientnerf.asset.palettes import PaletteHarmonics
-
-    stored = tree.voxel_index >= 0
-    order = tree.voxel_index[stored]
-    if np.array_equal(order, np.arange(len(order))):
-        return tree
-    index = np.full_like(tree.voxel_index, -1)
-    index[stored] = np.arange(len(order))
-    harmonics = tree.harmonics.subset(order) if isinstance(tree.harmonics, PaletteHarmonics) else tree.harmonics[order]
-    return replace(tree, voxel_index=index, density_values=tree.density_values[order], harmonics=harmonics)
 
 
 def packed_of(tree: NerfTree) -> Packed:
@@ -220,6 +198,27 @@ def _pack_cascade(tree: NerfTree, number: int, cells: np.ndarray, has_density: n
     return leaps(full)
 
 
+def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`Packed.rows` and `Packed.voxel_of`."""
+    from efficientnerf.asset.cascades import cascades_of
+
+    if tree.brick + 2 > MOST_SIDE:
+        raise ValueError(f"bricks of {tree.brick} voxels along a side; at most {MOST_SIDE - 2} are rendered")
+    bricks, count = len(tree.voxel_index), len(tree.density_values)
+    if max(2 * bricks * (tree.brick + 2) ** 2, count, sum(cascade.brick_index.size for cascade in cascades_of(tree))) >= 2**31:
+        raise ValueError(f"{bricks} bricks of {tree.brick} voxels along a side: more than the CPU's kernels can number")
+    begin, stored = np.empty((bricks, tree.brick**2), np.int32), np.empty((bricks, tree.brick**2), np.int32)
+    rows, voxel_of, voxel = np.empty((bricks, (tree.brick + 2) ** 2, 2), np.int32), np.full(count + 1, -1, np.int32), 0
+    for cascade, ends in zip(cascades_of(tree), bricks_of(tree), strict=True):
+        columns, each = cascade.shape[0] * cascade.shape[1], max(1, COLUMN_CELLS_PER_CALL // max(1, cascade.shape[2]))
+        for first in range(0, columns, each):
+            last = min(columns, first + each)
+            voxel = order_voxels(first, last, voxel, tree.brick, cascade.brick_index, tree.voxel_index, begin, stored, voxel_of)
+        for first, end in brick_ranges(*ends, tree.brick):
+            fill_rows(first, end, cells, tree.brick, cascade.brick_index, begin, stored, rows)
+    return rows, voxel_of
+
+
 def pack(tree: NerfTree) -> Packed:
     """The packed form of a tree; ValueError for nearest lookup, since the kernel that reads it interpolates."""
     from efficientnerf.asset.cascades import cascades_of
@@ -228,7 +227,7 @@ def pack(tree: NerfTree) -> Packed:
     if tree.lookup != "trilinear":
         raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; render it by `backends.numba.tree.nearest`")
 
-    tree, bricks = _in_order(tree), bricks_of(tree)
+    bricks = bricks_of(tree)
     cells = np.empty((len(tree.voxel_index), 3), np.int32)
     has_density = np.zeros((len(cells), ((tree.brick + 2) ** 3 + 63) // 64), np.int64)
     leap = [_pack_cascade(tree, n, cells, has_density).reshape(-1) for n in range(len(bricks))]
@@ -241,7 +240,10 @@ def pack(tree: NerfTree) -> Packed:
     else:
         none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
         coded = np.ascontiguousarray(harmonics, np.float32), *none
-    ranks, slopes = _stored_ranks(tree.voxel_index), [_colour_slope(tree, *ends) for ends in bricks]
+    rows, voxel_of = _rows(tree, cells)
+    density = np.zeros(len(voxel_of), np.float32)
+    density[:-1] = tree.density_values[voxel_of[:-1]]
+    slopes = [_colour_slope(tree, *ends) for ends in bricks]
     joined = (leap[0], brick_index[0]) if len(leap) == 1 else (np.concatenate(leap), np.concatenate(brick_index))
-    own = np.ascontiguousarray(joined[1]), tree.voxel_index, tree.density_values
-    return Packed(*_places(tree), joined[0], has_density, ranks, cells, *own, *coded, np.array(slopes))
+    own = np.ascontiguousarray(joined[1]), tree.voxel_index, density
+    return Packed(*_places(tree), joined[0], has_density, rows, voxel_of, cells, *own, *coded, np.array(slopes))

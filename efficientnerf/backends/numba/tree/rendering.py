@@ -1,6 +1,6 @@
 """Rendering of interpolated trees on the CPU (numba, all cores): from trees and cameras to the arrays of the kernels.
 
-Images and rays are rendered from the tree's packed form by `tree.image` and `tree.march`; nearest-lookup trees by `tree.nearest`. The torch reference is
+Images and rays are rendered from the tree's packed form by `tree.image` and `tree.packets`; nearest-lookup trees by `tree.nearest`. The torch reference is
 `efficientnerf.asset.rendering.render_reference`.
 """
 
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.blocks import MIN_BLOCKS, POOL_BYTES
 from efficientnerf.backends.numba.tree.image import TILE, WORK, downsample, render_batch
 from efficientnerf.backends.numba.tree.march import LOG2E, STEP
 from efficientnerf.backends.numba.tree.packed import brick_ranges, bricks_of, packed_of
@@ -57,14 +56,31 @@ def _cone(camera: Camera) -> np.ndarray:
 
 def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray = EVERYWHERE) -> ViewColours:
     """Of all cascades, as far as the cone reaches; the direction is that of cascade 0."""
-    colours, packed = np.empty((len(tree.density_values) + 1, 4), np.float32), packed_of(tree)
-    colours[-1] = 0, np.nan, np.nan, np.nan
-    views = _views(tree, view_direction, _min_distance(tree))
+    colours, packed = _colour_buffer(tree), packed_of(tree)
+    views = _views(tree, view_direction, _near_distance(tree, view_direction))
     for cascade, bricks in enumerate(bricks_of(tree)):
         for first, end in brick_ranges(*bricks, tree.brick):
             direction, scale = views.direction[cascade], views.density_scale[cascade]
             compute_view_colours(first, end, cascade, packed, tree.brick, direction, cone, scale, tree.degree, colours)
     return ViewColours(views, colours)
+
+
+def _colour_buffer(tree: NerfTree) -> np.ndarray:
+    """An array for view colours: that of an earlier image if none uses it. Fresh memory would cost as much time as a third of the colours."""
+    kept = tree.derived.setdefault("view_colours", [])
+    try:
+        return kept.pop()
+    except IndexError:
+        colours = np.empty((len(tree.density_values) + 1, 4), np.float32)
+        colours[-1] = 0
+        return colours
+
+
+def _keep_buffer(tree: NerfTree, colours: ViewColours) -> None:
+    """Leaves the array of view colours, which nothing refers to any more, to the next image."""
+    kept = tree.derived.setdefault("view_colours", [])
+    if not kept and len(colours.colours) == len(tree.density_values) + 1:
+        kept.append(colours.colours)
 
 
 def _views(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray) -> Views:
@@ -84,6 +100,20 @@ def _min_distance(tree: NerfTree) -> np.ndarray:
     return (VOXELS_PER_SLOPE if tree.ndc is None else VOXELS_PER_SLOPE_NDC) * packed_of(tree).colour_slope
 
 
+def _near_distance(tree: NerfTree, view_direction: np.ndarray) -> np.ndarray:
+    """`_min_distance` of each cascade, minus infinity where its box is farther than that from the point that the view is from."""
+    least = _min_distance(tree)
+    if tree.ndc is not None:
+        return least
+    packed = packed_of(tree)
+    for n, (ratio, *shift) in enumerate(packed.places):
+        eye = -view_direction[:, 3] / ratio + shift
+        beside = np.maximum(np.maximum(-eye, eye - packed.grids[n, :3] * tree.brick), 0)
+        if np.linalg.norm(beside) >= least[n] + 2 * tree.brick + 4:
+            least[n] = -np.inf
+    return least
+
+
 def _render(
     tree: NerfTree, batch: RayBatch, colours: ViewColours, background: np.ndarray, tile: tuple[int, int], out: tuple[np.ndarray, ...],
     statistics: np.ndarray | None = None,
@@ -93,21 +123,15 @@ def _render(
     progress = np.zeros((threads, 3), np.int64)
     # In pieces: signals are answered between calls.
     while not render_batch(
-        batch, background, packed_of(tree), tree.brick, colours.colours, colours.views, float(tree.voxel), tile, threads, _capacity(tree), WORK, progress,
+        batch, background, packed_of(tree), tree.brick, colours.colours, colours.views, float(tree.voxel), tile, threads, WORK, progress,
         *out, statistics,
     ):  # fmt: skip
         pass
 
 
-def _capacity(tree: NerfTree) -> int:
-    """Blocks in a thread's pool."""
-    return min(max(1, len(tree.voxel_index)), max(MIN_BLOCKS, POOL_BYTES // (16 * (tree.brick + 2) ** 3)))
-
-
 def scratch_bytes(tree: NerfTree) -> int:
-    """Memory of the view's colours and of the threads' pools while an image is rendered."""
-    each = 4 * len(tree.voxel_index) + (_capacity(tree) + 1) * (16 * (tree.brick + 2) ** 3 + 5)
-    return 16 * (len(tree.density_values) + 1) + numba.get_num_threads() * each
+    """Memory of the view's colours while an image is rendered."""
+    return 16 * (len(tree.density_values) + 1)
 
 
 def render_rays(
@@ -231,6 +255,7 @@ def render_image(
             add_environment(environment, batch, fine[1], fine[0])
         if supersample > 1:
             downsample(supersample, *fine, *part)
+    _keep_buffer(tree, colours)
     return image
 
 

@@ -51,7 +51,8 @@ class View(NamedTuple):
                     harmonics' frame
     direction_rate  change of that direction per voxel, at most
     min_distance    voxels from the point whose direction is zero, on the scale of `direction_rate`, within which a voxel's direction differs too much from that
-                    of the samples beside it: blocks there hold voxel indices and no colours. Infinity where rays have no common point.
+                    of the samples beside it: harmonics are summed at each of them. Infinity where rays have no common point, minus infinity
+                    where no voxel is so near.
     density_scale   float32 factor of densities
     degree          of the harmonics
     """
@@ -74,8 +75,8 @@ class Views(NamedTuple):
 
 
 class PackedPointers(NamedTuple):
-    """One cascade of a `Packed`, with its arrays as pointers, and its sizes: cells along each axis, mask words of a block, rank words of a brick, bricks of
-    all cascades, harmonics, code groups and palette entries; `coded` is whether there are codes.
+    """One cascade of a `Packed`, with its arrays as pointers, and its sizes: cells along each axis, mask words of a block, stored voxels of all
+    cascades, harmonics, code groups and palette entries; `coded` is whether there are codes.
 
     ratio  of its voxels' side to that of cascade 0
     shift  x, y, z: a point of cascade 0 is here at p / ratio + shift, voxel coordinates
@@ -92,9 +93,9 @@ class PackedPointers(NamedTuple):
     leap: Any
     has_density: Any
     mask_words: int
-    stored_ranks: Any
-    rank_words: int
-    bricks: int
+    rows: Any
+    voxels: int
+    voxel_of: Any
     cells: Any
     brick_index: Any
     voxel_index: Any
@@ -118,8 +119,8 @@ def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
     first = grids[cascade, 3]
     return PackedPointers(
         brick, grids[cascade, 0], grids[cascade, 1], grids[cascade, 2], places[cascade, 0], places[cascade, 1], places[cascade, 2], places[cascade, 3],
-        advanced(pointer(packed.leap), first), pointer(packed.has_density), packed.has_density.shape[1], pointer(packed.stored_ranks),
-        packed.stored_ranks.shape[1], len(packed.cells), pointer(packed.cells), advanced(pointer(packed.brick_index), first), pointer(packed.voxel_index),
+        advanced(pointer(packed.leap), first), pointer(packed.has_density.view(np.int32)), packed.has_density.shape[1], pointer(packed.rows),
+        len(packed.voxel_of) - 1, pointer(packed.voxel_of), pointer(packed.cells), advanced(pointer(packed.brick_index), first), pointer(packed.voxel_index),
         pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh), pointer(packed.base), pointer(packed.base_table),
         pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1], pointer(packed.code_columns),
     )  # fmt: skip
@@ -200,18 +201,18 @@ def _palette_colours(a, b, c, d, grid, basis):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
-def _palette_base(n, grid, scale, y):  # type: ignore[no-untyped-def]
-    """Density, and red, green and blue of degree 0; y is the first harmonic."""
+def _palette_base(n, place, grid, scale, y):  # type: ignore[no-untyped-def]
+    """Density, and red, green and blue of degree 0, of stored voxel n, whose place in the packed order is given; y is the first harmonic."""
     table, base = grid.base_table, 3 * n
     r, g, b = table[3 * np.int64(grid.base[base])], table[3 * np.int64(grid.base[base + 1]) + 1], table[3 * np.int64(grid.base[base + 2]) + 2]
-    return pack4(grid.density[n] * scale, y * r, y * g, y * b)
+    return pack4(grid.density[place] * scale, y * r, y * g, y * b)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
-def _float_colours(n, grid, scale, basis, lane):  # type: ignore[no-untyped-def]
-    """Density, red, green and blue of a stored voxel whose harmonics are floats."""
+def _float_colours(n, place, grid, scale, basis, lane):  # type: ignore[no-untyped-def]
+    """The same, of all degrees, of a voxel whose harmonics are floats."""
     r, g, b = sh_colour(n, grid, basis, lane, 4)
-    return pack4(grid.density[n] * scale, r, g, b)
+    return pack4(grid.density[place] * scale, r, g, b)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -224,21 +225,36 @@ def view_direction(x, y, z, direction):  # type: ignore[no-untyped-def]
     )
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
+    """Which voxels of a brick are stored, and their places in the packed order; returns their number."""
+    brick, count = grid.brick, 0
+    side, mask = brick + 2, (np.int64(1) << grid.brick) - 1
+    for i in range(brick):
+        for j in range(brick):
+            at, local = 2 * ((owner * side + i + 1) * side + j + 1), (i * brick + j) * brick
+            bits = np.int64(grid.rows[at + 1])
+            first = grid.rows[at] + (bits & 1)
+            bits = bits >> 1 & mask
+            for k in range(brick):
+                stored[count], place[count] = local + k, first
+                count, first = count + (bits >> k & 1), first + (bits >> k & 1)
+    for n in range(count, count + 3):  # the last group of four is filled up with its last voxel
+        stored[n], place[n] = stored[max(count - 1, 0)], place[max(count - 1, 0)]
+    return count
+
+
 @numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
-def _brick_colours(owner, grid, view, steps, stored, basis, out):  # type: ignore[no-untyped-def]
+def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type: ignore[no-untyped-def]
     """Densities and colours of a brick's voxels, four at a time, into their rows of out (N, 4).
 
     steps   (b^3, 3) float32: see `_voxel_steps`
-    stored  (b^3 + 3,) int64, scratch
+    stored  (b^3 + 3,) int64, scratch, and place likewise
     basis   (K, 4) float32, scratch
     """
-    brick, cells, index, count = grid.brick, grid.cells, grid.voxel_index, 0
-    first = owner * brick * brick * brick
-    for local in range(brick * brick * brick):
-        stored[count] = local
-        count += index[first + local] >= 0
-    for n in range(count, count + 3):  # the last group of four is filled up with its last voxel
-        stored[n] = stored[max(count - 1, 0)]
+    brick, cells, index = grid.brick, grid.cells, grid.voxel_index
+    first, scale = owner * brick * brick * brick, view.density_scale
+    count = _stored_voxels(owner, grid, stored, place)
     x, y, z = view_direction(cells[3 * owner] * brick + 0.5, cells[3 * owner + 1] * brick + 0.5, cells[3 * owner + 2] * brick + 0.5, view.direction)
     for n in range(0, count, 4):
         i, j, k, l = stored[n], stored[n + 1], stored[n + 2], stored[n + 3]
@@ -248,17 +264,18 @@ def _brick_colours(owner, grid, view, steps, stored, basis, out):  # type: ignor
         inverse = rsqrt4(dx * dx + dy * dy + dz * dz)
         sh_basis(dx * inverse, dy * inverse, dz * inverse, view.degree, basis)
         a, b, c, d = np.int64(index[first + i]), np.int64(index[first + j]), np.int64(index[first + k]), np.int64(index[first + l])
+        p, q, r, s = place[n], place[n + 1], place[n + 2], place[n + 3]
         if grid.coded:
             ca, cb, cc, cd = _palette_colours(a, b, c, d, grid, basis)
-            store4(out, 4 * a, ca + _palette_base(a, grid, view.density_scale, basis[0]))
-            store4(out, 4 * b, cb + _palette_base(b, grid, view.density_scale, basis[0]))
-            store4(out, 4 * c, cc + _palette_base(c, grid, view.density_scale, basis[0]))
-            store4(out, 4 * d, cd + _palette_base(d, grid, view.density_scale, basis[0]))
+            store4(out, 4 * p, ca + _palette_base(a, p, grid, scale, basis[0]))
+            store4(out, 4 * q, cb + _palette_base(b, q, grid, scale, basis[0]))
+            store4(out, 4 * r, cc + _palette_base(c, r, grid, scale, basis[0]))
+            store4(out, 4 * s, cd + _palette_base(d, s, grid, scale, basis[0]))
         else:
-            store4(out, 4 * a, _float_colours(a, grid, view.density_scale, basis, 0))
-            store4(out, 4 * b, _float_colours(b, grid, view.density_scale, basis, 1))
-            store4(out, 4 * c, _float_colours(c, grid, view.density_scale, basis, 2))
-            store4(out, 4 * d, _float_colours(d, grid, view.density_scale, basis, 3))
+            store4(out, 4 * p, _float_colours(a, p, grid, scale, basis, 0))
+            store4(out, 4 * q, _float_colours(b, q, grid, scale, basis, 1))
+            store4(out, 4 * r, _float_colours(c, r, grid, scale, basis, 2))
+            store4(out, 4 * s, _float_colours(d, s, grid, scale, basis, 3))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -273,16 +290,16 @@ def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def compute_view_colours(first, end, cascade, packed, brick, direction, cone, density_scale, degree, out):  # type: ignore[no-untyped-def]
     """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of the voxels of bricks first <= B < end, all of one cascade,
-    into out (N + 1, 4).
+    into out (N + 1, 4), in the packed order.
 
     cone  (5,) axis, cosine and sine of the half angle of a cone round all that is seen, in the frame of directions: bricks that are farther from it than any
           whose voxels a ray or its normal may need are left out. Zeros: none are
 
-    The last row, of voxels that are not stored, is for the caller to fill: density 0, colour NaN.
+    The last row, of voxels that are not stored, is for the caller to fill with zeros.
     """
     cube = brick * brick * brick
     for task in numba.prange((end - first + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
-        steps, stored, basis = np.empty(3 * cube, np.float32), np.empty(cube + 3, np.int64), np.empty(128, np.float32)
+        steps, stored, basis = np.empty(3 * cube, np.float32), np.empty((2, cube + 3), np.int64), np.empty(128, np.float32)
         grid, view = packed_pointers(packed, brick, cascade), View(pointer(direction), 0.0, 0.0, density_scale, degree)
         _voxel_steps(brick, view.direction, pointer(steps))
         # From a ray to a normal's block one voxel, through that block and to the middle of the brick beside it; and one for rounding.
@@ -292,4 +309,4 @@ def compute_view_colours(first, end, cascade, packed, brick, direction, cone, de
             x, y, z = view_direction(a, e, c, view.direction)
             along = x * cone[0] + y * cone[1] + z * cone[2]
             if np.sqrt(max(x * x + y * y + z * z - along * along, 0.0)) * cone[3] - along * cone[4] <= reach:
-                _brick_colours(owner, grid, view, pointer(steps), pointer(stored), pointer(basis), pointer(out))
+                _brick_colours(owner, grid, view, pointer(steps), pointer(stored[0]), pointer(stored[1]), pointer(basis), pointer(out))

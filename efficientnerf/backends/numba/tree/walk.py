@@ -1,7 +1,7 @@
 """Ray marching over a tree's own arrays (numba), specialised by lookup; rendering of nearest-lookup trees and refinement share it.
 
 Samples lie as FORMAT.md says, section 6; in nested trees as `efficientnerf.asset.rendering.ray_parts` says. Interpolated trees are rendered from their packed
-form: `efficientnerf.backends.numba.tree.march`.
+form: `efficientnerf.backends.numba.tree.packets`.
 
 Coordinates of rays are in voxels of the tree's own grid, cascade 0. N stored voxels, S samples of a ray, L cascades, C coarse cells of all outer cascades.
 """

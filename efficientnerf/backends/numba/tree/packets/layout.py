@@ -1,0 +1,29 @@
+"""Where the numbers of sixteen rays lie in the scratch of a thread: sixteen of each, one a ray.
+
+Floats: where a ray's part in a cascade begins, its direction, the first sample and the one after the last; what it met, see below; of the sample that is to be
+composited the place in its block and the distance; weights of its eight voxels, two of each row; what comes out of them, (16, 4); the direction that harmonics
+are evaluated along, and their values, (K, 16); colours of some voxels along each ray, (CACHED, 16, 4). Integers: of that sample the brick, the row and the
+place in it; its eight voxels and which of each pair is stored; whether the harmonics are evaluated; which voxels those are, -1 for none.
+
+State: transmittance; colour; distance at which the transmittance fell to one half; weight of samples near the camera without a colour yet, and that of the next
+colour; counts of coarse cells visited, of samples tested, of samples interpolated and of colours looked up; depth and normal.
+"""
+
+from __future__ import annotations
+
+ENTRY_X, ENTRY_Y, ENTRY_Z, ALONG_X, ALONG_Y, ALONG_Z, FIRST, LAST = range(0, 128, 16)
+TRANSMITTANCE, RED, GREEN, BLUE, HALF_DISTANCE, PENDING_WEIGHT, GAIN = range(128, 240, 16)
+VISITED, TESTED, INTERPOLATED, LOOKUPS, DEPTH, NORMAL_X, NORMAL_Y, NORMAL_Z = range(240, 368, 16)
+X, Y, Z, DISTANCE = range(368, 432, 16)
+WEIGHT, SAMPLE, SH_X, SH_Y, SH_Z, BASIS = 432, 560, 624, 640, 656, 672
+MOST_HARMONICS = 25
+CACHED_BITS = 7
+CACHED = 1 << CACHED_BITS  # colours of voxels near the camera that sixteen rays share
+COLOURS = BASIS + 16 * MOST_HARMONICS
+FLOATS = COLOURS + 64 * CACHED
+
+OWNER, ROW, PLACE, VOXEL, PAIR, HAS_BASIS = 0, 16, 32, 48, 176, 240
+CACHE = 256
+INTS = CACHE + CACHED
+
+ORIGIN, DIRECTION, COSINE, BEGIN, ENDS = 0, 48, 96, 112, 128  # float64: x, y, z of sixteen, and so on; then by cascade where they enter and leave it

@@ -1,0 +1,156 @@
+"""Marching of sixteen rays, one a lane, through a cascade of a packed, interpolated tree (numba).
+
+Each ray goes on to its next sample of which one of the eight voxels has density; when half of them are at one, or have none left, these are composited
+together. Were all waited for, the gaps between surfaces that rays cross would be crossed one after the other: docs/experiments/renderer.md
+
+All rays sample at t = t_enter + (k + 1/2) STEP, whatever is skipped and whatever the other lanes do: neither changes any value.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import popcount
+from efficientnerf.backends.numba.tree.march import PARALLEL, SKIP_MARGIN, STEP
+from efficientnerf.backends.numba.tree.packets.composite import composite
+from efficientnerf.backends.numba.tree.packets.lanes import (
+    abs16,
+    bits_of,
+    broadcast16,
+    ceil16,
+    floor16,
+    gather16,
+    load16,
+    mask_of,
+    max16,
+    min16,
+    select16,
+    store16,
+    to_float16,
+    to_int16,
+)
+from efficientnerf.backends.numba.tree.packets.layout import (
+    ALONG_X,
+    ALONG_Y,
+    ALONG_Z,
+    DISTANCE,
+    ENTRY_X,
+    ENTRY_Y,
+    ENTRY_Z,
+    FIRST,
+    LAST,
+    OWNER,
+    TESTED,
+    VISITED,
+    X,
+    Y,
+    Z,
+)
+from efficientnerf.backends.numba.tree.view_colours import FASTMATH
+
+_HALF, _ONE, _NONE, _FAR = np.float32(0.5), np.float32(1), np.float32(0), np.float32(1e30)
+_STEP, _PER_STEP = np.float32(STEP), np.float32(1 / STEP)
+_SKIP = np.float32(0.5 + SKIP_MARGIN)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+def _axis(d):  # type: ignore[no-untyped-def]
+    """How rays cross the faces across an axis: slope, never, ahead and beside. A ray crosses the plane at x at (x - ex) * slope + never, and the face of cell
+    a, `far` cells ahead, is at (a + beside + far * ahead) * width.
+
+    Along an axis that a ray hardly moves on it never does; 1 / dx would be infinite, zero times that no number, and the ray would stay where it is.
+    """
+    moves, ahead = abs16(d) >= PARALLEL, d > _NONE
+    return (
+        select16(moves, _ONE / d, _NONE), select16(moves, broadcast16(_NONE), _FAR), select16(ahead, broadcast16(_ONE), -_ONE),
+        select16(ahead, broadcast16(_NONE), _ONE),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+def _near(a, e, c, grid, view):  # type: ignore[no-untyped-def]
+    """Which cells are too near for colours of the view, see `View`."""
+    d, brick = view.direction, np.float32(grid.brick)
+    x, y, z = a * brick + _HALF * brick, e * brick + _HALF * brick, c * brick + _HALF * brick
+    u = x * np.float32(d[0]) + y * np.float32(d[1]) + z * np.float32(d[2]) + np.float32(d[3])
+    v = x * np.float32(d[4]) + y * np.float32(d[5]) + z * np.float32(d[6]) + np.float32(d[7])
+    w = x * np.float32(d[8]) + y * np.float32(d[9]) + z * np.float32(d[10]) + np.float32(d[11])
+    least = np.float32(view.direction_rate * (view.min_distance + 2 * grid.brick + 4))
+    return u * u + v * v + w * w < least * least
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped-def]
+    """Adds the samples FIRST <= k < LAST of sixteen rays' parts in a cascade to their states, see `layout`; both below 2^24. The half distance is one from the
+    entry, voxels.
+
+    shared  whether rays beside each other are neighbours
+    view    see `View`; its density scale is STEP, in units of the frame, times log2(e)
+    """
+    ex, ey, ez = load16(floats, ENTRY_X), load16(floats, ENTRY_Y), load16(floats, ENTRY_Z)
+    dx, dy, dz = load16(floats, ALONG_X), load16(floats, ALONG_Y), load16(floats, ALONG_Z)
+    side, words = grid.brick + 2, 2 * grid.mask_words
+    width, per_brick = np.float32(grid.brick), np.float32(1 / grid.brick)
+    row, layer = np.float32(side), np.float32(side * side)
+    slope_x, never_x, ahead_x, beside_x = _axis(dx)
+    slope_y, never_y, ahead_y, beside_y = _axis(dy)
+    slope_z, never_z, ahead_z, beside_z = _axis(dz)
+    most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)
+    some_near = view.min_distance > -np.inf
+    # Integers are kept as float32: conversions would lengthen the dependency chain from step to step.
+    k, last = load16(floats, FIRST), load16(floats, LAST)
+    until, owner, visited, tested = k, broadcast16(np.int32(0)), broadcast16(_NONE), broadcast16(_NONE)
+    bx = by = bz = px = py = pz = distance = broadcast16(_NONE)
+    going, ready, close = bits_of(k < last), np.int64(0), np.int64(0)
+    while going != 0:
+        lanes = mask_of(going)
+        enters = lanes & (k >= until)
+        entering = bits_of(enters)
+        if entering != 0:
+            s = (k + _HALF) * _STEP
+            a = min16(max16(floor16((ex + s * dx) * per_brick), _NONE), most_x)
+            e = min16(max16(floor16((ey + s * dy) * per_brick), _NONE), most_y)
+            c = min16(max16(floor16((ez + s * dz) * per_brick), _NONE), most_z)
+            cell = select16(enters, (to_int16(a) * grid.ny + to_int16(e)) * grid.nz + to_int16(c), 0)
+            leap = gather16(grid.leap, cell)
+            visited = visited + select16(enters, broadcast16(_ONE), _NONE)
+            # A ray leaves the cell, or the empty cube of cells around it, at the nearest of three faces.
+            far = max16(to_float16(leap), _ONE)
+            tx = ((a + beside_x + far * ahead_x) * width - ex) * slope_x + never_x
+            ty = ((e + beside_y + far * ahead_y) * width - ey) * slope_y + never_y
+            tz = ((c + beside_z + far * ahead_z) * width - ez) * slope_z + never_z
+            then = min16(max16(ceil16(min16(tx, min16(ty, tz)) * _PER_STEP - _SKIP), k + _ONE), last)
+            full = enters & (leap == 0)
+            until = select16(enters, then, until)
+            k = select16(enters & (leap > 0), then, k)
+            filled = bits_of(full)
+            if filled != 0:
+                owner = select16(full, gather16(grid.brick_index, select16(full, cell, 0)), owner)
+                bx = select16(full, ex - a * width + _HALF, bx)
+                by = select16(full, ey - e * width + _HALF, by)
+                bz = select16(full, ez - c * width + _HALF, bz)
+                if some_near:
+                    close = (close & ~filled) | (filled & bits_of(_near(a, e, c, grid, view)))
+        inside = lanes & (k < until)
+        if bits_of(inside) != 0:
+            s = (k + _HALF) * _STEP
+            x, y, z = bx + s * dx, by + s * dy, bz + s * dz
+            voxel = to_int16(floor16(x) * layer + floor16(y) * row + floor16(z))
+            word = gather16(grid.has_density, select16(inside, owner * words + (voxel >> 5), 0))
+            found = inside & ((word >> (voxel & 31)) & 1 != 0)
+            tested = tested + select16(inside, broadcast16(_ONE), _NONE)
+            k = select16(inside, k + _ONE, k)
+            px, py, pz, distance = select16(found, x, px), select16(found, y, py), select16(found, z, pz), select16(found, s, distance)
+            ready |= bits_of(found)
+        going = bits_of(k < last) & ~ready & going
+        if ready != 0 and popcount(ready) >= popcount(going):
+            store16(floats, X, px)
+            store16(floats, Y, py)
+            store16(floats, Z, pz)
+            store16(floats, DISTANCE, distance)
+            store16(ints, OWNER, owner)
+            ended = composite(ready, ready & close, shared, grid, view, colours, floats, ints)
+            going, ready = going | (ready & ~ended & bits_of(k < last)), np.int64(0)
+    store16(floats, VISITED, load16(floats, VISITED) + visited)
+    store16(floats, TESTED, load16(floats, TESTED) + tested)
