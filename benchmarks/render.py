@@ -119,7 +119,8 @@ def memory(tree: Any, view: Any) -> dict[str, float]:
     framebuffer = sum(part.nbytes for part in vars(rendering).values())
     total = own + packed_of(tree).nbytes + scratch_bytes(tree) + framebuffer
     each = round(total / max(1, len(tree.density_values)), 1)
-    return {"tree": own, "packed": packed_of(tree).nbytes, "view_colours": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
+    packed = packed_of(tree).nbytes
+    return {"tree": own, "packed": packed, "view_colours": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
 
 
 def main() -> int:
