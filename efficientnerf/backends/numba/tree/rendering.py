@@ -66,7 +66,7 @@ def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray =
 
 
 def _colour_buffer(tree: NerfTree) -> np.ndarray:
-    """An array for view colours: that of an earlier image if none uses it. Fresh memory would cost as much time as a third of the colours."""
+    """An array for view colours: that of an earlier image if none uses it."""
     kept = tree.derived.setdefault("view_colours", [])
     try:
         return kept.pop()
