@@ -69,9 +69,9 @@ def as_blender(source: Path, folder: Path) -> Path:
 
 
 def _pixels(path: Path) -> np.ndarray:
-    from PIL import Image
+    from stages.io.pictures import opened
 
-    with Image.open(path) as image:
+    with opened(path) as image:
         return np.asarray(image)
 
 

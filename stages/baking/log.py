@@ -24,7 +24,7 @@ class RefinementLog:
     """log.jsonl: a line every few steps, and at each preview.
 
         seconds          of the stage so far
-        psnr             running mean over the training rays, each over the backgrounds that it is compared over
+        psnr             running mean over the training rays, each over the backgrounds that it is compared over; null before the first step
         preview_psnr     of the preview, if one was drawn
         rays_per_second  of the steps alone, the mean since the last line
         resolution       voxels along the longest side
@@ -58,7 +58,8 @@ class RefinementLog:
         if state.step % EVERY == 0 or last or drawn is not None:
             rate = rays * (state.step - self.logged) / max(self.working, 1e-9)
             line = {
-                "step": state.step, "phase": phase, "seconds": round(self.stopwatch.seconds, 3), "psnr": psnr_of(self.error), "preview_psnr": drawn,
+                "step": state.step, "phase": phase, "seconds": round(self.stopwatch.seconds, 3), "preview_psnr": drawn,
+                "psnr": psnr_of(self.error) if rays else None,
                 "rays": rays, "rays_per_second": round(rate), "voxels": len(state.density), "resolution": max(state.tree.resolution),
             }  # fmt: skip
             self.unwritten.append(json.dumps(line, sort_keys=True))

@@ -86,7 +86,7 @@ class Refinement:
             if after != "none":
                 self._save()
         point.state.to_host()
-        return point.state.tree
+        return replace(point.state.tree)  # what a renderer made of earlier values is left behind
 
     def _begin_phase(self) -> None:
         """Allot time to the phase, if there is a budget."""

@@ -24,7 +24,7 @@ class _Line(msgspec.Struct):
     """What has to hold of a line that is read again."""
 
     step: Annotated[int, msgspec.Meta(ge=0, le=2**53)]
-    psnr: Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
+    psnr: Annotated[float, msgspec.Meta(ge=-1000, le=1000)] | None
     preview_psnr: Annotated[float, msgspec.Meta(ge=-1000, le=1000)] | None = None
 
 
@@ -125,7 +125,8 @@ def draw_curve(path: Path, log: Path, more: Iterable[dict[str, Any]] = ()) -> No
     from stages.figures.plots import curve
 
     lines = [*read_lines(log), *more]
-    series = {"training rays, running mean": ([x["step"] for x in lines], [x["psnr"] for x in lines])}
+    known = [x for x in lines if x["psnr"] is not None]
+    series = {"training rays, running mean": ([x["step"] for x in known], [x["psnr"] for x in known])}
     previews = [(x["step"], x["preview_psnr"]) for x in lines if x.get("preview_psnr") is not None]
     if previews:
         series["preview view"] = ([step for step, _ in previews], [psnr for _, psnr in previews])

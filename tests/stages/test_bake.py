@@ -172,7 +172,7 @@ def replaced(name: str, values: Callable[[np.ndarray], np.ndarray]) -> Callable[
 
 
 CHANGES: list[Callable[[dict[str, np.ndarray]], object]] = [
-    said(-1), said(10**9), said(7), said(3, 1), said(3, 7), said(8, 1, pruned=None),
+    said(-1), said(10**9), said(7), said(2, 1), said(3, 7), said(8, 1, pruned=None),
     said(3, pruned=3), said(3, schedule=[]), said(3, more=1), said(3, seconds=-1.0),
     replaced("square_sh", lambda v: v[:-1]), replaced("visits", lambda v: v.astype(np.float32)),
     replaced("coordinates", lambda v: v + 1), replaced("coordinates", lambda v: v - 1), replaced("coordinates", lambda v: v[::-1]),

@@ -20,9 +20,7 @@ from efficientnerf.asset.refinement import host
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets
-from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.training.patches import PatchGrid
 
 PATCH_SIDE = 4  # docs/experiments/tree-training-kernels.md
 WEIGHT_RAYS, ERROR_RAYS = 2**16, 2**14  # of a bundle; where the error is measured the rays leave records
@@ -69,18 +67,14 @@ def error(tree: NerfTree, targets: Targets, count: int, seed: int) -> float:
 
 
 def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progress: Callable[[int, int], None] | None = None) -> np.ndarray:
-    """(N,) the greatest contribution of each voxel to one of about `count` random training pixels, in patches. Those of tiles that do not meet the tree
-    count as seen: nothing contributes to them.
+    """(N,) the greatest contribution of each voxel to one of `count` random training pixels. They are rendered in the order of the images, where neighbours
+    meet the same voxels; each is drawn by itself, for patches would leave voxels out that single views show.
 
     progress  called with the number of pixels done and `count`
     """
     rng = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 4, 0]))
-    patches = PatchGrid(targets.host_pixels, PATCH_SIDE)
-    met = tiles_met(tree, patches)
-    chances = probabilities(met)
-    rays = count if met is None else max(1, int(count * met.mean()))
-    drawn = (targets.of(patches.draw(min(WEIGHT_RAYS, rays - begin), rng, chances).pixels) for begin in range(0, rays, WEIGHT_RAYS))
-    bundles = _reported(drawn, rays, count, progress)
+    chosen = np.sort(targets.host_pixels.choose(count, rng))
+    bundles = _reported((targets.of(chosen[begin : begin + WEIGHT_RAYS]) for begin in range(0, count, WEIGHT_RAYS)), count, progress)
     if targets.on_device:
         from efficientnerf.asset.refinement import device
 
@@ -88,11 +82,11 @@ def max_weights(tree: NerfTree, targets: Targets, count: int, seed: int, progres
     return host.max_weights(tree, bundles)
 
 
-def _reported(bundles: Iterator[Bundle], rays: int, count: int, progress: Callable[[int, int], None] | None) -> Iterator[Bundle]:
-    """The bundles of so many rays, which stand for `count` pixels; reports the pixels done after each."""
+def _reported(bundles: Iterator[Bundle], count: int, progress: Callable[[int, int], None] | None) -> Iterator[Bundle]:
+    """The bundles, reporting the rays done after each."""
     done = 0
     for bundle in bundles:
         yield bundle
-        done = min(rays, done + WEIGHT_RAYS)
+        done += len(bundle[0])
         if progress is not None:
-            progress(count * done // rays, count)
+            progress(done, count)

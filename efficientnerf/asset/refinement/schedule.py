@@ -27,7 +27,8 @@ class Phase:
     after: Operation = "none"
 
 
-PHASES = (Phase("all voxels", 0.5, "prune"), Phase("voxels that show", 0.5))
+# docs/experiments/tree-training.md
+PHASES = (Phase("all voxels", 0.3, "prune"), Phase("voxels that show", 0.7))
 
 
 def phases_of(*, whole: bool, ndc: bool, discretised: bool) -> tuple[Phase, ...]:

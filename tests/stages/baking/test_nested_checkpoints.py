@@ -36,7 +36,7 @@ def some_state(tree: NerfTree, pruned: bool) -> RefinementState:
     for name in STATE:
         values = getattr(state, name)
         values[:] = rng.integers(1, 100, values.shape)
-    state.step = 7 if pruned else 4
+    state.step = 7 if pruned else 3
     return state
 
 

@@ -28,7 +28,7 @@ from stages.training.log import read_lines
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import StopAt, job, poses
 
-SECONDS = 30.0
+SECONDS = 60.0
 QUICK = BakeSettings(resolution=16, samples_per_voxel=1, visibility_rays=1000, refine_rays_per_batch=64, time_budget=SECONDS)
 
 
@@ -95,7 +95,7 @@ def test_the_budget_is_met_and_its_steps_give_the_same_asset(inputs: dict[str, P
     said = fitted(made)
     assert 0.9 * SECONDS <= now[0] <= SECONDS
     first, second = (one["iterations"] for one in said["schedule"])
-    assert first == pytest.approx(SECONDS / 2, abs=1)  # of a second each, in a half of the time
+    assert first == pytest.approx(PHASES[0].share * SECONDS, abs=1)  # of a second each
     assert second == pytest.approx((SECONDS - first - 2) / 0.5, abs=2)  # what is left after the pruning
     assert said["steps"] == first + second
     assert made.facts["schedule"] == said["schedule"]
@@ -141,7 +141,7 @@ def test_the_way_that_is_done_grows_to_one_and_does_not_jump(steps: int) -> None
     assert schedule.begin(len(PHASES)) == steps
     done = [schedule.fraction(step) for step in range(steps + 1)]
     if steps > 1:
-        np.testing.assert_allclose(np.diff(done), 1 / steps, atol=0.5 / steps if steps % 2 else 1e-12)
+        np.testing.assert_allclose(np.diff(done), 1 / steps, atol=0.5 / steps)
     assert done[-1] == pytest.approx(1.0 if steps else 0.0)
     assert recorded_schedule(PHASES, schedule.state()) == schedule
 
