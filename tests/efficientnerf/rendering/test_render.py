@@ -109,7 +109,7 @@ def test_pictures_are_their_rays() -> None:
     picture = render(tree, camera)
     flat = render_rays(tree, *rays(camera))
     shape = (camera.height, camera.width)
-    np.testing.assert_allclose(picture.colour.reshape(-1, 3), flat.colour, atol=1e-5)  # neighbours share sums, which are rounded in another order
+    np.testing.assert_allclose(picture.colour.reshape(-1, 3), flat.colour, atol=1e-4)  # what weighs less than that is shaded with its neighbours
     assert np.array_equal(picture.opacity.reshape(-1), flat.opacity)
     slant = (rays(camera)[1] @ camera.forward).reshape(shape)
     np.testing.assert_allclose(picture.depth, flat.depth.reshape(shape) * slant, rtol=1e-5)
