@@ -55,15 +55,16 @@ def stride_for(views: Sequence[View], rays: int) -> int:
     return max(1, math.ceil(math.sqrt(total / rays)))
 
 
-def ground_truth(folder: Path, view: View, background: tuple[float, float, float] | None) -> GroundTruth:
-    """The image of a view at working size.
+def ground_truth(folder: Path, view: View, background: tuple[float, float, float] | None, stride: int = 1) -> GroundTruth:
+    """The image of a view at working size, of the pixels that `subsample` keeps.
 
     background  what images with alpha are composited on; None: alpha below one half masks
     """
     from stages.io.scene import read_image, read_mask
 
-    pixels = read_image(folder, view).astype(np.float32) / 255.0
+    pixels = subsample(read_image(folder, view), stride).astype(np.float32) / 255.0
     mask = read_mask(folder, view)
+    mask = None if mask is None else subsample(mask, stride)
     if pixels.shape[2] == 3:
         return GroundTruth(pixels, mask, None)
     alpha = pixels[..., 3]

@@ -49,12 +49,12 @@ class Previews:
         if self.view is None:
             return None
         from efficientnerf.evaluation.metrics import WINDOW, psnr, ssim
-        from stages.evaluation.views import ground_truth, subsample, subsample_camera
+        from stages.evaluation.views import ground_truth, subsample_camera
         from stages.figures.plots import to_uint8
         from stages.io.png import write_png
 
         stride = max(1, math.ceil(max(self.view.camera.width, self.view.camera.height) / SIDE))
-        truth = subsample(ground_truth(self.poses, self.view, self.background).colour, stride)
+        truth = ground_truth(self.poses, self.view, self.background, stride).colour
         render = np.clip(self.render(subsample_camera(self.view.camera, stride)), 0, 1)
         write_png(to_uint8(np.concatenate([truth, render], axis=1)), self.work / f"preview_{step:06d}.png")
         self.figures = {"preview_psnr": round(float(psnr(render, truth)), 2)}
