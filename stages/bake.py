@@ -69,8 +69,8 @@ class BakeSettings:
     max_mib: PositiveInt | Auto = setting(
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
-        " 36 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed. Smaller where voxels as fine as pixels"
-        " resolve take less.",
+        " 36 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed; less where voxels as fine as pixels"
+        " resolve are fewer.",
         unit="MiB",
     )
     layout: Literal["compact", "packed", "small", "sparse"] = setting(
