@@ -47,7 +47,7 @@ def large_child(job: Job) -> None:
 
 def test_the_memory_of_a_child_counts(tmp_path: Path) -> None:
     usage = local.execute(Stage("toy", 1, NoSettings, (), large_child), Job(settings=NoSettings(), out=tmp_path / "out", work=tmp_path / "work"))
-    assert usage.peak_memory > 0.9 * 2**30  # what the system counts lags behind a little
+    assert usage.peak_memory > 2**30
 
 
 def test_waiting_is_not_busy(tmp_path: Path) -> None:

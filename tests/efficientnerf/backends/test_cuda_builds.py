@@ -1,4 +1,4 @@
-"""Every CUDA kernel is built to machine code, for two generations of devices: Triton needs no device for that, and the interpreter accepts more
+"""Every CUDA kernel is built to machine code, for three generations of devices: Triton needs no device for that, and the interpreter accepts more
 than the compiler does.
 """
 
@@ -15,7 +15,7 @@ pytest.importorskip("triton", reason="Triton is not installed: pip install trito
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)  # more than a minute of one core, on a machine that may be busy
+@pytest.mark.timeout(900)  # two minutes of one core, on a machine that may be busy
 def test_all_kernels_build_without_spilling(tmp_path: Path) -> None:
     """In a process of its own: kernels that were defined for the interpreter cannot be compiled."""
     environment = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path)}

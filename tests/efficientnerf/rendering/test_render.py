@@ -110,7 +110,7 @@ def test_pictures_are_their_rays() -> None:
     flat = render_rays(tree, *rays(camera))
     shape = (camera.height, camera.width)
     np.testing.assert_allclose(picture.colour.reshape(-1, 3), flat.colour, atol=1e-4)  # what weighs less than that is shaded with its neighbours
-    np.testing.assert_allclose(picture.opacity.reshape(-1), flat.opacity, atol=1e-5)
+    np.testing.assert_allclose(picture.opacity.reshape(-1), flat.opacity, atol=1e-6)
     slant = (rays(camera)[1] @ camera.forward).reshape(shape)
     np.testing.assert_allclose(picture.depth, flat.depth.reshape(shape) * slant, rtol=1e-5)
     assert np.array_equal(np.isinf(picture.depth), picture.opacity < 0.5)

@@ -148,6 +148,16 @@ def test_killed_and_resumed_gives_the_same_bits(ten: tuple[list[str], Path, Capt
     assert first_seen["detecting features"] >= 6  # what was found before the kill is used
 
 
+def test_damaged_database_is_made_anew(ten: tuple[list[str], Path, Capture], tmp_path: Path) -> None:
+    names, work, capture = ten
+    shutil.copytree(work, tmp_path / "work")
+    path = database_path(tmp_path / "work")
+    size = path.stat().st_size
+    with open(path, "r+b") as file:
+        file.truncate(size * 2 // 3)
+    assert numbers(find(STILL_LIFE, names, tmp_path / "work")) == numbers(capture)
+
+
 def test_an_image_that_colmap_cannot_read_is_not_left_out(resumed: tuple[Path, list[WorkImage]]) -> None:
     work, images = resumed
     quiet: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
@@ -234,7 +244,7 @@ def test_a_database_that_colmap_could_not_bear_is_not_handed_to_it(resumed: tupl
     assert 1 not in found["keypoints"] or not found["matches"]
 
 
-@pytest.mark.parametrize("how", ["cut", "link"])
+@pytest.mark.parametrize("how", ["cut", "zero", "link"])
 def test_every_scratch_file_of_finding_cameras_may_be_damaged(ten: tuple[list[str], Path, Capture], tmp_path: Path, how: str) -> None:
     names, work, capture = ten
     shutil.copytree(work, tmp_path / "work")
