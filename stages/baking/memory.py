@@ -33,10 +33,11 @@ def voxels_needed(voxels: int, harmonics: int) -> int:
     return (COPIES * 4 * (1 + 3 * harmonics) + VOXEL + 4 * min(MAX_SHARES, count_cores())) * voxels
 
 
-def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int) -> int:
+def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int, *, smooth: bool) -> int:
     """Bytes that such a tree takes on a device while it is refined there (`efficientnerf.asset.refinement.device`): values and means of squares in
-    float32, visits and stamps, sums of gradients in 64 bits; of bricks their voxels with a border; of the grid's cells three numbers while it is sent."""
-    return (28 + 36 * harmonics) * voxels + 4 * (brick + 2) ** 3 * bricks + 12 * cells
+    float32, visits and stamps, sums of gradients in 64 bits; where there is a total variation (`smooth`) the six voxels beside each, and densities before a
+    step; of bricks their voxels with a border; of the grid's cells three numbers while it is sent."""
+    return (28 + 36 * harmonics + 28 * smooth) * voxels + 4 * (brick + 2) ** 3 * bricks + 12 * cells
 
 
 def free_on_device(device: str) -> int:

@@ -278,7 +278,7 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets, splits: int = 
     if splits and room is not None:
         voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
     bricks = -(-len(tree.voxel_index) * voxels // max(len(tree.density_values), 1))
-    needed = needed_on_device(voxels, tree.harmonics_count, bricks, cells, tree.brick)
+    needed = needed_on_device(voxels, tree.harmonics_count, bricks, cells, tree.brick, smooth=total_variation(job.settings, tree) > 0)
     needed += voxels * bool(tree.outer)  # the cascade of each voxel
     if targets.pixels.images is not None:
         needed += targets.pixels.images.nbytes

@@ -107,7 +107,7 @@ def images() -> None:
 
 
 def fit() -> None:
-    from efficientnerf.backends.triton import tree_gradients
+    from efficientnerf.backends.triton import tree_gradients, tree_steps
     from tests.efficientnerf.trees import random_cascades, random_tree
 
     rays = tree_gradients.Rays(torch.zeros(8, 3), torch.ones(8, 3), torch.ones(8, 3))
@@ -120,8 +120,10 @@ def fit() -> None:
         outputs = tree_gradients.forward(g, rays, *values)
         tree_gradients.backward(g, rays, *values, outputs, (outputs[0], outputs[1]), sums, stamp, 7)
         tree_gradients.max_contributions(g, rays, values[0], outputs[1], squares[0])
-        rates = tree_gradients.LearningRates(0.1, 0.1, 0.5)
-        tree_gradients.rmsprop_step(g, values, sums, squares, visits, stamp, number=7, rays=8, rates=rates, decay=0.9, epsilon=1e-10)
+        for momentum, total_variation in ((0.0, 0.0), (0.9, 0.1)):
+            rule = tree_steps.Hyperparameters(0.1, 0.1, 0.5, 0.9, 1e-10, momentum, total_variation)
+            neighbours = tree_steps.Neighbours(torch.zeros(count), torch.zeros(count, 6, dtype=torch.int32))
+            tree_steps.step(g, values, sums, tree_steps.Moments(*values, *squares, visits), stamp, rule, neighbours, number=7, rays=8)
 
 
 if __name__ == "__main__":

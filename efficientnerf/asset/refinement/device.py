@@ -1,6 +1,6 @@
 """Steps of refinement on CUDA: pixels, rays, values and steps stay on the device, and the host waits only when the state is fetched.
 
-Kernels: `efficientnerf.backends.triton.tree_gradients`. N voxels, K harmonics, R rays.
+Kernels: `efficientnerf.backends.triton.tree_gradients` and `tree_steps`. N voxels, K harmonics, R rays.
 """
 
 from __future__ import annotations
@@ -13,70 +13,53 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.refinement.host import DECAY, EPSILON
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
-from efficientnerf.asset.refinement.state import STATE, RefinementState
+from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, neighbours_of
+from efficientnerf.backends.numba.tree_training.steps import neighbours_of
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients
-from efficientnerf.backends.triton.tree_gradients import DeviceGrid, LearningRates, Rays, device_grid
+from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
+from efficientnerf.backends.triton.tree_steps import Hyperparameters, Moments, Neighbours, step
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.readback import LAG
 
 
 class DeviceArrays:
-    """A state's arrays on a device, by name (`efficientnerf.asset.refinement.state.STATE`), and the sums of the gradients."""
+    """A state's arrays on a device, by name (`efficientnerf.asset.refinement.state.STATE`), and the sums of the gradients.
 
-    def __init__(self, state: RefinementState, device: torch.device) -> None:
-        self.beside: Tensor | None
+    smooth  whether steps have a total variation
+    """
+
+    def __init__(self, state: RefinementState, device: torch.device, *, smooth: bool = False) -> None:
         self.values: dict[str, Tensor] = {name: torch.from_numpy(np.ascontiguousarray(getattr(state, name))).to(device) for name in STATE}
         self.grid = device_grid(state.tree, device)
         count, width = state.sh.shape
         self.by_thickness = torch.zeros(count, dtype=torch.int64, device=device)
         self.by_sh = torch.zeros(count, width, dtype=torch.int64, device=device)
         self.stamp = torch.zeros(count, dtype=torch.int32, device=device)
-        self.tree, self.beside = state.tree, None  # the second (N, 6), where total variation is asked for
+        beside = torch.from_numpy(voxels_beside(state.tree) if smooth else np.zeros((0, 6), np.int32)).to(device)
+        self.neighbours = Neighbours(torch.zeros(len(beside), device=device), beside)
+        none = torch.zeros(0, device=device)
+        self.moments = Moments(none, none, *(self.values[name] for name in MOMENTS))
 
     def to_host(self) -> dict[str, np.ndarray]:
         """The arrays on the host."""
         return {name: values.cpu().numpy() for name, values in self.values.items()}
 
-    def add_total_variation(self, weight: float, number: int, scale: float) -> None:
-        """Add its gradient of the voxels that were met in step `number` to the sums, which hold `scale` to a one."""
-        if self.beside is None:
-            self.beside = torch.from_numpy(voxels_beside(self.tree)).to(self.stamp.device)
-            sides = np.full(len(self.stamp), self.tree.voxel, np.float32) if not self.tree.outer else voxel_sides(self.tree)
-            self.sides = torch.from_numpy(sides).to(self.stamp.device)
-        thickness = (self.values["density"] * self.sides).clamp(min=MIN_THICKNESS)
-        here = thickness.log()
-        slope = torch.zeros_like(here)
-        for face in range(6):
-            beyond = self.beside[:, face].long()
-            slope += torch.where(beyond >= 0, here - here[beyond.clamp(min=0)], 0)
-        slope *= weight * scale / thickness * (self.stamp == number)
-        self.by_thickness += slope.to(torch.int64)
-
-    def step(
-        self, number: int, rays: Rays, wanted: Any, density_lr: float, sh_lr: float, view_dependent_lr_ratio: float = 1.0, total_variation: float = 0.0
-    ) -> Tensor:
+    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters) -> Tensor:
         """Losses (R,) of the rays before the step."""
-        v, sums = self.values, (self.by_thickness, self.by_sh)
-        outputs = tree_gradients.forward(self.grid, rays, v["density"], v["sh"])
+        values, sums = (self.values["density"], self.values["sh"]), (self.by_thickness, self.by_sh)
+        outputs = tree_gradients.forward(self.grid, rays, *values)
         loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
-        tree_gradients.backward(self.grid, rays, v["density"], v["sh"], outputs, (by[0], by[1]), sums, self.stamp, number)
-        if total_variation > 0:
-            self.add_total_variation(total_variation, number, tree_gradients.fixed_point_scale(len(loss)))
-        tree_gradients.rmsprop_step(
-            self.grid, (v["density"], v["sh"]), sums, (v["square_density"], v["square_sh"]), v["visits"], self.stamp,
-            number=number, rays=len(loss), rates=LearningRates(density_lr, sh_lr, view_dependent_lr_ratio), decay=DECAY, epsilon=EPSILON,
-        )  # fmt: skip
+        tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number)
+        step(self.grid, values, sums, self.moments, self.stamp, hyperparameters, self.neighbours, number=number, rays=len(loss))
         return loss
 
 
@@ -108,7 +91,7 @@ def optimise(
     """See `efficientnerf.asset.refinement.fit.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
     assert isinstance(targets.pixels, DevicePixels)
     state.fetch()
-    state.device_state = arrays = DeviceArrays(state, targets.pixels.device)
+    state.device_state = arrays = DeviceArrays(state, targets.pixels.device, smooth=rule.total_variation > 0)
     patches = PatchGrid(targets.host_pixels, patch_side)
     chances = probabilities(tiles_met(state.tree, patches))
     pending: deque[tuple[Tensor, Any]] = deque()
@@ -117,8 +100,8 @@ def optimise(
         number = state.step + 1
         origins, directions, wanted = targets.of(patches.draw(rays, step_rng(seed, number), chances).pixels)
         factor = fall(number)
-        rates = density_lr * factor, sh_lr * factor, view_dependent_lr_ratio
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, *rates, rule.total_variation)
+        hyperparameters = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, DECAY, EPSILON, total_variation=rule.total_variation)
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters)
         pending.append(to_host_async(loss.mean() / 3))
         state.step = number
         if error is None or len(pending) > LAG:

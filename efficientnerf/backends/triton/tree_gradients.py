@@ -1,4 +1,4 @@
-"""Loss gradients of a tree's values, and steps along them, on CUDA (Triton); `efficientnerf.backends.numba.tree_training` is the same on the CPU.
+"""Loss gradients of a tree's values on CUDA (Triton); `efficientnerf.backends.numba.tree_training` is the same on the CPU.
 
 A ray is marched twice (`efficientnerf.backends.triton.tree_march`): first for its colour and final transmittance, then, with the gradients of its loss by
 these known, once more from the front; what lies behind a sample is its ray's colour less what was composited so far. Samples are not stored.
@@ -23,7 +23,6 @@ from torch import Tensor
 
 from efficientnerf.asset.cascades import voxel_cascades
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets
-from efficientnerf.backends.numba.tree_training.steps import MAX_THICKNESS, MIN_THICKNESS
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import DeviceCascades, brick_arrays, device_cascades
@@ -37,11 +36,9 @@ if TYPE_CHECKING:
 # anywhere, and a program lasts as long as its longest.
 SHAPES = {4: (32, 1), 16: (16, 1), 32: (8, 1), 64: (8, 2), 128: (8, 4)}
 RAYS_PER_PROGRAM = 256 if INTERPRETED else 32  # where no coefficients are read
-VOXELS_PER_PROGRAM = 256 if INTERPRETED else 32  # of a step
 # A sample's gradients are below 25 (four for each channel's colour, through the colour behind and against the background, and the opacity's), and a voxel
 # is a corner of at most 7 samples of a ray: the sums stay below 2^8 a ray.
 BITS_PER_RAY = 8
-MAX_VISITS = 60000  # beyond it the bias correction is one
 
 
 class Rays(NamedTuple):
@@ -50,14 +47,6 @@ class Rays(NamedTuple):
     origins: Tensor
     directions: Tensor
     views: Tensor
-
-
-class LearningRates(NamedTuple):
-    """Of the logarithm of the optical thickness, of the harmonics, and the share of the latter for those of degree 1 and above."""
-
-    density: float
-    sh: float
-    view_share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,42 +250,6 @@ def _max_contributions(  # type: ignore[no-untyped-def]
     march_cascades(cascades, origin, direction, live, given, Absorption(tl.full((BLOCK,), 1.0, tl.float32)), _raise_maximum, CASCADES, BRICK, NEAREST, 0, 0)
 
 
-@triton.jit(do_not_specialize=["number"])
-def _rmsprop_step(  # type: ignore[no-untyped-def]
-    density, sh, sum_thickness, sum_sh, square_density, square_sh, visits, stamp, cascade_of, place,
-    voxels, number, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, min_thickness, max_thickness, max_visits,
-    CASCADES: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each."""
-    v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    met = tl.load(stamp + v, v < voxels, other=-1) == number
-    if tl.max(met.to(tl.int32), 0) > 0:
-        visited = tl.minimum(tl.load(visits + v, met, other=0) + 1, max_visits)
-        tl.store(visits + v, visited, met)
-        correction = 1 / (1 - tl.exp(visited.to(tl.float32) * log_decay))
-        side = voxel
-        if CASCADES > 1:
-            side = voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
-        # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
-        depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, min_thickness)
-        g = tl.load(sum_thickness + v, met, other=0).to(tl.float32) * unit * depth
-        square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * g * g
-        change = density_rate * g / (tl.sqrt(square * correction) + epsilon)
-        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), min_thickness), max_thickness) / side, met)
-        tl.store(square_density + v, square, met)
-        tl.store(sum_thickness + v, tl.zeros_like(v), met)
-        column = tl.arange(0, ROW)
-        at = v[:, None] * WIDTH + column[None, :]
-        there = met[:, None] & (column < WIDTH)[None, :]
-        by_sh = tl.load(sum_sh + at, there, other=0).to(tl.float32) * unit
-        square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
-        tl.store(square_sh + v, square, met)
-        scale = sh_rate / (tl.sqrt(square * correction) + epsilon)
-        share = tl.where(column < 3, 1.0, view_share)
-        tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * share[None, :] * by_sh, there)
-        tl.store(sum_sh + at, tl.zeros_like(at), there)
-
-
 def fixed_point_scale(rays: int) -> float:
     """2^k, the integer that stands for a gradient of one: the sums over so many rays stay below 2^62."""
     return 2.0 ** (62 - BITS_PER_RAY - math.ceil(math.log2(max(rays, 1))))
@@ -346,17 +299,4 @@ def max_contributions(g: DeviceGrid, rays: Rays, density: Tensor, transmittance:
     _max_contributions[(blocks(count, RAYS_PER_PROGRAM),)](
         rays.origins, rays.directions, g.grid, *g.cascades.arrays, g.index, density, transmittance, maximum, count, *g.cascades.shape, float(g.voxel),
         NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, BLOCK=RAYS_PER_PROGRAM, num_warps=1,
-    )  # fmt: skip
-
-
-def rmsprop_step(
-    g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], squares: tuple[Tensor, Tensor], visits: Tensor, stamp: Tensor, *,
-    number: int, rays: int, rates: LearningRates, decay: float, epsilon: float,
-) -> None:  # fmt: skip
-    """A step for the voxels that the last `backward`, of `rays` rays, met; see `efficientnerf.backends.numba.tree_training.steps.step`."""
-    voxels = len(visits)
-    _rmsprop_step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
-        *values, *sums, *squares, visits, stamp, g.cascade_of, g.cascades.place, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel),
-        *map(float, rates), decay, math.log(decay), epsilon, MIN_THICKNESS, MAX_THICKNESS, MAX_VISITS, CASCADES=g.cascades.grids, WIDTH=3 * g.terms, ROW=g.row,
-        BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

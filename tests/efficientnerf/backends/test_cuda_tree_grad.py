@@ -165,15 +165,17 @@ def test_interrupted_or_not_the_bytes_are_the_same() -> None:
         assert np.array_equal(getattr(whole, name), getattr(apart, name)), name
 
 
-def test_the_room_that_a_fit_takes_is_known_before() -> None:
+@pytest.mark.parametrize("smooth", [False, True])
+def test_the_room_that_a_fit_takes_is_known_before(*, smooth: bool) -> None:
     from stages.baking.memory import needed_on_device
 
     tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
-    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE))
-    tensors = [*arrays.values.values(), arrays.by_thickness, arrays.by_sh, arrays.stamp, arrays.grid.index, arrays.grid.grid]
+    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE), smooth=smooth)
+    tensors = [*arrays.values.values(), *arrays.neighbours, arrays.by_thickness, arrays.by_sh, arrays.stamp, arrays.grid.index, arrays.grid.grid]
     taken = sum(t.numel() * t.element_size() for t in tensors)
     # The grid is there once then; three times while it is sent.
-    assert needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4) == taken + 8 * tree.brick_index.size
+    needed = needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4, smooth=smooth)
+    assert needed == taken + 8 * tree.brick_index.size
     nest = device.DeviceArrays(initial_state(random_cascades(4)), torch.device(DEVICE)).grid
     assert nest.grid.numel() == 3 * 4**3
     assert len(nest.cascade_of) == len(random_cascades(4).density_values)

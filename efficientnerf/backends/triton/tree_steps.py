@@ -1,0 +1,135 @@
+"""Optimiser steps on a tree's values on CUDA (Triton): those of `efficientnerf.backends.numba.tree_training.steps`, whose formulas hold here.
+
+Gradients are sums in fixed point (`efficientnerf.backends.triton.tree_gradients`), which a step sets back to zero. N voxels, K harmonics.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from efficientnerf.backends.numba.tree_training.steps import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS
+from efficientnerf.backends.triton.launch import INTERPRETED, blocks
+from efficientnerf.backends.triton.tree_gradients import DeviceGrid, fixed_point_scale
+
+VOXELS_PER_PROGRAM = 256 if INTERPRETED else 32
+
+
+class Hyperparameters(NamedTuple):
+    """Those of the CPU's step of the same names, and
+
+    sh_rate     learning rate of the harmonics
+    view_share  of that for harmonics of degree 1 and above
+    """
+
+    density_rate: float
+    sh_rate: float
+    view_share: float
+    decay: float
+    epsilon: float
+    momentum: float = 0.0
+    total_variation: float = 0.0
+
+
+class Moments(NamedTuple):
+    """Running means of the gradients, (N,) and (N, 3 K), without rows where there is no momentum; of their squares (N,), (N,); and visits (N,) int32."""
+
+    density: Tensor
+    sh: Tensor
+    square_density: Tensor
+    square_sh: Tensor
+    visits: Tensor
+
+
+class Neighbours(NamedTuple):
+    """For total variation; without rows where there is none.
+
+    density  (N,) before the step
+    beside   (N, 6) int32 voxels beyond the faces of each, -1 where none is stored
+    """
+
+    density: Tensor
+    beside: Tensor
+
+
+@triton.jit
+def _total_variation(v, met, thickness, side, weight, before, beside, min_thickness):  # type: ignore[no-untyped-def]
+    """Gradient of the term by the logarithm of the optical thickness."""
+    here, slope = tl.log(thickness), tl.zeros_like(thickness)
+    for face in tl.static_range(6):
+        other = tl.load(beside + 6 * v + face, met, other=-1)
+        beyond = tl.maximum(tl.load(before + other, other >= 0, other=0.0) * side, min_thickness)
+        slope += tl.where(other >= 0, here - tl.log(beyond), 0.0)
+    return weight * slope
+
+
+@triton.jit(do_not_specialize=["number"])
+def _step(  # type: ignore[no-untyped-def]
+    density, sh, sum_thickness, sum_sh, mean_density, mean_sh, square_density, square_sh, visits, before, beside, stamp, cascade_of, place,
+    voxels, number, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, momentum, log_momentum, total_variation,
+    min_thickness, max_thickness, max_visits,
+    CASCADES: tl.constexpr, MOMENTUM: tl.constexpr, SMOOTH: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each. MOMENTUM: Adam. SMOOTH: with total variation."""
+    v = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    met = tl.load(stamp + v, v < voxels, other=-1) == number
+    if tl.max(met.to(tl.int32), 0) > 0:
+        visited = tl.minimum(tl.load(visits + v, met, other=0) + 1, max_visits)
+        tl.store(visits + v, visited, met)
+        correction = 1 / (1 - tl.exp(visited.to(tl.float32) * log_decay))
+        ahead = 1.0
+        if MOMENTUM:
+            ahead = 1 / (1 - tl.exp(visited.to(tl.float32) * log_momentum))
+        side = voxel
+        if CASCADES > 1:
+            side = voxel * tl.load(place + 4 * tl.load(cascade_of + v, met, other=0).to(tl.int32) + 3)
+        # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
+        depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, min_thickness)
+        g = tl.load(sum_thickness + v, met, other=0).to(tl.float32) * unit * depth
+        if SMOOTH:
+            g += _total_variation(v, met, depth, side, total_variation, before, beside, min_thickness)
+        square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * g * g
+        if MOMENTUM:
+            g = momentum * tl.load(mean_density + v, met, other=0.0) + (1 - momentum) * g
+            tl.store(mean_density + v, g, met)
+        change = density_rate * ahead * g / (tl.sqrt(square * correction) + epsilon)
+        tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), min_thickness), max_thickness) / side, met)
+        tl.store(square_density + v, square, met)
+        tl.store(sum_thickness + v, tl.zeros_like(v), met)
+        column = tl.arange(0, ROW)
+        at = v[:, None] * WIDTH + column[None, :]
+        there = met[:, None] & (column < WIDTH)[None, :]
+        by_sh = tl.load(sum_sh + at, there, other=0).to(tl.float32) * unit
+        square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
+        tl.store(square_sh + v, square, met)
+        if MOMENTUM:
+            by_sh = momentum * tl.load(mean_sh + at, there, other=0.0) + (1 - momentum) * by_sh
+            tl.store(mean_sh + at, by_sh, there)
+        scale = sh_rate * ahead / (tl.sqrt(square * correction) + epsilon)
+        share = tl.where(column < 3, 1.0, view_share)
+        tl.store(sh + at, tl.load(sh + at, there, other=0.0) - scale[:, None] * share[None, :] * by_sh, there)
+        tl.store(sum_sh + at, tl.zeros_like(at), there)
+
+
+def step(
+    g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], moments: Moments, stamp: Tensor, h: Hyperparameters, neighbours: Neighbours, *,
+    number: int, rays: int,
+) -> None:  # fmt: skip
+    """A step for the voxels that the last gradients, of `rays` rays, stamped with `number`; the others stay.
+
+    values  density (N,) and harmonics (N, 3 K)
+    """
+    voxels = len(moments.visits)
+    if h.total_variation > 0:
+        neighbours.density.copy_(values[0])
+    _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
+        *values, *sums, *moments, *neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel),
+        float(h.density_rate), float(h.sh_rate), float(h.view_share), h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0),
+        float(h.total_variation), MIN_THICKNESS, MAX_THICKNESS, MAX_VISITS,
+        CASCADES=g.cascades.grids, MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
+        BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
+    )  # fmt: skip
