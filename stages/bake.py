@@ -220,7 +220,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=8,
+    version=9,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

@@ -160,7 +160,7 @@ def camera_changes(t: Trainer) -> dict[str, float] | None:
 
 STAGE = Stage(
     name="train",
-    version=3,
+    version=4,
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,

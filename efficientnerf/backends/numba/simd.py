@@ -3,6 +3,9 @@
 numba has no vector type and does not vectorise across neighbouring scalars by itself. These types and intrinsics map to LLVM vectors, which LLVM legalises
 to the registers of the processor: a vector wider than a register becomes several.
 
+No kernel lets the compiler reorder sums or fuse products into them (`fastmath`): a process that compiles a kernel and one that loads it from the cache use
+copies that were optimised in different surroundings, and would differ in the last bit. What is to be fused says so, by `fmuladd`.
+
 A name's suffix is the number of lanes.
 """
 
@@ -23,7 +26,6 @@ EXP2_COEFFICIENTS = (-0.69314442, 0.24018671, -0.05531669, 0.00922838, -0.000954
 
 _VECTOR4 = ir.VectorType(ir.FloatType(), 4)
 _VECTOR16 = ir.VectorType(ir.FloatType(), 16)
-_FASTMATH = ("contract", "reassoc", "nsz")
 
 
 class Float32x4(types.Type):
@@ -62,7 +64,7 @@ def _overload_arithmetic(operation: Any, name: str) -> None:
     def elementwise(typing_context: Any, a: Any, b: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             left, right = (arg if isinstance(kind, Float32x4) else splat(builder, arg, 4) for kind, arg in zip(signature.args, args, strict=True))
-            return getattr(builder, name)(left, right, flags=_FASTMATH)
+            return getattr(builder, name)(left, right)
 
         return float32x4(a, b), codegen
 
@@ -110,6 +112,14 @@ def advanced(typing_context: Any, address: Any, count: Any) -> Any:
 
 
 @intrinsic
+def fmuladd(typing_context: Any, a: Any, b: Any, total: Any) -> Any:
+    """a b + total of three float32 or three float64: `multiply_add`."""
+    if a not in (types.float32, types.float64) or not a == b == total:
+        raise TypeError(f"fmuladd of {a}, {b} and {total}: expected numbers of one type")
+    return a(a, b, total), lambda context, builder, signature, args: multiply_add(builder, *args)
+
+
+@intrinsic
 def popcount(typing_context: Any, bits: Any) -> Any:
     """Number of set bits of an int64."""
     return types.int64(types.int64), lambda context, builder, signature, args: builder.ctpop(args[0])
@@ -130,7 +140,7 @@ def scale4(typing_context: Any, factor: Any, value: Any) -> Any:
     """factor * value for a float32 and a Float32x4."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fmul(splat(builder, args[0], 4), args[1], flags=_FASTMATH)
+        return builder.fmul(splat(builder, args[0], 4), args[1])
 
     return float32x4(types.float32, float32x4), codegen
 
@@ -140,8 +150,7 @@ def add_scaled4(typing_context: Any, total: Any, factor: Any, value: Any) -> Any
     """total + factor * value for a float32 factor."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        product = builder.fmul(splat(builder, args[1], 4), args[2], flags=_FASTMATH)
-        return builder.fadd(args[0], product, flags=_FASTMATH)
+        return multiply_add(builder, splat(builder, args[1], 4), args[2], args[0])
 
     return float32x4(float32x4, types.float32, float32x4), codegen
 
@@ -218,10 +227,10 @@ def sigmoid(typing_context: Any, value: Any) -> Any:
             return _constant(args[0].type, x)
 
         # exp(-x) = 2^-y = 2^(127 - n) 2^-f with y + 127 = n + f, 0 <= f < 1. n is positive, so truncation finds it.
-        y = _add(builder, _mul(builder, args[0], constant(math.log2(math.e))), constant(127))
+        y = multiply_add(builder, args[0], constant(math.log2(math.e)), constant(127))
         for bound, order in ((1.0, "<"), (253.0, ">")):
             y = builder.select(builder.fcmp_ordered(order, y, constant(bound)), constant(bound), y)
-        return builder.fdiv(constant(1), _add(builder, _exp2(builder, y, 254), constant(1)))
+        return builder.fdiv(constant(1), builder.fadd(_exp2(builder, y, 254), constant(1)))
 
     return value(value), codegen
 
@@ -256,15 +265,15 @@ def trilinear4(typing_context: Any, address: Any, a: Any, b: Any, c: Any, d: Any
         sums, weights = [], []
         for p in range(2):
             for q in range(2):
-                edge = _mul(builder, sides[0][p], sides[1][q])
+                edge = builder.fmul(sides[0][p], sides[1][q])
                 for r in range(2):
-                    weight = _repeat_lanes(builder, _mul(builder, edge, sides[2][r]))
+                    weight = _repeat_lanes(builder, builder.fmul(edge, sides[2][r]))
                     ahead = ir.Constant(ir.IntType(64), 4 * r)
                     for use, stride in ((p, layer), (q, row)):
                         ahead = builder.add(ahead, stride) if use else ahead
                     value = _concat(builder, [_load(builder, values, builder.add(start, ahead)) for start in starts])
                     valid = builder.fcmp_ordered("ord", value, value)
-                    sums.append(_mul(builder, weight, builder.select(valid, value, _constant(_VECTOR16, 0))))
+                    sums.append(builder.fmul(weight, builder.select(valid, value, _constant(_VECTOR16, 0))))
                     weights.append(builder.select(valid, weight, _constant(_VECTOR16, 0)))
         total, total_weight = _tree_sum(builder, sums), _tree_sum(builder, weights)
         some = builder.fcmp_ordered(">", total_weight, _constant(_VECTOR16, 0))
@@ -288,7 +297,7 @@ def add_scaled_gathered16(typing_context: Any, total: Any, factor: Any, address:
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         value = _concat(builder, [_load(builder, args[2], start) for start in args[3:]])
-        return _add(builder, args[0], _mul(builder, _repeat_lanes(builder, args[1]), value))
+        return multiply_add(builder, _repeat_lanes(builder, args[1]), value, args[0])
 
     index = types.int64
     return float32x16(float32x16, float32x4, types.CPointer(types.float32), index, index, index, index), codegen
@@ -311,18 +320,18 @@ def splat(builder: Any, value: Any, lanes: int) -> Any:
     return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(ir.IntType(32), lanes), None))
 
 
-def _mul(builder: Any, x: Any, y: Any) -> Any:
-    return builder.fmul(x, y, flags=_FASTMATH)
-
-
-def _add(builder: Any, x: Any, y: Any) -> Any:
-    return builder.fadd(x, y, flags=_FASTMATH)
+def multiply_add(builder: Any, a: Any, b: Any, total: Any) -> Any:
+    """a b + total of floats, or of vectors of them: rounded once where the processor has an instruction for it, else twice, wherever the code is used."""
+    kind, vector = a.type, isinstance(a.type, ir.VectorType)
+    name = f"v{kind.count}" if vector else ""
+    name += "f32" if (kind.element if vector else kind) == ir.FloatType() else "f64"
+    return builder.call(builder.module.declare_intrinsic(f"llvm.fmuladd.{name}", (), ir.FunctionType(kind, [kind] * 3)), [a, b, total])
 
 
 def _tree_sum(builder: Any, values: list[Any]) -> Any:
     """Sum of a power of two of vectors, pairwise: short dependency chains."""
     while len(values) > 1:
-        values = [builder.fadd(left, right, flags=("contract", "nsz")) for left, right in zip(values[::2], values[1::2], strict=True)]
+        values = [builder.fadd(left, right) for left, right in zip(values[::2], values[1::2], strict=True)]
     return values[0]
 
 
@@ -338,9 +347,9 @@ def _exp2(builder: Any, y: Any, bias: int) -> Any:
     f = builder.fsub(y, builder.sitofp(n, y.type))
     power = _constant(y.type, EXP2_COEFFICIENTS[-1])
     for coefficient in (*EXP2_COEFFICIENTS[-2::-1], 1.0):
-        power = _add(builder, _mul(builder, power, f), _constant(y.type, coefficient))
+        power = multiply_add(builder, power, f, _constant(y.type, coefficient))
     exponent = builder.shl(builder.sub(_constant(whole, bias), n), _constant(whole, 23))
-    return _mul(builder, power, builder.bitcast(exponent, y.type))
+    return builder.fmul(power, builder.bitcast(exponent, y.type))
 
 
 def _shuffle(builder: Any, left: Any, right: Any, lanes: Iterable[int]) -> Any:

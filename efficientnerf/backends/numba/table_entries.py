@@ -11,13 +11,12 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from efficientnerf.backends.numba.simd import splat
+from efficientnerf.backends.numba.simd import multiply_add, splat
 
 CORNERS = 8
 ENTRIES_PER_LINE = 8  # of a cache line of 64 bytes
 
 _ENTRY = ir.VectorType(ir.FloatType(), 2)
-_FASTMATH = ("contract", "reassoc", "nsz")
 
 
 def _corners(builder: Any, table: Any, index: Any, weight: Any, n: Any, row: Any) -> Any:
@@ -36,9 +35,8 @@ def gather_corners(typing_context: Any, table: Any, index: Any, weight: Any, n: 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         sums = [ir.Constant(_ENTRY, [0.0, 0.0])] * 2  # two accumulators shorten the dependency chain
         for corner, (entry, factor) in enumerate(_corners(builder, *args)):
-            product = builder.fmul(factor, builder.load(entry, align=4), flags=_FASTMATH)
-            sums[corner % 2] = builder.fadd(sums[corner % 2], product, flags=_FASTMATH)
-        total = builder.fadd(*sums, flags=_FASTMATH)
+            sums[corner % 2] = multiply_add(builder, factor, builder.load(entry, align=4), sums[corner % 2])
+        total = builder.fadd(*sums)
         features = [builder.extract_element(total, ir.Constant(ir.IntType(32), k)) for k in range(2)]
         return context.make_tuple(builder, signature.return_type, features)
 
@@ -54,8 +52,7 @@ def scatter_add_corners(typing_context: Any, table: Any, index: Any, weight: Any
         *corners, first, second = args
         grad = builder.insert_element(splat(builder, first, 2), second, ir.Constant(ir.IntType(32), 1))
         for entry, factor in _corners(builder, *corners):
-            product = builder.fmul(factor, grad, flags=_FASTMATH)
-            builder.store(builder.fadd(builder.load(entry, align=4), product, flags=_FASTMATH), entry, align=4)
+            builder.store(multiply_add(builder, factor, grad, builder.load(entry, align=4)), entry, align=4)
         return context.get_dummy_value()
 
     address = types.CPointer(types.float32)

@@ -23,7 +23,7 @@ from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic, overload
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import splat
+from efficientnerf.backends.numba.simd import multiply_add, splat
 
 LANES = 16
 # Features of the processor that numba compiles for.
@@ -50,7 +50,6 @@ _FLOAT32 = ir.VectorType(ir.FloatType(), LANES)
 _INT32 = ir.VectorType(ir.IntType(32), LANES)
 _INT16 = ir.VectorType(ir.IntType(16), LANES)
 _BFLOAT16 = ir.VectorType(_BFloat(), 2 * LANES)
-_CONTRACT = ("contract",)
 
 float_pointer, pair_pointer, bfloat16_pointer = (types.CPointer(kind) for kind in (types.float32, types.int32, types.int16))
 
@@ -78,7 +77,7 @@ def _unpack_pairs(builder: Any, pairs: Any) -> tuple[Any, Any]:
 def _multiply_add(builder: Any, total: Any, a: Any, b: Any) -> Any:
     """total + a b of float32, or total + a_0 b_0 + a_1 b_1 of pairs."""
     if a.type == _FLOAT32:
-        return builder.fadd(builder.fmul(a, b, flags=_CONTRACT), total, flags=_CONTRACT)
+        return multiply_add(builder, a, b, total)
     if DOTS:
         dots = ir.FunctionType(_FLOAT32, [_FLOAT32, _BFLOAT16, _BFLOAT16])
         dot = builder.module.declare_intrinsic("llvm.x86.avx512bf16.dpbf16ps.512", (), dots)

@@ -10,8 +10,7 @@ import math
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import EXP2_COEFFICIENTS
-from efficientnerf.backends.numba.tree.view_colours import FASTMATH
+from efficientnerf.backends.numba.simd import EXP2_COEFFICIENTS, fmuladd
 
 STEP = 0.5  # voxels
 EARLY_STOP = 1e-3  # transmittance at which a ray may end
@@ -25,11 +24,11 @@ PARALLEL = np.float32(1e-30)  # component of a unit direction below which a ray 
 _EXP2 = tuple(np.float32(c) for c in EXP2_COEFFICIENTS)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def exp2_neg(x):  # type: ignore[no-untyped-def]
     """2^-x of a float32 x >= 0."""
     y = min(x, np.float32(126))
     whole = np.int32(y)
     f = y - np.float32(whole)
-    p = _ONE + f * (_EXP2[0] + f * (_EXP2[1] + f * (_EXP2[2] + f * (_EXP2[3] + f * _EXP2[4]))))
+    p = fmuladd(f, fmuladd(f, fmuladd(f, fmuladd(f, fmuladd(f, _EXP2[4], _EXP2[3]), _EXP2[2]), _EXP2[1]), _EXP2[0]), _ONE)
     return p * np.int32((np.int32(127) - whole) << np.int32(23)).view(np.float32)

@@ -33,9 +33,6 @@ from efficientnerf.rendering import harmonics
 
 BRICKS_PER_TASK = 256
 
-# Sums may be reordered and products fused; infinities and NaN keep their meaning.
-FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
-
 _ONE = np.float32(1)
 _C0 = np.float32(harmonics.C0)
 _C1 = np.float32(harmonics.C1)
@@ -126,7 +123,7 @@ def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def sh_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
     """`efficientnerf.rendering.harmonics.basis` of one direction into (K,), or of four, given as Float32x4, into (K, 4)."""
     two, three, four, seven = np.float32(2), np.float32(3), np.float32(4), np.float32(7)
@@ -162,7 +159,7 @@ def sh_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
         store(out, 24, (xx * (xx - yy * three) - yy * (xx * three - yy)) * _C4[8])
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
     """Red, green and blue of stored voxel n before the sigmoid; the harmonics of the direction are basis[lane :: lanes]."""
     y = basis[lane]
@@ -187,7 +184,7 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
     return r, g, b
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _palette_colours(a, b, c, d, grid, basis):  # type: ignore[no-untyped-def]
     """(0, red, green, blue) of the harmonics above degree 0 of four stored voxels, as four Float32x4; `basis` (K, 4) is of their directions."""
     codes, total = grid.codes, zeros16()
@@ -200,7 +197,7 @@ def _palette_colours(a, b, c, d, grid, basis):  # type: ignore[no-untyped-def]
     return split16(total)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _palette_base(n, place, grid, scale, y):  # type: ignore[no-untyped-def]
     """Density, and red, green and blue of degree 0, of stored voxel n, whose place in the packed order is given; y is the first harmonic."""
     table, base = grid.base_table, 3 * n
@@ -208,7 +205,7 @@ def _palette_base(n, place, grid, scale, y):  # type: ignore[no-untyped-def]
     return pack4(grid.density[place] * scale, y * r, y * g, y * b)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _float_colours(n, place, grid, scale, basis, lane):  # type: ignore[no-untyped-def]
     """The same, of all degrees, of a voxel whose harmonics are floats."""
     r, g, b = sh_colour(n, grid, basis, lane, 4)
@@ -244,7 +241,7 @@ def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
     return count
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type: ignore[no-untyped-def]
     """Densities and colours of a brick's voxels, four at a time, into their rows of out (N, 4).
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.simd import fmuladd, pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
@@ -103,7 +103,7 @@ def packets_of(rays: int, side: int = 1) -> np.ndarray:
     return np.append(np.arange(0, rays, side), rays).astype(np.int64)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@numba.njit(cache=True, error_model="numpy")
 def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-def]
     """Sums of the harmonics of the slots at which samples lie, along the packet's mean direction; returns how many of these hold a voxel, see `stored`."""
     found, width = 0, 3 * terms
@@ -126,9 +126,9 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
         at, row = 4 * np.int64(packet.stored[2 * n]), width * np.int64(packet.stored[2 * n + 1])
         red, green, blue = basis[0] * sh[row], basis[0] * sh[row + 1], basis[0] * sh[row + 2]
         for k in range(1, terms):
-            red += basis[k] * sh[row + 3 * k]
-            green += basis[k] * sh[row + 3 * k + 1]
-            blue += basis[k] * sh[row + 3 * k + 2]
+            red = fmuladd(basis[k], sh[row + 3 * k], red)
+            green = fmuladd(basis[k], sh[row + 3 * k + 1], green)
+            blue = fmuladd(basis[k], sh[row + 3 * k + 2], blue)
         packet.colour[at], packet.colour[at + 1], packet.colour[at + 2], packet.colour[at + 3] = red, green, blue, 1
     return found
 

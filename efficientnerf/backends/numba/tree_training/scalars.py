@@ -9,7 +9,7 @@ from numba import types
 from numba.extending import overload
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import EXP2_COEFFICIENTS
+from efficientnerf.backends.numba.simd import EXP2_COEFFICIENTS, fmuladd
 
 _ONE, _LOG2E = np.float32(1), np.float32(math.log2(math.e))
 _C = tuple(np.float32(c) for c in EXP2_COEFFICIENTS)
@@ -27,13 +27,13 @@ def _cast_like(value, like):  # type: ignore[no-untyped-def]
     return (lambda value, like: np.float32(value)) if like == types.float32 else (lambda value, like: np.float64(value))
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _exp_neg(x):  # type: ignore[no-untyped-def]
     """exp(-x) of a float32 x >= 0, to 1e-7."""
     y = min(x * _LOG2E, _MOST)
     whole = np.int32(y)
     f = y - np.float32(whole)
-    p = _ONE + f * (_C[0] + f * (_C[1] + f * (_C[2] + f * (_C[3] + f * _C[4]))))
+    p = fmuladd(f, fmuladd(f, fmuladd(f, fmuladd(f, fmuladd(f, _C[4], _C[3]), _C[2]), _C[1]), _C[0]), _ONE)
     return p * np.int32((np.int32(127) - whole) << np.int32(23)).view(np.float32)
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.simd import fmuladd, pointer
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
 from efficientnerf.backends.numba.tree_training.packets import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
@@ -163,7 +163,7 @@ def _link(low, chunks, slab, records, head, following):  # type: ignore[no-untyp
     return 0
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@numba.njit(cache=True, error_model="numpy")
 def _gather(number, terms, records, following, gradient):  # type: ignore[no-untyped-def]
     """Sum of the records of a list into `gradient` (3 terms,); returns that by density."""
     by_density = 0.0
@@ -174,9 +174,9 @@ def _gather(number, terms, records, following, gradient):  # type: ignore[no-unt
         by_density += records.gradient[at, 3]
         basis = records.basis[records.numbers[at, 1]]
         for k in range(terms):
-            gradient[3 * k] += basis[k] * red
-            gradient[3 * k + 1] += basis[k] * green
-            gradient[3 * k + 2] += basis[k] * blue
+            gradient[3 * k] = fmuladd(basis[k], red, gradient[3 * k])
+            gradient[3 * k + 1] = fmuladd(basis[k], green, gradient[3 * k + 1])
+            gradient[3 * k + 2] = fmuladd(basis[k], blue, gradient[3 * k + 2])
         number = following[number, 1]
     return by_density
 
@@ -198,7 +198,7 @@ def _regularised(place, slope, thickness, voxel, neighbours, h):  # type: ignore
     return slope
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@numba.njit(cache=True, error_model="numpy")
 def _update(v, by_density, gradient, terms, values, moments, neighbours, h, of_square, of_mean):  # type: ignore[no-untyped-def]
     """A step of one voxel; of_square, of_mean: `corrections` of the moments."""
     decay, epsilon, momentum = h.decay, h.epsilon, h.momentum
@@ -218,20 +218,23 @@ def _update(v, by_density, gradient, terms, values, moments, neighbours, h, of_s
     change = h.density_rate * ahead * slope / (np.sqrt(square * correction) + epsilon)
     new_density = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel
     values.density[v] = values.dense[values.places[v]] = new_density
-    row, rates, mean = values.sh[v], h.sh_rates, gradient.dtype.type(0)
-    for j in range(3 * terms):
-        mean += gradient[j] * gradient[j]
-    square = decay * moments.square_sh[v] + (1 - decay) * mean / (3 * terms)
+    row, rates = values.sh[v], h.sh_rates
+    red = green = blue = gradient.dtype.type(0)  # three sums, as one would wait for itself
+    for k in range(terms):
+        red = fmuladd(gradient[3 * k], gradient[3 * k], red)
+        green = fmuladd(gradient[3 * k + 1], gradient[3 * k + 1], green)
+        blue = fmuladd(gradient[3 * k + 2], gradient[3 * k + 2], blue)
+    square = decay * moments.square_sh[v] + (1 - decay) * (red + green + blue) / (3 * terms)
     moments.square_sh[v] = square
     scale = gradient.dtype.type(ahead / (np.sqrt(square * correction) + epsilon))
     if momentum > 0:
         running, old, new = moments.sh[v], gradient.dtype.type(momentum), gradient.dtype.type(1 - momentum)
         for j in range(3 * terms):
             running[j] = old * running[j] + new * gradient[j]
-            row[j] -= scale * rates[j] * running[j]
+            row[j] = fmuladd(-scale * rates[j], running[j], row[j])
     else:
         for j in range(3 * terms):
-            row[j] -= scale * rates[j] * gradient[j]
+            row[j] = fmuladd(-scale * rates[j], gradient[j], row[j])
 
 
 @numba.njit(cache=True, error_model="numpy")

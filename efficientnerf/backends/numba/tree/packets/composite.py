@@ -56,7 +56,7 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     Z,
 )
 from efficientnerf.backends.numba.tree.packets.rows import pair_of
-from efficientnerf.backends.numba.tree.view_colours import FASTMATH, sh_basis, sh_colour
+from efficientnerf.backends.numba.tree.view_colours import sh_basis, sh_colour
 
 _HALF, _ONE, _NONE = np.float32(0.5), np.float32(1), np.float32(0)
 _LEAST = np.float32(1e-30)  # weight of stored voxels below which a sample has no colour
@@ -75,7 +75,7 @@ def _find_voxels(lane, grid, ints):  # type: ignore[no-untyped-def]
         ints[PAIR + 16 * n + lane] = pair
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _weigh(n, edge, fz, gz, floats, ints):  # type: ignore[no-untyped-def]
     """Weights of the voxels of row n, into `floats`; returns their sum."""
     pair = load16(ints, PAIR + 16 * n)
@@ -85,12 +85,12 @@ def _weigh(n, edge, fz, gz, floats, ints):  # type: ignore[no-untyped-def]
     return first + second
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _add_voxel(total, n, lane, colours, floats, ints):  # type: ignore[no-untyped-def]
     return add_scaled4(total, floats[WEIGHT + 16 * n + lane], load4(colours, 4 * np.int64(ints[VOXEL + 16 * n + lane])))
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _mix_view_colours(lane, colours, floats, ints):  # type: ignore[no-untyped-def]
     """Weighted density, red, green and blue of a ray's sample."""
     even = _add_voxel(_add_voxel(pack4(_NONE, _NONE, _NONE, _NONE), 0, lane, colours, floats, ints), 2, lane, colours, floats, ints)
@@ -100,7 +100,7 @@ def _mix_view_colours(lane, colours, floats, ints):  # type: ignore[no-untyped-d
     store4(floats, SAMPLE + 4 * lane, even + odd)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def _evaluate_basis(view, floats, ints):  # type: ignore[no-untyped-def]
     """Harmonics of the rays' directions, once."""
     if ints[HAS_BASIS] == 0:
@@ -108,7 +108,7 @@ def _evaluate_basis(view, floats, ints):  # type: ignore[no-untyped-def]
         ints[HAS_BASIS] = 1
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def _colours_along(voxel, entry, grid, view, floats):  # type: ignore[no-untyped-def]
     """Density, red, green and blue of a voxel along each of the rays, into an entry of the cache."""
     n, y = np.int64(grid.voxel_of[voxel]), load16(floats, BASIS)
@@ -129,7 +129,7 @@ def _colours_along(voxel, entry, grid, view, floats):  # type: ignore[no-untyped
     store_channels16(floats, COLOURS + 64 * entry, density, red, green, blue)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def _mix_cached(lane, grid, view, floats, ints):  # type: ignore[no-untyped-def]
     """`_mix_view_colours` by the harmonics of voxels along the rays: those that rays which are neighbours share are summed once for all of them."""
     total = pack4(_NONE, _NONE, _NONE, _NONE)
@@ -144,7 +144,7 @@ def _mix_cached(lane, grid, view, floats, ints):  # type: ignore[no-untyped-def]
     store4(floats, SAMPLE + 4 * lane, total)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def _mix_harmonics(lane, grid, view, floats, ints):  # type: ignore[no-untyped-def]
     """The same for rays that share nothing, and the weight of the colour; none is looked up until that is MIN_COLOUR_WEIGHT."""
     sigma = red = green = blue = _NONE
@@ -165,14 +165,14 @@ def _mix_harmonics(lane, grid, view, floats, ints):  # type: ignore[no-untyped-d
     store4(floats, SAMPLE + 4 * lane, pack4(sigma, red, green, blue))
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def _half_distance(lane, floats):  # type: ignore[no-untyped-def]
     """Distance at which the transmittance falls to one half, within a ray's sample."""
     within = np.log2(2 * floats[TRANSMITTANCE + lane]) / floats[SAMPLE + 4 * lane] - _HALF
     floats[HALF_DISTANCE + lane] = floats[DISTANCE + lane] + within * np.float32(STEP)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def composite(ready, near, shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped-def]
     """Composites the samples of some rays, given as bits, those of `near` by harmonics; returns which rays end, their transmittance being spent.
 

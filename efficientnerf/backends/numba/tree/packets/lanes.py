@@ -17,7 +17,6 @@ from efficientnerf.backends.numba.simd import Float32x16, broadcast_like, float3
 LANES = 16
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 _FLOATS, _INTS, _BITS = (ir.VectorType(kind, LANES) for kind in (ir.FloatType(), _I32, ir.IntType(1)))
-_FLAGS = ("contract", "nsz")
 
 
 class Int32x16(types.Type):
@@ -83,7 +82,7 @@ def _overload_operator(operation: Any, vector: Any, result: Any, emit: Any) -> N
 
 _ORDERS = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">=", operator.eq: "==", operator.ne: "!="}
 for _operation, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
-    _overload_operator(_operation, float32x16, float32x16, lambda builder, a, b, name=_name: getattr(builder, name)(a, b, flags=_FLAGS))
+    _overload_operator(_operation, float32x16, float32x16, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
 for _operation, _name in (
     (operator.add, "add"), (operator.sub, "sub"), (operator.mul, "mul"), (operator.and_, "and_"), (operator.or_, "or_"), (operator.rshift, "lshr"),
     (operator.lshift, "shl"),

@@ -47,14 +47,13 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     Y,
     Z,
 )
-from efficientnerf.backends.numba.tree.view_colours import FASTMATH
 
 _HALF, _ONE, _NONE, _FAR = np.float32(0.5), np.float32(1), np.float32(0), np.float32(1e30)
 _STEP, _PER_STEP = np.float32(STEP), np.float32(1 / STEP)
 _SKIP = np.float32(0.5 + SKIP_MARGIN)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _axis(d):  # type: ignore[no-untyped-def]
     """How rays cross the faces across an axis: slope, never, ahead and beside. A ray crosses the plane at x at (x - ex) * slope + never, and the face of cell
     a, `far` cells ahead, is at (a + beside + far * ahead) * width.
@@ -68,7 +67,7 @@ def _axis(d):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _near(a, e, c, grid, view):  # type: ignore[no-untyped-def]
     """Which cells are too near for colours of the view, see `View`."""
     d, brick = view.direction, np.float32(grid.brick)
@@ -80,7 +79,7 @@ def _near(a, e, c, grid, view):  # type: ignore[no-untyped-def]
     return u * u + v * v + w * w < least * least
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@numba.njit(cache=True, error_model="numpy")
 def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped-def]
     """Adds the samples FIRST <= k < LAST of sixteen rays' parts in a cascade to their states, see `layout`; both below 2^24. The half distance is one from the
     entry, voxels.

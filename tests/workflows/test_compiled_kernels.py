@@ -1,0 +1,35 @@
+"""A run that compiles its kernels and one that finds them compiled make the same artifacts."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.torture import sources
+from benchmarks.torture.comparison import digests
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_compiled_or_loaded_the_artifacts_are_the_same(tmp_path: Path) -> None:
+    """numba keeps copies of what a kernel calls; the process that compiles uses other ones than those which load."""
+    source = sources.make("llff", tmp_path / "source")
+    cache = tmp_path / "cache"
+    environment = {**os.environ, "ENERF_CACHE_DIR": str(cache), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    made, kernels = [], []
+    for name in ("compiles", "loads"):
+        command = [sys.executable, "-m", "workflows.cli.main", *source.arguments(tmp_path / name)]
+        subprocess.run(command, cwd=ROOT, env=environment, check=True, capture_output=True)
+        made.append(digests(tmp_path / name))
+        kernels.append(set(cache.rglob("*.nbc")))
+    assert None not in made[0].values()
+    assert made[0] == made[1]
+    assert kernels[0] == kernels[1]
+    assert len(kernels[0]) > 20
