@@ -141,9 +141,8 @@ def run(job: Job) -> None:
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
-    mib, views = budget_of(s, given(settings.max_mib), whole=whole, packed=settings.layout == "packed"), scene.views_of(s, "train")
-    discretised = m.settings.discretise != "off" or settings.lookup == "nearest"
-    phases = schedule.phases_of(whole=whole, ndc=s.forward is not None, discretised=discretised)
+    mib, views = budget_of(s, given(settings.max_mib), packed=settings.layout == "packed"), scene.views_of(s, "train")
+    phases = schedule.PHASES
     splits = schedule.count_splits(phases)
     pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole))
     plan = _plan(job, m, s, pixels, mib, splits, whole=whole)

@@ -23,7 +23,7 @@ MIN_RESOLUTION = 32  # voxels along the longest side
 # normalised device coordinates (images hold noise that finer voxels would learn); voxels along the longest side, at most; MiB of an asset, at most
 VOXEL_PIXELS, SCENE_VOXEL_PIXELS, NDC_VOXEL_PIXELS = 0.5, 1.0, 4 / 3
 MAX_RESOLUTION = 1024
-MAX_MIB, SCENE_MAX_MIB = 38, 38
+MAX_MIB = 38
 # Of whole scenes: cascades at most; the share of what the field shows that may lie beyond the last one, in the environment map; coarse cells of all of them.
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
@@ -84,14 +84,14 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
 
 
-def budget_of(s: Scene, given: int | None, *, whole: bool = False, packed: bool = False) -> int:
-    """MiB that an asset may have: those given, or else MAX_MIB, or SCENE_MAX_MIB of a whole scene. In normalised device coordinates, where nothing is empty
+def budget_of(s: Scene, given: int | None, *, packed: bool = False) -> int:
+    """MiB that an asset may have: those given, or else MAX_MIB. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
     large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
     if given is None and packed:
-        return math.ceil(budget_of(s, None, whole=whole) / 3)
+        return math.ceil(budget_of(s, None) / 3)
     if given is not None or s.forward is None:
-        return (SCENE_MAX_MIB if whole else MAX_MIB) if given is None else given
+        return MAX_MIB if given is None else given
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
     return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
 

@@ -25,7 +25,7 @@ from stages import bake
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 from stages.bake import BakeSettings
 from stages.baking import holes, pruning, resolution, whole_scene
-from stages.baking.resolution import MAX_CELLS, SCENE_MAX_MIB, budget_of, finest_of_cascades
+from stages.baking.resolution import MAX_CELLS, MAX_MIB, budget_of, finest_of_cascades
 from stages.framing.view_coverage import close_to_path
 from stages.io import field_file
 from stages.io.png import write_png
@@ -189,7 +189,7 @@ def test_holes_are_found_and_their_voxels_restored(inputs: dict[str, Path], tmp_
 
 def test_all_cascades_of_a_scene_are_split(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: tuple[Path, int]) -> None:
     phases = (Phase("coarse", 0.5, "split"), Phase("fine", 0.25, "prune"), Phase("last", 0.25))
-    monkeypatch.setattr(schedule, "phases_of", lambda **about: phases)
+    monkeypatch.setattr(schedule, "PHASES", phases)
     tree, report = baked(tmp_path, inputs)
     whole = format.load(undisturbed[0] / "out" / BakeOutputs.asset)
     assert tree.voxel == pytest.approx(whole.voxel)
@@ -250,8 +250,8 @@ def test_a_scene_is_as_fine_as_pixels_cells_and_settings_allow(inputs: dict[str,
     assert 4 * 0.5 * (held.resolution / 4) ** 3 <= MAX_CELLS
     assert held.resolution > 384
     assert finest_of_cascades(sharp, box, 4, 4, 99).resolution == 99
-    assert budget_of(s, None, whole=True) == SCENE_MAX_MIB
-    assert budget_of(s, 7, whole=True) == 7
+    assert budget_of(s, None) == MAX_MIB
+    assert budget_of(s, 7) == 7
 
 
 def test_a_scene_that_does_not_fit_into_memory_is_refused_before_voxels_are_baked(inputs: dict[str, Path], tmp_path: Path) -> None:

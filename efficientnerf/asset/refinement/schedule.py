@@ -31,16 +31,6 @@ class Phase:
 PHASES = (Phase("all voxels", 0.3, "prune"), Phase("voxels that show", 0.7))
 
 
-def phases_of(*, whole: bool, ndc: bool, discretised: bool) -> tuple[Phase, ...]:
-    """The phases of a refinement.
-
-    whole        of a scene without a constant background
-    ndc          in normalised device coordinates
-    discretised  of a field that was trained on the asset's own voxels, which are not split
-    """
-    return PHASES
-
-
 def count_splits(phases: Sequence[Phase]) -> int:
     """How often the resolution is doubled in these phases."""
     return sum(phase.after == "split" for phase in phases)

@@ -48,7 +48,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(autouse=True)
 def split_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(schedule, "phases_of", lambda **about: PHASES)
+    monkeypatch.setattr(schedule, "PHASES", PHASES)
     monkeypatch.setattr(plots, "curve", lambda path, *_, **__: path.write_bytes(b""))
 
 
@@ -118,7 +118,7 @@ def test_what_a_split_takes_counts_as_memory(inputs: dict[str, Path], tmp_path: 
     needs = {}
     for count in (0, 1):
         made = job(tmp_path / str(count), replace(QUICK, resolution=12 * 2**count, refine_steps=0), **inputs)
-        monkeypatch.setattr(schedule, "phases_of", lambda count=count, **about: PHASES[1 - count :] if count else PHASES[1:])
+        monkeypatch.setattr(schedule, "PHASES", PHASES[1 - count :] if count else PHASES[1:])
         bake.run(made)
         needs[count] = made.facts["memory"]["terms"]
     assert needs[1]["the grid"] > 3 * needs[0]["the grid"]  # the voxels baked are the same
