@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from efficientnerf.asset.cascades import voxel_sides
+from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
+from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.rendering import render_reference
 from efficientnerf.asset.tree import NerfTree
+from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
-from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, Records, packets_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.steps import sum_gradients
+from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, sum_gradients, values_of
 from tests.efficientnerf.balls import BOUNDS
-from tests.efficientnerf.trees import uniform_tree
+from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
 
 def seen_at_random(count: int, matte: float, dtype: Any = np.float64) -> RayTargets:
@@ -68,20 +71,44 @@ def ball_tree(side: int = 20) -> NerfTree:
     return replace(tree, bounds_min=BOUNDS[0], harmonics=sh, background=(1.0, 1.0, 1.0))
 
 
-def device_gradients(tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str) -> tuple[np.ndarray, ...]:
+def device_gradients(
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, targets: RayTargets, device: str, *, min_weight: float = 0.0, terms: int = 25
+) -> tuple[np.ndarray, ...]:
     """`gradients` by Triton's kernels, and the voxels that rays meet are stamped."""
     from efficientnerf.asset.refinement.device import rays_in_voxels, values_of
     from efficientnerf.backends.triton import tree_gradients
 
     rays = rays_in_voxels(tree, *(torch.from_numpy(a).to(device) for a in (origins, directions)))
     grid, density, sh = values_of(tree, torch.device(device))
-    outputs = tree_gradients.forward(grid, rays, density, sh)
+    outputs = tree_gradients.forward(grid, rays, density, sh, min_weight=min_weight)
     sent = RayTargets(*(torch.from_numpy(np.asarray(part, np.float32)).to(device) for part in targets[:4]), targets.opacity_weight)
     loss, *by = tree_gradients.loss_and_gradients(*outputs, sent)
     sums = torch.zeros(density.shape, dtype=torch.int64, device=device), torch.zeros(sh.shape, dtype=torch.int64, device=device)
     stamp = torch.zeros(len(density), dtype=torch.int32, device=device)
-    tree_gradients.backward(grid, rays, density, sh, outputs, (by[0], by[1]), sums, stamp, 3)
+    tree_gradients.backward(grid, rays, density, sh, outputs, (by[0], by[1]), sums, stamp, 3, min_weight=min_weight, terms=terms)
     by_thickness, by_sh = (part.cpu().double().numpy() / tree_gradients.fixed_point_scale(len(origins)) for part in sums)
     assert set(stamp.tolist()) <= {0, 3}
     assert not (by_sh.any(axis=1) & (stamp.cpu().numpy() != 3)).any()
     return loss.cpu().numpy(), by_thickness * voxel_sides(tree), by_sh.reshape(tree.sh.shape)
+
+
+def records_of(tree: NerfTree, state: RefinementState, seed: int, packet: int = 4) -> Records:
+    origins, directions = rays_at(tree, 100, seed=seed)
+    seen = seen_at_random(100, 0.2, np.float32)
+    start, along, bases = in_voxels(tree, origins, directions)
+    first = packets_of(100, packet)
+    cells, basis = cells_of(tree_grid(tree)), packet_bases(bases, first)
+    values = values_of(cells, state.density, state.sh)
+    return kernels.forward_backward(cells, first, start, along, basis, values.dense, values.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
+
+
+def empty_moments(state: RefinementState, *, adam: bool) -> Moments:
+    count, width = state.sh.shape if adam else (0, state.sh.shape[1])
+    return Moments(np.zeros(count, np.float32), np.zeros((count, width), np.float32), state.square_density, state.square_sh, state.visits)
+
+
+def rule_of(tree: NerfTree, state: RefinementState, **more: Any) -> Hyperparameters:
+    return Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, np.full(state.sh.shape[1], 0.01, np.float32), 0.9, 1e-12, **more)
+
+
+GRIDS: list[Callable[[], NerfTree]] = [lambda: random_tree(4, brick=2, degree=1), lambda: random_cascades(4, brick=2)]

@@ -53,12 +53,12 @@ class DeviceArrays:
         """The arrays on the host."""
         return {name: values.cpu().numpy() for name, values in self.values.items()}
 
-    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters) -> Tensor:
+    def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters, min_weight: float = 0.0) -> Tensor:
         """Losses (R,) of the rays before the step."""
         values, sums = (self.values["density"], self.values["sh"]), (self.by_thickness, self.by_sh)
-        outputs = tree_gradients.forward(self.grid, rays, *values)
+        outputs = tree_gradients.forward(self.grid, rays, *values, min_weight=min_weight)
         loss, *by = tree_gradients.loss_and_gradients(*outputs, wanted)
-        tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number)
+        tree_gradients.backward(self.grid, rays, *values, outputs, (by[0], by[1]), sums, self.stamp, number, min_weight=min_weight, terms=hyperparameters.terms)
         step(self.grid, values, sums, self.moments, self.stamp, hyperparameters, self.neighbours, number=number, rays=len(loss))
         return loss
 
@@ -100,8 +100,11 @@ def optimise(
         number = state.step + 1
         origins, directions, wanted = targets.of(patches.draw(rays, step_rng(seed, number), chances).pixels)
         factor = fall(number)
-        hyperparameters = Hyperparameters(density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, DECAY, EPSILON, total_variation=rule.total_variation)
-        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters)
+        hyperparameters = Hyperparameters(
+            density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, DECAY, EPSILON, total_variation=rule.total_variation, sparsity=rule.sparsity,
+            entropy=rule.entropy, terms=rule.terms(number, state.tree.harmonics_count),
+        )  # fmt: skip
+        loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters, rule.min_weight)
         pending.append(to_host_async(loss.mean() / 3))
         state.step = number
         if error is None or len(pending) > LAG:

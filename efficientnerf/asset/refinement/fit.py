@@ -38,12 +38,11 @@ def optimise(
     fall                     factor of the learning rates by a step's number (`efficientnerf.asset.refinement.schedule`)
     view_dependent_lr_ratio  factor of that for harmonics of degree 1 and above
     patch_side               pixels along a side of the patches that rays are drawn in
-    rule                     what is minimised besides; ValueError on a device that has no kernels for it
+    rule                     what is minimised besides
     """
     if targets.on_device:
         from efficientnerf.asset.refinement import device
 
-        rule.refuse_on_device()
         yield from device.optimise(
             state, targets, until=until, rays=rays, density_lr=density_lr, sh_lr=sh_lr, fall=fall, seed=seed, view_dependent_lr_ratio=view_dependent_lr_ratio,
             patch_side=patch_side, rule=rule,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-
-ON_DEVICE = ("total_variation",)
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -24,12 +22,6 @@ class Rule:
     entropy: float = 0.0
     min_weight: float = 0.0
     degree: Callable[[int], int] | None = None
-
-    def refuse_on_device(self) -> None:
-        """ValueError where this is more than the kernels of a device do."""
-        stated = [field.name for field in fields(self) if field.name not in ON_DEVICE and getattr(self, field.name) != field.default]
-        if stated:
-            raise ValueError(f"{', '.join(stated)}: of trees that are trained on the CPU only. Leave it out, or train with --device cpu.")
 
     def terms(self, step: int, most: int) -> int:
         """Coefficients of a channel that a step moves, of so many."""

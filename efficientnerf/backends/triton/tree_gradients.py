@@ -85,23 +85,26 @@ def device_grid(tree: NerfTree, device: str | torch.device) -> DeviceGrid:
 
 
 class Scene(NamedTuple):
-    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels; basis (R, C) harmonics of the columns; column (C,)."""
+    """index of `DeviceGrid`; density (N,) and sh (N, 3 K); voxel: side of cascade 0's voxels; min_weight: below it samples absorb, and have neither a colour
+    nor a gradient; basis (R, C) harmonics of the columns; column (C,)."""
 
     index: Any
     density: Any
     sh: Any
     voxel: Any
+    min_weight: Any
     basis: Any
     column: Any
 
 
 class Sums(NamedTuple):
-    """Where gradients are added, `scale` to a one: thickness (N,), sh (N, 3 K); stamp (N,), set to `number`."""
+    """Where gradients are added, `scale` to a one: thickness (N,), sh (N, 3 K), the first `terms` coefficients of each channel; stamp (N,), set to `number`."""
 
     thickness: Any
     sh: Any
     stamp: Any
     number: Any
+    terms: Any
     scale: Any
 
 
@@ -144,13 +147,13 @@ def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.c
 
 @triton.jit
 def _shaded(scene, sample, transmittance, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Of samples: whether they absorb, weight, colour (Vec3), transmittance behind them, and the sum of the corners' weights."""
+    """Of samples: whether they show, weight where they do, colour (Vec3), transmittance behind them, and the sum of the corners' weights."""
     thickness = _thickness(scene.index, scene.density, sample, scene.voxel, BRICK, NEAREST)
     after = transmittance * tl.exp(-thickness)
     weight = transmittance - after
-    visible = thickness > 0
+    visible = (thickness > 0) & (weight >= scene.min_weight)
     mixed, total = interpolate_harmonics(scene.index, scene.sh, sample, visible, scene.column, 3 * K, BRICK, NEAREST)
-    return visible, weight, colour_of(mixed, total, scene.basis, scene.column % 3), after, total
+    return visible, weight * visible.to(tl.float32), colour_of(mixed, total, scene.basis, scene.column % 3), after, total
 
 
 @triton.jit
@@ -170,13 +173,13 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
 
 @triton.jit
 def _forward(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, rays, nx, ny, nz, voxel,
+    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, rays, nx, ny, nz, voxel, min_weight,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Premultiplied colour (R, 3) and final transmittance (R,) of rays."""
     r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
     cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
-    scene = Scene(index, density, sh, voxel, basis, tl.arange(0, ROW))
+    scene = Scene(index, density, sh, voxel, min_weight, basis, tl.arange(0, ROW))
     start = Forward(tl.full((BLOCK,), 1.0, tl.float32), zeros_vec3(BLOCK))
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
     store_vec3(colour, r, end.colour, live)
@@ -202,24 +205,24 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
         tl.store(sums.stamp + voxel, sums.number, stored)
         tl.atomic_add(sums.thickness + voxel, (scaled * by_depth * STEP).to(tl.int64), stored, sem="relaxed")
         row = sums.sh + voxel[:, None] * (3 * K) + column[None, :]
-        tl.atomic_add(row, (scaled[:, None] * by_column).to(tl.int64), stored[:, None] & (column < 3 * K)[None, :], sem="relaxed")
+        tl.atomic_add(row, (scaled[:, None] * by_column).to(tl.int64), stored[:, None] & (column < 3 * sums.terms)[None, :], sem="relaxed")
     return Backward(after, behind)
 
 
-@triton.jit(do_not_specialize=["number"])
+@triton.jit(do_not_specialize=["number", "terms"])
 def _backward(  # type: ignore[no-untyped-def]
     origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, grad_colour, grad_opacity, sum_thickness, sum_sh, stamp,
-    rays, nx, ny, nz, voxel, number, scale,
+    rays, nx, ny, nz, voxel, min_weight, number, terms, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds `scale` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as integers; stamps the voxels that rays meet."""
     r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
     cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
-    scene = Scene(index, density, sh, voxel, basis, tl.arange(0, ROW))
+    scene = Scene(index, density, sh, voxel, min_weight, basis, tl.arange(0, ROW))
     behind = load_vec3(colour, r, live)
     by_colour = load_vec3(grad_colour, r, live)
     by_end = tl.load(transmittance + r, live, other=1.0) * tl.load(grad_opacity + r, live, other=0.0)
-    given = (scene, Upstream(by_colour, by_end), Sums(sum_thickness, sum_sh, stamp, number, scale))
+    given = (scene, Upstream(by_colour, by_end), Sums(sum_thickness, sum_sh, stamp, number, terms, scale))
     start = Backward(tl.full((BLOCK,), 1.0, tl.float32), behind)
     march_cascades(cascades, origin, direction, live, given, start, _add_gradients, CASCADES, BRICK, NEAREST, K, ROW)
 
@@ -255,12 +258,15 @@ def fixed_point_scale(rays: int) -> float:
     return 2.0 ** (62 - BITS_PER_RAY - math.ceil(math.log2(max(rays, 1))))
 
 
-def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor) -> tuple[Tensor, Tensor]:
-    """Premultiplied colour (R, 3) and final transmittance (R,) of rays through voxels of density (N,) and harmonics (N, 3 K)."""
+def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, *, min_weight: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Premultiplied colour (R, 3) and final transmittance (R,) of rays through voxels of density (N,) and harmonics (N, 3 K).
+
+    min_weight  samples that weigh less absorb, and have neither a colour nor a gradient
+    """
     count = len(rays.origins)
     colour, transmittance = torch.empty(count, 3, device=density.device), torch.empty(count, device=density.device)
     _forward[(blocks(count, g.rays),)](
-        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, colour, transmittance, count, *g.cascades.shape, float(g.voxel),
+        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, colour, transmittance, count, *g.cascades.shape, float(g.voxel), float(min_weight),
         NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
     return colour, transmittance
@@ -277,9 +283,9 @@ def loss_and_gradients(colour: Tensor, transmittance: Tensor, targets: RayTarget
 
 def backward(
     g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, outputs: tuple[Tensor, Tensor], by: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor],
-    stamp: Tensor, number: int,
+    stamp: Tensor, number: int, *, min_weight: float = 0.0, terms: int = 25,
 ) -> None:  # fmt: skip
-    """Add the gradients by optical thickness and harmonics to `sums`, (N,) and (N, 3 K) int64, `fixed_point_scale(R)` to a one.
+    """Add the gradients by optical thickness and by the first `terms` harmonics to `sums`, (N,) and (N, 3 K) int64, `fixed_point_scale(R)` to a one.
 
     outputs  of `forward`
     by       gradients by colour (R, 3) and opacity (R,)
@@ -288,7 +294,7 @@ def backward(
     count = len(rays.origins)
     _backward[(blocks(count, g.rays),)](
         *rays, g.grid, *g.cascades.arrays, g.index, density, sh, *outputs, *(part.contiguous() for part in by), *sums, stamp,
-        count, *g.cascades.shape, float(g.voxel), number, fixed_point_scale(count),
+        count, *g.cascades.shape, float(g.voxel), float(min_weight), number, min(terms, g.terms), fixed_point_scale(count),
         NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
 

@@ -33,6 +33,9 @@ class Hyperparameters(NamedTuple):
     epsilon: float
     momentum: float = 0.0
     total_variation: float = 0.0
+    sparsity: float = 0.0
+    entropy: float = 0.0
+    terms: int = 25
 
 
 class Moments(NamedTuple):
@@ -67,11 +70,21 @@ def _total_variation(v, met, thickness, side, weight, before, beside, min_thickn
     return weight * slope
 
 
-@triton.jit(do_not_specialize=["number"])
+@triton.jit
+def _of_opacity(thickness, sparsity, entropy):  # type: ignore[no-untyped-def]
+    """Gradients of sparsity and entropy by the logarithm of the optical thickness."""
+    left = tl.exp(-thickness)
+    # The logarithm of little is that of a series, for 1 - exp(-x) has few digits there.
+    series = thickness * (1 - thickness * (1 / 2 - thickness * (1 / 6 - thickness / 24)))
+    opacity = tl.maximum(tl.where(thickness < 1 / 16, series, 1 - left), 1e-30)
+    return thickness * left * (sparsity - entropy * (tl.log(opacity) + thickness))
+
+
+@triton.jit(do_not_specialize=["number", "terms"])
 def _step(  # type: ignore[no-untyped-def]
     density, sh, sum_thickness, sum_sh, mean_density, mean_sh, square_density, square_sh, visits, before, beside, stamp, cascade_of, place,
-    voxels, number, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, momentum, log_momentum, total_variation,
-    min_thickness, max_thickness, max_visits,
+    voxels, number, terms, unit, voxel, density_rate, sh_rate, view_share, decay, log_decay, epsilon, momentum, log_momentum, total_variation, sparsity,
+    entropy, min_thickness, max_thickness, max_visits,
     CASCADES: tl.constexpr, MOMENTUM: tl.constexpr, SMOOTH: tl.constexpr, WIDTH: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """`efficientnerf.backends.numba.tree_training.steps.step` from gradients as integers, of `unit` each. MOMENTUM: Adam. SMOOTH: with total variation."""
@@ -92,6 +105,7 @@ def _step(  # type: ignore[no-untyped-def]
         g = tl.load(sum_thickness + v, met, other=0).to(tl.float32) * unit * depth
         if SMOOTH:
             g += _total_variation(v, met, depth, side, total_variation, before, beside, min_thickness)
+        g += _of_opacity(depth, sparsity, entropy)
         square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * g * g
         if MOMENTUM:
             g = momentum * tl.load(mean_density + v, met, other=0.0) + (1 - momentum) * g
@@ -102,9 +116,9 @@ def _step(  # type: ignore[no-untyped-def]
         tl.store(sum_thickness + v, tl.zeros_like(v), met)
         column = tl.arange(0, ROW)
         at = v[:, None] * WIDTH + column[None, :]
-        there = met[:, None] & (column < WIDTH)[None, :]
+        there = met[:, None] & (column < 3 * terms)[None, :]
         by_sh = tl.load(sum_sh + at, there, other=0).to(tl.float32) * unit
-        square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(by_sh * by_sh, 1) / WIDTH
+        square = decay * tl.load(square_sh + v, met, other=0.0) + (1 - decay) * tl.sum(by_sh * by_sh, 1) / (3 * terms)
         tl.store(square_sh + v, square, met)
         if MOMENTUM:
             by_sh = momentum * tl.load(mean_sh + at, there, other=0.0) + (1 - momentum) * by_sh
@@ -119,7 +133,7 @@ def step(
     g: DeviceGrid, values: tuple[Tensor, Tensor], sums: tuple[Tensor, Tensor], moments: Moments, stamp: Tensor, h: Hyperparameters, neighbours: Neighbours, *,
     number: int, rays: int,
 ) -> None:  # fmt: skip
-    """A step for the voxels that the last gradients, of `rays` rays, stamped with `number`; the others stay.
+    """A step for the voxels that the last gradients, of `rays` rays and as many terms, stamped with `number`; the others stay.
 
     values  density (N,) and harmonics (N, 3 K)
     """
@@ -127,9 +141,9 @@ def step(
     if h.total_variation > 0:
         neighbours.density.copy_(values[0])
     _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
-        *values, *sums, *moments, *neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, 1 / fixed_point_scale(rays), float(g.voxel),
-        float(h.density_rate), float(h.sh_rate), float(h.view_share), h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0),
-        float(h.total_variation), MIN_THICKNESS, MAX_THICKNESS, MAX_VISITS,
+        *values, *sums, *moments, *neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, min(h.terms, g.terms), 1 / fixed_point_scale(rays),
+        *map(float, (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))),
+        *map(float, (h.total_variation, h.sparsity, h.entropy, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS,
         CASCADES=g.cascades.grids, MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
         BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

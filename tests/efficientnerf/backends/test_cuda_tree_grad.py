@@ -10,20 +10,20 @@ import pytest
 import torch
 
 from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
-from efficientnerf.asset.refinement.device import voxels_beside
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
-from efficientnerf.asset.refinement.rule import Rule
+from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.schedule import exponential_fall
 from efficientnerf.asset.refinement.state import STATE, RefinementState, initial_state
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
 from tests.efficientnerf.device import DEVICE
-from tests.efficientnerf.refinements import ball_tree, device_gradients, gradients_by_autograd, seen_at_random
+from tests.efficientnerf.refinements import ball_tree, device_gradients, gradients, gradients_by_autograd, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at, uniform_tree
 from tests.efficientnerf.walls import camera_at, wall
 
@@ -60,6 +60,33 @@ def test_values_and_gradients_through_cascades_are_those_of_autograd(count: int,
         assert (off > 2e-3 * scale).mean() < 0.02
     for n in range(count):
         assert (found[1][voxel_cascades(tree) == n] != 0).mean() > 0.1
+
+
+@pytest.mark.parametrize(
+    "tree", [random_tree(5, brick=3, degree=1, sigma=8.0), replace(random_cascades(2, brick=2), environment=None)], ids=["one", "cascades"]
+)
+def test_light_samples_absorb_and_have_no_gradient(tree: NerfTree) -> None:
+    origins, directions = (a[np.arange(60) % 4 != 2] for a in (nested_rays(tree, 60) if tree.outer else rays_at(tree, 60)))
+    seen = seen_at_random(len(origins), 0.5)
+    found = device_gradients(tree, origins, directions, seen, DEVICE, min_weight=0.03)
+    wanted = gradients(tree, origins, directions, seen, stop=EARLY_STOP, min_weight=0.03)
+    everything = gradients(tree, origins, directions, seen, stop=EARLY_STOP)
+    assert np.abs(everything[0] - wanted[0]).max() > 0.01
+    for ours, theirs in zip(found, wanted, strict=True):
+        assert (np.abs(ours - theirs) > 5e-4 * np.abs(theirs).max()).mean() < 0.03  # a weight may lie on the other side of the bound
+    assert 0 < (found[1] != 0).sum() < (everything[1] != 0).sum()
+
+
+def test_terms_that_are_not_trained_have_no_gradient_and_change_no_other() -> None:
+    tree = random_tree(4, brick=2, degree=2, share=0.8, sigma=5.0)
+    origins, directions = rays_at(tree, 30)
+    seen = seen_at_random(30, 0.3)
+    whole, few = (device_gradients(tree, origins, directions, seen, DEVICE, terms=terms) for terms in (9, 4))
+    np.testing.assert_array_equal(few[1], whole[1])
+    np.testing.assert_array_equal(few[2][:, :4], whole[2][:, :4])
+    assert few[2][:, :4].any()
+    assert whole[2][:, 4:].any()
+    assert not few[2][:, 4:].any()
 
 
 def test_sums_do_not_depend_on_the_order_of_the_rays() -> None:
@@ -103,13 +130,13 @@ def test_an_empty_tree_and_rays_beside_it_have_no_gradient() -> None:
     assert (device_gradients(bare, origins, directions, seen_at_random(40, 0.0), DEVICE)[0] > 0).any()
 
 
-def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 4, tv: float = 0.0) -> tuple[RefinementState, list[float]]:
+def fitted(targets: Targets, tree: NerfTree, until: list[int], rays: int = 24, steps: int = 4, rule: Rule = PLAIN) -> tuple[RefinementState, list[float]]:
     """Steps in one go, or in several with the state fetched in between, as a checkpoint does."""
     o = initial_state(tree)
     errors: list[float] = []
     for end in until:
         errors += optimise(o, targets, until=end, rays=rays, density_lr=0.3, sh_lr=0.05, fall=exponential_fall(0.1, steps), seed=1, view_dependent_lr_ratio=0.5,
-                           rule=Rule(total_variation=tv))  # fmt: skip
+                           rule=rule)  # fmt: skip
         o.fetch()
     return o, errors
 
@@ -122,15 +149,18 @@ def nested_balls() -> NerfTree:
     return replace(tree, harmonics=np.zeros((len(tree.density_values), 4, 3), np.float32))
 
 
-@pytest.mark.parametrize(("tree", "tv"), [(ball_tree(8), 0.0), (nested_balls(), 0.03)], ids=["one grid", "cascades"])
-def test_steps_are_those_of_the_cpu(tree: NerfTree, tv: float) -> None:
+FULL = Rule(total_variation=0.03, sparsity=0.01, entropy=0.02, min_weight=2e-3, degree=lambda step: int(step > 2))
+
+
+@pytest.mark.parametrize(("tree", "rule"), [(ball_tree(8), PLAIN), (nested_balls(), FULL)], ids=["one grid", "cascades"])
+def test_steps_are_those_of_the_cpu(tree: NerfTree, rule: Rule) -> None:
     """From colours that are no pixel's: where an error is next to nothing its rounding would show, for steps are of one length."""
     tree = replace(tree, harmonics=np.random.default_rng(0).normal(size=tree.sh.shape).astype(np.float32))
     on_host = Targets(pixels(6, 16), (1.0, 1.0, 1.0))
     on_device = on_host.sent(DEVICE)
     assert on_device.on_device
-    ours, errors = fitted(on_device, tree, [4], tv=tv)
-    theirs, wanted = fitted(on_host, tree, [4], tv=tv)
+    ours, errors = fitted(on_device, tree, [4], rule=rule)
+    theirs, wanted = fitted(on_host, tree, [4], rule=rule)
     assert (ours.visits == theirs.visits).mean() > 0.99
     assert len(np.unique(theirs.visits)) > 2
     for name in ("density", "sh", "square_density", "square_sh"):
@@ -141,16 +171,9 @@ def test_steps_are_those_of_the_cpu(tree: NerfTree, tv: float) -> None:
     assert error(ours.result(), on_device, 500, 0) == pytest.approx(error(theirs.result(), on_host, 500, 0), rel=1e-2)
 
 
-@pytest.mark.parametrize("more", [{"sparsity": 0.1}, {"entropy": 0.1}, {"min_weight": 1e-4}, {"degree": lambda step: 0}])
-def test_rules_without_kernels_are_refused_by_name(more: dict[str, Any]) -> None:
-    targets = Targets(pixels(2, 8), (1.0, 1.0, 1.0)).sent(DEVICE)
-    with pytest.raises(ValueError, match=next(iter(more))):
-        next(optimise(initial_state(ball_tree(8)), targets, until=1, rays=8, density_lr=0.3, sh_lr=0.05, fall=lambda _: 1.0, seed=1, rule=Rule(**more)))
-
-
 @pytest.mark.parametrize("tree", [random_tree(2), random_tree(3, brick=1), nested_balls()], ids=["one", "bricks of one voxel", "cascades"])
 def test_voxels_beside_are_a_step_away(tree: NerfTree) -> None:
-    beside, at, cascades = voxels_beside(tree), voxel_coordinates(tree), voxel_cascades(tree)
+    beside, at, cascades = device.voxels_beside(tree), voxel_coordinates(tree), voxel_cascades(tree)
     place = {(int(of), *map(int, row)): n for n, (of, row) in enumerate(zip(cascades, at, strict=True))}
     for face in range(6):
         step = np.eye(3, dtype=int)[face // 2] * (1 if face % 2 else -1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numba
 import numpy as np
@@ -13,15 +12,14 @@ import pytest
 
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
-from efficientnerf.asset.refinement.state import RefinementState, initial_state
+from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
-from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
-from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, Records, packets_of
+from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, Hyperparameters, Moments, neighbours_of, step, sum_gradients, values_of
-from tests.efficientnerf.refinements import gradients, gradients_by_autograd, seen_at_random
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, Hyperparameters, neighbours_of, step, sum_gradients, values_of
+from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
 # brick, degree, lookup
@@ -74,24 +72,6 @@ def test_light_samples_absorb_and_have_no_gradient() -> None:
     np.testing.assert_allclose(loss, gradients(black, origins, directions, seen)[0], atol=1e-9)
 
 
-def records_of(tree: NerfTree, state: RefinementState, seed: int, packet: int = 4) -> Records:
-    origins, directions = rays_at(tree, 100, seed=seed)
-    seen = seen_at_random(100, 0.2, np.float32)
-    start, along, bases = in_voxels(tree, origins, directions)
-    first = packets_of(100, packet)
-    cells, basis = cells_of(tree_grid(tree)), packet_bases(bases, first)
-    values = values_of(cells, state.density, state.sh)
-    return kernels.forward_backward(cells, first, start, along, basis, values.dense, values.sh, seen, RecordBuffer(), stop=EARLY_STOP)[1]
-
-
-def empty_moments(state: RefinementState, *, adam: bool) -> Moments:
-    count, width = state.sh.shape if adam else (0, state.sh.shape[1])
-    return Moments(np.zeros(count, np.float32), np.zeros((count, width), np.float32), state.square_density, state.square_sh, state.visits)
-
-
-GRIDS: list[Callable[[], NerfTree]] = [lambda: random_tree(4, brick=2, degree=1), lambda: random_cascades(4, brick=2)]
-
-
 @pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
 @pytest.mark.parametrize(("momentum", "terms"), [(0.0, 4), (0.8, 4), (0.8, 1)])
 def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: float, terms: int) -> None:
@@ -140,19 +120,13 @@ def test_the_same_bytes_on_any_number_of_threads() -> None:
             moments, cells = empty_moments(o, adam=True), cells_of(tree_grid(tree))
             values = values_of(cells, o.density, o.sh)
             for _ in range(2):
-                loss, records = kernels.forward_backward(
-                    cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer()
-                )
+                loss, records = kernels.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer())
                 step(records, values, moments, rule_of(tree, o, momentum=0.9))
             found.append((loss, o.density, o.sh, *moments))
     finally:
         numba.set_num_threads(threads)
     for a, b in zip(*found, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def rule_of(tree: NerfTree, state: RefinementState, **more: Any) -> Hyperparameters:
-    return Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, np.full(state.sh.shape[1], 0.01, np.float32), 0.9, 1e-12, **more)
 
 
 def penalty(tree: NerfTree, log_thickness: np.ndarray, old: np.ndarray, met: np.ndarray, kind: str) -> float:

@@ -1,0 +1,123 @@
+"""Optimiser steps of the CUDA kernels against the CPU's, and their regularisers against autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from efficientnerf.asset.cascades import voxel_cascades, voxel_sides
+from efficientnerf.asset.refinement.state import RefinementState, initial_state
+from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree_training import steps as host
+from efficientnerf.backends.numba.tree_training.packets import cells_of
+from tests.efficientnerf.device import DEVICE
+from tests.efficientnerf.refinements import GRIDS, empty_moments, records_of, rule_of
+
+device = pytest.importorskip("efficientnerf.backends.triton.tree_steps")
+refinement = pytest.importorskip("efficientnerf.asset.refinement.device")
+kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
+
+DECAY, EPSILON, RAYS = 0.9, 1e-12, 100
+
+
+def sent(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.array(values)).to(DEVICE)
+
+
+class OnDevice:
+    """A state on the device, and steps of it from given gradients."""
+
+    def __init__(self, tree: NerfTree, state: RefinementState, *, adam: bool, smooth: bool) -> None:
+        self.grid = kernels.device_grid(tree, DEVICE)
+        self.values = sent(state.density), sent(state.sh)
+        means = (np.zeros_like(a) if adam else np.zeros(0, np.float32) for a in (state.density, state.sh))
+        self.moments = device.Moments(*map(sent, means), sent(state.square_density), sent(state.square_sh), sent(state.visits))
+        beside = sent(refinement.voxels_beside(tree) if smooth else np.zeros((0, 6), np.int32))
+        self.neighbours = device.Neighbours(torch.zeros(len(beside), device=DEVICE), beside)
+
+    def step(self, by_thickness: np.ndarray, by_sh: np.ndarray, met: np.ndarray, number: int, **more: Any) -> None:
+        scale = kernels.fixed_point_scale(RAYS)
+        sums = tuple(sent(np.rint(by.astype(np.float64) * scale).astype(np.int64)) for by in (by_thickness, by_sh))
+        stamp = sent(np.where(met, number, number - 1).astype(np.int32))
+        rule = device.Hyperparameters(0.1, 0.01, 0.5, DECAY, EPSILON, **more)
+        device.step(self.grid, self.values, sums, self.moments, stamp, rule, self.neighbours, number=number, rays=RAYS)
+        for part in sums:
+            assert not part.cpu().numpy()[met].any()  # ready for the next step
+
+
+TERMS: list[dict[str, Any]] = [
+    {}, {"momentum": 0.8}, {"total_variation": 0.7}, {"sparsity": 0.7}, {"entropy": 0.7}, {"terms": 1},
+    {"momentum": 0.6, "total_variation": 0.1, "sparsity": 0.2, "entropy": 0.3, "terms": 1},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
+@pytest.mark.parametrize("more", TERMS, ids=lambda more: "-".join(more) or "plain")
+def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str, Any]) -> None:
+    tree = made()
+    o, adam, smooth = initial_state(tree), "momentum" in more, "total_variation" in more
+    there = OnDevice(tree, o, adam=adam, smooth=smooth)
+    cells = cells_of(tree_grid(tree))
+    moments, neighbours = empty_moments(o, adam=adam), host.neighbours_of(cells, len(o.density)) if smooth else host.NO_NEIGHBOURS
+    rule = rule_of(tree, o, **more)
+    rule.sh_rates[3:] *= 0.5
+    width = 3 * more.get("terms", 25)
+    for number in (1, 2, 3):
+        records = records_of(tree, o, number)
+        by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
+        host.sum_gradients(records, by_density, by_sh)
+        met = np.zeros(len(o.density), bool)
+        for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
+            met[records.numbers[begin:end, 0]] = True
+        by_sh[:, width:] = 0  # are not asked for
+        host.step(records, host.values_of(cells, o.density, o.sh), moments, rule, neighbours)
+        there.step(by_density / voxel_sides(tree), by_sh, met, number, **more)
+        for ours, theirs in zip((*there.values, *there.moments), (o.density, o.sh, *moments), strict=True):
+            if theirs.size:
+                np.testing.assert_allclose(ours.cpu().numpy(), theirs, rtol=2e-4, atol=2e-5 * np.abs(theirs).max())
+    assert len(np.unique(o.visits)) > 1  # some were not met by every bundle
+
+
+def penalty(tree: NerfTree, logarithm: torch.Tensor, kind: str) -> torch.Tensor:
+    """The term of weight one over all voxels, by the formula of the CPU's step; those beside each are constants."""
+    thickness = torch.exp(logarithm)
+    alpha = -torch.expm1(-thickness)
+    if kind == "sparsity":
+        return alpha.sum()
+    if kind == "entropy":
+        return (-alpha * torch.log(alpha) + torch.exp(-thickness) * thickness).sum()
+    at = np.concatenate([voxel_coordinates(tree), voxel_cascades(tree)[:, None]], axis=1)
+    number = {tuple(place): n for n, place in enumerate(at.tolist())}
+    pairs = [
+        (n, number[beside])
+        for n, place in enumerate(at.tolist()) for axis in range(3) for way in (-1, 1)
+        if (beside := (*(x + way * (axis == a) for a, x in enumerate(place[:3])), place[3])) in number
+    ]  # fmt: skip
+    here, other = np.array(pairs).T
+    return ((logarithm[here] - logarithm.detach()[other]) ** 2).sum() / 2
+
+
+@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
+@pytest.mark.parametrize("kind", ["total_variation", "sparsity", "entropy"])
+def test_regularisers_are_slopes_of_their_terms(made: Callable[[], NerfTree], kind: str) -> None:
+    """Without rays' gradients; from next to nothing to opaque, on both sides of where the logarithm of an opacity is that of a series."""
+    tree = made()
+    sides = voxel_sides(tree)
+    thickness = np.random.default_rng(0).permutation(np.geomspace(2e-7, 20, len(sides)))
+    o = initial_state(replace(tree, density_values=(thickness / sides).astype(np.float32)))
+    there = OnDevice(tree, o, adam=False, smooth=kind == "total_variation")
+    there.step(np.zeros_like(o.density), np.zeros_like(o.sh), np.ones(len(sides), bool), 1, **{kind: 0.7})
+    logarithm = torch.from_numpy(np.log(o.density.astype(np.float64) * sides)).requires_grad_()
+    (slope,) = torch.autograd.grad(0.7 * penalty(tree, logarithm, kind), logarithm)
+    size, moved = np.sqrt(there.moments.square_density.cpu().double().numpy() / (1 - DECAY)), there.values[0].cpu().numpy() - o.density
+    np.testing.assert_allclose(size, slope.abs().numpy(), rtol=1e-3, atol=1e-6 * np.abs(size).max())
+    clear = size > 1e-4 * size.max()
+    assert (np.sign(moved) == -np.sign(slope.numpy()))[clear].all()
+    assert (moved > 0).any() == (kind != "sparsity")
+    np.testing.assert_array_equal(there.values[1].cpu().numpy(), o.sh)
