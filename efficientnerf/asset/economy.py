@@ -33,7 +33,8 @@ COST_PRIOR = 8.0  # symbols of all contexts together that each context is begun 
 class _Voxels:
     """The values of a tree's voxels in the order of the file.
 
-    worth  (N,) float32: what a squared error of the colour counts
+    worth       (N,) float32: what a squared error of the colour counts
+    neighbours  (3 N,) int32, see `packed.neighbours_of`
     """
 
     density: np.ndarray
@@ -72,7 +73,7 @@ def _voxels_of(tree: NerfTree, order: np.ndarray, weight: np.ndarray | None) -> 
     worth = opacity if weight is None else np.asarray(weight, np.float32)[order]
     grids = [packed.padded(cascade.brick_index >= 0) for cascade in cascades_of(tree)]
     stored = (tree.voxel_index[bricks_of(tree)] >= 0).astype(np.uint8)
-    return _Voxels(density, opacity, np.clip(tree.sh[order], -LIMIT, LIMIT), worth, packed.neighbours_of(grids, stored, tree.brick), side)
+    return _Voxels(density, opacity, np.clip(tree.sh[order], -LIMIT, LIMIT), worth, packed.neighbours_of(grids, stored, tree.brick).reshape(-1), side)
 
 
 def _bits(counts: np.ndarray) -> np.ndarray:
@@ -84,7 +85,7 @@ def _bits(counts: np.ndarray) -> np.ndarray:
 
 def _counted(symbols: int, contexts: int, walk: Callable[[Any], None]) -> np.ndarray:
     """How often (n, 256) each symbol of each context occurs on a walk."""
-    coder = streams.recorder(symbols)
+    coder = streams.recorder([symbols])
     walk(coder)
     return streams.counts(coder, contexts)
 
@@ -102,13 +103,14 @@ def _densities(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
     table, codes = np.unique(quantised_density(voxels.density, voxels.side), return_inverse=True)
     codes = codes.reshape(-1).astype(np.uint8)
     count, side = len(codes), float(np.max(voxels.side))
+    whole = np.array([0, count])  # which codes are neighbours' says where slices begin
     # In front of what it hides a voxel's weight is that over its opacity.
     weight = (CONTRAST / rate) * voxels.worth / np.maximum(voxels.opacity, 0.05)
     shown = -np.expm1(-table * np.float32(side)).astype(np.float32)
 
     def walk(coder: Any) -> None:
         for piece in _pieces(count):
-            walks.walk_densities(coder, codes, voxels.neighbours, len(table), piece.start, piece.stop)
+            walks.walk_densities(coder, codes, voxels.neighbours, len(table), whole, piece.start, piece.stop)
 
     for _ in range(PASSES):
         bits = _bits(_counted(count, walks.DENSITY_CONTEXTS, walk)[:, : len(table)])
@@ -126,19 +128,19 @@ def _bases(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
     values = np.ascontiguousarray(voxels.sh[:, 0], np.float32)
     nearest, table = base_codes(values)
     codes, count = nearest.copy(), len(values)
+    whole = np.array([0, count])
     weight = ((C0 * _slopes(values)) ** 2 * (voxels.worth / np.float32(rate))[:, None]).astype(np.float32)
 
     def walk(coder: Any) -> None:
-        for channel in (1, 0, 2):
-            for piece in _pieces(count):
-                walks.walk_bases(coder, codes, voxels.neighbours, len(table), channel, piece.start, piece.stop)
+        for piece in _pieces(count):
+            walks.walk_bases(coder, codes, voxels.neighbours, len(table), whole, piece.start, piece.stop)
 
     for _ in range(PASSES):
         bits = _bits(_counted(3 * count, walks.BASE_CONTEXTS, walk))
         codes[:] = nearest
         for channel in (1, 0, 2):
             for piece in _pieces(count):
-                choices.choose_bases(values, weight, table, voxels.neighbours, bits, codes, channel, piece.start, piece.stop)
+                choices.choose_bases(values, weight, table, voxels.neighbours, bits, codes.reshape(-1), channel, piece.start, piece.stop)
     return codes, table
 
 
@@ -157,7 +159,7 @@ def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, e
     weight = (voxels.worth * slope / (4 * math.pi * rate)).astype(np.float32)
     out = np.zeros((count, sh.shape[1] - 1), np.uint8)
     palettes: list[np.ndarray] = []
-    beside = np.minimum(4 * density.astype(np.int32) // levels, 3).astype(np.uint8)
+    beside = packed.quarters_of(levels)[density]
     split = walks.REPEAT_CONTEXTS
     for k in range(1, sh.shape[1]):
         vectors = np.ascontiguousarray(sh[:, k], np.float32)
@@ -165,13 +167,10 @@ def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, e
         codes, palette = _sorted(codes, palette)
         before = beside.copy()
 
-        def walk(coder: Any, codes: np.ndarray = codes, before: np.ndarray = before) -> None:
-            situation = before.copy()
-            for piece in _pieces(count):
-                walks.walk_codes(coder, codes, voxels.neighbours, situation, 0, 0, piece.start, piece.stop)
-
         for _ in range(PASSES):
-            counts = _counted(2 * count, split + walks.CODE_CONTEXTS, walk)
+            counts, situation = np.zeros((split + walks.CODE_CONTEXTS, 256), np.int64), before.copy()
+            for piece in _pieces(count):
+                choices.count_codes(codes, voxels.neighbours, situation, counts, piece.start, piece.stop)
             repeat_bits, code_bits = _bits(counts[:split, :4]), _bits(counts[split:, : len(palette)])
             beside = before.copy()
             for piece in _pieces(count):

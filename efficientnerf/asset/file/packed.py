@@ -1,16 +1,15 @@
 """The layout `packed`: the tensors of `compact`, entropy-coded for sending and archiving. FORMAT.md, section 14.
 
 `packed` makes one set of tensors of the other and `unpacked` back, without loss. Both take the walks of `efficientnerf.backends.numba.entropy.walks`, so that
-the context of a symbol is stated once.
+the context of a symbol is stated once. Streams are cut into slices of bricks, which all cores decode: a slice knows no voxel of another one.
 
-B bricks, N stored voxels, b voxels along a side of a brick, G groups of harmonics.
+B bricks, N stored voxels, b voxels along a side of a brick, G groups of harmonics, S slices.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,40 +17,52 @@ import numpy as np
 from efficientnerf.asset.file import streams
 from efficientnerf.asset.file.checks import number
 from efficientnerf.asset.file.container import FormatError
+from efficientnerf.asset.file.streams import Family
 from efficientnerf.asset.file.whole_scene import bits, booleans, grids_of, occupancy_name
 
 MINOR = 5  # the version that brought it
 STREAMS = ("packed.occupancy", "packed.mask", "packed.density", "packed.base", "packed.sh")
 TABLES = ("density.table", "base.table", "sh.palette")
 MOST = 2**31 - 1  # bricks or voxels, which are counted in 32 bits
+SLICE_VOXELS = 2**17  # about; docs/experiments/packed.md
 Tensors = dict[str, np.ndarray]
-Run = Callable[[str, int, int, list[tuple[int, int]], Callable[[Any], None]], None]
+Walk = Callable[[Any], None]
+Run = Callable[[str, Sequence[int], Sequence[Family], Walk], None]  # a stream, how many symbols its slices have at most, its contexts, and what codes them
 
 
-def counts_of(name: str, meta: dict[str, Any]) -> tuple[int, int, int]:
-    """Bricks, voxels and bytes of a code as the metadata claim them."""
+def counts_of(name: str, meta: dict[str, Any]) -> tuple[int, int, int, int]:
+    """Bricks, voxels, bytes of a code and bricks of a slice as the metadata claim them."""
     found = meta.get("packed")
     if not isinstance(found, dict):
         raise FormatError(f"{name}: metadata 'packed' is {str(found)[:60]}; expected an object")
     bricks, voxels = (int(number(name, found, key, 0, MOST, whole=True)) for key in ("bricks", "voxels"))
-    return bricks, voxels, int(number(name, found, "code_bytes", 1, 2, whole=True))
+    width = int(number(name, found, "code_bytes", 1, 2, whole=True))
+    each = int(number(name, found, "slice_bricks", max(1, math.ceil(bricks / streams.MOST_SLICES)), MOST, whole=True))
+    return bricks, voxels, width, each
 
 
 def claimed(name: str, meta: dict[str, Any], groups: int) -> tuple[dict[str, tuple[int, ...]], dict[str, np.dtype[Any]]]:
     """Shapes of the tensors of `compact` that the file will be unpacked to, and their types where these may differ."""
-    bricks, voxels, width = counts_of(name, meta)
+    bricks, voxels, width, _ = counts_of(name, meta)
     shapes: dict[str, tuple[int, ...]] = {"brick.mask": (bricks, math.ceil(int(meta["brick"]) ** 3 / 64))}
     shapes |= {"voxel.density": (voxels,), "voxel.base": (voxels, 3), "voxel.sh": (voxels, groups)}
     return shapes, {"voxel.sh": np.dtype(f"<u{width}")}
 
 
+def slice_bricks(bricks: int, voxels: int) -> int:
+    """Bricks of each slice of a tree of so many bricks and voxels, of the last one at most."""
+    return max(1, math.ceil(bricks / min(max(1, voxels // SLICE_VOXELS), streams.MOST_SLICES)))
+
+
 def packed(meta: dict[str, Any], tensors: Tensors) -> tuple[Tensors, dict[str, Any]]:
     """Tensors of `packed`, and the entry of the metadata, of those of `compact`, the occupancy of all cascades among them."""
     shapes = {name: values.shape for name, values in tensors.items()}
-    entry = {"bricks": shapes["brick.mask"][0], "voxels": shapes["voxel.density"][0], "code_bytes": tensors["voxel.sh"].dtype.itemsize}
+    bricks, voxels = shapes["brick.mask"][0], shapes["voxel.density"][0]
+    each = slice_bricks(bricks, voxels)
+    entry = {"bricks": bricks, "voxels": voxels, "code_bytes": tensors["voxel.sh"].dtype.itemsize, "slice_bricks": each}
     out = {name: tensors[name] for name in TABLES}
 
-    def run(stream: str, symbols: int, contexts: int, families: list[tuple[int, int]], walk: Callable[[Any], None]) -> None:
+    def run(stream: str, symbols: Sequence[int], families: Sequence[Family], walk: Walk) -> None:
         coder = streams.recorder(symbols)
         walk(coder)
         out[stream] = streams.written(coder, families)
@@ -61,27 +72,27 @@ def packed(meta: dict[str, Any], tensors: Tensors) -> tuple[Tensors, dict[str, A
     cube = int(meta["brick"]) ** 3
     masks = tensors["brick.mask"]
     stored = np.unpackbits(masks.view(np.uint8).reshape(len(masks), 8 * masks.shape[1]), axis=1, bitorder="little", count=cube)
-    codes = {key: tensors[key].copy() for key in ("voxel.density", "voxel.base", "voxel.sh")}
-    _walk_all(meta, grids, stored, codes, out, run)
+    codes = {key: np.ascontiguousarray(tensors[key]) for key in ("voxel.density", "voxel.base", "voxel.sh")}
+    _walk_all(meta, grids, stored, codes, out, each, run)
     return {name: out[name] for name in (*STREAMS, *TABLES)}, {"packed": entry}
 
 
 def unpacked(name: str, meta: dict[str, Any], raw: Tensors) -> Tensors:
     """The tensors of `compact`; memory for them has been checked. FormatError where a stream is none, or does not hold what the metadata claim."""
-    bricks, voxels, width = counts_of(name, meta)
+    bricks, voxels, width, each = counts_of(name, meta)
     groups = len(meta["sh_groups"])
 
-    def run(stream: str, symbols: int, contexts: int, families: list[tuple[int, int]], walk: Callable[[Any], None]) -> None:
-        coder = streams.reader(name, stream, raw[stream], contexts)
+    def run(stream: str, symbols: Sequence[int], families: Sequence[Family], walk: Walk) -> None:
+        coder = streams.reader(name, stream, raw[stream], families, len(symbols))
         walk(coder)
-        streams.check(name, stream, coder, ended=True)
+        streams.check(name, stream, coder)
 
     if voxels and not (len(raw["density.table"]) and len(raw["base.table"])):
         raise FormatError(f"{name}: {voxels} voxels, but a table without entries")
     grids = [padded(np.zeros(grid.shape, bool)) for grid in grids_of(meta)]
     stored = np.zeros((bricks, int(meta["brick"]) ** 3), np.uint8)
     codes = {"voxel.density": np.zeros(voxels, np.uint8), "voxel.base": np.zeros((voxels, 3), np.uint8), "voxel.sh": np.zeros((voxels, groups), f"<u{width}")}
-    _walk_all(meta, grids, stored, codes, raw, run, name)
+    _walk_all(meta, grids, stored, codes, raw, each, run, name)
     words = math.ceil(stored.shape[1] / 64)
     mask = np.zeros((bricks, words * 8), np.uint8)
     mask[:, : math.ceil(stored.shape[1] / 8)] = np.packbits(stored, axis=1, bitorder="little")
@@ -97,91 +108,122 @@ def padded(cells: np.ndarray) -> np.ndarray:
     return out
 
 
-def _walk_all(meta: dict[str, Any], grids: list[np.ndarray], stored: np.ndarray, codes: Tensors, tables: Tensors, run: Run, name: str = "") -> None:
+def _walk_all(meta: dict[str, Any], grids: list[np.ndarray], stored: np.ndarray, codes: Tensors, tables: Tensors, each: int, run: Run, name: str = "") -> None:
     """Walk all streams in their order; arrays are filled where `run` reads.
 
     grids   cells of each cascade, padded; stored (B, b^3) uint8; codes N of each
     tables  of densities, bases and harmonics
+    each    bricks of a slice
     """
     from efficientnerf.backends.numba.entropy import walks
 
-    b, (bricks, _) = int(meta["brick"]), stored.shape
+    b, (bricks, cube) = int(meta["brick"]), stored.shape
 
     def occupancy(coder: Any) -> None:
         for cells in grids:
-            for piece in _pieces(cells.shape[0] - 1):
+            for piece in _pieces(cells.shape[0] - 1, 1):
                 walks.walk_cells(coder, cells, piece.start, piece.stop)
 
-    bits_family = [(0, walks.BIT_CONTEXTS)]
-    run(STREAMS[0], sum(math.prod(n - 1 for n in cells.shape) for cells in grids), walks.BIT_CONTEXTS, bits_family, occupancy)
+    bit_family = [Family(walks.BIT_CONTEXTS, symbols=2)]
+    run(STREAMS[0], [sum(math.prod(n - 1 for n in cells.shape) for cells in grids)], bit_family, occupancy)
     owned = sum(int(np.count_nonzero(cells)) for cells in grids)
     if owned != bricks:
         raise FormatError(f"{name}: {owned} occupied cells but {bricks} bricks")
-    before = _bricks_before(grids, bricks)
+    before, first = _bricks_before(grids, bricks, each), _slices(bricks, each)
+    border, inner = _borders(b)
 
     def masks(coder: Any) -> None:
-        for piece in _pieces(bricks):
-            walks.walk_masks(coder, stored, before, b, piece.start, piece.stop)
+        for piece in _pieces(min(each, bricks), 64):
+            walks.walk_masks(coder, stored, before, border, inner, b, first, piece.start, piece.stop)
 
-    run(STREAMS[1], stored.size, walks.BIT_CONTEXTS, bits_family, masks)
+    run(STREAMS[1], (cube * np.diff(first)).tolist(), bit_family, masks)
     voxels = int(np.count_nonzero(stored))
     if voxels != len(codes["voxel.density"]):
         raise FormatError(f"{name}: masks name {voxels} voxels but {len(codes['voxel.density'])} are stored")
-    _walk_codes(codes, tables, neighbours_of(grids, stored, b), run)
+    of_bricks = np.cumsum(np.append(0, np.count_nonzero(stored, axis=1)), dtype=np.int64)
+    _walk_codes(codes, tables, _neighbours(before, stored, b), of_bricks[first], run)
+
+
+def _slices(bricks: int, each: int) -> np.ndarray:
+    """(S + 1,) int64: the first brick of each slice, and how many bricks there are; S is 1 at least."""
+    return np.append(np.arange(0, max(1, bricks), each), bricks)
 
 
 def neighbours_of(grids: list[np.ndarray], stored: np.ndarray, b: int) -> np.ndarray:
-    """(N, 3) int32: the voxels one step back along x, y and z, -1 where none is stored; numbers as in the file.
+    """(N, 3) int32: the voxels one step back along x, y and z, -1 where none is stored in the same slice; numbers as in the file that is written.
 
     grids  cells of each cascade, `padded`; stored (B, b^3) uint8
     """
+    each = slice_bricks(len(stored), int(np.count_nonzero(stored)))
+    return _neighbours(_bricks_before(grids, len(stored), each), stored, b)
+
+
+def _neighbours(before: np.ndarray, stored: np.ndarray, b: int) -> np.ndarray:
     from efficientnerf.backends.numba.entropy import walks
 
     neighbours = np.full((int(np.count_nonzero(stored)), 3), -1, np.int32)
     index = np.where(stored, np.cumsum(stored, dtype=np.int32).reshape(stored.shape) - 1, -1).astype(np.int32)
-    before = _bricks_before(grids, len(stored))
     for piece in _pieces(len(stored)):
         walks.find_neighbours(index, before, b, neighbours, piece.start, piece.stop)
     return neighbours
 
 
-def _walk_codes(codes: Tensors, tables: Tensors, neighbours: np.ndarray, run: Run) -> None:
-    """Walk the streams of densities, bases and harmonics."""
+def _walk_codes(codes: Tensors, tables: Tensors, neighbours: np.ndarray, first: np.ndarray, run: Run) -> None:
+    """Walk the streams of densities, bases and harmonics.
+
+    first  (S + 1,) int64: voxels of the slices
+    """
     from efficientnerf.backends.numba.entropy import walks
 
     density, base, sh = codes["voxel.density"], codes["voxel.base"], codes["voxel.sh"]
-    voxels, groups = sh.shape
+    _, groups = sh.shape
+    near = neighbours.reshape(-1)
     entries = {key: len(tables[key]) for key in TABLES}
+    voxels = np.diff(first)
+
+    def pieces() -> Iterator[slice]:
+        return _pieces(int(voxels.max()))
 
     def densities(coder: Any) -> None:
-        for piece in _pieces(voxels):
-            walks.walk_densities(coder, density, neighbours, entries["density.table"], piece.start, piece.stop)
+        for piece in pieces():
+            walks.walk_densities(coder, density, near, entries["density.table"], first, piece.start, piece.stop)
 
     def bases(coder: Any) -> None:
-        for channel in (1, 0, 2):
-            for piece in _pieces(voxels):
-                walks.walk_bases(coder, base, neighbours, entries["base.table"], channel, piece.start, piece.stop)
+        for piece in pieces():
+            walks.walk_bases(coder, base, near, entries["base.table"], first, piece.start, piece.stop)
 
     shift = 8 if sh.dtype.itemsize == 2 else 0
-    split = walks.REPEAT_CONTEXTS, walks.CODE_CONTEXTS, *([walks.LOW_CONTEXTS] if shift else [])
+    quarters = quarters_of(entries["density.table"])
 
     def harmonics(coder: Any) -> None:
-        beside = np.minimum(4 * density.astype(np.int32) // max(1, entries["density.table"]), 3).astype(np.uint8)
-        for group in range(groups):
-            column = np.ascontiguousarray(sh[:, group])
-            for piece in _pieces(voxels):
-                first = group * sum(split)
-                walks.walk_codes(coder, column, neighbours, beside, shift, first, piece.start, piece.stop)
-            sh[:, group] = column
+        for piece in pieces() if groups else ():
+            walks.walk_codes(coder, sh, near, density, quarters, shift, first, piece.start, piece.stop)
 
-    run(STREAMS[2], voxels, walks.DENSITY_CONTEXTS, [(0, walks.DENSITY_CONTEXTS)], densities)
-    run(STREAMS[3], 3 * voxels, walks.BASE_CONTEXTS, [(0, 8), (8, 72), (72, 136)], bases)
-    ends = np.cumsum([0, *split * groups]).tolist()
-    run(STREAMS[4], groups * voxels * len(split), max(1, ends[-1]), list(itertools.pairwise(ends)) or [(0, 1)], harmonics)
+    run(STREAMS[2], voxels.tolist(), [Family(walks.DENSITY_CONTEXTS)], densities)
+    run(STREAMS[3], (3 * voxels).tolist(), [Family(8, 0), Family(72, 1), Family(136, 2)], bases)
+    families = code_families(groups, wide=shift > 0)
+    run(STREAMS[4], (len(families) * voxels if groups else 0 * voxels).tolist(), families, harmonics)
 
 
-def _bricks_before(grids: list[np.ndarray], bricks: int) -> np.ndarray:
-    """(B, 8) int32, see `walks.walk_masks`."""
+def quarters_of(entries: int) -> np.ndarray:
+    """(256,) uint8: the quarter of a table of densities that each code lies in."""
+    return np.minimum(4 * np.arange(256) // max(1, entries), 3).astype(np.uint8)
+
+
+def code_families(groups: int, *, wide: bool) -> list[Family]:
+    """The contexts of `packed.sh`, each group's in a lane; `wide` where codes have two bytes."""
+    from efficientnerf.backends.numba.entropy import walks
+
+    kinds = [(walks.REPEAT_CONTEXTS, walks.NEW + 1), (walks.CODE_CONTEXTS, 256), *([(walks.LOW_CONTEXTS, 256)] if wide else [])]
+    out = [Family(0)]
+    for group in range(groups):
+        for contexts, symbols in kinds:
+            out.append(Family(out[-1].end + contexts, group, symbols))
+    return out[1:] or [Family(1)]
+
+
+def _bricks_before(grids: list[np.ndarray], bricks: int, each: int) -> np.ndarray:
+    """(B, 8) int32, see `walks.walk_masks`, of slices of so many bricks."""
     before = np.full((bricks, 8), -1, np.int32)
     first = 0
     for cells in grids:
@@ -190,10 +232,21 @@ def _bricks_before(grids: list[np.ndarray], bricks: int) -> np.ndarray:
         for step in range(1, 8):
             before[first : first + len(x), step] = owner[x - (step >> 2), y - (step >> 1 & 1), z - (step & 1)]
         first += len(x)
+    number = np.arange(bricks)[:, None]
+    before[before < number - number % each] = -1
     return before
 
 
-def _pieces(count: int) -> Iterator[slice]:
+def _borders(b: int) -> tuple[np.ndarray, np.ndarray]:
+    """`border` and `inner` of `walks.walk_masks`."""
+    at = np.argwhere(np.ones((b + 1,) * 3, bool))
+    back = (at == 0) @ np.array([4, 2, 1])
+    place, slot = at @ np.array([(b + 1) ** 2, b + 1, 1]), (at - 1) % b @ np.array([b * b, b, 1])
+    beside = np.stack([place, back, slot], axis=1)[back > 0]
+    return np.ascontiguousarray(beside, np.int32), np.ascontiguousarray(place[back == 0], np.int32)
+
+
+def _pieces(count: int, first: int = 1024) -> Iterator[slice]:
     from efficientnerf.backends.pieces import pieces
 
-    return pieces(count, first=1024)
+    return pieces(count, first=first)

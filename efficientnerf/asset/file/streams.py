@@ -2,69 +2,113 @@
 
     which table each context has   T (a byte), then pairs of a table and a run length, until every context has one
     the tables                     frequencies of the symbols 0, 1, ... until their sum is 2^14; a 0 is followed by how many more zeros there are
-    rANS                           words of 16 bits, the state's upper and lower half first
+    the slices                     how many words each has
+    rANS                           words of 16 bits, slice by slice; a slice's begin with the upper and lower half of each lane's state
 
 Numbers are LEB128, but for T and tables, which are bytes.
 
-M symbols, n contexts, T tables.
+M symbols, n contexts, T tables, S slices, L lanes.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from efficientnerf.asset.file.container import FormatError
 
 MOST_TABLES = 255
+MOST_SLICES = 4096
+MOST_HEAD = 2**20  # bytes, more than those of 255 tables and 4096 slices
 PIECE = 2**20  # symbols that are encoded or counted at once
 EMPTY = np.zeros((0, 256), np.uint32)
 
 Coder = object  # of `efficientnerf.backends.numba.entropy.rans`, whose import is heavy
 
 
-def recorder(symbols: int) -> Coder:
-    """A coder that records at most so many symbols."""
+class Family(NamedTuple):
+    """Contexts of a stream up to `end`, from where the family before ends; they share tables among themselves alone.
+
+    lane     which state codes them
+    symbols  how many a table may have
+    """
+
+    end: int
+    lane: int = 0
+    symbols: int = 256
+
+
+def _ranges(families: Sequence[Family]) -> Iterator[tuple[slice, Family]]:
+    begin = 0
+    for family in families:
+        yield slice(begin, family.end), family
+        begin = family.end
+
+
+def _lanes(families: Sequence[Family]) -> int:
+    return 1 + max(family.lane for family in families)
+
+
+def recorder(most: Sequence[int]) -> Coder:
+    """A coder that records at most so many symbols of each slice."""
     from efficientnerf.backends.numba.entropy import rans
 
-    none = np.zeros(0, np.uint8)
+    ends = np.cumsum([0, *most], dtype=np.int64)
     blank = np.zeros((0, rans.SLOTS), np.uint8)
-    recorded = np.zeros(symbols, np.uint8), np.zeros(symbols, np.uint16)
-    return rans.Coder(False, np.zeros(3, np.int64), none.astype(np.uint16), none, blank, EMPTY, *recorded)
+    state, failed = np.zeros((len(most), 1), np.int64), np.zeros(len(most), np.int64)
+    none = np.zeros(0, np.uint8)
+    recorded = np.zeros(int(ends[-1]), np.uint8), np.zeros(int(ends[-1]), np.uint16)
+    return rans.Coder(False, state, ends[:-1].copy(), ends[:-1].copy(), failed, none.astype(np.uint16), none, blank, EMPTY, *recorded)
 
 
-def reader(name: str, tensor: str, raw: np.ndarray, contexts: int) -> Coder:
+def reader(name: str, tensor: str, raw: np.ndarray, families: Sequence[Family], slices: int) -> Coder:
     """A coder that reads the bytes of a tensor; FormatError where its tables break a rule."""
     from efficientnerf.backends.numba.entropy import rans
 
+    contexts, lanes = families[-1].end, _lanes(families)
     try:
-        table, frequency, at = _parsed(raw.tobytes() if len(raw) < 2**16 else raw[: 2**20].tobytes(), contexts, rans.SLOTS)
+        table, frequency, sizes, at = _parsed(raw[:MOST_HEAD].tobytes(), contexts, rans.SLOTS, slices)
     except (IndexError, ValueError) as error:
         what = "ends within its tables" if isinstance(error, IndexError) else str(error)
-        raise FormatError(f"{name}: '{tensor}' {what}; it is no stream of {contexts} contexts") from None
-    if (len(raw) - at) % 2 or len(raw) - at < 4:
-        raise FormatError(f"{name}: '{tensor}' has {len(raw) - at} bytes after its tables; expected words of 16 bits, two at least")
-    words = np.frombuffer(raw[at:].tobytes(), "<u2").astype(np.uint16)
+        raise FormatError(f"{name}: '{tensor}' {what}; it is no stream of {contexts} contexts and {slices} slices") from None
+    for part, family in _ranges(families):
+        if frequency[np.unique(table[part]), family.symbols :].any():
+            raise FormatError(f"{name}: '{tensor}' has a table of symbols above {family.symbols - 1} for one of the contexts {part.start} to {part.stop - 1}")
+    for number, size in enumerate(sizes):
+        if size < 2 * lanes:
+            raise FormatError(f"{name}: slice {number} of '{tensor}' has {size} words; expected {2 * lanes} at least")
+    if 2 * sum(sizes) != len(raw) - at:
+        raise FormatError(f"{name}: '{tensor}' has {len(raw) - at} bytes after its tables; expected {2 * sum(sizes)}, the words of its slices")
+    words = np.append(np.frombuffer(raw[at:].tobytes(), "<u2").astype(np.uint16), np.uint16(0))
     symbol, shares = np.zeros((len(frequency), rans.SLOTS), np.uint8), np.zeros((len(frequency), 256), np.uint32)
     rans.fill_slots(frequency, shares, symbol)
-    state = np.array([int(words[0]) << 16 | int(words[1]), 2, 0], np.int64)
-    if state[0] < rans.LOWEST:
-        raise FormatError(f"{name}: '{tensor}' begins with the state {state[0]}; expected {rans.LOWEST} or more")
-    return rans.Coder(True, state, words, table, symbol, shares, np.zeros(0, np.uint8), np.zeros(0, np.uint16))
+    ends = np.cumsum([0, *sizes], dtype=np.int64)
+    first = words[ends[:-1, None] + np.arange(2 * lanes)].astype(np.int64).reshape(slices, lanes, 2)
+    state = first[:, :, 0] << 16 | first[:, :, 1]
+    if state.min() < rans.LOWEST:
+        raise FormatError(f"{name}: '{tensor}' begins with the state {state.min()}; expected {rans.LOWEST} or more")
+    none = np.zeros(0, np.uint8), np.zeros(0, np.uint16)
+    return rans.Coder(True, state, ends[:-1] + 2 * lanes, ends[1:].copy(), np.zeros(slices, np.int64), words, table, symbol, shares, *none)
 
 
-def check(name: str, tensor: str, coder: Coder, *, ended: bool) -> None:
-    """FormatError where what was read so far is no stream; with `ended`, where it does not end with its bytes."""
+def check(name: str, tensor: str, coder: Coder) -> None:
+    """FormatError where what was read is no stream, or does not end with its bytes."""
     from efficientnerf.backends.numba.entropy import rans
 
     assert isinstance(coder, rans.Coder)
-    if coder.reads and coder.state[rans.FAILED]:
-        raise FormatError(f"{name}: '{tensor}' ends before its last symbol, or holds one that stands for nothing")
-    if coder.reads and ended and (coder.state[rans.AT] != len(coder.words) or coder.state[rans.X] != rans.LOWEST):
-        raise FormatError(f"{name}: '{tensor}' does not end where its last symbol does")
+    if not coder.reads:
+        return
+    if coder.failed.any():
+        what = "ends before its last symbol, or holds one that stands for nothing"
+        raise FormatError(f"{name}: slice {int(np.argmax(coder.failed != 0))} of '{tensor}' {what}")
+    if not_at_its_end := np.flatnonzero((coder.at != coder.end) | (coder.state != rans.LOWEST).any(axis=1)).tolist():
+        raise FormatError(f"{name}: slice {not_at_its_end[0]} of '{tensor}' does not end where its last symbol does")
 
 
-def _parsed(data: bytes, contexts: int, slots: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Table of each context, frequencies, and where the words begin. IndexError or ValueError where a rule is broken."""
+def _parsed(data: bytes, contexts: int, slots: int, slices: int) -> tuple[np.ndarray, np.ndarray, list[int], int]:
+    """Table of each context, frequencies, words of each slice, and where the words begin. IndexError or ValueError where a rule is broken."""
     at = 1
     tables = data[0]
     if tables == 0:
@@ -108,7 +152,8 @@ def _parsed(data: bytes, contexts: int, slots: int) -> tuple[np.ndarray, np.ndar
             symbol += 1
         if total != slots:
             raise ValueError(f"has a table whose sum is {total}, not {slots}")
-    return table, frequency, at
+    sizes = [number() for _ in range(slices)]
+    return table, frequency, sizes, at
 
 
 def counts(coder: Coder, contexts: int) -> np.ndarray:
@@ -116,53 +161,57 @@ def counts(coder: Coder, contexts: int) -> np.ndarray:
     from efficientnerf.backends.numba.entropy import rans
 
     assert isinstance(coder, rans.Coder)
-    count, out = int(coder.state[rans.AT]), np.zeros((contexts, 256), np.int64)
-    for begin in range(0, count, PIECE):
-        rans.count_symbols(coder.symbols[begin : min(count, begin + PIECE)], coder.contexts[begin : min(count, begin + PIECE)], out)
+    out = np.zeros((contexts, 256), np.int64)
+    for first, last in zip(coder.end.tolist(), coder.at.tolist(), strict=True):
+        for begin in range(first, last, PIECE):
+            part = slice(begin, min(last, begin + PIECE))
+            rans.count_symbols(coder.symbols[part], coder.contexts[part], out)
     return out
 
 
-def written(coder: Coder, families: list[tuple[int, int]]) -> np.ndarray:
-    """The bytes of the tensor that hold what `coder` recorded.
-
-    families  ranges of contexts, which share tables among themselves alone; together all
-    """
+def written(coder: Coder, families: Sequence[Family]) -> np.ndarray:
+    """The bytes of the tensor that hold what `coder` recorded."""
     from efficientnerf.backends.numba.entropy import rans
 
     assert isinstance(coder, rans.Coder)
-    count = int(coder.state[rans.AT])
-    symbols, contexts = coder.symbols[:count], coder.contexts[:count]
-    table, frequency = _tables(counts(coder, families[-1][1]), families)
+    begin, end, slices, lanes = coder.end, coder.at, len(coder.at), _lanes(families)
+    table, frequency = _tables(counts(coder, families[-1].end), families)
     symbol, shares = np.zeros((len(frequency), rans.SLOTS), np.uint8), np.zeros((len(frequency), 256), np.uint32)
     rans.fill_slots(frequency, shares, symbol)
-    words = np.zeros(count + 2, np.uint16)  # a symbol takes 14 bits at most
-    state = np.array([rans.LOWEST, len(words)], np.int64)
-    for end in range(count, 0, -PIECE):
-        begin = max(0, end - PIECE)
-        rans.encode(symbols[begin:end], contexts[begin:end], table, shares, words, state)
-    at = int(state[1])
-    ends = np.array([state[0] >> 16, state[0] & 0xFFFF], "<u2")
-    head = bytes([len(frequency)]) + _runs(table) + b"".join(map(_table, frequency))
-    return np.frombuffer(head + ends.tobytes() + words[at:].astype("<u2").tobytes(), np.uint8)
+    lane = np.zeros(len(table), np.uint8)
+    for part, family in _ranges(families):
+        lane[part] = family.lane
+    room = np.cumsum([0, *(end - begin + 2 * lanes)])  # a symbol takes a word at most
+    words, at, state = np.zeros(int(room[-1]), np.uint16), room[1:].copy(), np.full((slices, lanes), rans.LOWEST, np.int64)
+    each = max(1, PIECE // slices)
+    for done in range(0, int((end - begin).max()), each):
+        rans.encode(coder.symbols, coder.contexts, lane, table, shares, words, begin, end, at, state, done, each)
+    at -= 2 * lanes
+    words[at[:, None] + np.arange(2 * lanes)] = np.stack([state >> 16, state & 0xFFFF], axis=-1).reshape(slices, 2 * lanes)
+    sizes = (room[1:] - at).tolist()
+    if max(sizes) >= 2**28:
+        raise FormatError(f"a slice of {max(sizes)} words can't be saved; expected fewer than {2**28}")
+    head = bytes([len(frequency)]) + _runs(table) + b"".join(map(_table, frequency)) + b"".join(map(_leb128, sizes))
+    return np.frombuffer(b"".join([head, *(words[a:b].astype("<u2").tobytes() for a, b in zip(at, room[1:], strict=True))]), np.uint8)
 
 
-def _tables(counts: np.ndarray, families: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+def _tables(counts: np.ndarray, families: Sequence[Family]) -> tuple[np.ndarray, np.ndarray]:
     """The table of each context (n,) uint8, and the frequencies (T, 256) uint32 of each."""
     from efficientnerf.backends.numba.entropy import rans
 
     table = np.zeros(len(counts), np.uint8)
     rows: list[np.ndarray] = []
     most = max(1, MOST_TABLES // len(families))
-    for begin, end in families:
-        part = counts[begin:end]
+    for contexts, _ in _ranges(families):
+        part = counts[contexts]
         owner = rans.merge_contexts(part.astype(np.float64), most)
         known = np.unique(owner[part.sum(axis=1) > 0])
         last = len(rows)
         for least in known:
             rows.append(_quantised(part[owner == least].sum(axis=0), rans.SLOTS))
         which = {int(least): last + n for n, least in enumerate(known)}
-        for n in range(begin, end):  # contexts that do not occur share the table before theirs, so that runs are long
-            last = which.get(int(owner[n - begin]), last)
+        for n in range(contexts.start, contexts.stop):  # contexts that do not occur share the table before theirs, so that runs are long
+            last = which.get(int(owner[n - contexts.start]), last)
             table[n] = min(last, max(len(rows) - 1, 0))
     if not rows:
         rows.append(_quantised(np.zeros(256, np.int64), rans.SLOTS))

@@ -9,8 +9,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from efficientnerf.backends.numba.entropy.walks import DIGITS, MEAN_DIGITS, NEW, _predicted
+from efficientnerf.backends.numba.entropy.walks import NEW, REPEAT_CONTEXTS, base_prediction, density_context, known_codes, near_voxels, newness
 from efficientnerf.backends.numba.runtime import numba
+
+
+@numba.njit(cache=True, error_model="numpy")
+def count_codes(codes, neighbours, beside, counts, begin, end):  # type: ignore[no-untyped-def]
+    """Add the symbols of one group's codes (N,) uint8 to counts (272, 256) int64 of their contexts; `beside` as in `choose_codes`."""
+    for n in range(begin, end):
+        count, p, q, r = near_voxels(neighbours, n)
+        a, b, c, value = np.int64(codes[p]), np.int64(codes[q]), np.int64(codes[r]), np.int64(codes[n])
+        kinds, second, agreement, length = known_codes(count, a, b, c, 0)
+        symbol = NEW if kinds == 0 else 0 if value == a else 1 if value == second and kinds > 1 else 2 if value == c and kinds > 2 else NEW
+        situation = np.int64(beside[n])
+        counts[16 * agreement + situation, symbol] += 1
+        if symbol == NEW:
+            counts[REPEAT_CONTEXTS + 16 * length + situation, value] += 1
+        beside[n] = 4 * (newness(value) if symbol == NEW else 0) + (situation & 3)
 
 
 @numba.njit(inline="always")
@@ -28,30 +43,17 @@ def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code
 
     vectors      (N, D) float32; palette (P, D)
     weight       (N,) float32: bits that a squared error of 1 is worth
-    beside       (N,) uint8, as in `walks.walk_codes`, overwritten
+    neighbours   (3 N,) int32
+    beside       (N,) uint8: four times how the group before was coded, 0 as a neighbour's, else `newness`; and the quarter of the table that the density
+                 lies in; overwritten with what holds for this group
     repeat_bits  (112, 4) float32; code_bits (160, P), least_bits (160,) the least of each row
     """
     for n in range(begin, end):
-        digits, count, kinds = 0, 0, 0
-        known = (np.int64(-1), np.int64(-1), np.int64(-1))
-        known_a, known_b, known_c = known
-        for axis in range(3):
-            near = neighbours[n, axis]
-            if near < 0:
-                continue
-            value = np.int64(codes[near])
-            digits += DIGITS[value]
-            count += 1
-            if kinds == 0:
-                known_a, kinds = value, 1
-            elif kinds == 1:
-                if value != known_a:
-                    known_b, kinds = value, 2
-            elif value != known_a and value != known_b:
-                known_c, kinds = value, 3
+        count, p, q, r = near_voxels(neighbours, n)
+        known_a, known_c = np.int64(codes[p]), np.int64(codes[r])
+        kinds, known_b, agreement, length = known_codes(count, known_a, np.int64(codes[q]), known_c, 0)
         situation = np.int64(beside[n])
-        agreement = count if kinds < 2 else count + 2 if kinds == 2 else 6
-        row, context = 16 * agreement + situation, 16 * MEAN_DIGITS[count, digits] + situation
+        row, context = 16 * agreement + situation, 16 * length + situation
         best, least, found = np.int64(0), np.float32(np.inf), NEW
         for symbol in range(kinds):
             value = known_a if symbol == 0 else known_b if symbol == 1 else known_c
@@ -61,36 +63,29 @@ def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code
         if repeat_bits[row, NEW] + least_bits[context] < least:
             for p in range(palette.shape[0]):
                 cost = weight[n] * _error(vectors, palette, n, p) + repeat_bits[row, NEW] + code_bits[context, p]
-                if cost < least and p != known_a and p != known_b and p != known_c:
+                if cost < least and not ((kinds > 0 and p == known_a) or (kinds > 1 and p == known_b) or (kinds > 2 and p == known_c)):
                     best, least, found = np.int64(p), cost, NEW
         codes[n] = best
-        beside[n] = 4 * (0 if found != NEW else 1 if best < 8 else 2 if best < 64 else 3) + (situation & 3)
+        beside[n] = 4 * (newness(best) if found == NEW else 0) + (situation & 3)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def choose_bases(values, weight, table, neighbours, bits, codes, channel, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (N, 3) uint8 of one channel, of those between the nearest one, which is there before, and the one that is foretold.
+    """Codes (3 N,) uint8 of one channel, of those between the nearest one, which is there before, and the one that is foretold.
 
     values  (N, 3) float32; weight (N, 3); table (T, 3)
     bits    (136, 256) float32
     """
-    entries = np.int64(table.shape[0])
     for n in range(begin, end):
-        predicted, spread = _predicted(codes, neighbours, n, channel)
-        context = spread
-        if channel != 1:
-            green, _ = _predicted(codes, neighbours, n, 1)
-            difference = np.int64(codes[n, 1]) - green
-            predicted = min(max(predicted + difference, 0), entries - 1)
-            context = 8 + 32 * channel + 8 * spread + min(DIGITS[abs(difference)], 7)
-        nearest = np.int64(codes[n, channel])
+        predicted, context = base_prediction(codes, neighbours, np.int64(table.shape[0]), n, channel)
+        nearest = np.int64(codes[3 * n + channel])
         best, least = nearest, np.float32(np.inf)
         for code in range(min(nearest, predicted), max(nearest, predicted) + 1):
             difference = values[n, channel] - table[code, channel]
             cost = weight[n, channel] * difference * difference + bits[context, (code - predicted) & 255]
             if cost < least:
                 best, least = np.int64(code), cost
-        codes[n, channel] = best
+        codes[3 * n + channel] = best
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -102,13 +97,7 @@ def choose_densities(opacity, weight, table, neighbours, bits, codes, begin, end
     """
     entries = table.shape[0]
     for n in range(begin, end):
-        total, count = 0, 0
-        for axis in range(3):
-            near = neighbours[n, axis]
-            if near >= 0:
-                total += codes[near]
-                count += 1
-        context = 1 + min(32 * (total // count) // entries, 31) if count else 0
+        context = density_context(codes, neighbours, n, entries)
         best, least = 0, np.float32(np.inf)
         for code in range(entries):
             difference = opacity[n] - table[code]

@@ -1,28 +1,36 @@
-"""rANS (Duda 2013) with static tables that contexts choose: the state of 32 bits is refilled by words of 16.
+"""rANS (Duda 2013) with static tables that contexts choose: states of 32 bits are refilled by words of 16.
 
-M symbols, T tables, n contexts.
+A stream is cut into slices that know nothing of each other, so that cores decode them at the same time. In a slice several states, the lanes, take words in
+turn (Giesen 2014): while one waits for its table the next ones go on. Nothing branches on what is decoded.
+
+M symbols, T tables, n contexts, S slices, L lanes.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import advanced, pointer
 
 BITS = 14  # of probabilities
 SLOTS = 1 << BITS
-LOWEST = 1 << 16  # of the state between symbols
-X, AT, FAILED = 0, 1, 2  # of `Coder.state`: the state, the next word (or record), whether words ran out
+LOWEST = 1 << 16  # of a state between symbols
 
 
 class Coder(NamedTuple):
     """One stream, read or written by the same walk.
 
     reads    whether symbols are read from words; else they are recorded, for `encode`
-    state    (3,) int64: X, AT, FAILED
-    words    (W,) uint16
+    state    (S, L) int64
+    at, end  (S,) int64: the next word of each slice and the end of its words; the next record and the first
+    failed   (S,) int64: not 0 where words ran out, or a symbol stood for nothing
+    words    (W + 1,) uint16, of which the last is none
     table    (n,) uint8, of each context
     symbol   (T, SLOTS) uint8: which symbol a slot stands for
     shares   (T, 256) uint32: of a symbol the number of its slots, and 2^16 times the first of them
@@ -31,6 +39,9 @@ class Coder(NamedTuple):
 
     reads: bool
     state: np.ndarray
+    at: np.ndarray
+    end: np.ndarray
+    failed: np.ndarray
     words: np.ndarray
     table: np.ndarray
     symbol: np.ndarray
@@ -39,34 +50,100 @@ class Coder(NamedTuple):
     contexts: np.ndarray
 
 
-@numba.njit(inline="always")
-def coded(reads, state, words, table, symbol, shares, symbols, contexts, context, value):  # type: ignore[no-untyped-def]
-    """The next symbol of a coder, whose fields come first: read, or `value`, which is recorded.
+class Slice(NamedTuple):
+    """Where one slice of a coder lies: pointers, which no reference count slows down, and the end of its words."""
 
-    Inlined, and of arrays that were taken from the tuple before the loop: a call with all of them, or references that are counted, take four times as long.
+    reads: Any
+    end: Any
+    state: Any
+    words: Any
+    table: Any
+    symbol: Any
+    shares: Any
+    symbols: Any
+    contexts: Any
+
+
+@intrinsic
+def digits(typing_context: Any, value: Any) -> Any:
+    """Number of binary digits of an int64 that is not negative."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.sub(ir.Constant(ir.IntType(64), 64), builder.ctlz(args[0], ir.Constant(ir.IntType(1), 0)))
+
+    return types.int64(types.int64), codegen
+
+
+@numba.njit(inline="always")
+def slice_of(coder, s):  # type: ignore[no-untyped-def]
+    reads, state, _, end, _, words, table, symbol, shares, symbols, contexts = coder
+    return Slice(
+        reads, end[s], advanced(pointer(state), s * state.shape[1]), pointer(words), pointer(table), pointer(symbol), pointer(shares), pointer(symbols),
+        pointer(contexts),
+    )  # fmt: skip
+
+
+@numba.njit(inline="always")
+def _refilled(one, lane, x, at):  # type: ignore[no-untyped-def]
+    """Keep the state of a lane, with a word more if it is low: where the next word is, and 1 if there was none."""
+    low = np.int64(x < LOWEST)
+    there = low & np.int64(at < one.end)
+    word = np.int64(one.words[at])
+    one.state[lane] = (x << (low << 4)) | (word & -low)
+    return at + there, low ^ there
+
+
+@numba.njit(inline="always")
+def coded(one, lane, context, value, at):  # type: ignore[no-untyped-def]
+    """The next symbol of a slice, read, or `value`, which is recorded; where it goes on; and 1 if words ran out.
+
+    lane  whose state it is; the same for all symbols of a context
+    at    where the slice is
     """
-    if not reads:
-        at = state[AT]
-        symbols[at] = value
-        contexts[at] = context
-        state[AT] = at + 1
-        return np.int64(value)
-    x = state[X]
-    row = np.int64(table[context])
+    if not one.reads:
+        one.symbols[at] = value
+        one.contexts[at] = context
+        return np.int64(value), at + 1, np.int64(0)
+    row = np.int64(one.table[context])
+    x = one.state[lane]
     slot = x & (SLOTS - 1)
-    found = np.int64(symbol[row, slot])
-    share = np.int64(shares[row, found])
-    x = (share & 0xFFFF) * (x >> BITS) + slot - (share >> 16)
-    if x < LOWEST:
-        at = state[AT]
-        if at < words.shape[0]:
-            x = (x << 16) | np.int64(words[at])
-        else:
-            state[FAILED] = 1
-            x = LOWEST
-        state[AT] = at + 1
-    state[X] = x
-    return found
+    found = np.int64(one.symbol[(row << BITS) + slot])
+    share = np.int64(one.shares[(row << 8) + found])
+    at, lacking = _refilled(one, lane, (share & 0xFFFF) * (x >> BITS) + slot - (share >> 16), at)
+    return found, at, lacking
+
+
+@numba.njit(inline="always")
+def coded_bit(one, lane, context, value, at):  # type: ignore[no-untyped-def]
+    """As `coded`, of a context whose tables have the symbols 0 and 1 alone: what slots stand for is not looked up."""
+    if not one.reads:
+        one.symbols[at] = value
+        one.contexts[at] = context
+        return np.int64(value), at + 1, np.int64(0)
+    row = np.int64(one.table[context]) << 8
+    x = one.state[lane]
+    slot = x & (SLOTS - 1)
+    found = np.int64(slot >= np.int64(one.shares[row + 1]) >> 16)
+    share = np.int64(one.shares[row + found])
+    at, lacking = _refilled(one, lane, (share & 0xFFFF) * (x >> BITS) + slot - (share >> 16), at)
+    return found, at, lacking
+
+
+@numba.njit(inline="always")
+def coded_few(one, lane, context, value, at):  # type: ignore[no-untyped-def]
+    """As `coded_bit`, of the symbols 0 to 3."""
+    if not one.reads:
+        one.symbols[at] = value
+        one.contexts[at] = context
+        return np.int64(value), at + 1, np.int64(0)
+    row = np.int64(one.table[context]) << 8
+    x = one.state[lane]
+    slot = x & (SLOTS - 1)
+    found = np.int64(slot >= np.int64(one.shares[row + 1]) >> 16) + np.int64(slot >= np.int64(one.shares[row + 2]) >> 16)
+    found += np.int64(slot >= np.int64(one.shares[row + 3]) >> 16)
+    share = np.int64(one.shares[row + found])
+    at, lacking = _refilled(one, lane, (share & 0xFFFF) * (x >> BITS) + slot - (share >> 16), at)
+    return found, at, lacking
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -81,23 +158,28 @@ def fill_slots(frequency, shares, symbol):  # type: ignore[no-untyped-def]
             reached += count
 
 
-@numba.njit(cache=True, error_model="numpy")
-def encode(symbols, contexts, table, shares, words, state):  # type: ignore[no-untyped-def]
-    """Encode these symbols, the last first; words are written from the end of `words` towards its beginning.
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def encode(symbols, contexts, lanes, table, shares, words, begin, end, at, state, done, most):  # type: ignore[no-untyped-def]
+    """Encode `most` symbols of each slice that are left, the last first, after `done` before; words are written from the end towards the beginning.
 
-    state  (2,) int64, kept between calls: the state, and the place of the last word written
+    lanes       (n,) uint8, of each context
+    begin, end  (S,) int64: symbols of the slices
+    at          (S,) int64, kept between calls: the place of the last word written
+    state       (S, L) int64, kept too
     """
-    x, at = state[0], state[1]
-    for n in range(symbols.shape[0] - 1, -1, -1):
-        t, s = table[contexts[n]], symbols[n]
-        share = np.int64(shares[t, s])
-        count = share & 0xFFFF
-        if x >= count << (32 - BITS):
-            at -= 1
-            words[at] = x & 0xFFFF
-            x >>= 16
-        x = ((x // count) << BITS) + x % count + (share >> 16)
-    state[0], state[1] = x, at
+    for s in numba.prange(len(begin)):
+        place = at[s]
+        for m in range(max(begin[s], end[s] - done), max(begin[s], end[s] - done - most), -1):
+            c = contexts[m - 1]
+            share = np.int64(shares[table[c], symbols[m - 1]])
+            lane, count = lanes[c], share & 0xFFFF
+            x = state[s, lane]
+            if x >= count << (32 - BITS):
+                place -= 1
+                words[place] = x & 0xFFFF
+                x >>= 16
+            state[s, lane] = ((x // count) << BITS) + x % count + (share >> 16)
+        at[s] = place
 
 
 @numba.njit(cache=True, error_model="numpy")

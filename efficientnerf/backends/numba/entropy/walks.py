@@ -1,17 +1,18 @@
 """In which order the tensors of the layout `packed` are coded, and the context of each symbol: one walk for reading and writing.
 
 Values of what was coded before predict what follows: those of the cells or voxels one step back along x, y and z, which always come first.
-FORMAT.md, section 14.
+FORMAT.md, section 14. A walk goes on from item `begin` of each slice to its item `end`, on all cores.
 
-B bricks, N stored voxels, b voxels along a side of a brick.
+B bricks, N stored voxels, b voxels along a side of a brick, S slices, G groups of harmonics.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from efficientnerf.backends.numba.entropy.rans import FAILED, coded
+from efficientnerf.backends.numba.entropy.rans import coded, coded_bit, coded_few, digits, slice_of
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer
 
 BIT_CONTEXTS = 128  # which of seven neighbours are set
 DENSITY_CONTEXTS = 33
@@ -20,18 +21,13 @@ REPEAT_CONTEXTS, CODE_CONTEXTS, LOW_CONTEXTS = 7 * 16, 10 * 16, 256  # of a grou
 NEW = 3  # symbol: the code of no neighbour
 
 
-DIGITS = np.array([n.bit_length() for n in range(256)], np.int64)  # binary digits
-# Of a sum of the digits of so many numbers: 1 and their mean, rounded down; 0 of none.
-MEAN_DIGITS = np.array([[0] * 25, *([1 + digits // count for digits in range(25)] for count in (1, 2, 3))], np.int64)
-
-
 @numba.njit(cache=True, error_model="numpy")
 def walk_cells(coder, cells, begin, end):  # type: ignore[no-untyped-def]
-    """Planes `begin` to `end` of a grid along x.
+    """Planes `begin` to `end` of a grid along x, in a stream of one slice.
 
     cells  (X + 1, Y + 1, Z + 1) uint8, 1 where one is occupied; the first plane, row and column are 0
     """
-    reads, state, words, table, symbol_of, shares, symbols, contexts = coder
+    one, at, failed = slice_of(coder, 0), coder.at[0], coder.failed[0]
     _, ny, nz = cells.shape
     for x in range(begin + 1, end + 1):
         for y in range(1, ny):
@@ -39,10 +35,46 @@ def walk_cells(coder, cells, begin, end):  # type: ignore[no-untyped-def]
                 a, b, c = cells[x - 1, y, z], cells[x, y - 1, z], cells[x, y, z - 1]
                 d, e, f, g = cells[x - 1, y - 1, z], cells[x - 1, y, z - 1], cells[x, y - 1, z - 1], cells[x - 1, y - 1, z - 1]
                 context = a | b << 1 | c << 2 | d << 3 | e << 4 | f << 5 | g << 6
-                value = coded(reads, state, words, table, symbol_of, shares, symbols, contexts, context, cells[x, y, z])
-                if value > 1:
-                    state[FAILED] = 1
-                cells[x, y, z] = value & 1
+                value, at, lacking = coded_bit(one, 0, context, cells[x, y, z], at)
+                failed |= lacking
+                cells[x, y, z] = value
+    coder.at[0], coder.failed[0] = at, failed
+
+
+@numba.njit
+def _walk_masks(coder, s, stored, before, border, inner, b, begin, end):  # type: ignore[no-untyped-def]
+    one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
+    cube, side, plane = stored.shape[1], b + 1, (b + 1) * (b + 1)
+    room = np.zeros(side * plane, np.uint8)
+    near, voxels, bricks, places, own = pointer(room), pointer(stored), pointer(before), pointer(border), pointer(inner)
+    for n in range(begin, end):
+        for m in range(len(border)):
+            brick = np.int64(bricks[8 * n + places[3 * m + 1]])
+            near[places[3 * m]] = voxels[max(brick, 0) * cube + places[3 * m + 2]] & np.uint8(brick >= 0)
+        for v in range(cube):
+            p = np.int64(own[v])
+            context = np.int64(near[p - plane]) | np.int64(near[p - side]) << 1 | np.int64(near[p - 1]) << 2
+            context |= np.int64(near[p - plane - side]) << 3 | np.int64(near[p - plane - 1]) << 4
+            context |= np.int64(near[p - side - 1]) << 5 | np.int64(near[p - plane - side - 1]) << 6
+            value, at, lacking = coded_bit(one, 0, context, voxels[n * cube + v], at)
+            failed |= lacking
+            near[p] = value
+            voxels[n * cube + v] = value
+    coder.at[s], coder.failed[s] = at, failed
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def walk_masks(coder, stored, before, border, inner, b, first, begin, end):  # type: ignore[no-untyped-def]
+    """Voxels of bricks.
+
+    stored  (B, b^3) uint8, 1 where a voxel is
+    before  (B, 8) int32: the brick that lies one cell back along x (4), y (2) and z (1), by the sum of these; -1 where none does, or one of another slice
+    border  (M, 3) int32: places beside a brick: where in a cube of side b + 1, of which column of `before`, and which voxel of that brick
+    inner   (b^3,) int32: where in that cube the brick's own voxels are
+    first   (S + 1,) int64: bricks of the slices
+    """
+    for s in numba.prange(len(first) - 1):
+        _walk_masks(coder, s, stored, before, border, inner, b, min(first[s] + begin, first[s + 1]), min(first[s] + end, first[s + 1]))
 
 
 @numba.njit(inline="always")
@@ -50,46 +82,13 @@ def _slot(p, q, r, b):  # type: ignore[no-untyped-def]
     return (p * b + q) * b + r
 
 
-@numba.njit(cache=True, error_model="numpy")
-def walk_masks(coder, stored, before, b, begin, end):  # type: ignore[no-untyped-def]
-    """Bricks `begin` to `end`.
-
-    stored  (B, b^3) uint8, 1 where a voxel is
-    before  (B, 8) int32: the brick that lies one cell back along x (4), y (2) and z (1), by the sum of these; -1 where none does
-    """
-    reads, state, words, table, symbol_of, shares, symbols, contexts = coder
-    near = np.zeros((b + 1, b + 1, b + 1), np.uint8)
-    for n in range(begin, end):
-        for p in range(b + 1):
-            for q in range(b + 1):
-                for r in range(b + 1):
-                    if p > 0 and q > 0 and r > 0:
-                        near[p, q, r] = stored[n, _slot(p - 1, q - 1, r - 1, b)]
-                        continue
-                    brick = before[n, (p == 0) * 4 + (q == 0) * 2 + (r == 0)]
-                    near[p, q, r] = 0
-                    if brick >= 0:
-                        near[p, q, r] = stored[brick, _slot((p - 1) % b, (q - 1) % b, (r - 1) % b, b)]
-        for p in range(1, b + 1):
-            for q in range(1, b + 1):
-                for r in range(1, b + 1):
-                    context = near[p - 1, q, r] | near[p, q - 1, r] << 1 | near[p, q, r - 1] << 2 | near[p - 1, q - 1, r] << 3
-                    context |= near[p - 1, q, r - 1] << 4 | near[p, q - 1, r - 1] << 5 | near[p - 1, q - 1, r - 1] << 6
-                    value = coded(reads, state, words, table, symbol_of, shares, symbols, contexts, context, near[p, q, r])
-                    if value > 1:
-                        state[FAILED] = 1
-                    value &= 1
-                    near[p, q, r] = value
-                    stored[n, _slot(p - 1, q - 1, r - 1, b)] = value
-
-
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def find_neighbours(index, before, b, neighbours, begin, end):  # type: ignore[no-untyped-def]
     """Voxels one step back along x, y and z from those of bricks `begin` to `end`: neighbours (N, 3) int32, -1 where none is stored.
 
     index  (B, b^3) int32: numbers of the stored voxels
     """
-    for n in range(begin, end):
+    for n in numba.prange(begin, end):
         for p in range(b):
             for q in range(b):
                 for r in range(b):
@@ -104,100 +103,167 @@ def find_neighbours(index, before, b, neighbours, begin, end):  # type: ignore[n
                         neighbours[voxel, axis] = -1 if brick < 0 else index[brick, _slot(i % b, j % b, k % b, b)]
 
 
-@numba.njit(cache=True, error_model="numpy")
-def walk_densities(coder, codes, neighbours, entries, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (N,) uint8 into a table of so many entries."""
-    reads, state, words, table, symbol_of, shares, symbols, contexts = coder
-    for n in range(begin, end):
-        total, count = 0, 0
-        for axis in range(3):
-            near = neighbours[n, axis]
-            if near >= 0:
-                total += codes[near]
-                count += 1
-        context = 1 + min(32 * (total // count) // entries, 31) if count else 0
-        codes[n] = coded(reads, state, words, table, symbol_of, shares, symbols, contexts, context, codes[n])
+@numba.njit(inline="always")
+def near_voxels(neighbours, n):  # type: ignore[no-untyped-def]
+    """How many neighbours voxel n has, and which, those that are there first; the first of them stands for those that are not, and n itself for none."""
+    i, j, k = np.int64(neighbours[3 * n]), np.int64(neighbours[3 * n + 1]), np.int64(neighbours[3 * n + 2])
+    x, y, z = i >= 0, j >= 0, k >= 0
+    count = np.int64(x) + np.int64(y) + np.int64(z)
+    a = i if x else j if y else k if z else n
+    second = j if x and y else k
+    return count, a, second if count > 1 else a, k if count > 2 else a
 
 
 @numba.njit(inline="always")
-def _predicted(codes, neighbours, n, channel):  # type: ignore[no-untyped-def]
-    """Mean of the neighbours' codes, and the class of how far they lie apart: 0 without neighbours, else 1 to 7."""
-    total, count, least, most = np.int64(0), 0, np.int64(255), np.int64(0)
-    for axis in range(3):
-        near = neighbours[n, axis]
-        if near >= 0:
-            value = np.int64(codes[near, channel])
-            total += value
-            count += 1
-            least, most = min(least, value), max(most, value)
-    if count == 0:
-        return np.int64(0), np.int64(0)
-    return total // count, 1 + min(DIGITS[most - least], 6)
+def _mean(total, count):  # type: ignore[no-untyped-def]
+    """Sums below 2^16 of 0 to 3 values, divided by how many and rounded down; 0 of none."""
+    return (total * (131072 if count == 1 else 65536 if count == 2 else 43691 if count == 3 else 0)) >> 17
 
 
-@numba.njit(cache=True, error_model="numpy")
-def walk_bases(coder, codes, neighbours, entries, channel, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (N, 3) uint8 of one channel; green (1) comes first, and how far it is from its prediction corrects that of red (0) and blue (2)."""
-    reads, state, words, table, symbol_of, shares, symbols, contexts = coder
+@numba.njit(inline="always")
+def _sum(count, a, b, c):  # type: ignore[no-untyped-def]
+    """Of the values that are there."""
+    return a * np.int64(count > 0) + b * np.int64(count > 1) + c * np.int64(count > 2)
+
+
+@numba.njit(inline="always")
+def density_context(codes, neighbours, n, entries):  # type: ignore[no-untyped-def]
+    count, p, q, r = near_voxels(neighbours, n)
+    mean = _mean(_sum(count, np.int64(codes[p]), np.int64(codes[q]), np.int64(codes[r])), count)
+    return np.int64(count > 0) * (1 + min(32 * mean // entries, 31))
+
+
+@numba.njit
+def _walk_densities(coder, s, codes, neighbours, entries, begin, end):  # type: ignore[no-untyped-def]
+    one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
+    values, near, length = pointer(codes), pointer(neighbours), np.uint32(entries)
     for n in range(begin, end):
-        predicted, spread = _predicted(codes, neighbours, n, channel)
-        context = spread
-        if channel != 1:
-            green, _ = _predicted(codes, neighbours, n, 1)
-            difference = np.int64(codes[n, 1]) - green
-            predicted = min(max(predicted + difference, 0), entries - 1)
-            context = 8 + 32 * channel + 8 * spread + min(DIGITS[abs(difference)], 7)
-        symbol = coded(reads, state, words, table, symbol_of, shares, symbols, contexts, context, (np.int64(codes[n, channel]) - predicted) & 255)
-        codes[n, channel] = (predicted + symbol) & 255
+        value, at, lacking = coded(one, 0, density_context(values, near, n, np.int64(length)), values[n], at)
+        failed |= lacking
+        values[n] = value
+    coder.at[s], coder.failed[s] = at, failed
 
 
-@numba.njit(cache=True, error_model="numpy")
-def walk_codes(coder, codes, neighbours, beside, shift, first, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (N,) of one group: whether each is that of a neighbour, and which if not.
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def walk_densities(coder, codes, neighbours, entries, first, begin, end):  # type: ignore[no-untyped-def]
+    """Codes (N,) uint8 into a table of so many entries.
 
-    beside     (N,) uint8: four times how the group before was coded, 0 as a neighbour's, else 1 to 3 by its leading byte; and the quarter of the table that the
-               density lies in; overwritten with what holds for this group
-    shift      8 for codes of two bytes, 0 for those of one: a code's leading byte is what is left above
-    first      context of the group
+    first  (S + 1,) int64: voxels of the slices
     """
-    reads, state, words, table, symbol_of, shares, symbols, contexts = coder
+    for s in numba.prange(len(first) - 1):
+        _walk_densities(coder, s, codes, neighbours, entries, min(first[s] + begin, first[s + 1]), min(first[s] + end, first[s + 1]))
+
+
+@numba.njit(inline="always")
+def _predicted(codes, count, p, q, r, channel):  # type: ignore[no-untyped-def]
+    """Mean of the neighbours' codes, and the class of how far they lie apart: 0 without neighbours, else 1 to 7."""
+    a, b, c = np.int64(codes[3 * p + channel]), np.int64(codes[3 * q + channel]), np.int64(codes[3 * r + channel])
+    apart = max(a, b, c) - min(a, b, c)
+    return _mean(_sum(count, a, b, c), count), np.int64(count > 0) * (1 + min(digits(apart), 6))
+
+
+@numba.njit(inline="always")
+def base_prediction(codes, neighbours, entries, n, channel):  # type: ignore[no-untyped-def]
+    """What a voxel's code of a channel is predicted to be, and its context. Green (1) comes first; how far it is from its prediction corrects the others."""
+    count, p, q, r = near_voxels(neighbours, n)
+    predicted, spread = _predicted(codes, count, p, q, r, channel)
+    if channel == 1:
+        return predicted, spread
+    green, _ = _predicted(codes, count, p, q, r, 1)
+    difference = np.int64(codes[3 * n + 1]) - green
+    return min(max(predicted + difference, 0), entries - 1), 8 + 32 * channel + 8 * spread + min(digits(abs(difference)), 7)
+
+
+@numba.njit
+def _walk_bases(coder, s, codes, neighbours, entries, begin, end):  # type: ignore[no-untyped-def]
+    one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
+    values, near = pointer(codes), pointer(neighbours)
     for n in range(begin, end):
-        digits, count, kinds = 0, 0, 0
-        known_a, known_b, known_c = np.int64(-1), np.int64(-1), np.int64(-1)
-        for axis in range(3):
-            near = neighbours[n, axis]
-            if near < 0:
-                continue
-            value = np.int64(codes[near])
-            digits += DIGITS[value >> shift]
-            count += 1
-            if kinds == 0:
-                known_a, kinds = value, 1
-            elif kinds == 1:
-                if value != known_a:
-                    known_b, kinds = value, 2
-            elif value != known_a and value != known_b:
-                known_c, kinds = value, 3
-        situation = np.int64(beside[n])
-        value = np.int64(codes[n])
-        symbol = NEW
-        if not reads:
-            symbol = 0 if value == known_a else 1 if value == known_b else 2 if value == known_c else NEW
-        agreement = count if kinds < 2 else count + 2 if kinds == 2 else 6  # 0; 1 to 3; 4 and 5; 6
-        symbol = coded(reads, state, words, table, symbol_of, shares, symbols, contexts, first + 16 * agreement + situation, symbol)
-        if symbol == NEW:
-            context = first + REPEAT_CONTEXTS + 16 * MEAN_DIGITS[count, digits] + situation
-            leading = coded(reads, state, words, table, symbol_of, shares, symbols, contexts, context, value >> shift)
-            if shift:
-                context = first + REPEAT_CONTEXTS + CODE_CONTEXTS + leading
-                value = leading << 8 | coded(reads, state, words, table, symbol_of, shares, symbols, contexts, context, value & 255)
-            else:
+        predicted, context = base_prediction(values, near, entries, n, 1)
+        symbol, at, lacking = coded(one, 0, context, (np.int64(values[3 * n + 1]) - predicted) & 255, at)
+        values[3 * n + 1] = (predicted + symbol) & 255
+        failed |= lacking
+        predicted, context = base_prediction(values, near, entries, n, 0)
+        symbol, at, lacking = coded(one, 1, context, (np.int64(values[3 * n]) - predicted) & 255, at)
+        values[3 * n] = (predicted + symbol) & 255
+        failed |= lacking
+        predicted, context = base_prediction(values, near, entries, n, 2)
+        symbol, at, lacking = coded(one, 2, context, (np.int64(values[3 * n + 2]) - predicted) & 255, at)
+        values[3 * n + 2] = (predicted + symbol) & 255
+        failed |= lacking
+    coder.at[s], coder.failed[s] = at, failed
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def walk_bases(coder, codes, neighbours, entries, first, begin, end):  # type: ignore[no-untyped-def]
+    """Codes (N, 3) uint8: of each voxel green, then red, then blue, each of which has a lane.
+
+    first  (S + 1,) int64: voxels of the slices
+    """
+    for s in numba.prange(len(first) - 1):
+        _walk_bases(coder, s, codes, neighbours, entries, min(first[s] + begin, first[s + 1]), min(first[s] + end, first[s + 1]))
+
+
+@numba.njit(inline="always")
+def known_codes(count, a, b, c, shift):  # type: ignore[no-untyped-def]
+    """Of the codes of the neighbours that are there: how many are different, the second of these, in which of seven ways they agree, and the class of their
+    leading bytes' lengths."""
+    apart = np.int64(b != a)
+    kinds = np.int64(count > 0) * (1 + apart + np.int64(c != a and c != b))
+    agreement = count + 2 * np.int64(kinds == 2) + 3 * np.int64(kinds == 3)  # 0; 1 to 3; 4 and 5; 6
+    lengths = _sum(count, digits(a >> shift), digits(b >> shift), digits(c >> shift))
+    return kinds, b if apart else c, agreement, np.int64(count > 0) + _mean(lengths, count)
+
+
+@numba.njit(inline="always")
+def newness(leading):  # type: ignore[no-untyped-def]
+    """Class of a code that is none of its neighbours', 1 to 3."""
+    return 1 + np.int64(leading >= 8) + np.int64(leading >= 64)
+
+
+@numba.njit
+def _walk_codes(coder, s, codes, neighbours, densities, quarters, shift, begin, end):  # type: ignore[no-untyped-def]
+    one, at, failed = slice_of(coder, s), coder.at[s], coder.failed[s]
+    groups = codes.shape[1]
+    each = REPEAT_CONTEXTS + CODE_CONTEXTS + (LOW_CONTEXTS if shift else 0)
+    values, near, density, quarter = pointer(codes), pointer(neighbours), pointer(densities), pointer(quarters)
+    for n in range(begin, end):
+        count, p, q, r = near_voxels(near, n)
+        beside = np.int64(quarter[density[n]])
+        situation = beside
+        for g in range(groups):
+            a, b, c = np.int64(values[p * groups + g]), np.int64(values[q * groups + g]), np.int64(values[r * groups + g])
+            kinds, second, agreement, length = known_codes(count, a, b, c, shift)
+            value = np.int64(values[n * groups + g])
+            symbol = NEW
+            if not one.reads:
+                symbol = NEW if kinds == 0 else 0 if value == a else 1 if value == second and kinds > 1 else 2 if value == c and kinds > 2 else NEW
+            o = each * g
+            symbol, at, lacking = coded_few(one, g, o + 16 * agreement + situation, symbol, at)
+            failed |= lacking | (np.int64(symbol >= kinds) & np.int64(symbol != NEW))  # names no neighbour
+            if symbol == NEW:
+                leading, at, lacking = coded(one, g, o + REPEAT_CONTEXTS + 16 * length + situation, value >> shift, at)
+                failed |= lacking
+                situation = 4 * newness(leading) + beside
                 value = leading
-            beside[n] = 4 * (1 if leading < 8 else 2 if leading < 64 else 3) + (situation & 3)
-        else:
-            value = known_a if symbol == 0 else known_b if symbol == 1 else known_c
-            beside[n] = situation & 3
-            if symbol >= kinds:  # names no neighbour
-                state[FAILED] = 1
-                value = np.int64(0)
-        codes[n] = value
+                if shift:
+                    low, at, lacking = coded(one, g, o + REPEAT_CONTEXTS + CODE_CONTEXTS + leading, np.int64(values[n * groups + g]) & 255, at)
+                    failed |= lacking
+                    value = leading << 8 | low
+            else:
+                value = a if symbol == 0 else second if symbol == 1 else c
+                situation = beside
+            values[n * groups + g] = value
+    coder.at[s], coder.failed[s] = at, failed
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def walk_codes(coder, codes, neighbours, densities, quarters, shift, first, begin, end):  # type: ignore[no-untyped-def]
+    """Codes (N, G) of the groups of each voxel, each of which has a lane: whether one is that of a neighbour, and which if not.
+
+    densities  (N,) uint8 codes; quarters (256,) uint8: the quarter of the table that each lies in
+    shift      8 for codes of two bytes, 0 for those of one: a code's leading byte is what is left above
+    first      (S + 1,) int64: voxels of the slices
+    """
+    for s in numba.prange(len(first) - 1):
+        _walk_codes(coder, s, codes, neighbours, densities, quarters, shift, min(first[s] + begin, first[s + 1]), min(first[s] + end, first[s + 1]))
