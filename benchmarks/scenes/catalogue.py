@@ -1,9 +1,11 @@
-"""Four kinds of scenes: what is in them, and where the cameras of each split stand.
+"""Six kinds of scenes: what is in them, and where the cameras of each split stand.
 
 object   an object with alpha: bounded
 court    an object in a court with surroundings out to 40 units: unbounded
 window   a street seen from one side, from 2 to 60 units away: forward-facing
 gloss    mirrors, highlights and wires thinner than a pixel, with alpha: bounded
+thicket  a plant, a wire-frame ball, a fence and a word, with alpha: bounded
+garden   the same otherwise: for reports alone
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.scenes.shapes import Box, Capsule, Ground, Material, Shape, Sphere
+from benchmarks.scenes.thin import garden, thicket
 from efficientnerf.geometry.cameras import Camera
 
 GOLDEN = np.pi * (3 - np.sqrt(5))
@@ -144,5 +147,7 @@ def recipes() -> dict[str, Recipe]:
         "object": Recipe(_toy(), True, _dome(3.4, -5.0, 70.0, (0.0, 0.0, 0.45)), 1.4),
         "court": Recipe(_court(), False, _dome(3.2, 8.0, 40.0, (0.0, 0.0, 0.4)), 0.9),
         "window": Recipe(_street(), False, _window, 0.9, forward_facing=True),
+        "thicket": Recipe(thicket(), True, _dome(3.0, -5.0, 70.0, (0.0, 0.0, 0.3)), 1.5),
+        "garden": Recipe(garden(), True, _dome(3.0, -5.0, 70.0, (0.0, 0.0, 0.3)), 1.5),
         "gloss": Recipe(_gloss(), True, _dome(3.6, -5.0, 70.0, (0.0, 0.0, 0.5)), 1.4),
     }

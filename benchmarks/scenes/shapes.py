@@ -133,6 +133,36 @@ class Capsule:
 
 
 @dataclass(frozen=True)
+class Disc:
+    """A flat disc without thickness, seen from both sides: a leaf."""
+
+    centre: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    radius: float
+    material: Material
+
+    @property
+    def ball(self) -> tuple[np.ndarray, float]:
+        return np.array(self.centre), self.radius
+
+    @property
+    def unit(self) -> np.ndarray:
+        """(3,) the axis, of length one."""
+        axis = np.array(self.axis)
+        return np.asarray(axis / np.linalg.norm(axis))
+
+    def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        offset = np.array(self.centre) - origins
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (offset @ self.unit) / (directions @ self.unit)
+            away = ((t[:, None] * directions - offset) ** 2).sum(-1)
+        return np.where(np.isfinite(t) & (t > NEAREST) & (away <= self.radius**2), t, np.inf)
+
+    def normal(self, points: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self.unit, points.shape)
+
+
+@dataclass(frozen=True)
 class Ground:
     """The horizontal plane at a height, without end."""
 
