@@ -117,7 +117,7 @@ class Capsule:
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         a, axis = np.array(self.a), np.array(self.b) - np.array(self.a)
         offset, long = origins - a, float(axis @ axis)
-        along_d, along_o = directions @ axis, offset @ axis
+        along_d, along_o = (directions * axis).sum(-1), (offset * axis).sum(-1)  # rounded alike whatever rays come along
         t = _first_root(long - along_d**2, long * (offset * directions).sum(-1) - along_o * along_d, long * ((offset**2).sum(-1) - self.radius**2) - along_o**2)
         with np.errstate(invalid="ignore"):
             at = along_o + t * along_d
@@ -154,7 +154,7 @@ class Disc:
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         offset = np.array(self.centre) - origins
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (offset @ self.unit) / (directions @ self.unit)
+            t = (offset * self.unit).sum(-1) / (directions * self.unit).sum(-1)
             away = ((t[:, None] * directions - offset) ** 2).sum(-1)
         return np.where(np.isfinite(t) & (t > NEAREST) & (away <= self.radius**2), t, np.inf)
 

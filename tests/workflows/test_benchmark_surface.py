@@ -104,4 +104,4 @@ def test_a_made_scene_s_mesh_keeps_its_floor() -> None:
     assert found.f[voxel] > 0.99
     assert found.f[voxel / 2] > 0.85
     assert found.normals < 9
-    assert images["iou"] > 0.95
+    assert images["iou"] > 0.85
