@@ -1,7 +1,8 @@
-"""Benchmarks on a CUDA device: tests, kernels, renders, training steps, a bake and the pipeline, written to benchmarks/results/gpu.json after each part.
+"""Benchmarks on a CUDA device: tests, kernels, renders, rays of tree training, training steps, a bake and the pipeline; written to
+benchmarks/results/gpu.json after each part.
 
-    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,renders,training,asset,pipeline,paper] [--seconds 570] [--preset standard] [--asset FILE]
-                             [--json FILE]
+    python benchmarks/gpu.py [SOURCE] [--parts tests,kernels,renders,trees,training,asset,pipeline,paper] [--seconds 570] [--preset standard]
+                             [--asset FILE] [--json FILE]
 
 Prints a line and ends where torch has no CUDA device. Each part runs in a process of its own, because an error on a device can break what follows it;
 a part that has not ended after its share of --seconds is stopped and recorded as such. All but the pipeline need METHOD alone
@@ -26,7 +27,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 # Seconds at most. Most of the tests' time is compilation of kernels.
-PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
+PARTS = {"tests": 200.0, "kernels": 60.0, "renders": 90.0, "trees": 60.0, "training": 60.0, "asset": 90.0, "pipeline": 600.0, "paper": 120.0}
 TILES = [((8, 4), 2), ((8, 8), 2), ((8, 8), 4), ((4, 4), 1), ((16, 2), 1), ((16, 4), 2)]
 TESTS = ["tests/efficientnerf", "--ignore=tests/efficientnerf/backends/test_cuda_builds.py", "-k", "cuda or readback or device or gpu"]
 METHOD = ["torch", "triton", "numba", "scipy", "safetensors", "msgspec", "platformdirs"]
@@ -104,6 +105,10 @@ def measured(part: str, given: argparse.Namespace, seconds: float) -> dict[str, 
 
         tree = format.load(given.asset) if given.asset else gpu_kernels.shell(384)
         return gpu_kernels.frame_rates("cuda", tree, 800, 10, TILES)
+    if part == "trees":
+        import gpu_tree
+
+        return {f"degree_{n}": gpu_tree.tree_rates("cuda", gpu_kernels.shell(384, n), 800, 8, 2048, 20, 2048) for n in (0, 2)}
     if part == "paper":
         return gpu_kernels.paper_rates("cuda", 300, 400, 40)
     if part == "asset":

@@ -105,8 +105,8 @@ def kernel_rates(device: str, rays_: int, log2_table: int, repeats: int) -> dict
     return out
 
 
-def shell(resolution: int) -> NerfTree:
-    """A bumpy shell with soft edges, degree 2, with about as many voxels as an object of that size."""
+def shell(resolution: int, degree: int = 2) -> NerfTree:
+    """A bumpy shell with soft edges, with about as many voxels as an object of that size."""
     side = resolution // 4 * 4
     kept = []
     for x in range(side):
@@ -118,7 +118,7 @@ def shell(resolution: int) -> NerfTree:
         kept.append(np.concatenate([np.full((len(at), 1), x), at, off[tuple(at.T)][:, None]], axis=1))
     found = np.concatenate(kept)
     density = (60.0 * np.exp(-(found[:, 3] ** 2) / 2)).astype(np.float32)
-    sh = np.random.default_rng(0).normal(size=(len(found), 9, 3)).astype(np.float32)
+    sh = np.random.default_rng(0).normal(size=(len(found), (degree + 1) ** 2, 3)).astype(np.float32)
     return tree_from_voxels((side // 4,) * 3, 2.0 / side, np.full(3, -1.0), found[:, :3].astype(np.int64), density, sh)
 
 

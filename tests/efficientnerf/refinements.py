@@ -51,9 +51,17 @@ def gradients(
     min_weight: float = 0.0,
 ) -> tuple[np.ndarray, ...]:  # fmt: skip
     """Loss of each ray, and the gradients of their sum by density and harmonics, from the kernels, in packets of so many rays."""
+    return packet_gradients(tree, origins, directions, seen, packets_of(len(origins), packet), dtype, stop, min_weight)
+
+
+def packet_gradients(
+    tree: NerfTree, origins: np.ndarray, directions: np.ndarray, seen: RayTargets, first: np.ndarray, dtype: Any = np.float64, stop: float = 0.0,
+    min_weight: float = 0.0,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """`gradients` of packets whose first rays, and the end, are (P + 1,)."""
     start, along, bases = in_voxels(tree, origins, directions)
     density, sh = tree.density_values.astype(dtype), tree.sh.reshape(len(tree.sh), -1).astype(dtype)
-    cells, first = cells_of(tree_grid(tree)), packets_of(len(start), packet)
+    cells = cells_of(tree_grid(tree))
     dense = dense_densities(cells, voxel_places(cells, len(sh)), density)
     loss, records = kernels.forward_backward(
         cells, first, start, along, packet_bases(bases.astype(dtype), first), dense, sh, seen, RecordBuffer(dtype), stop=stop,

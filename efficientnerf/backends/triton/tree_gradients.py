@@ -187,16 +187,22 @@ def _forward(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
+def by_sample(by, behind, weight, rgb, after):  # type: ignore[no-untyped-def]
+    """Of samples, front to back: colour behind them (Vec3), gradients by their optical thickness, and by the arguments of the sigmoids (Vec3)."""
+    rest = Vec3(behind.x - weight * rgb.x, behind.y - weight * rgb.y, behind.z - weight * rgb.z)
+    g = by.colour
+    by_depth = by.end + g.x * (after * rgb.x - rest.x) + g.y * (after * rgb.y - rest.y) + g.z * (after * rgb.z - rest.z)
+    return rest, by_depth, Vec3(g.x * weight * rgb.x * (1 - rgb.x), g.y * weight * rgb.y * (1 - rgb.y), g.z * weight * rgb.z * (1 - rgb.z))
+
+
+@triton.jit
 def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
     """given  Scene, Upstream and Sums"""
     scene, by, sums = given[0], given[1], given[2]
     column, channel = scene.column, scene.column % 3
     visible, weight, rgb, after, total = _shaded(scene, sample, state.transmittance, BRICK, NEAREST, K)
-    behind = Vec3(state.behind.x - weight * rgb.x, state.behind.y - weight * rgb.y, state.behind.z - weight * rgb.z)
-    g = by.colour
-    by_depth = by.end + g.x * (after * rgb.x - behind.x) + g.y * (after * rgb.y - behind.y) + g.z * (after * rgb.z - behind.z)
-    by_red, by_green, by_blue = g.x * weight * rgb.x * (1 - rgb.x), g.y * weight * rgb.y * (1 - rgb.y), g.z * weight * rgb.z * (1 - rgb.z)
-    by_logit = tl.where((channel == 0)[None, :], by_red[:, None], tl.where((channel == 1)[None, :], by_green[:, None], by_blue[:, None]))
+    behind, by_depth, by_rgb = by_sample(by, state.behind, weight, rgb, after)
+    by_logit = tl.where((channel == 0)[None, :], by_rgb.x[:, None], tl.where((channel == 1)[None, :], by_rgb.y[:, None], by_rgb.z[:, None]))
     by_column = scene.basis * by_logit / total[:, None]
     for n in tl.static_range(1 if NEAREST else 8):
         voxel = tl.load(scene.index + corner_place(sample.corner, n, BRICK), visible, other=-1).to(tl.int64)
