@@ -2,8 +2,8 @@
 
     python benchmarks/size_quality.py RUN [--sizes 1,2,5,10,20,40] [--layouts compact,packed] [--out benchmarks/results] [--set STAGE.NAME=VALUE]
 
-RUN has to be trained; it is not changed. Each budget (bake.max_mib) is baked and evaluated in a copy beside it by the stages themselves, with the
-run's other settings. Writes size_quality_NAME.json, .md and .png; the network's PSNR is of the views that the evaluate stage rendered.
+RUN has to be trained; it is not changed. Each budget, in MB of 10^6 bytes (bake.max_mib is in MiB), is baked and evaluated in a copy beside it by the stages
+themselves, with the run's other settings. Writes size_quality_NAME.json, .md and .png; the network's PSNR is of the views that the evaluate stage rendered.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from stages.artifacts import BakeOutputs, EvaluateOutputs
 from workflows.paper.document import hardware, versions
 
 
-def row_of(run: Path, layout: str, size: int, settings: dict[str, str]) -> dict[str, Any]:
-    """Bake to at most `size` MiB, evaluate, and read the figures."""
-    took = made(run, "bake", {**settings, "bake.layout": layout, "bake.max_mib": size})
+def row_of(run: Path, layout: str, size: float, settings: dict[str, str]) -> dict[str, Any]:
+    """Bake to at most `size` MB, evaluate, and read the figures."""
+    took = made(run, "bake", {**settings, "bake.layout": layout, "bake.max_mib": repr(size * 1e6 / 2**20)})
     made(run, "evaluate", {"evaluate.field_views": 1})
     report, metrics = read_json(BakeOutputs.of_run(run).report), read_json(EvaluateOutputs.of_run(run).metrics)
-    stored = BakeOutputs.of_run(run).asset.stat().st_size / 2**20
+    stored = BakeOutputs.of_run(run).asset.stat().st_size / 1e6
     if stored > size:
-        raise SystemExit(f"bake.max_mib={size}: the asset has {stored:.1f} MiB")
+        raise SystemExit(f"{size:g} MB: the asset has {stored:.2f} MB")
     return {
         "layout": layout,
-        "max_mib": size,
-        "mib": stored,
+        "max_mb": size,
+        "mb": stored,
         "voxels": report["voxels"],
         "resolution": report["resolution"],
         "psnr": metrics["asset"]["psnr"],
@@ -42,12 +42,12 @@ def row_of(run: Path, layout: str, size: int, settings: dict[str, str]) -> dict[
 
 
 def in_markdown(name: str, rows: list[dict[str, Any]], network: float | None) -> str:
-    columns = ("layout", "budget / MiB", "file / MiB", "voxels", "grid", "PSNR / dB", "SSIM", "baking / s")
+    columns = ("layout", "budget / MB", "file / MB", "voxels", "grid", "PSNR / dB", "SSIM", "baking / s")
     lines = [f"# Size and quality of the asset: {name}", "", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     for row in rows:
         grid = " x ".join(str(n) for n in row["resolution"])
         figures = f"{row['psnr']:.2f} | {row['ssim']:.4f} | {row['baking']['seconds']:.0f}"
-        lines.append(f"| {row['layout']} | {row['max_mib']} | {row['mib']:.2f} | {row['voxels']:,} | {grid} | {figures} |")
+        lines.append(f"| {row['layout']} | {row['max_mb']:g} | {row['mb']:.2f} | {row['voxels']:,} | {grid} | {figures} |")
     lines += ["", f"PSNR over {rows[0]['views']} test views at full working size." + (f" The network: {network:.2f} dB." if network else "")]
     return "\n".join(lines) + "\n"
 
@@ -61,13 +61,13 @@ def plot(path: Path, rows: list[dict[str, Any]], network: float | None, name: st
     axes = figure.add_subplot()
     for layout in dict.fromkeys(row["layout"] for row in rows):
         chosen = [row for row in rows if row["layout"] == layout]
-        axes.plot([row["mib"] for row in chosen], [row["psnr"] for row in chosen], "o-", label=layout)
+        axes.plot([row["mb"] for row in chosen], [row["psnr"] for row in chosen], "o-", label=layout)
     if network:
         axes.axhline(network, color="grey", linestyle="--", label="network")
     axes.set_xscale("log", base=2)
-    budgets = sorted({row["max_mib"] for row in rows})
-    axes.set_xticks(budgets, [str(budget) for budget in budgets])
-    axes.set(xlabel="asset file / MiB", ylabel="PSNR of test views / dB", title=name)
+    budgets = sorted({row["max_mb"] for row in rows})
+    axes.set_xticks(budgets, [f"{budget:g}" for budget in budgets])
+    axes.set(xlabel="asset file / MB", ylabel="PSNR of test views / dB", title=name)
     axes.grid(alpha=0.3)
     axes.legend()
     figure.savefig(path, metadata={"Software": None})
@@ -76,7 +76,7 @@ def plot(path: Path, rows: list[dict[str, Any]], network: float | None, name: st
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--sizes", default="1,2,5,10,20,40", help="budgets in MiB")
+    parser.add_argument("--sizes", default="1,2,5,10,20,40", help="budgets in MB")
     parser.add_argument("--layouts", default="compact,packed", help="values of bake.layout")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parent / "results")
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="STAGE.NAME=VALUE")
@@ -85,10 +85,10 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory(prefix="sizes-", dir=given.run.resolve().parent) as folder:
         work = linked_copy(given.run, Path(folder) / "run")
-        sizes = sorted(int(word) for word in given.sizes.split(","))
+        sizes = sorted(float(word) for word in given.sizes.split(","))
         for layout, size in ((layout, size) for layout in given.layouts.split(",") for size in sizes):
             rows.append(row_of(work, layout, size, settings))
-            print(f"{layout} {size:5} MiB: {rows[-1]['mib']:.1f} MiB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
+            print(f"{layout} {size:5g} MB: {rows[-1]['mb']:.2f} MB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
         measured = EvaluateOutputs.of_run(given.run).metrics  # of more than one view, where the run has been evaluated
         network = read_json(measured if measured.exists() else EvaluateOutputs.of_run(work).metrics)["network"]
     name = given.run.resolve().name

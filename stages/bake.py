@@ -1,8 +1,9 @@
 """The bake stage: a trained field in, the asset out.
 
     asset.nerftree  see efficientnerf/asset/FORMAT.md
-    report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the refinement; of a scene without a
-                    constant background, which is baked whole (`stages.baking.whole_scene`): its cascades, and the share of the rays that end in holes
+    report.json     resolution and what decided it, voxels, bytes; PSNR of a sample of the training pixels before and after the refinement, and of a packed
+                    asset as it is written; of a scene without a constant background, which is baked whole (`stages.baking.whole_scene`): its cascades, and
+                    the share of the rays that end in holes
     log.jsonl       a line every few steps of the refinement
     curve.png       PSNR over these steps
     previews/       renders of a validation view
@@ -20,13 +21,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 
-from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, PositiveInt, Seed, given, setting
+from efficientnerf.settings import Auto, Count, Fraction, NonNegative, Off, Seed, given, setting
 from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job, Stage
 from stages.artifacts import BakeInputs, BakeOutputs, needs_of
 from stages.baking.metadata import metadata_of, sources_of
 from stages.compiling import compiling_kernels
 from stages.cores import use_all_cores
+
+PSNR_BYTES = 16  # by which a header grows at most, once the PSNR of what is written is known
 
 if TYPE_CHECKING:
     from efficientnerf.asset.refinement.targets import Targets
@@ -66,7 +69,7 @@ class BakeSettings:
         1_000_000, "Training pixels that the field is rendered for, to find the visible voxels.", advanced=True
     )
     weight_threshold: Fraction = setting(1e-3, "A voxel is kept where its weight in some pixel exceeds this.", advanced=True)
-    max_mib: PositiveInt | Auto = setting(
+    max_mib: Annotated[float, Meta(gt=0.0)] | Auto = setting(
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
         " 36 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed; less where voxels as fine as pixels"
@@ -155,11 +158,13 @@ def run(job: Job) -> None:
     tree, report = refined(job, s, baked_tree(job, m, s, plan, metadata), targets, phases, room, stopwatch, plan.samples)
     if tree.region is not None and not bounds_are_given(job.inputs["poses"]):
         tree = replace(tree, region=replace(tree.region, bricks=foreground_bricks(tree)))
-    provenance = {**metadata["provenance"], "sources": sources_of(job), "metrics": {"training_psnr": report["psnr_after"]}}
+    metrics = {"training_psnr": report["psnr_after"]}
+    provenance = {**metadata["provenance"], "sources": sources_of(job), "metrics": metrics}
     outputs = BakeOutputs(job.out)
     tree = tree.with_metadata(provenance=provenance)
     if settings.layout == "packed":
-        tree = packed_tree(job, tree, targets, mib * 2**20)
+        tree, psnr = packed_tree(job, tree, targets, int(mib * 2**20) - PSNR_BYTES)
+        metrics["training_psnr"] = report["psnr_written"] = round(psnr, 3)
     format.save(tree, outputs.asset, settings.layout)
     found: dict[str, Any] = {"resolution": list(tree.resolution), "voxels": len(tree.density_values), "bricks": len(tree.voxel_index)}
     found |= {"bytes": outputs.asset.stat().st_size, "optimisation": report}
@@ -169,7 +174,7 @@ def run(job: Job) -> None:
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _room(settings: BakeSettings, m: Any, plan: Plan, mib: int, splits: int) -> int:
+def _room(settings: BakeSettings, m: Any, plan: Plan, mib: float, splits: int) -> int:
     """How many voxels the asset holds on the plan's grids once they were split so often."""
     from stages.baking.whole_scene import room_of
 
@@ -178,7 +183,7 @@ def _room(settings: BakeSettings, m: Any, plan: Plan, mib: int, splits: int) -> 
     return room_of(settings, m, grids, mib, environment=plan.samples is not None)
 
 
-def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: int, splits: int, *, whole: bool) -> Plan:
+def _plan(job: Job, m: Any, s: Scene, pixels: Pixels, mib: float, splits: int, *, whole: bool) -> Plan:
     """The voxels to bake, which will be split so often: cascades of a whole scene, or else one grid of what lies in the field's box."""
     from efficientnerf.asset.bake import grid_of
     from stages.baking.plan import Plan
@@ -219,7 +224,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=9,
+    version=10,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

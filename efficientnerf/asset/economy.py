@@ -34,7 +34,7 @@ class _Voxels:
     """The values of a tree's voxels in the order of the file.
 
     worth       (N,) float32: what a squared error of the colour counts
-    neighbours  (3 N,) int32, see `packed.neighbours_of`
+    neighbours  (3 N,) int32 and first (S + 1,), see `packed.neighbours_of`
     """
 
     density: np.ndarray
@@ -42,28 +42,64 @@ class _Voxels:
     sh: np.ndarray
     worth: np.ndarray
     neighbours: np.ndarray
+    first: np.ndarray
     side: Any
+
+    def pieces(self) -> Any:
+        """Slices of the voxels of the longest slice of the file."""
+        from efficientnerf.backends.pieces import pieces
+
+        return pieces(int(np.diff(self.first).max()), first=1024)
+
+
+@dataclass(frozen=True, eq=False)
+class Economy:
+    """A tree with what its codes are chosen from at any rate: the nearest codes and the palettes that the passes begin with.
+
+    order     (N,) voxels in the order of the file
+    clusters  (codes (N,) uint8, palette (P, 3)) of each harmonic above the base
+    """
+
+    tree: NerfTree
+    order: np.ndarray
+    voxels: _Voxels
+    clusters: list[tuple[np.ndarray, np.ndarray]]
+
+    def at(self, rate: float) -> NerfTree:
+        """The tree with codes for `packed`.
+
+        rate  distortion that a bit has to be worth: the greater, the smaller the file
+        """
+        density, levels = _densities(self.voxels, rate)
+        base, table = _bases(self.voxels, rate)
+        codes, palette = _harmonics(self.voxels, density, len(levels), rate, self.clusters)
+        back = np.argsort(self.order)
+        harmonics = PaletteHarmonics(base[back], table, codes[back], palette, (1,) * len(self.clusters))
+        return replace(self.tree, density_values=levels[density][back], harmonics=harmonics)
+
+
+def economy_of(tree: NerfTree, weight: np.ndarray | None = None, entries: int = ENTRIES) -> Economy:
+    """What codes are chosen from, of a tree with voxels.
+
+    weight   (N,) greatest weight of each voxel in a photograph, as `refinement.fit.max_weights` finds it; by default its opacity
+    entries  of the palette, at most 256
+    """
+    order = order_of(tree)
+    voxels = _voxels_of(tree, order, weight)
+    found = []
+    for k in range(1, tree.harmonics_count):
+        palette, codes = clustered(np.ascontiguousarray(voxels.sh[:, k], np.float32), voxels.worth, entries, seed=k)
+        found.append(_sorted(codes, palette))
+    return Economy(tree, order, voxels, found)
 
 
 def economised(tree: NerfTree, weight: np.ndarray | None = None, rate: float = DEFAULT_RATE, entries: int = ENTRIES) -> NerfTree:
-    """The tree with codes for `packed`.
-
-    weight   (N,) greatest weight of each voxel in a photograph, as `refinement.fit.max_weights` finds it; by default its opacity
-    rate     distortion that a bit has to be worth: the greater, the smaller the file
-    entries  of the palette, at most 256
-    """
+    """The tree with codes for `packed` at a rate, see `Economy.at`; arguments as of `economy_of`."""
     if not len(tree.density_values):
         from efficientnerf.asset.quantisation import compacted
 
         return compacted(tree, entries)
-    order = order_of(tree)
-    voxels = _voxels_of(tree, order, weight)
-    density = _densities(voxels, rate)
-    base, table = _bases(voxels, rate)
-    codes, palette = _harmonics(voxels, density[0], len(density[1]), rate, entries)
-    back = np.argsort(order)
-    harmonics = PaletteHarmonics(base[back], table, codes[back], palette, (1,) * (tree.harmonics_count - 1))
-    return replace(tree, density_values=density[1][density[0]][back], harmonics=harmonics)
+    return economy_of(tree, weight, entries).at(rate)
 
 
 def _voxels_of(tree: NerfTree, order: np.ndarray, weight: np.ndarray | None) -> _Voxels:
@@ -73,7 +109,8 @@ def _voxels_of(tree: NerfTree, order: np.ndarray, weight: np.ndarray | None) -> 
     worth = opacity if weight is None else np.asarray(weight, np.float32)[order]
     grids = [packed.padded(cascade.brick_index >= 0) for cascade in cascades_of(tree)]
     stored = (tree.voxel_index[bricks_of(tree)] >= 0).astype(np.uint8)
-    return _Voxels(density, opacity, np.clip(tree.sh[order], -LIMIT, LIMIT), worth, packed.neighbours_of(grids, stored, tree.brick).reshape(-1), side)
+    neighbours, first = packed.neighbours_of(grids, stored, tree.brick)
+    return _Voxels(density, opacity, np.clip(tree.sh[order], -LIMIT, LIMIT), worth, neighbours.reshape(-1), first, side)
 
 
 def _bits(counts: np.ndarray) -> np.ndarray:
@@ -83,17 +120,11 @@ def _bits(counts: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(-np.log2(smooth / smooth.sum(axis=1, keepdims=True)), np.float32)
 
 
-def _counted(symbols: int, contexts: int, walk: Callable[[Any], None]) -> np.ndarray:
-    """How often (n, 256) each symbol of each context occurs on a walk."""
-    coder = streams.recorder([symbols])
+def _counted(symbols: np.ndarray, contexts: int, walk: Callable[[Any], None]) -> np.ndarray:
+    """How often (n, 256) each symbol of each context occurs on a walk of so many symbols of each slice."""
+    coder = streams.recorder(symbols.tolist())
     walk(coder)
     return streams.counts(coder, contexts)
-
-
-def _pieces(count: int) -> Any:
-    from efficientnerf.backends.pieces import pieces
-
-    return pieces(count, first=1024)
 
 
 def _densities(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
@@ -102,21 +133,20 @@ def _densities(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
 
     table, codes = np.unique(quantised_density(voxels.density, voxels.side), return_inverse=True)
     codes = codes.reshape(-1).astype(np.uint8)
-    count, side = len(codes), float(np.max(voxels.side))
-    whole = np.array([0, count])  # which codes are neighbours' says where slices begin
+    side = float(np.max(voxels.side))
     # In front of what it hides a voxel's weight is that over its opacity.
     weight = (CONTRAST / rate) * voxels.worth / np.maximum(voxels.opacity, 0.05)
     shown = -np.expm1(-table * np.float32(side)).astype(np.float32)
 
     def walk(coder: Any) -> None:
-        for piece in _pieces(count):
-            walks.walk_densities(coder, codes, voxels.neighbours, len(table), whole, piece.start, piece.stop)
+        for piece in voxels.pieces():
+            walks.walk_densities(coder, codes, voxels.neighbours, len(table), voxels.first, piece.start, piece.stop)
 
     for _ in range(PASSES):
-        bits = _bits(_counted(count, walks.DENSITY_CONTEXTS, walk)[:, : len(table)])
-        for piece in _pieces(count):
+        bits = _bits(_counted(np.diff(voxels.first), walks.DENSITY_CONTEXTS, walk)[:, : len(table)])
+        for piece in voxels.pieces():
             choices.choose_densities(
-                voxels.opacity, weight.astype(np.float32), shown, voxels.neighbours, bits, codes, piece.start, piece.stop
+                voxels.opacity, weight.astype(np.float32), shown, voxels.neighbours, bits, codes, voxels.first, piece.start, piece.stop
             )  # fmt: skip
     return codes, table.astype(np.float32)
 
@@ -127,20 +157,19 @@ def _bases(voxels: _Voxels, rate: float) -> tuple[np.ndarray, np.ndarray]:
 
     values = np.ascontiguousarray(voxels.sh[:, 0], np.float32)
     nearest, table = base_codes(values)
-    codes, count = nearest.copy(), len(values)
-    whole = np.array([0, count])
+    codes = nearest.copy()
     weight = ((C0 * _slopes(values)) ** 2 * (voxels.worth / np.float32(rate))[:, None]).astype(np.float32)
 
     def walk(coder: Any) -> None:
-        for piece in _pieces(count):
-            walks.walk_bases(coder, codes, voxels.neighbours, len(table), whole, piece.start, piece.stop)
+        for piece in voxels.pieces():
+            walks.walk_bases(coder, codes, voxels.neighbours, len(table), voxels.first, piece.start, piece.stop)
 
     for _ in range(PASSES):
-        bits = _bits(_counted(3 * count, walks.BASE_CONTEXTS, walk))
+        bits = _bits(_counted(3 * np.diff(voxels.first), walks.BASE_CONTEXTS, walk))
         codes[:] = nearest
         for channel in (1, 0, 2):
-            for piece in _pieces(count):
-                choices.choose_bases(values, weight, table, voxels.neighbours, bits, codes.reshape(-1), channel, piece.start, piece.stop)
+            for piece in voxels.pieces():
+                choices.choose_bases(values, weight, table, voxels.neighbours, bits, codes.reshape(-1), channel, voxels.first, piece.start, piece.stop)
     return codes, table
 
 
@@ -150,9 +179,9 @@ def _slopes(base: np.ndarray) -> np.ndarray:
     return np.maximum(colour * (1 - colour), 0.05)
 
 
-def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, entries: int) -> tuple[np.ndarray, np.ndarray]:
-    """Codes (N, K - 1) uint8 and palette (P, K - 1, 3) float32, halves in value; entries lie by how often they occur."""
-    from efficientnerf.backends.numba.entropy import choices, walks
+def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, clusters: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Codes (N, K - 1) uint8 and palette (P, K - 1, 3) float32, halves in value; entries lie by how often the nearest codes name them."""
+    from efficientnerf.backends.numba.entropy import choices
 
     sh, count = voxels.sh, len(voxels.sh)
     slope = np.square(_slopes(sh[:, 0])).mean(axis=1)
@@ -160,22 +189,16 @@ def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, e
     out = np.zeros((count, sh.shape[1] - 1), np.uint8)
     palettes: list[np.ndarray] = []
     beside = packed.quarters_of(levels)[density]
-    split = walks.REPEAT_CONTEXTS
-    for k in range(1, sh.shape[1]):
+    for k, (nearest, palette) in enumerate(clusters, 1):
         vectors = np.ascontiguousarray(sh[:, k], np.float32)
-        palette, codes = clustered(vectors, voxels.worth, entries, seed=k)
-        codes, palette = _sorted(codes, palette)
-        before = beside.copy()
-
+        codes, before = nearest.copy(), beside.copy()
         for _ in range(PASSES):
-            counts, situation = np.zeros((split + walks.CODE_CONTEXTS, 256), np.int64), before.copy()
-            for piece in _pieces(count):
-                choices.count_codes(codes, voxels.neighbours, situation, counts, piece.start, piece.stop)
-            repeat_bits, code_bits = _bits(counts[:split, :4]), _bits(counts[split:, : len(palette)])
+            repeat_bits, code_bits = _code_bits(codes, voxels, before, len(palette))
             beside = before.copy()
-            for piece in _pieces(count):
+            for piece in voxels.pieces():
                 choices.choose_codes(
-                    vectors, weight, palette, voxels.neighbours, beside, repeat_bits, code_bits, code_bits.min(axis=1), codes, piece.start, piece.stop
+                    vectors, weight, palette, voxels.neighbours, beside, repeat_bits, code_bits, code_bits.min(axis=1), codes, voxels.first, piece.start,
+                    piece.stop,
                 )  # fmt: skip
             palette = _centred(palette, codes, vectors, weight)
         out[:, k - 1] = codes
@@ -184,6 +207,17 @@ def _harmonics(voxels: _Voxels, density: np.ndarray, levels: int, rate: float, e
         return out, np.zeros((0, 0, 3), np.float32)
     length = max(map(len, palettes))
     return out, np.stack([np.pad(palette, ((0, length - len(palette)), (0, 0))) for palette in palettes], axis=1)
+
+
+def _code_bits(codes: np.ndarray, voxels: _Voxels, beside: np.ndarray, entries: int) -> tuple[np.ndarray, np.ndarray]:
+    """What it costs to repeat a neighbour or not (112, 4), and to name an entry (160, P), in the contexts of one group's codes (N,)."""
+    from efficientnerf.backends.numba.entropy import choices, walks
+
+    split, situation = walks.REPEAT_CONTEXTS, beside.copy()
+    counts = np.zeros((split + walks.CODE_CONTEXTS, 256), np.int64)
+    for begin in range(0, len(codes), streams.PIECE):
+        choices.count_codes(codes, voxels.neighbours, situation, counts, begin, min(len(codes), begin + streams.PIECE))
+    return _bits(counts[:split, :4]), _bits(counts[split:, :entries])
 
 
 def _sorted(codes: np.ndarray, palette: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

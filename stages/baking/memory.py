@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from stages.io.scene import Scene, View
 
 COPIES = 3  # of every voxel's values at the same time: as baked, in the tree, and in the refinement
+PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, those in the order of the file or decoded, two in the refinement
 # Bytes. Of a voxel besides its values: coordinates and keys while it is sorted into the tree; of a coarse cell: its brick, its row while voxels are chosen,
 # its distance to the next one; of a brick's voxel: greatest weight, three times while they grow, and its number; of a training pixel that visibility is
 # measured on: its number, or of whole scenes the field's samples along its ray, twice while they are joined; of a ray of a refinement step: its records.
@@ -28,9 +29,9 @@ VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 1
 MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.contributions
 
 
-def voxels_needed(voxels: int, harmonics: int) -> int:
-    """Bytes that density and K harmonics of so many voxels take while they are baked and refined, in float32."""
-    return (COPIES * 4 * (1 + 3 * harmonics) + VOXEL + 4 * min(MAX_SHARES, count_cores())) * voxels
+def voxels_needed(voxels: int, harmonics: int, *, packed: bool = False) -> int:
+    """Bytes that density and K harmonics of so many voxels take while they are baked and refined, and `packed`, in float32."""
+    return ((COPIES + PACKED_COPIES * packed) * 4 * (1 + 3 * harmonics) + VOXEL + 4 * min(MAX_SHARES, count_cores())) * voxels
 
 
 def needed_on_device(voxels: int, harmonics: int, bricks: int, cells: int, brick: int, *, smooth: bool) -> int:
@@ -67,7 +68,7 @@ def needed(
     rays = min(settings.visibility_rays, count_pixels(tuple(views)))
     return Need({
         PIXELS: pixels[PIXELS],
-        "voxels": max(voxels_needed(voxels, (degree + 1) ** 2), pixels["reading images"] + pixels["directions of pixels"]),
+        "voxels": max(voxels_needed(voxels, (degree + 1) ** 2, packed=settings.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
         "the grid": CELL * cells + BRICK_VOXEL * settings.brick_size**3 * bricks,
         "rays": (SCENE_RAY if whole else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
         "the field": 3 * 4 * parameters(trained) + DENSITY_VOXEL * (given(trained.occupancy_resolution) or 192) ** 3 // 4,
@@ -75,7 +76,7 @@ def needed(
     })  # fmt: skip
 
 
-def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: int, *, splits: int, whole: bool) -> PixelRows | None:
+def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: float, *, splits: int, whole: bool) -> PixelRows | None:
     """Where the pixels are put, before anything else is done: None for memory, or a file in the scratch folder where they might not fit beside the voxels.
 
     How many voxels there are is not known yet: refused is what would not fit without any, and the rest by `refuse_more_than_fits`, before voxels are baked.
@@ -87,7 +88,7 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: in
     settings, degree = job.settings, m.fine.degree
     channels = channels_of(job.inputs["poses"], views)
     finest, cells = _finest_cells(job, m, s, whole=whole)
-    room = most_voxels(mib * 2**20, settings.layout, degree, (1, 1, 1), settings.brick_size)
+    room = most_voxels(int(mib * 2**20), settings.layout, degree, (1, 1, 1), settings.brick_size)
     voxels = min(max(MAX_OVERSHOOT * room, most_children(room) if splits else 0), cells * settings.brick_size**3)
 
     def at_most(count: int, *, stored: bool) -> Need:
@@ -98,7 +99,7 @@ def rows_for_baking(job: Job, m: Any, s: Scene, views: tuple[View, ...], mib: in
     remedy = f"Lower bake.max_resolution ({finest} voxels), bake.visibility_rays ({settings.visibility_rays}) or poses.max_image_size."
     rows = place_pixels(job, at_most(0, stored=stored), views, channels, remedy, stored=stored)
     if job.memory is not None and (most := at_most(voxels, stored=stored).total) > job.memory.bytes:
-        job.warn(f"an asset of {mib} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. Should it not fit, that is said"
+        job.warn(f"an asset of {mib:g} MiB may need {size_text(most)} of memory; {size_text(job.memory.bytes)} may be taken. Should it not fit, that is said"
                  " once its voxels are counted, before they are baked; with a lower bake.max_mib it surely fits.")  # fmt: skip
     return rows
 
@@ -121,7 +122,7 @@ def _finest_cells(job: Job, m: Any, s: Scene, *, whole: bool) -> tuple[int, int]
     return finest, cells if stated else min(cells, 2 * MAX_CELLS)  # coarse cells are more by those that make grids fit each other
 
 
-def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: int, splits: int, room: Callable[[int], int]) -> None:
+def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any, plan: Plan, mib: float, splits: int, room: Callable[[int], int]) -> None:
     """UsageError where the voxels would take more memory than the job may.
 
     pixels        as they were placed
@@ -136,5 +137,5 @@ def refuse_more_than_fits(job: Job, m: Any, views: tuple[View, ...], pixels: Any
     about: dict[str, Any] = {"cells": plan.cells * 8**splits, "bricks": bricks, "voxels": voxels, "degree": m.fine.degree, "whole": whole, "device": job.device}
     need = needed(job.settings, m.settings, views, pixels.images.shape[1], **about, stored=isinstance(pixels.images, PixelFile))
     harmonics = (m.fine.degree + 1) ** 2
-    remedy = f"Lower bake.max_mib ({mib}) or bake.resolution ({plan.choice.resolution}): {voxels:,} voxels with {harmonics} harmonics are too many."
+    remedy = f"Lower bake.max_mib ({mib:g}) or bake.resolution ({plan.choice.resolution}): {voxels:,} voxels with {harmonics} harmonics are too many."
     refuse_what_does_not_fit(job, need, remedy)

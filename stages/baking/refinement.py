@@ -25,7 +25,8 @@ from stages.baking.checkpoint import Point
 from stages.baking.holes import find_holes
 from stages.baking.log import RefinementLog
 from stages.baking.pruning import Pruned, most_children
-from stages.baking.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, timed_schedule
+from stages.baking.timing import FINISH_SECONDS_PER_VOXEL, HOLD, WARMUP, WEIGHT_SECONDS, Stopwatch, allotted, clock, packing_seconds, timed_schedule
+from stages.cores import count_cores
 from stages.training.budget import Budget
 from stages.training.log import draw_curve, psnr_of
 from stages.training.previews import Previews
@@ -196,6 +197,9 @@ def refined(
     before = fit.error(tree, targets, sample, settings.seed)
     measuring = clock() - began
     finish = measuring + FINISH_SECONDS_PER_VOXEL * most
+    if settings.layout == "packed":
+        weighed = min(max(settings.visibility_rays, most), 4 * len(targets.pixels))
+        finish += packing_seconds(most, count_cores(), measuring / sample, settings.refine_rays_per_batch, weighed, sample)
     schedule = stated_schedule(phases, steps) if seconds is None else RefinementSchedule(phases)
     baked = None if samples is None else _without_harmonics(tree, capped=bool(steps))
     point = _first_point(job, tree, schedule, stopwatch, timed=seconds is not None, capped=bool(steps))

@@ -84,7 +84,7 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
 
 
-def budget_of(s: Scene, given: int | None, *, packed: bool = False) -> int:
+def budget_of(s: Scene, given: float | None, *, packed: bool = False) -> float:
     """MiB that an asset may have: those given, or else MAX_MIB. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
     large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""

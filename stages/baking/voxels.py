@@ -42,7 +42,7 @@ def voxel_space(job: Job, m: Any) -> Space:
     return space if depth == 1 else space.with_voxel_depth(depth)
 
 
-def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
+def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> tuple[Choice, Visibility, np.ndarray]:
     """The asset's resolution; the visibility of the voxels to bake, which will be split so often to have it, and their coordinates (N, 3)."""
     from efficientnerf.asset import bake
     from efficientnerf.asset.file import serialisation
@@ -53,7 +53,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
 
     def room(resolution: int) -> int:
         shape, _ = bake.grid_of(bounds, resolution, brick)
-        return serialisation.most_voxels(mib * 2**20, settings.layout, m.fine.degree, shape, brick)
+        return serialisation.most_voxels(int(mib * 2**20), settings.layout, m.fine.degree, shape, brick)
 
     finest = choice = finest_choice(settings, m, s)
     if (given(settings.resolution) or given(m.settings.discretise)) is not None:

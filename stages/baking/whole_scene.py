@@ -52,7 +52,7 @@ def boxes_of(grids: Sequence[Grid], brick: int) -> list[np.ndarray]:
     return [np.stack([low, low + np.asarray(shape) * brick * voxel]) for shape, voxel, low in grids]
 
 
-def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: int, splits: int = 0) -> Plan:
+def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib: float, splits: int = 0) -> Plan:
     """The cascades, their voxels, which will be split so often, the region and the environment."""
     from efficientnerf.asset.field_samples import cascade_visibility, environment_beyond, seen_weights
     from stages.baking.resolution import Choice, affordable_resolution, baked_resolution, finest_of_cascades
@@ -99,12 +99,12 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
     return Plan(choice, space, grids, indices, sum(len(one.cells) for one in seen), weights, samples, region, environment)
 
 
-def room_of(settings: BakeSettings, m: Any, grids: Sequence[Grid], mib: int, *, environment: bool = True) -> int:
+def room_of(settings: BakeSettings, m: Any, grids: Sequence[Grid], mib: float, *, environment: bool = True) -> int:
     """How many voxels an asset of so many MiB holds, beside the cells of these grids and an environment map."""
     from efficientnerf.asset.file.serialisation import most_voxels
 
     cells = sum(math.prod(shape) for shape, _, _ in grids)
-    size = mib * 2**20 - (24 * settings.environment_size**2 if environment else 0)  # float32
+    size = int(mib * 2**20) - (24 * settings.environment_size**2 if environment else 0)  # float32
     return most_voxels(size, settings.layout, m.fine.degree, (cells, 1, 1), settings.brick_size)
 
 

@@ -342,6 +342,20 @@ def test_the_asset_keeps_to_its_size_and_to_the_voxels_that_weigh_most(inputs: d
     assert sizes[64] > sizes[1] > 2**16
 
 
+def test_a_packed_asset_keeps_to_a_part_of_a_mib_and_says_what_its_codes_show(inputs: dict[str, Path], tmp_path: Path) -> None:
+    settings = BakeSettings(
+        resolution=40, samples_per_voxel=1, weight_threshold=0.0, visibility_rays=4000, max_mib=0.1, layout="packed", refine_steps=2, refine_rays_per_batch=512
+    )
+    made = job(tmp_path, settings, **inputs)
+    run(made)
+    path, report = made.out / BakeOutputs.asset, json.loads((made.out / "report.json").read_text())
+    assert path.stat().st_size == report["bytes"] <= 0.1 * 2**20
+    about = format.describe(path)
+    assert about["layout"] == "packed"
+    assert about["provenance"]["metrics"]["training_psnr"] == report["optimisation"]["psnr_written"]
+    assert report["optimisation"]["psnr_written"] > report["optimisation"]["psnr_after"] - 3
+
+
 def test_a_field_trained_on_voxel_centres_is_baked_for_nearest_lookup(tmp_path: Path, inputs: dict[str, Path]) -> None:
     scene = inputs["poses"]
     train.run(job(tmp_path / "train", settings(iterations=30, sample_batch_size=4096, occupancy_warmup_steps=10, discretise=20), poses=scene))

@@ -13,7 +13,9 @@ from efficientnerf.asset.format import serialize
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.refinement.targets import Targets
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from stages.bake import BakeSettings
 from stages.baking import economy
+from stages.baking.timing import REFIT_STEPS, packing_seconds
 from tests.efficientnerf.balls import BOUNDS, pixels
 
 
@@ -29,8 +31,11 @@ def packed(tree: NerfTree, size: int) -> tuple[NerfTree, list[str], list[str]]:
     """The packed tree, what was said and what was warned of."""
     said: list[str] = []
     warned: list[str] = []
-    job: Any = SimpleNamespace(settings=SimpleNamespace(visibility_rays=1000, seed=0), say=said.append, warn=warned.append, safe_point=lambda: None)
-    return economy.packed_tree(job, tree, Targets(pixels(), (1.0, 1.0, 1.0)), size), said, warned
+    settings = BakeSettings(visibility_rays=1000, seed=0, refine_rays_per_batch=256)
+    job: Any = SimpleNamespace(device="cpu", settings=settings, say=said.append, warn=warned.append, safe_point=lambda: None)
+    found, psnr = economy.packed_tree(job, tree, Targets(pixels(), (1.0, 1.0, 1.0)), size)
+    assert f"{psnr:.2f} dB" in said.pop()
+    return found, said, warned
 
 
 @pytest.fixture(scope="module")
@@ -69,3 +74,25 @@ def test_a_size_that_nothing_has_is_warned_of(tree: NerfTree) -> None:
     _, _, warned = packed(tree, 1000)
     assert len(warned) == 1
     assert "bake.max_mib" in warned[0]
+
+
+def test_what_packing_takes_grows_with_what_there_is_to_do() -> None:
+    least = packing_seconds(10**6, 2, 1e-6, 2**15, 10**6, 2**16)
+    assert least > REFIT_STEPS * 2**15 * 1e-6
+    assert packing_seconds(10**6, 4, 1e-6, 2**15, 10**6, 2**16) < least
+    for more in ((2 * 10**6, 2, 1e-6, 2**15, 10**6, 2**16), (10**6, 2, 2e-6, 2**15, 10**6, 2**16), (10**6, 2, 1e-6, 2**16, 10**6, 2**16)):
+        assert packing_seconds(*more) > 1.2 * least
+
+
+def test_a_stopped_packing_stops_at_each_step(tree: NerfTree) -> None:
+    """Signals are answered before codes are chosen and after each step that tables are fitted in."""
+    calls = 0
+
+    def count() -> None:
+        nonlocal calls
+        calls += 1
+
+    settings = BakeSettings(visibility_rays=1000, seed=0, refine_rays_per_batch=256)
+    job: Any = SimpleNamespace(device="cpu", settings=settings, say=lambda _: None, warn=lambda _: None, safe_point=count)
+    economy.packed_tree(job, tree, Targets(pixels(), (1.0, 1.0, 1.0)), 10**7)
+    assert calls > REFIT_STEPS / economy.REFIT_ROUNDS

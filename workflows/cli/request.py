@@ -30,7 +30,7 @@ class Options:
     sets: tuple[str, ...] = ()
     seed: int | None = None
     budget: str | None = None
-    target_mib: int | None = None
+    target_mib: float | None = None
     device: str | None = None
     memory: str | None = None
     strict: bool = False
@@ -115,7 +115,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         for stage, seconds in share_budget(seconds_of(options.budget)).items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:
-        settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib}")
+        settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
     memory, limit = _memory(options.memory, standing, warnings)
     run = Run(
         path,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @memory_option
 @click.option("--seed", type=int, help="Seed of every stage with random choices.")
 @click.option("--budget", metavar="TIME", help="Time for training the field and the asset, as 90s, 10m or 1h; sets train.time_budget and bake.time_budget.")
-@click.option("--target-mib", type=int, metavar="N", help="Largest size of the asset in MiB; sets bake.max_mib.")
+@click.option("--target-mib", type=float, metavar="N", help="Largest size of the asset in MiB; sets bake.max_mib.")
 @click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Show what would be done and why; do nothing.")

@@ -140,8 +140,7 @@ def _walk_all(meta: dict[str, Any], grids: list[np.ndarray], stored: np.ndarray,
     voxels = int(np.count_nonzero(stored))
     if voxels != len(codes["voxel.density"]):
         raise FormatError(f"{name}: masks name {voxels} voxels but {len(codes['voxel.density'])} are stored")
-    of_bricks = np.cumsum(np.append(0, np.count_nonzero(stored, axis=1)), dtype=np.int64)
-    _walk_codes(codes, tables, _neighbours(before, stored, b), of_bricks[first], run)
+    _walk_codes(codes, tables, _neighbours(before, stored, b), _voxels_before(stored)[first], run)
 
 
 def _slices(bricks: int, each: int) -> np.ndarray:
@@ -149,13 +148,19 @@ def _slices(bricks: int, each: int) -> np.ndarray:
     return np.append(np.arange(0, max(1, bricks), each), bricks)
 
 
-def neighbours_of(grids: list[np.ndarray], stored: np.ndarray, b: int) -> np.ndarray:
-    """(N, 3) int32: the voxels one step back along x, y and z, -1 where none is stored in the same slice; numbers as in the file that is written.
+def neighbours_of(grids: list[np.ndarray], stored: np.ndarray, b: int) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) int32: the voxels one step back along x, y and z, -1 where none is stored in the same slice; numbers as in the file that is written. And
+    (S + 1,) int64: the first voxel of each slice, and N.
 
     grids  cells of each cascade, `padded`; stored (B, b^3) uint8
     """
     each = slice_bricks(len(stored), int(np.count_nonzero(stored)))
-    return _neighbours(_bricks_before(grids, len(stored), each), stored, b)
+    return _neighbours(_bricks_before(grids, len(stored), each), stored, b), _voxels_before(stored)[_slices(len(stored), each)]
+
+
+def _voxels_before(stored: np.ndarray) -> np.ndarray:
+    """(B + 1,) int64: how many voxels lie before each brick, and N."""
+    return np.cumsum(np.append(0, np.count_nonzero(stored, axis=1)), dtype=np.int64)
 
 
 def _neighbours(before: np.ndarray, stored: np.ndarray, b: int) -> np.ndarray:

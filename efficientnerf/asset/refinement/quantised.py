@@ -90,4 +90,12 @@ def _moved(tree: NerfTree, density: np.ndarray, base: np.ndarray, palette: np.nd
     table, codes = np.unique(tree.density_values, return_inverse=True)
     entries = np.clip(held.palette + palette, -MAX_HALF, MAX_HALF).astype(np.float16).astype(np.float32)
     harmonics = replace(held, base_table=(held.base_table + base).astype(np.float32), palette=entries)
-    return replace(tree, density_values=(table * np.exp(density)).astype(np.float32)[codes.reshape(-1)], harmonics=harmonics)
+    return replace(tree, density_values=_rising((table * np.exp(density)).astype(np.float32))[codes.reshape(-1)], harmonics=harmonics)
+
+
+def _rising(table: np.ndarray) -> np.ndarray:
+    """The table (T,) with each entry greater than those before it: codes, which are the ranks of densities, stay what they are, and so does a file's size."""
+    out = table.copy()
+    for n in range(1, len(out)):
+        out[n] = max(out[n], np.nextafter(out[n - 1], np.float32(np.inf)))
+    return out

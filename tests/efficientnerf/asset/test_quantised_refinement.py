@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from efficientnerf.asset.format import serialize
 from efficientnerf.asset.palettes import PaletteHarmonics
 from efficientnerf.asset.quantisation import compacted
 from efficientnerf.asset.refinement.fit import error
@@ -38,7 +39,9 @@ def test_tables_that_are_off_are_put_right_and_codes_stay() -> None:
     assert isinstance(after, PaletteHarmonics)
     assert np.array_equal(before.base, after.base)
     assert np.array_equal(before.codes, after.codes)
-    assert len(np.unique(found.density_values)) <= len(np.unique(tree.density_values))
+    ranks = [np.unique(one.density_values, return_inverse=True)[1] for one in (tree, found)]
+    assert np.array_equal(*ranks)
+    assert len(serialize(found, "packed")) == len(serialize(tree, "packed"))
     assert np.array_equal(after.palette, after.palette.astype(np.float16).astype(np.float32))
     assert error(found, seen, 4096, 1) < 0.8 * error(tree, seen, 4096, 1)
 
@@ -69,3 +72,12 @@ def test_a_worse_tree_is_never_made(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_tree_without_codes_is_refused() -> None:
     with pytest.raises(ValueError, match="without codes"):
         refit(ball_tree(), targets(), 1)
+
+
+def test_densities_that_would_meet_or_pass_each_other_keep_their_order() -> None:
+    from efficientnerf.asset.refinement.quantised import _rising
+
+    found = _rising(np.array([0, 3, 3, 1, 5], np.float32))
+    assert (np.diff(found) > 0).all()
+    np.testing.assert_allclose(found, [0, 3, 3, 3, 5], rtol=1e-6)
+    assert np.array_equal(_rising(found), found)

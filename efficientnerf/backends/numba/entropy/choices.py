@@ -1,5 +1,6 @@
 """Codes that are cheap for what they are worth: each voxel's is the one of least distortion and bits, given those of its neighbours before it.
 
+Slices know nothing of each other, so that all cores choose; `first` (S + 1,) int64 says which voxel each begins with, and N.
 Contexts are those of `walks`; what a symbol of a context costs was counted in the pass before. Distortions are in bits: squared errors times a weight.
 
 N stored voxels, P entries of a palette, D numbers of a vector, T entries of a table.
@@ -37,17 +38,8 @@ def _error(vectors, palette, n, p):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")
-def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (N,) uint8 of one group. A palette is searched only where its cheapest entry, were it exact, would be better than a neighbour's.
-
-    vectors      (N, D) float32; palette (P, D)
-    weight       (N,) float32: bits that a squared error of 1 is worth
-    neighbours   (3 N,) int32
-    beside       (N,) uint8: four times how the group before was coded, 0 as a neighbour's, else `newness`; and the quarter of the table that the density
-                 lies in; overwritten with what holds for this group
-    repeat_bits  (112, 4) float32; code_bits (160, P), least_bits (160,) the least of each row
-    """
+@numba.njit
+def _choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, begin, end):  # type: ignore[no-untyped-def]
     for n in range(begin, end):
         count, p, q, r = near_voxels(neighbours, n)
         known_a, known_c = np.int64(codes[p]), np.int64(codes[r])
@@ -69,13 +61,24 @@ def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code
         beside[n] = 4 * (newness(best) if found == NEW else 0) + (situation & 3)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def choose_bases(values, weight, table, neighbours, bits, codes, channel, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (3 N,) uint8 of one channel, of those between the nearest one, which is there before, and the one that is foretold.
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, first, begin, end):  # type: ignore[no-untyped-def]
+    """Codes (N,) uint8 of one group. A palette is searched only where its cheapest entry, were it exact, would be better than a neighbour's.
 
-    values  (N, 3) float32; weight (N, 3); table (T, 3)
-    bits    (136, 256) float32
+    vectors      (N, D) float32; palette (P, D)
+    weight       (N,) float32: bits that a squared error of 1 is worth
+    neighbours   (3 N,) int32
+    beside       (N,) uint8: four times how the group before was coded, 0 as a neighbour's, else `newness`; and the quarter of the table that the density
+                 lies in; overwritten with what holds for this group
+    repeat_bits  (112, 4) float32; code_bits (160, P), least_bits (160,) the least of each row
     """
+    for s in numba.prange(len(first) - 1):
+        least, most = min(first[s] + begin, first[s + 1]), min(first[s] + end, first[s + 1])
+        _choose_codes(vectors, weight, palette, neighbours, beside, repeat_bits, code_bits, least_bits, codes, least, most)
+
+
+@numba.njit
+def _choose_bases(values, weight, table, neighbours, bits, codes, channel, begin, end):  # type: ignore[no-untyped-def]
     for n in range(begin, end):
         predicted, context = base_prediction(codes, neighbours, np.int64(table.shape[0]), n, channel)
         nearest = np.int64(codes[3 * n + channel])
@@ -88,13 +91,19 @@ def choose_bases(values, weight, table, neighbours, bits, codes, channel, begin,
         codes[3 * n + channel] = best
 
 
-@numba.njit(cache=True, error_model="numpy")
-def choose_densities(opacity, weight, table, neighbours, bits, codes, begin, end):  # type: ignore[no-untyped-def]
-    """Codes (N,) uint8.
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def choose_bases(values, weight, table, neighbours, bits, codes, channel, first, begin, end):  # type: ignore[no-untyped-def]
+    """Codes (3 N,) uint8 of one channel, of those between the nearest one, which is there before, and the one that is foretold.
 
-    opacity  (N,) float32 of the voxels; table (T,) float32 of the entries
-    bits     (33, T) float32
+    values  (N, 3) float32; weight (N, 3); table (T, 3)
+    bits    (136, 256) float32
     """
+    for s in numba.prange(len(first) - 1):
+        _choose_bases(values, weight, table, neighbours, bits, codes, channel, min(first[s] + begin, first[s + 1]), min(first[s] + end, first[s + 1]))
+
+
+@numba.njit
+def _choose_densities(opacity, weight, table, neighbours, bits, codes, begin, end):  # type: ignore[no-untyped-def]
     entries = table.shape[0]
     for n in range(begin, end):
         context = density_context(codes, neighbours, n, entries)
@@ -105,3 +114,14 @@ def choose_densities(opacity, weight, table, neighbours, bits, codes, begin, end
             if cost < least:
                 best, least = code, cost
         codes[n] = best
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def choose_densities(opacity, weight, table, neighbours, bits, codes, first, begin, end):  # type: ignore[no-untyped-def]
+    """Codes (N,) uint8.
+
+    opacity  (N,) float32 of the voxels; table (T,) float32 of the entries
+    bits     (33, T) float32
+    """
+    for s in numba.prange(len(first) - 1):
+        _choose_densities(opacity, weight, table, neighbours, bits, codes, min(first[s] + begin, first[s + 1]), min(first[s] + end, first[s + 1]))
