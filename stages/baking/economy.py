@@ -1,7 +1,7 @@
 """The codes of an asset in the layout `packed`: as good as bake.max_mib has room for.
 
-How many bytes codes take is known once they are coded. So codes are chosen at a rate, and where the file is too large, at the next one that follows from its
-size, until it fits. Where even the coarsest codes are too large, the voxels that weigh least are left out. Then the tables and palettes that codes stand for
+How many bytes codes take is known once they are coded. So codes are chosen at a rate, and then at the next one that follows from the file's size, until
+it is nearly filled. Where even the coarsest codes are too large, the voxels that weigh least are left out. Then the tables and palettes that codes stand for
 are fitted to the images, which changes no file's size. An attempt that was stopped begins here again: its refinement is done.
 """
 
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 # docs/experiments/packed.md
-FILL, AIM = 0.97, 0.985  # of the size, at least, where codes are coarser than they would be by default; and what is aimed at
+FILL, AIM = 0.97, 0.985  # of the size, at least, where codes could be finer; and what is aimed at
 STEEPNESS = 2.0  # of the rate over the size: the rate grows by the size to this power, until two sizes are known
 LEAST_STEEPNESS, MOST_STEEPNESS = 0.8, 5.0
+FINEST = 5e-7  # rate below which codes are as good as the floats
 COARSEST = 3e-4  # rate beyond which voxels are left out instead
 REFIT_ROUNDS = 4
 FIXED = 2**14  # bytes, about, of header, tables and palette
@@ -68,7 +69,7 @@ def _coded(job: Job, tree: NerfTree, targets: Targets, size: int) -> NerfTree:
         job.say(f"codes at a rate of {rate:.3g} take {took / 2**20:.2f} MiB")
         if took <= size:
             best, high = found, rate
-            if rate == economy.DEFAULT_RATE or took >= FILL * size:
+            if rate == FINEST or took >= FILL * size:
                 break
         else:
             low = rate
@@ -80,7 +81,7 @@ def _coded(job: Job, tree: NerfTree, targets: Targets, size: int) -> NerfTree:
         guess = rate * (took / (AIM * size)) ** _steepness(before, (took, rate))
         if low is not None and high is not None and not low < guess < high:
             guess = (low * high) ** 0.5
-        before, rate = (took, rate), float(min(max(guess, economy.DEFAULT_RATE), COARSEST))
+        before, rate = (took, rate), float(min(max(guess, FINEST), COARSEST))
         if rate in (low, high):
             break
     if best is None:

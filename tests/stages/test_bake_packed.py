@@ -43,11 +43,13 @@ def tree() -> NerfTree:
     return noisy()
 
 
-def test_what_fits_has_the_codes_of_the_default_rate(tree: NerfTree) -> None:
+def test_where_there_is_room_codes_are_as_fine_as_they_may_be(tree: NerfTree) -> None:
     found, said, warned = packed(tree, 10**7)
     assert isinstance(found.harmonics, PaletteHarmonics)
-    assert len(said) == 1
+    assert len(said) == 2
     assert f"{DEFAULT_RATE:.3g}" in said[0]
+    assert f"{economy.FINEST:.3g}" in said[1]
+    assert len(serialize(found, "packed")) > len(serialize(economised(tree), "packed"))
     assert not warned
 
 
