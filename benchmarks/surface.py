@@ -143,7 +143,7 @@ def image_scores(found: Surface, truth: Surface, cameras: Sequence[Camera], regi
         own, true = own + int(one.covered.sum()), true + int(other.covered.sum())
         errors.append(np.abs(one.depth[common] - other.depth[common]))
     depth = float(np.median(np.concatenate(errors))) if both else float("inf")
-    return {"iou": both / max(either, 1), "missed": 1 - both / max(true, 1), "added": 1 - both / max(own, 1), "depth": depth}
+    return {"iou": both / max(either, 1), "missed": (true - both) / max(true, 1), "added": (own - both) / max(own, 1), "depth": depth}
 
 
 def aligned(source: np.ndarray, target: np.ndarray) -> Similarity:

@@ -111,7 +111,8 @@ class MeshOutputs(Outputs):
     ply = Name("mesh.ply")  # the capture's frame
     glb = Name("mesh.glb")  # y up
     preview = Name("preview.png")
-    report = Name("report.json")  # counts, topology, bounds, area, volume
+    check = Name("check.png")  # where it differs most from the asset: opacity, mesh, what is missed and added
+    report = Name("report.json")  # counts, topology, bounds, area, volume, agreement with the asset
 
 
 class PointsOutputs(Outputs):

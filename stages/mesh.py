@@ -15,8 +15,10 @@ from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
+from stages.meshing.check import asset_views, checked, shown_by, warning_of
 
 if TYPE_CHECKING:
+    from efficientnerf.surface.agreement import AssetView
     from efficientnerf.surface.mesh import Mesh
     from stages.io.exporters.writing import SourceFrame
 
@@ -36,15 +38,24 @@ class MeshSettings:
     )
     max_faces: Annotated[int, Meta(ge=100)] = setting(200_000, "Most faces of the mesh, which is decimated to this many.")
     density_threshold: float | Auto = setting("auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.")
-    min_component: Fraction = setting(0.01, "Area below which connected components are dropped, as a fraction of the largest one's.", advanced=True)
+    min_component: Fraction = setting(
+        0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
+    )
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(10, "Iterations of Taubin smoothing, which keeps the volume.", advanced=True)
 
 
-def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None]) -> Mesh:
-    """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
+def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None) -> Mesh:
+    """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text).
+
+    views  is given those of the asset that say which components it shows
+    """
     from efficientnerf.surface.isosurface import NoSurface
     from efficientnerf.surface.nested import scene_surface
 
+    progress = whole_progress(progress, 1 + len(tree.outer))
+    seen = asset_views(tree, progress)
+    if views is not None:
+        views += seen
     try:
         return scene_surface(
             tree,
@@ -53,23 +64,24 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             viewpoints=orbit_points(tree.metadata),
-            progress=whole_progress(progress, 1 + len(tree.outer)),
+            shown=shown_by(seen, float(tree.voxel), lambda: progress(1, 1, PARTS[0])),
+            progress=progress,
         )
     except NoSurface as error:
         raise StageFailed(f"mesh: {error}. {remedy('mesh', given(settings.density_threshold))}") from error
 
 
 def whole_progress(progress: Callable[[int, int, str], None], grids: int = 1) -> Callable[[int, int, str], None]:
-    """Progress over the parts of the surfaces of so many grids together: a bar that never goes back."""
+    """Progress over views of the asset and the parts of the surfaces of so many grids together: a bar that never goes back."""
     begun: list[str] = []
-    reached = 0
+    reached, most = 0, 1 + grids * len(PARTS)
 
     def part(done: int, total: int, text: str) -> None:
         nonlocal reached
-        if not begun or (begun[-1] != text and len(begun) < grids * len(PARTS)):
+        if not begun or (begun[-1] != text and len(begun) < most):
             begun.append(text)
         reached = max(reached, (len(begun) - 1) * STEPS + (STEPS * done // total if total else STEPS))
-        progress(reached, grids * len(PARTS) * STEPS, text)
+        progress(reached, most * STEPS, text)
 
     return part
 
@@ -133,7 +145,8 @@ def run(job: Job) -> None:
     tree = restricted(load(inputs_of(MeshInputs, job.inputs).bake.asset), job.settings.region)
     frame = source_frame(tree.metadata)
     refuse_what_does_not_fit(job, surface_needed(tree), "Lower bake.max_mib or bake.resolution.")
-    found = mesh_of(tree, job.settings, job.reached)
+    seen: list[AssetView] = []
+    found = mesh_of(tree, job.settings, job.reached, seen)
     job.safe_point()
     orbit = tree.metadata.get("orbit", {})
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
@@ -144,12 +157,16 @@ def run(job: Job) -> None:
     mesh = in_capture(found, frame)
     for path in (outputs.ply, outputs.glb):
         MESH_EXPORTERS[path.suffix](mesh, path, frame)
-    report = describe(mesh, frame)
+    agreed, picture = checked(found, seen, job.safe_point)
+    write_png(picture, outputs.check)
+    report = describe(mesh, frame) | agreed
     write_json(outputs.report, report)
+    if (doubt := warning_of(report)) is not None:
+        job.warn(doubt)
     if not report["watertight"]:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['non_manifold_edges']} non-manifold edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}", **facts)
 
 
-STAGE = Stage(name="mesh", version=2, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)
+STAGE = Stage(name="mesh", version=3, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

@@ -13,7 +13,8 @@ from pipeline.errors import StageFailed
 from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
-from stages.mesh import orbit_points, remedy, whole_progress
+from stages.mesh import PARTS, orbit_points, remedy, whole_progress
+from stages.meshing.check import asset_views, shown_by
 
 if TYPE_CHECKING:
     from efficientnerf.surface.mesh import PointCloud
@@ -31,7 +32,9 @@ class PointsSettings:
     density_threshold: float | Auto = setting(
         "auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.", advanced=True
     )
-    min_component: Fraction = setting(0.01, "Area below which connected components get no points, as a fraction of the largest one's.", advanced=True)
+    min_component: Fraction = setting(
+        0.0, "Area below which connected components get no points, as a fraction of the largest one's; nor do those that no view shows.", advanced=True
+    )
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(10, "Iterations of Taubin smoothing of the surface.", advanced=True)
     seed: Seed = setting(0, "Seed of the places of the points on the surface.", advanced=True)
 
@@ -42,6 +45,8 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
     from efficientnerf.surface.mesh import PointCloud
     from efficientnerf.surface.nested import scene_points
 
+    progress = whole_progress(progress, 1 + len(tree.outer))
+    views = asset_views(tree, progress)
     try:
         cloud = scene_points(
             tree,
@@ -51,7 +56,8 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
             rounds=settings.smoothing_iterations,
             seed=settings.seed,
             viewpoints=orbit_points(tree.metadata),
-            progress=whole_progress(progress, 1 + len(tree.outer)),
+            shown=shown_by(views, float(tree.voxel), lambda: progress(1, 1, PARTS[0])),
+            progress=progress,
         )
     except NoSurface as error:
         raise StageFailed(f"points: {error}. {remedy('points', given(settings.density_threshold))}") from error
@@ -79,4 +85,4 @@ def run(job: Job) -> None:
     job.say(f"{len(cloud.positions)} points", points=len(cloud.positions))
 
 
-STAGE = Stage(name="points", version=2, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)
+STAGE = Stage(name="points", version=3, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)

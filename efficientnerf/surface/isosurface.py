@@ -28,9 +28,11 @@ from efficientnerf.surface.mesh import (
 from efficientnerf.surface.volume import NdcVolume, Volume
 
 Progress = Callable[[int, int, str], None]
+Shown = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # vertices, faces, component (F,) -> how much is seen of each component (C,)
 ViewDirections = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 LARGEST_SIDE = 4096  # voxels along a side of a grid that is baked
 BLOCK = 64  # voxels a side that are in memory at a time
+SHOWN = 1.0  # pixel of all views together that a component has to show
 CHUNK = 1 << 16  # points whose colours are looked up at a time
 
 
@@ -222,10 +224,13 @@ def _on_seams(local: np.ndarray, low: np.ndarray, high: np.ndarray, grid: np.nda
     return rows, ((corner[:, 0] * (grid[1] + 3) + corner[:, 1]) * (grid[2] + 3) + corner[:, 2]) * 3 + axis
 
 
-def visible_parts(vertices: np.ndarray, faces: np.ndarray, min_component: float, viewpoints: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """The closed mesh without small components, hollows, and what lies in hollows.
+def visible_parts(
+    vertices: np.ndarray, faces: np.ndarray, min_component: float, viewpoints: np.ndarray, shown: Shown | None = None
+) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
+    """The closed mesh without small components, hollows, and what lies in hollows; or, where views say what they see, without what they do not.
 
     min_component   components with less than this share of the largest one's area are removed
+    shown           how much views show of each component; None: not known
     returns         vertices, faces, and how many components were removed for which reason
 
     A component that encloses a negative volume is the wall of a hollow inside something solid. It cannot be seen from anywhere outside, and neither can
@@ -235,6 +240,10 @@ def visible_parts(vertices: np.ndarray, faces: np.ndarray, min_component: float,
     label = face_components(faces, len(vertices))
     areas, volumes = face_areas(vertices, faces), face_volumes(vertices, faces)
     area, volume = np.bincount(label, areas), np.bincount(label, volumes)
+    if shown is not None:
+        seen, enough = shown(vertices, faces, label) >= SHOWN, area >= min_component * area.max()
+        removed = {"unseen_removed": int((~seen).sum()), "small_removed": int((seen & ~enough).sum())}
+        return *compact(vertices, faces[(seen & enough)[label]]), {"components_found": len(area), **removed}
     hollow = volume <= 0
     large = ~hollow & (area >= min_component * area[~hollow].max())
     walls = vertices[faces[hollow[label]]]  # (F, 3, 3)
@@ -307,7 +316,7 @@ def _view_directions(normal: np.ndarray) -> list[np.ndarray]:
 
 
 def cleaned_surface(
-    volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
+    volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress, shown: Shown | None = None
 ) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:
     """Vertices, faces and facts of the surface before it is decimated; see `surface`."""
     level = automatic_threshold(volume) if threshold is None else float(threshold)
@@ -317,9 +326,19 @@ def cleaned_surface(
     vertices, faces = isosurface(volume, level, progress, enclosed=enclosed if enclosed.any() else None)
     if not len(faces):
         raise NoSurface(f"the density nowhere reaches {level:.4g} per unit")
-    vertices, faces, facts = visible_parts(vertices, faces, min_component, viewpoints)
+    vertices, faces, facts = visible_parts(vertices, faces, min_component, viewpoints, _in_world(volume, shown))
+    if not len(faces):
+        raise NoSurface(f"no view shows anything of the surface at {level:.4g} per unit")
     vertices = np.clip(smooth(vertices, faces, rounds), vertices.min(0), vertices.max(0))  # flat sides must not bulge out of the box
     return vertices, faces, {"threshold": level, "threshold_chosen": "automatic" if threshold is None else "given", **facts}
+
+
+def _in_world(volume: Volume, shown: Shown | None) -> Shown | None:
+    """What is shown of components of the volume's frame."""
+    if shown is None or not isinstance(volume, NdcVolume):
+        return shown
+    ndc = volume.ndc
+    return lambda vertices, faces, component: shown(ndc.world(vertices), faces, component)
 
 
 _NO_VIEWPOINTS = np.zeros((0, 3))
@@ -333,6 +352,7 @@ def surface(
     min_component: float = 0.01,
     rounds: int = 10,
     viewpoints: np.ndarray = _NO_VIEWPOINTS,
+    shown: Shown | None = None,
     progress: Progress = _silent,
 ) -> Mesh:
     """The volume's surface as a closed, coloured mesh in the training frame.
@@ -342,6 +362,7 @@ def surface(
     min_component  components with less than this share of the largest one's area are removed
     rounds         of smoothing
     viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
+    shown          how much views of the world show of components: those that they do not show are removed; None: hollows and what is in them are
     progress       called with (done, total, text); what it raises stops the work
 
     Of an `NdcVolume` it is the surface in normalised device coordinates (budget, rounds and sizes of components count there), in the world.
@@ -350,10 +371,10 @@ def surface(
     """
     ndc = volume if isinstance(volume, NdcVolume) else None
     viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS  # the cameras are before the near plane, outside of the volume
-    vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
+    vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress, shown)
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
-    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints)  # small components that decimation cut off
+    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # what decimation cut off
     normals = vertex_normals(vertices, triangles)
     colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
     mesh = Mesh(vertices, triangles, normals, colours, facts)
@@ -368,6 +389,7 @@ def points(
     min_component: float = 0.01,
     rounds: int = 10,
     viewpoints: np.ndarray = _NO_VIEWPOINTS,
+    shown: Shown | None = None,
     seed: int = 0,
     progress: Progress = _silent,
 ) -> PointCloud:
@@ -378,7 +400,7 @@ def points(
     """
     ndc = volume if isinstance(volume, NdcVolume) else None
     viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS
-    vertices, triangles, _ = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress)
+    vertices, triangles, _ = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress, shown)
     cloud = spread(volume, vertices, triangles, count, seed, progress)
     return cloud if ndc is None else ndc.points(cloud)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from efficientnerf.asset.cascades import Cascade, cascade_tree, cascades_of, voxel_cascades
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.surface.isosurface import NoSurface, Progress, cleaned_surface, points, spread, surface
+from efficientnerf.surface.isosurface import NoSurface, Progress, Shown, cleaned_surface, points, spread, surface
 from efficientnerf.surface.mesh import Mesh, PointCloud, compact, face_areas
 from efficientnerf.surface.volume import volume_of
 
@@ -24,8 +24,9 @@ ALONG = 0.7  # cosine of a lid's normal to that of the border
 
 
 def scene_surface(
-    tree: NerfTree, threshold: float | None, *, faces: int, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress
-) -> Mesh:
+    tree: NerfTree, threshold: float | None, *, faces: int, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress,
+    shown: Shown | None = None,
+) -> Mesh:  # fmt: skip
     """The surface of all cascades as one mesh; of a tree with one grid the same as `surface`. Arguments as there.
 
     threshold  density per world unit of the inmost cascade; each one after it has half of that, for its voxels are twice as large
@@ -35,7 +36,7 @@ def scene_surface(
     """
     if not tree.outer:
         return surface(
-            volume_of(tree), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, progress=progress
+            volume_of(tree), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown, progress=progress
         )  # fmt: skip
     found = []
     sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
@@ -45,8 +46,9 @@ def scene_surface(
             continue
         try:
             mesh = surface(
-                volume_of(part), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints, progress=progress
-            )
+                volume_of(part), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
+                progress=progress,
+            )  # fmt: skip
         except NoSurface:
             continue
         found.append((mesh, _visible(tree, number, mesh.vertices, mesh.faces)))
@@ -56,20 +58,22 @@ def scene_surface(
 
 
 def scene_points(
-    tree: NerfTree, count: int, threshold: float | None, *, min_component: float, rounds: int, viewpoints: np.ndarray, seed: int, progress: Progress
-) -> PointCloud:
+    tree: NerfTree, count: int, threshold: float | None, *, min_component: float, rounds: int, viewpoints: np.ndarray, seed: int, progress: Progress,
+    shown: Shown | None = None,
+) -> PointCloud:  # fmt: skip
     """Points on the surfaces of all cascades; of a tree with one grid the same as `points`. Arguments as there and for `scene_surface`.
 
     They are spread evenly in each cascade, and as many to a voxel's face in all of them: sparser where voxels are larger.
     """
     if not tree.outer:
         return points(
-            volume_of(tree), count, threshold, min_component=min_component, rounds=rounds, viewpoints=viewpoints, seed=seed, progress=progress
+            volume_of(tree), count, threshold, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown, seed=seed,
+            progress=progress,
         )  # fmt: skip
     found = []
     for number, part in _parts(tree):
         try:
-            vertices, triangles, _ = cleaned_surface(volume_of(part), _level(threshold, number), min_component, rounds, viewpoints, progress)
+            vertices, triangles, _ = cleaned_surface(volume_of(part), _level(threshold, number), min_component, rounds, viewpoints, progress, shown)
         except NoSurface:
             continue
         kept = triangles[_visible(tree, number, vertices, triangles)]

@@ -1,4 +1,4 @@
-"""Preview of a mesh: orthographic views from four sides, coloured above, shaded grey below."""
+"""Preview of a mesh: orthographic views from four sides, coloured above, shaded grey below. And where it differs from the asset."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from efficientnerf.surface.mesh import Mesh, sample
+from efficientnerf.surface.agreement import AssetView, differences
+from efficientnerf.surface.mesh import Mesh, face_vectors, sample
+from efficientnerf.surface.rasteriser import MeshImage
 
 _PAPER = np.array([0.93, 0.93, 0.93])
 _SAMPLES = 600_000
+_MISSED, _ADDED = np.array([0.85, 0.15, 0.1]), np.array([0.1, 0.35, 0.9])
 ROUND = (0.0, 90.0, 180.0, 270.0)
 IN_FRONT = (-36.0, -12.0, 12.0, 36.0)  # of forward-facing captures
 
@@ -72,3 +75,14 @@ def _front_samples(x: np.ndarray, y: np.ndarray, height: np.ndarray, size: int) 
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         np.maximum.at(front, (row + i, column + j), np.arange(len(order)))
     return np.where(front >= 0, order[front], -1) if len(order) else front
+
+
+def difference_row(mesh: Mesh, view: AssetView, image: MeshImage) -> np.ndarray:
+    """(H, 3 W, 3) uint8 sRGB: the asset's opacity, the mesh under a light at the camera, and both with what is missed in red and what is added in blue."""
+    vectors = face_vectors(mesh.vertices, mesh.faces)
+    facing = np.abs(vectors @ view.camera.forward) / np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
+    shade = np.where(image.covered, 0.15 + 0.75 * facing[image.face] if len(facing) else 0.0, _PAPER[0])[..., None].repeat(3, axis=2)
+    opacity = (_PAPER[0] * (1 - view.opacity) + 0.2 * view.opacity)[..., None].repeat(3, axis=2)
+    missed, added = differences(view, image)
+    marked = np.where(missed[..., None], _MISSED, np.where(added[..., None], _ADDED, 0.5 + 0.5 * shade))
+    return np.round(np.clip(np.concatenate([opacity, shade, marked], axis=1), 0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,88 @@
+"""The check of a mesh against the asset that it was made of: from captured cameras and from a turntable's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.geometry.cameras import Camera
+    from efficientnerf.surface.agreement import AssetView
+    from efficientnerf.surface.mesh import Mesh
+
+CAPTURED, ORBIT = 12, 12  # cameras
+LONGER_SIDE = 400  # of the images, pixels
+WARNED = 0.03  # share of pixels missed or added, from which the stage says so
+PICTURED = 3  # views in the picture: those that agree least
+
+
+def check_cameras(tree: NerfTree) -> list[Camera]:
+    """Some of the captured cameras, where the asset keeps any, and a turntable's."""
+    from efficientnerf.geometry.cameras import Camera
+    from stages.framing.camera_paths import turntable_cameras
+    from stages.framing.captured import captured_of
+
+    captured = captured_of(tree.metadata)
+    width, height = (LONGER_SIDE, 3 * LONGER_SIDE // 4) if captured is None else (captured.width, captured.height)
+    scale = LONGER_SIDE / max(width, height)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    out = turntable_cameras(tree, frames=ORBIT, width=size[0], height=size[1])
+    if captured is not None:
+        chosen = captured.poses[np.unique(np.linspace(0, len(captured.poses) - 1, CAPTURED).round().astype(int))]
+        lens = (captured.focal * scale, size[0] / 2, size[1] / 2)
+        out = [Camera(f"captured_{n:04d}", *size, "SIMPLE_PINHOLE", lens, pose) for n, pose in enumerate(chosen)] + out
+    return out
+
+
+def asset_views(tree: NerfTree, progress: Callable[[int, int, str], None]) -> list[AssetView]:
+    """What the cameras of the check see of the asset."""
+    from efficientnerf.surface.agreement import asset_view
+
+    cameras, out = check_cameras(tree), []
+    for number, camera in enumerate(cameras):
+        out.append(asset_view(tree, camera))
+        progress(number + 1, len(cameras), "views of the asset")
+    return out
+
+
+def checked(mesh: Mesh, views: list[AssetView], tick: Callable[[], None]) -> tuple[dict[str, Any], np.ndarray]:
+    """How a mesh of the training frame agrees with the asset, for its report, and a picture (H, W, 3) uint8. `tick` is called after each view."""
+    from efficientnerf.surface.agreement import agreement, differences
+    from efficientnerf.surface.rasteriser import mesh_image
+    from stages.figures.shading import difference_row
+
+    images = []
+    for view in views:
+        images.append(mesh_image(mesh.vertices, mesh.faces, view.camera))
+        tick()
+    wrong = [sum(int(part.sum()) for part in differences(view, image)) for view, image in zip(views, images, strict=True)]
+    worst = np.argsort(-np.array(wrong), kind="stable")[:PICTURED]
+    picture = np.concatenate([difference_row(mesh, views[n], images[n]) for n in worst])
+    found = {name: float(f"{value:.4g}") for name, value in asdict(agreement(views, images)).items()}
+    return {"silhouette_iou": found["iou"], "pixels_missed": found["missed"], "pixels_added": found["added"], "depth_difference": found["depth"],
+            "views_checked": len(views)}, picture  # fmt: skip
+
+
+def warning_of(report: dict[str, Any]) -> str | None:
+    """What to warn of, if anything."""
+    if max(report["pixels_missed"], report["pixels_added"]) <= WARNED:
+        return None
+    shares = f"{100 * report['pixels_missed']:.1f} % of what the asset shows is missing from the mesh, {100 * report['pixels_added']:.1f} % of the mesh is"
+    return f"{shares} beyond it (check.png). Raise mesh.max_faces, or set mesh.density_threshold by hand."
+
+
+def shown_by(views: list[AssetView], voxel: float, tick: Callable[[], None]) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    """(vertices, faces, component of each face) -> how much of each component the views show; see `efficientnerf.surface.agreement.shown_pixels`. `tick` is
+    called before each view; what it raises stops the work."""
+    from efficientnerf.surface.agreement import shown_pixels
+
+    def ticking() -> Iterator[AssetView]:
+        for view in views:
+            tick()
+            yield view
+
+    return lambda vertices, faces, component: shown_pixels(vertices, faces, component, ticking(), voxel)
