@@ -80,17 +80,6 @@ for _operation, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (opera
 
 
 @intrinsic
-def rsqrt4(typing_context: Any, value: Any) -> Any:
-    """1 / sqrt(x), elementwise."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        root = builder.module.declare_intrinsic("llvm.sqrt.v4f32", (), ir.FunctionType(_VECTOR4, [_VECTOR4]))
-        return builder.fdiv(_constant(_VECTOR4, 1), builder.call(root, [args[0]]))
-
-    return float32x4(float32x4), codegen
-
-
-@intrinsic
 def pointer(typing_context: Any, array: Any) -> Any:
     """Pointer to the first element of a contiguous array: p[n] is its n-th element in C order, without bounds checks and without wraparound.
 
@@ -283,24 +272,6 @@ def trilinear4(typing_context: Any, address: Any, a: Any, b: Any, c: Any, d: Any
     index = types.int64
     result = types.Tuple((float32x4, float32x16))
     return result(types.CPointer(types.float32), index, index, index, index, index, index, float32x4, float32x4, float32x4), codegen
-
-
-@intrinsic
-def zeros16(typing_context: Any) -> Any:
-    """A Float32x16 of zeros."""
-    return float32x16(), lambda context, builder, signature, args: _constant(_VECTOR16, 0)
-
-
-@intrinsic
-def add_scaled_gathered16(typing_context: Any, total: Any, factor: Any, address: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """total + the four-number groups at p[a], p[b], p[c], p[d], each times its lane of `factor` (Float32x4)."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = _concat(builder, [_load(builder, args[2], start) for start in args[3:]])
-        return multiply_add(builder, _repeat_lanes(builder, args[1]), value, args[0])
-
-    index = types.int64
-    return float32x16(float32x16, float32x4, types.CPointer(types.float32), index, index, index, index), codegen
 
 
 @intrinsic

@@ -12,11 +12,10 @@ import torch
 from efficientnerf.asset.queries import density_block, normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
-from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, sigmoid, split16, trilinear4, unpack4
+from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcount, sigmoid, split16, trilinear4, unpack4
 from efficientnerf.backends.numba.tree import march
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.packets import lanes
-from efficientnerf.backends.numba.tree.packets.rows import pair_of
 from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, sh_basis
 from efficientnerf.geometry.cameras import Camera, rays, resized
 from efficientnerf.rendering.harmonics import basis_numpy
@@ -99,6 +98,13 @@ def test_four_points_are_interpolated_over_the_stored_corners() -> None:
             np.testing.assert_allclose(row, expected, atol=2e-6)
         assert np.isfinite(found).all()
         np.testing.assert_allclose(first, np.array(found)[:, 0], atol=2e-6)
+
+
+@numba.njit
+def pair_of(row, k, rows):  # type: ignore[no-untyped-def]
+    """Of voxels k and k + 1 of a row, numbered over all bricks: the first that is stored, and which are: bit 0, bit 1."""
+    mask = np.int64(rows[2 * row + 1])
+    return rows[2 * row] + popcount(mask & ((np.int64(1) << k) - 1)), mask >> k & 3
 
 
 @numba.njit

@@ -61,7 +61,7 @@ def render_batch(  # type: ignore[no-untyped-def]
 
     background     (3,) float32 colour to composite over
     packed         see `Packed`
-    view_colours   (N + 1, 4) float32: see `compute_view_colours`; not read where distances of the views are infinity
+    view_colours   (N + 2, 4) float32, finite: see `compute_view_colours`, from row 1 on; not read where distances of the views are infinity
     views          see `Views`
     voxel          size of a voxel of cascade 0, world units
     tile           (rows, columns) of a tile
@@ -89,7 +89,7 @@ def render_batch(  # type: ignore[no-untyped-def]
             cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointer(views.direction), views.direction_rate,
             pointer(views.min_distance), pointer(views.density_scale), views.degree,
         )  # fmt: skip
-        _render_runs(worker, threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours), voxel, scratch, outputs)
+        _render_runs(worker, threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
     left = 0
     for worker in range(threads):
         left += progress[worker, 0] != ALL_RUNS

@@ -39,7 +39,7 @@ def _allocate(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np
 
 
 class ViewColours(NamedTuple):
-    """Colours of a tree's voxels for a view, see `compute_view_colours`, and where they may be used, see `View`."""
+    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4), and where they may be used, see `View`."""
 
     views: Views
     colours: np.ndarray
@@ -61,7 +61,7 @@ def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray =
     for cascade, bricks in enumerate(bricks_of(tree)):
         for first, end in brick_ranges(*bricks, tree.brick):
             direction, scale = views.direction[cascade], views.density_scale[cascade]
-            compute_view_colours(first, end, cascade, packed, tree.brick, direction, cone, scale, tree.degree, colours)
+            compute_view_colours(first, end, cascade, packed, tree.brick, direction, cone, scale, tree.degree, colours[1:])
     return ViewColours(views, colours)
 
 
@@ -71,15 +71,13 @@ def _colour_buffer(tree: NerfTree) -> np.ndarray:
     try:
         return kept.pop()
     except IndexError:
-        colours = np.empty((len(tree.density_values) + 1, 4), np.float32)
-        colours[-1] = 0
-        return colours
+        return np.zeros((len(tree.density_values) + 2, 4), np.float32)  # finite, for what is not computed may be read and weighed by zero
 
 
 def _keep_buffer(tree: NerfTree, colours: ViewColours) -> None:
     """Leaves the array of view colours, which nothing refers to any more, to the next image."""
     kept = tree.derived.setdefault("view_colours", [])
-    if not kept and len(colours.colours) == len(tree.density_values) + 1:
+    if not kept and len(colours.colours) == len(tree.density_values) + 2:
         kept.append(colours.colours)
 
 
@@ -131,7 +129,7 @@ def _render(
 
 def scratch_bytes(tree: NerfTree) -> int:
     """Memory of the view's colours while an image is rendered."""
-    return 16 * (len(tree.density_values) + 1)
+    return 16 * (len(tree.density_values) + 2)
 
 
 def render_rays(
@@ -162,7 +160,7 @@ def render_rays(
     if len(origins):
         shared = eye is not None and _any_far(tree, view_direction)
         never = np.full(len(packed_of(tree).grids), np.inf)
-        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((1, 4), np.float32))
+        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((2, 4), np.float32))
         _render(tree, batch, colours, np.zeros(3, np.float32), (1, TILE * TILE) if rows == 1 else (TILE, TILE), out)
     colour, opacity, depth, normal = out
     return colour.reshape(-1, 3), opacity.reshape(-1), depth.reshape(-1), normal.reshape(-1, 3)

@@ -15,20 +15,18 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import (
     add_scaled4,
-    add_scaled_gathered16,
     advanced,
     broadcast_like,
     load4,
     pack4,
     pointer,
-    rsqrt4,
     scale4,
-    split16,
     store,
     store4,
     unpack4,
-    zeros16,
 )
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, sqrt16
+from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
 from efficientnerf.rendering import harmonics
 
 BRICKS_PER_TASK = 256
@@ -185,31 +183,15 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _palette_colours(a, b, c, d, grid, basis):  # type: ignore[no-untyped-def]
-    """(0, red, green, blue) of the harmonics above degree 0 of four stored voxels, as four Float32x4; `basis` (K, 4) is of their directions."""
-    codes, total = grid.codes, zeros16()
-    for k in range(grid.terms - 1):
-        e, g = k * grid.entries, grid.code_columns[k]
-        total = add_scaled_gathered16(
-            total, load4(basis, 4 * k + 4), grid.palette, 4 * (e + np.int64(codes[a * grid.groups + g])), 4 * (e + np.int64(codes[b * grid.groups + g])),
-            4 * (e + np.int64(codes[c * grid.groups + g])), 4 * (e + np.int64(codes[d * grid.groups + g])),
-        )  # fmt: skip
-    return split16(total)
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _palette_base(n, place, grid, scale, y):  # type: ignore[no-untyped-def]
-    """Density, and red, green and blue of degree 0, of stored voxel n, whose place in the packed order is given; y is the first harmonic."""
-    table, base = grid.base_table, 3 * n
+def _palette_colour(n, density, grid, basis, lane):  # type: ignore[no-untyped-def]
+    """Density, red, green and blue of stored voxel n by its codes; `basis` (K, 16) is of sixteen directions, that of `lane` its own."""
+    table, base, code, y = grid.base_table, 3 * n, n * grid.groups, basis[lane]
     r, g, b = table[3 * np.int64(grid.base[base])], table[3 * np.int64(grid.base[base + 1]) + 1], table[3 * np.int64(grid.base[base + 2]) + 2]
-    return pack4(grid.density[place] * scale, y * r, y * g, y * b)
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _float_colours(n, place, grid, scale, basis, lane):  # type: ignore[no-untyped-def]
-    """The same, of all degrees, of a voxel whose harmonics are floats."""
-    r, g, b = sh_colour(n, grid, basis, lane, 4)
-    return pack4(grid.density[place] * scale, r, g, b)
+    total = pack4(density, y * r, y * g, y * b)
+    for k in range(grid.terms - 1):
+        e = k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])
+        total = add_scaled4(total, basis[16 * k + 16 + lane], load4(grid.palette, 4 * e))
+    return total
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -236,52 +218,47 @@ def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
             for k in range(brick):
                 stored[count], place[count] = local + k, first
                 count, first = count + (bits >> k & 1), first + (bits >> k & 1)
-    for n in range(count, count + 3):  # the last group of four is filled up with its last voxel
-        stored[n], place[n] = stored[max(count - 1, 0)], place[max(count - 1, 0)]
     return count
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type: ignore[no-untyped-def]
-    """Densities and colours of a brick's voxels, four at a time, into their rows of out (N, 4).
+    """Densities and colours of a brick's voxels into their rows of out (N, 4); directions and harmonics are those of sixteen neighbours at once.
 
-    steps   (b^3, 3) float32: see `_voxel_steps`
-    stored  (b^3 + 3,) int64, scratch, and place likewise
-    basis   (K, 4) float32, scratch
+    steps   (3, G, 16) float32: see `_voxel_steps`
+    stored  (b^3,) int64, scratch, and place likewise
+    basis   (K, 16) float32, scratch
     """
     brick, cells, index = grid.brick, grid.cells, grid.voxel_index
-    first, scale = owner * brick * brick * brick, view.density_scale
+    cube = brick * brick * brick
+    first, padded, group = owner * cube, (cube + 15) // 16 * 16, np.int64(-1)
     count = _stored_voxels(owner, grid, stored, place)
     x, y, z = view_direction(cells[3 * owner] * brick + 0.5, cells[3 * owner + 1] * brick + 0.5, cells[3 * owner + 2] * brick + 0.5, view.direction)
-    for n in range(0, count, 4):
-        i, j, k, l = stored[n], stored[n + 1], stored[n + 2], stored[n + 3]
-        dx = pack4(steps[3 * i], steps[3 * j], steps[3 * k], steps[3 * l]) + np.float32(x)
-        dy = pack4(steps[3 * i + 1], steps[3 * j + 1], steps[3 * k + 1], steps[3 * l + 1]) + np.float32(y)
-        dz = pack4(steps[3 * i + 2], steps[3 * j + 2], steps[3 * k + 2], steps[3 * l + 2]) + np.float32(z)
-        inverse = rsqrt4(dx * dx + dy * dy + dz * dz)
-        sh_basis(dx * inverse, dy * inverse, dz * inverse, view.degree, basis)
-        a, b, c, d = np.int64(index[first + i]), np.int64(index[first + j]), np.int64(index[first + k]), np.int64(index[first + l])
-        p, q, r, s = place[n], place[n + 1], place[n + 2], place[n + 3]
+    for n in range(count):
+        local, p = stored[n], place[n]
+        if local >> 4 != group:
+            group = local >> 4
+            dx, dy = load16(steps, 16 * group) + np.float32(x), load16(steps, padded + 16 * group) + np.float32(y)
+            dz = load16(steps, 2 * padded + 16 * group) + np.float32(z)
+            inverse = broadcast16(_ONE) / sqrt16(dx * dx + dy * dy + dz * dz)
+            sh_basis(dx * inverse, dy * inverse, dz * inverse, view.degree, basis)
+        voxel, lane, density = np.int64(index[first + local]), local & 15, grid.density[p] * view.density_scale
         if grid.coded:
-            ca, cb, cc, cd = _palette_colours(a, b, c, d, grid, basis)
-            store4(out, 4 * p, ca + _palette_base(a, p, grid, scale, basis[0]))
-            store4(out, 4 * q, cb + _palette_base(b, q, grid, scale, basis[0]))
-            store4(out, 4 * r, cc + _palette_base(c, r, grid, scale, basis[0]))
-            store4(out, 4 * s, cd + _palette_base(d, s, grid, scale, basis[0]))
+            store4(out, 4 * p, _palette_colour(voxel, density, grid, basis, lane))
         else:
-            store4(out, 4 * p, _float_colours(a, p, grid, scale, basis, 0))
-            store4(out, 4 * q, _float_colours(b, q, grid, scale, basis, 1))
-            store4(out, 4 * r, _float_colours(c, r, grid, scale, basis, 2))
-            store4(out, 4 * s, _float_colours(d, s, grid, scale, basis, 3))
+            r, g, b = sh_colour(voxel, grid, basis, lane, 16)
+            store4(out, 4 * p, pack4(density, r, g, b))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
-    """Difference of the view direction of each voxel of a brick to that of the brick's first, see `View`, into (b^3, 3)."""
-    for n in range(brick * brick * brick):
+    """Difference of the view direction of each voxel of a brick to that of the brick's first, see `View`, into (3, G, 16), of G groups of sixteen voxels."""
+    cube = brick * brick * brick
+    padded = (cube + 15) // 16 * 16
+    for n in range(cube):
         i, j, k = n // (brick * brick), n // brick % brick, n % brick
         for m in range(3):
-            out[3 * n + m] = direction[4 * m] * i + direction[4 * m + 1] * j + direction[4 * m + 2] * k
+            out[m * padded + n] = direction[4 * m] * i + direction[4 * m + 1] * j + direction[4 * m + 2] * k
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -296,7 +273,7 @@ def compute_view_colours(first, end, cascade, packed, brick, direction, cone, de
     """
     cube = brick * brick * brick
     for task in numba.prange((end - first + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
-        steps, stored, basis = np.empty(3 * cube, np.float32), np.empty((2, cube + 3), np.int64), np.empty(128, np.float32)
+        steps, stored, basis = np.zeros(3 * (cube + 15), np.float32), np.empty((2, cube), np.int64), np.empty(16 * MOST_HARMONICS, np.float32)
         grid, view = packed_pointers(packed, brick, cascade), View(pointer(direction), 0.0, 0.0, density_scale, degree)
         _voxel_steps(brick, view.direction, pointer(steps))
         # From a ray to a normal's block one voxel, through that block and to the middle of the brick beside it; and one for rounding.

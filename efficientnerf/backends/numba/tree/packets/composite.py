@@ -15,14 +15,18 @@ from efficientnerf.backends.numba.tree.packets.lanes import (
     bits_of,
     broadcast16,
     channels16,
+    copy4,
     exp2_neg16,
     floor16,
     load16,
     lowest_bit,
     mask_of,
+    mix_pairs,
+    popcount16,
     select16,
     store16,
     store_channels16,
+    store_pairs16,
     to_int16,
 )
 from efficientnerf.backends.numba.tree.packets.layout import (
@@ -32,16 +36,16 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     CACHED_BITS,
     COLOURS,
     DISTANCE,
+    FAR_ROWS,
     GAIN,
     GREEN,
     HALF_DISTANCE,
     HAS_BASIS,
     INTERPOLATED,
     LOOKUPS,
+    NEAR_ROWS,
     OWNER,
-    PAIR,
     PENDING_WEIGHT,
-    PLACE,
     RED,
     ROW,
     SAMPLE,
@@ -55,7 +59,6 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     Y,
     Z,
 )
-from efficientnerf.backends.numba.tree.packets.rows import pair_of
 from efficientnerf.backends.numba.tree.view_colours import sh_basis, sh_colour
 
 _HALF, _ONE, _NONE = np.float32(0.5), np.float32(1), np.float32(0)
@@ -63,41 +66,31 @@ _LEAST = np.float32(1e-30)  # weight of stored voxels below which a sample has n
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _find_voxels(lane, grid, ints):  # type: ignore[no-untyped-def]
-    """The eight voxels of a ray's sample; N in place of those of a row that stores neither."""
-    side = grid.brick + 2
-    first, k = np.int64(ints[OWNER + lane]) * side * side + np.int64(ints[ROW + lane]), np.int64(ints[PLACE + lane])
-    for n in range(4):
-        voxel, pair = pair_of(first + (side if n & 2 else 0) + (n & 1), k, grid.rows)
-        voxel = voxel if pair != 0 else grid.voxels
-        ints[VOXEL + 32 * n + lane] = voxel
-        ints[VOXEL + 32 * n + 16 + lane] = voxel + (pair == 3)
-        ints[PAIR + 16 * n + lane] = pair
+def _fetch_rows(lane, grid, ints):  # type: ignore[no-untyped-def]
+    """The four rows around a ray's sample."""
+    first = 2 * np.int64(ints[ROW + lane])
+    copy4(ints, NEAR_ROWS + 4 * lane, grid.rows, first)
+    copy4(ints, FAR_ROWS + 4 * lane, grid.rows, first + 2 * (grid.brick + 2))
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _weigh(n, edge, fz, gz, floats, ints):  # type: ignore[no-untyped-def]
-    """Weights of the voxels of row n, into `floats`; returns their sum."""
-    pair = load16(ints, PAIR + 16 * n)
-    first, second = edge * select16(pair == 2, fz, select16(pair == 0, _NONE, gz)), edge * select16(pair == 3, fz, _NONE)
-    store16(floats, WEIGHT + 32 * n, first)
-    store16(floats, WEIGHT + 32 * n + 16, second)
-    return first + second
+def _weigh(n, first, mask, edge, bit, fz, gz, floats, ints):  # type: ignore[no-untyped-def]
+    """The first voxel of row n, and weights of it and of the next; returns their sum.
 
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _add_voxel(total, n, lane, colours, floats, ints):  # type: ignore[no-untyped-def]
-    return add_scaled4(total, floats[WEIGHT + 16 * n + lane], load4(colours, 4 * np.int64(ints[VOXEL + 16 * n + lane])))
+    bit  of the first voxel in the mask; voxels that are not stored have no weight, and what lies in their place is any voxel beside them
+    """
+    store16(ints, VOXEL + 16 * n, first + popcount16(mask & ((bit << 1) - 1)) - 1)
+    here, next_ = select16((mask & bit) != 0, edge * gz, _NONE), select16((mask & (bit << 1)) != 0, edge * fz, _NONE)
+    store_pairs16(floats, WEIGHT + 32 * n, here, next_)
+    return here + next_
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _mix_view_colours(lane, colours, floats, ints):  # type: ignore[no-untyped-def]
     """Weighted density, red, green and blue of a ray's sample."""
-    even = _add_voxel(_add_voxel(pack4(_NONE, _NONE, _NONE, _NONE), 0, lane, colours, floats, ints), 2, lane, colours, floats, ints)
-    odd = _add_voxel(_add_voxel(pack4(_NONE, _NONE, _NONE, _NONE), 1, lane, colours, floats, ints), 3, lane, colours, floats, ints)
-    even = _add_voxel(_add_voxel(even, 4, lane, colours, floats, ints), 6, lane, colours, floats, ints)
-    odd = _add_voxel(_add_voxel(odd, 5, lane, colours, floats, ints), 7, lane, colours, floats, ints)
-    store4(floats, SAMPLE + 4 * lane, even + odd)
+    a, b = np.int64(ints[VOXEL + lane]), np.int64(ints[VOXEL + 16 + lane])
+    c, d = np.int64(ints[VOXEL + 32 + lane]), np.int64(ints[VOXEL + 48 + lane])
+    store4(floats, SAMPLE + 4 * lane, mix_pairs(floats, WEIGHT + 2 * lane, 32, colours, 4 * a, 4 * b, 4 * c, 4 * d))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -134,7 +127,7 @@ def _mix_cached(lane, grid, view, floats, ints):  # type: ignore[no-untyped-def]
     """`_mix_view_colours` by the harmonics of voxels along the rays: those that rays which are neighbours share are summed once for all of them."""
     total = pack4(_NONE, _NONE, _NONE, _NONE)
     for n in range(8):
-        weight, voxel = floats[WEIGHT + 16 * n + lane], np.int64(ints[VOXEL + 16 * n + lane])
+        weight, voxel = floats[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)], np.int64(ints[VOXEL + 16 * (n >> 1) + lane]) + (n & 1)
         if weight != 0:
             entry = (voxel * 0x9E3779B1 & 0xFFFFFFFF) >> 32 - CACHED_BITS
             if ints[CACHE + entry] != voxel:
@@ -149,7 +142,9 @@ def _mix_harmonics(lane, grid, view, floats, ints):  # type: ignore[no-untyped-d
     """The same for rays that share nothing, and the weight of the colour; none is looked up until that is MIN_COLOUR_WEIGHT."""
     sigma = red = green = blue = _NONE
     for n in range(8):
-        sigma += floats[WEIGHT + 16 * n + lane] * grid.density[ints[VOXEL + 16 * n + lane]]
+        weight = floats[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)]
+        if weight != 0:
+            sigma += weight * grid.density[np.int64(ints[VOXEL + 16 * (n >> 1) + lane]) + (n & 1)]
     sigma *= view.density_scale
     before = floats[TRANSMITTANCE + lane]
     gain = floats[PENDING_WEIGHT + lane] + before - before * exp2_neg(sigma)
@@ -158,9 +153,9 @@ def _mix_harmonics(lane, grid, view, floats, ints):  # type: ignore[no-untyped-d
         floats[PENDING_WEIGHT + lane], floats[GAIN + lane] = _NONE, gain
         floats[LOOKUPS + lane] += _ONE
         for n in range(8):
-            weight = floats[WEIGHT + 16 * n + lane]
+            weight = floats[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)]
             if weight != 0:
-                r, g, b = sh_colour(np.int64(grid.voxel_of[ints[VOXEL + 16 * n + lane]]), grid, advanced(floats, BASIS), lane, 16)
+                r, g, b = sh_colour(np.int64(grid.voxel_of[np.int64(ints[VOXEL + 16 * (n >> 1) + lane]) + (n & 1)]), grid, advanced(floats, BASIS), lane, 16)
                 red, green, blue = red + weight * r, green + weight * g, blue + weight * b
     store4(floats, SAMPLE + 4 * lane, pack4(sigma, red, green, blue))
 
@@ -180,16 +175,19 @@ def composite(ready, near, shared, grid, view, colours, floats, ints):  # type: 
     """
     x, y, z = load16(floats, X), load16(floats, Y), load16(floats, Z)
     i, j, k = floor16(x), floor16(y), floor16(z)
-    store16(ints, ROW, to_int16(i * np.float32(grid.brick + 2) + j))
-    store16(ints, PLACE, to_int16(k))
+    side = grid.brick + 2
+    store16(ints, ROW, load16(ints, OWNER) * (side * side) + to_int16(i * np.float32(side) + j))
     left = ready
     while left != 0:
-        _find_voxels(lowest_bit(left), grid, ints)
+        _fetch_rows(lowest_bit(left), grid, ints)
         left &= left - 1
     fx, fy, fz = x - i, y - j, z - k
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
-    weight = _weigh(0, gx * gy, fz, gz, floats, ints) + _weigh(1, gx * fy, fz, gz, floats, ints)
-    weight = weight + (_weigh(2, fx * gy, fz, gz, floats, ints) + _weigh(3, fx * fy, fz, gz, floats, ints))
+    bit = broadcast16(np.int32(1)) << to_int16(k)
+    first, mask, next_first, next_mask = channels16(ints, NEAR_ROWS)
+    weight = _weigh(0, first, mask, gx * gy, bit, fz, gz, floats, ints) + _weigh(1, next_first, next_mask, gx * fy, bit, fz, gz, floats, ints)
+    first, mask, next_first, next_mask = channels16(ints, FAR_ROWS)
+    weight = weight + (_weigh(2, first, mask, fx * gy, bit, fz, gz, floats, ints) + _weigh(3, next_first, next_mask, fx * fy, bit, fz, gz, floats, ints))
     left = ready & ~near
     while left != 0:
         _mix_view_colours(lowest_bit(left), colours, floats, ints)

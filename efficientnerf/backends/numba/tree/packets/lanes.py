@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
-from efficientnerf.backends.numba.simd import Float32x16, broadcast_like, float32x16, splat, store
+from efficientnerf.backends.numba.simd import Float32x16, broadcast_like, float32x4, float32x16, multiply_add, splat, store
 
 LANES = 16
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
@@ -244,15 +244,65 @@ def gather16(typing_context: Any, address: Any, index: Any) -> Any:
 
 @intrinsic
 def channels16(typing_context: Any, address: Any, index: Any) -> Any:
-    """Sixteen groups of four float32 from p[index] on: the first of each, the second, the third and the fourth, as four Float32x16."""
+    """Sixteen groups of four float32 or int32 from p[index] on: the first of each, the second, the third and the fourth, as four vectors."""
+    vector, element = (int32x16, _I32) if address.dtype == types.int32 else (float32x16, ir.FloatType())
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.VectorType(ir.FloatType(), 4 * LANES)
+        kind = ir.VectorType(element, 4 * LANES)
         whole = builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), kind.as_pointer()), align=4)
         lanes = [ir.Constant(ir.VectorType(_I32, LANES), list(range(n, 4 * LANES, 4))) for n in range(4)]
         return context.make_tuple(builder, signature.return_type, [builder.shuffle_vector(whole, whole, each) for each in lanes])
 
-    return types.UniTuple(float32x16, 4)(address, types.int64), codegen
+    return types.UniTuple(vector, 4)(address, types.int64), codegen
+
+
+@intrinsic
+def copy4(typing_context: Any, target: Any, at: Any, source: Any, index: Any) -> Any:
+    """p[at : at + 4] = q[index : index + 4] for pointers to int32."""
+    kind = ir.VectorType(_I32, 4)
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = builder.load(builder.bitcast(builder.gep(args[2], [args[3]]), kind.as_pointer()), align=4)
+        builder.store(value, builder.bitcast(builder.gep(args[0], [args[1]]), kind.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(types.CPointer(types.int32), types.int64, types.CPointer(types.int32), types.int64), codegen
+
+
+@intrinsic
+def store_pairs16(typing_context: Any, address: Any, index: Any, a: Any, b: Any) -> Any:
+    """p[index : index + 32] = a[0], b[0], a[1], b[1], ... for a pointer to float32."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        order = [LANES * (n % 2) + n // 2 for n in range(2 * LANES)]
+        whole = builder.shuffle_vector(args[2], args[3], ir.Constant(ir.VectorType(_I32, 2 * LANES), order))
+        builder.store(whole, builder.bitcast(builder.gep(args[0], [args[1]]), whole.type.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(types.CPointer(types.float32), types.int64, float32x16, float32x16), codegen
+
+
+@intrinsic
+def mix_pairs(typing_context: Any, weights: Any, at: Any, stride: Any, values: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Weighted sum of eight groups of four float32: those at q[a], q[b], q[c] and q[d], and the one after each, by two weights each, at p[at], p[at + stride]
+    and so on."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pair, eight = ir.VectorType(ir.FloatType(), 2), ir.VectorType(ir.FloatType(), 8)
+        sums: list[Any] = [None, None]
+        for n, index in enumerate(args[4:]):
+            place = builder.add(args[1], builder.mul(args[2], ir.Constant(_I64, n)))
+            two = builder.load(builder.bitcast(builder.gep(args[0], [place]), pair.as_pointer()), align=4)
+            weight = builder.shuffle_vector(two, two, ir.Constant(ir.VectorType(_I32, 8), [0, 0, 0, 0, 1, 1, 1, 1]))
+            value = builder.load(builder.bitcast(builder.gep(args[3], [index]), eight.as_pointer()), align=4)
+            total = sums[n % 2]
+            sums[n % 2] = builder.fmul(weight, value) if total is None else multiply_add(builder, weight, value, total)
+        both = builder.fadd(*sums)
+        halves = [builder.shuffle_vector(both, both, ir.Constant(ir.VectorType(_I32, 4), list(range(n, n + 4)))) for n in (0, 4)]
+        return builder.fadd(*halves)
+
+    index = types.int64
+    return float32x4(types.CPointer(types.float32), index, index, types.CPointer(types.float32), index, index, index, index), codegen
 
 
 @intrinsic

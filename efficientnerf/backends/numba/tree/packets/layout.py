@@ -1,9 +1,10 @@
 """Where the numbers of sixteen rays lie in the scratch of a thread: sixteen of each, one a ray.
 
 Floats: where a ray's part in a cascade begins, its direction, the first sample and the one after the last; what it met, see below; of the sample that is to be
-composited the place in its block and the distance; weights of its eight voxels, two of each row; what comes out of them, (16, 4); the direction that harmonics
-are evaluated along, and their values, (K, 16); colours of some voxels along each ray, (CACHED, 16, 4). Integers: of that sample the brick, the row and the
-place in it; its eight voxels and which of each pair is stored; whether the harmonics are evaluated; which voxels those are, -1 for none.
+composited the place in its block and the distance; weights of its eight voxels, (4, 16, 2), two of each row; what comes out of them, (16, 4); the direction
+that harmonics are evaluated along, and their values, (K, 16); colours of some voxels along each ray, (CACHED, 16, 4). Integers: of that sample the brick, and
+its first row; that row and the one after it as `rows` has them, (16, 4), and the two beside them; the first voxel of each row, (4, 16); whether the harmonics
+are evaluated; which voxels those are, -1 for none.
 
 State: transmittance; colour; distance at which the transmittance fell to one half; weight of samples near the camera without a colour yet, and that of the next
 colour; counts of coarse cells visited, of samples tested, of samples interpolated and of colours looked up; depth and normal.
@@ -22,8 +23,8 @@ CACHED = 1 << CACHED_BITS  # colours of voxels near the camera that sixteen rays
 COLOURS = BASIS + 16 * MOST_HARMONICS
 FLOATS = COLOURS + 64 * CACHED
 
-OWNER, ROW, PLACE, VOXEL, PAIR, HAS_BASIS = 0, 16, 32, 48, 176, 240
-CACHE = 256
+OWNER, ROW, NEAR_ROWS, FAR_ROWS, VOXEL, HAS_BASIS = 0, 16, 32, 96, 160, 224
+CACHE = 240
 INTS = CACHE + CACHED
 
 ORIGIN, DIRECTION, COSINE, BEGIN, ENDS = 0, 48, 96, 112, 128  # float64: x, y, z of sixteen, and so on; then by cascade where they enter and leave it

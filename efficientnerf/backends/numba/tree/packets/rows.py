@@ -81,10 +81,3 @@ def fill_rows(first, end, cells, brick, brick_index, begin, stored, rows):  # ty
                         row = (i - 1 - (p - 1) * brick) * brick + j - 1 - (q - 1) * brick
                         voxel, mask = _row(before, here, after, row, brick - 1, begin, stored)
                         rows[owner, i * side + j, 0], rows[owner, i * side + j, 1] = voxel, mask
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def pair_of(row, k, rows):  # type: ignore[no-untyped-def]
-    """Of voxels k and k + 1 of a row, numbered over all bricks: the first that is stored, and which are: bit 0, bit 1."""
-    mask = np.int64(rows[2 * row + 1])
-    return rows[2 * row] + popcount(mask & ((np.int64(1) << k) - 1)), mask >> k & 3
