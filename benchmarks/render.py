@@ -1,10 +1,11 @@
-"""Speed of rendering an asset on the CPU, and what bounds it: written to benchmarks/results/render_cpu.json.
+"""Speed of rendering assets on the CPU, and what bounds it: written to benchmarks/results/render_cpu.json.
 
-    python benchmarks/render.py ASSET [--width 800 --height 800] [--frames 24] [--threads N] [--json FILE]
-    python benchmarks/render.py --whole-scene --width 640 --height 480
+    python benchmarks/render.py ASSET... [--sizes 800x800 640x480] [--threads 1 2] [--frames 24] [--rounds 3] [--against CHECKOUT] [--json FILE]
+    python benchmarks/render.py --whole-scene --sizes 640x480
 
 Cameras are spread evenly on the asset's orbit, or inside of the scene that `whole_scene.py` makes, of nested grids. Besides frames a second: samples and
-colours of a ray, the bytes that they read, the measured bandwidth of the memory, and the load average.
+colours of a ray, the bytes that they read, the measured bandwidth of the memory, and the load average. Each asset, size and number of threads is rendered in a
+process of its own, once in each round; with `--against` by the code of another checkout too, in turn.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import datetime
 import json
 import os
 import platform
+import subprocess
 import sys
 import time
 from importlib.metadata import version
@@ -123,65 +125,119 @@ def memory(tree: Any, view: Any) -> dict[str, float]:
     return {"tree": own, "packed": packed, "view_colours": scratch_bytes(tree), "framebuffer": framebuffer, "total": total, "bytes_per_voxel": each}
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("asset", type=Path, nargs="?")
-    what.add_argument("--whole-scene", action="store_true", help="render the made scene")
-    parser.add_argument("--width", type=int, default=800)
-    parser.add_argument("--height", type=int, default=800)
-    parser.add_argument("--frames", type=int, default=24)
-    parser.add_argument("--fov", type=float, default=39.6, help="vertical, degrees; by default that of the Realistic Synthetic scenes")
-    parser.add_argument("--supersample", type=int, default=1)
-    parser.add_argument("--threads", type=int, help="of numba; all cores by default")
-    parser.add_argument("--json", type=Path, help="results/render_cpu.json or results/render_whole_scene_cpu.json by default")
-    given = parser.parse_args()
-    given.json = given.json or HERE / "results" / ("render_whole_scene_cpu.json" if given.whole_scene else "render_cpu.json")
-    if given.threads is not None:
-        os.environ["NUMBA_NUM_THREADS"] = str(given.threads)
+def measure_task(task: dict[str, Any]) -> dict[str, Any]:
+    """One asset, size and number of threads, by the code of a checkout: run in a process of its own."""
+    os.environ["NUMBA_NUM_THREADS"] = str(task["threads"])
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    sys.path.insert(0, str(HERE.parent))
+    sys.path.insert(0, task["checkout"])
+    sys.path.append(str(HERE))  # `whole_scene` of this checkout
 
-    import numba
     import whole_scene
 
     from efficientnerf.asset import format
 
-    before = os.getloadavg()
+    asset = Path(task["asset"]) if task["asset"] else None
     begin = time.perf_counter()
-    tree = whole_scene.whole_scene() if given.whole_scene else format.load(given.asset)
+    tree = whole_scene.whole_scene() if asset is None else format.load(asset)
     loading = time.perf_counter() - begin
-    size = given.width, given.height, given.frames
-    views = whole_scene.cameras(*size) if given.whole_scene else cameras(tree, *size, given.fov)
+    size = task["width"], task["height"], task["frames"]
+    views = whole_scene.cameras(*size) if asset is None else cameras(tree, *size, task["fov"])
+    result: dict[str, Any] = {"speed": measure(tree, views, task["supersample"])}
+    if task["whole"]:
+        result |= {
+            "asset": {
+                "name": "made scene" if asset is None else "/".join(asset.parts[-3:]),
+                "bytes": 0 if asset is None else asset.stat().st_size,
+                "voxels": len(tree.density_values),
+                "resolution": list(tree.resolution),
+                "cascades": 1 + len(tree.outer),
+                "ndc": tree.ndc is not None,
+                "sh_degree": tree.degree,
+                "load_s": round(loading, 3),
+            },
+            "work": counts(tree, views),
+            "memory": memory(tree, views[0]),
+        }
+    return result
+
+
+def _in_process(task: dict[str, Any]) -> dict[str, Any]:
+    """`measure_task` in a process of its own."""
+    command = [sys.executable, str(HERE / "render.py"), "--task", json.dumps(task)]
+    environment = os.environ | {"PYTHONPATH": task["checkout"]}
+    told = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, encoding="utf-8").stdout
+    answer: dict[str, Any] = json.loads(told.splitlines()[-1])
+    return answer
+
+
+def _mean(rounds: list[dict[str, Any]]) -> dict[str, float]:
+    """The mean of what was measured in each round."""
+    return {name: round(sum(each["speed"][name] for each in rounds) / len(rounds), 3) for name in rounds[0]["speed"]}
+
+
+def compare(task: dict[str, Any], other: Path | None, rounds: int) -> dict[str, Any]:
+    """A row of the results: the rounds' means of this checkout, and of another in turn with it."""
+    before = os.getloadavg()
+    mine, others = [], []
+    for n in range(rounds):
+        mine.append(_in_process(task | {"whole": n == 0}))
+        if other is not None:
+            others.append(_in_process(task | {"checkout": str(other.resolve())}))
+    row = {name: task[name] for name in ("width", "height", "supersample", "frames", "threads")} | mine[0] | {"speed": _mean(mine)}
+    row["speed"]["read_gb_per_s"] = round(row["work"]["bytes_per_ray"] * row["speed"]["rays_per_s"] / 1e9, 1)
+    if others:
+        row["before"] = _mean(others)
+        row["times_as_fast"] = round(row["before"]["mean_ms"] / row["speed"]["mean_ms"], 2)
+    return row | {"load": {"before": before, "after": os.getloadavg()}}
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, height = (int(side) for side in text.split("x"))
+    return width, height
+
+
+def _options() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("assets", type=Path, nargs="*")
+    parser.add_argument("--whole-scene", action="store_true", help="render the made scene too")
+    parser.add_argument("--sizes", type=_size, nargs="+", default=[(800, 800)], metavar="WxH")
+    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--fov", type=float, default=39.6, help="vertical, degrees; by default that of the Realistic Synthetic scenes")
+    parser.add_argument("--supersample", type=int, default=1)
+    parser.add_argument("--threads", type=int, nargs="+", default=[os.cpu_count() or 1], help="of numba; all cores by default")
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--against", type=Path, help="another checkout of this project, to be measured in turn with this one")
+    parser.add_argument("--json", type=Path, default=HERE / "results" / "render_cpu.json")
+    parser.add_argument("--task", type=json.loads, help=argparse.SUPPRESS)
+    return parser
+
+
+def main() -> int:
+    parser = _options()
+    given = parser.parse_args()
+    if given.task:
+        print(json.dumps(measure_task(given.task)))
+        return 0
+    sources = [*(str(asset.resolve()) for asset in given.assets), *([""] if given.whole_scene else [])]
+    if not sources:
+        parser.error("name assets, or --whole-scene")
+    rows = []
+    for source in sources:
+        for width, height in given.sizes:
+            for threads in given.threads:
+                task = {"asset": source, "width": width, "height": height, "frames": given.frames, "fov": given.fov, "supersample": given.supersample}
+                rows.append(compare(task | {"threads": threads, "checkout": str(HERE.parent), "whole": False}, given.against, given.rounds))
+                row = rows[-1]
+                ratio = f", {row['times_as_fast']} times as fast as before" if given.against else ""
+                print(f"{row['asset']['name']} {width}x{height}, {threads} threads: {row['speed']['frames_per_s']} frames a second{ratio}", flush=True)
     result = {
         "date": datetime.date.today().isoformat(),
-        "asset": {
-            "name": "made scene" if given.whole_scene else given.asset.name,
-            "bytes": 0 if given.whole_scene else given.asset.stat().st_size,
-            "voxels": len(tree.density_values),
-            "resolution": list(tree.resolution),
-            "cascades": 1 + len(tree.outer),
-            "sh_degree": tree.degree,
-            "load_s": round(loading, 3),
-        },
-        "image": {"width": given.width, "height": given.height, "supersample": given.supersample, "frames": given.frames},
-        "speed": measure(tree, views, given.supersample),
-        "work": counts(tree, views),
-        "memory": memory(tree, views[0]),
-        "machine": {
-            "processor": processor(),
-            "cores": os.cpu_count(),
-            "threads": numba.get_num_threads(),
-            "platform": platform.platform(),
-            "memory": bandwidth(),
-            "load": {"before": before, "after": os.getloadavg()},
-        },
+        "renders": rows,
+        "machine": {"processor": processor(), "cores": os.cpu_count(), "platform": platform.platform(), "memory": bandwidth()},
         "versions": {name: version(name) for name in ("numba", "numpy", "llvmlite")} | {"python": platform.python_version()},
     }
-    result["speed"]["read_gb_per_s"] = round(result["work"]["bytes_per_ray"] * result["speed"]["rays_per_s"] / 1e9, 1)
     given.json.parent.mkdir(parents=True, exist_ok=True)
     given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(result, indent=1))
     print(f"written to {given.json}")
     return 0
 
