@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from stages.io.scene import Scene, View
 
 MIN_TRACK = 3  # images that a sparse point must be observed in
+GOLDEN = (math.sqrt(5) - 1) / 2  # multiples of it, without their whole parts, fill an interval evenly
 MIN_DISTANCE = 1e-9  # the scene is 2 across: a point nearer to a camera than this has no direction
 
 
@@ -77,7 +79,8 @@ def stated_planes(s: Scene, settings: TrainSettings) -> tuple[float, float]:
 
 
 def sparse_depth_of(folder: Path, s: Scene) -> SparseDepthRays | None:
-    """Rays of training cameras to the sparse points that are registered in their images; None: there are none.
+    """Rays to the sparse points that are registered in training images, from the cameras of these and from between each and the nearest of the others that see
+    the point, where held-out views may lie and nothing else keeps fog away; None: there are none.
 
     Only points that are observed in `MIN_TRACK` images or more, and only from cameras that they lie before: posed data sets name points behind a camera,
     or in it, too.
@@ -100,8 +103,26 @@ def sparse_depth_of(folder: Path, s: Scene) -> SparseDepthRays | None:
     before = (offset * forward[view]).sum(1) > MIN_DISTANCE  # so is the distance; what is not a number is not before anything
     if not before.any():
         return None
-    offset, distance, view = offset[before], distance[before], view[before]
-    return SparseDepthRays(centres[view].astype(np.float32), (offset / distance[:, None]).astype(np.float32), distance.astype(np.float32))
+    point, view = point[before], view[before]
+    origins = np.concatenate([centres[view], _between(point, view, centres)])
+    offset = np.concatenate([points.xyz[point]] * 2) - origins
+    distance = np.linalg.norm(offset, axis=1)
+    return SparseDepthRays(origins.astype(np.float32), (offset / distance[:, None]).astype(np.float32), distance.astype(np.float32))
+
+
+def _between(point: np.ndarray, view: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """(A, 3) for each observation of a point by a view, in the order of the points, a place on the way from its camera to the nearest other one that observes
+    the same point; the camera itself where there is none. Both see the point, so that what lies between these three is most likely empty."""
+    origins = centres[view]
+    for part in np.split(np.arange(len(point)), np.flatnonzero(np.diff(point)) + 1):
+        own = centres[view[part]]
+        apart = np.linalg.norm(own[:, None] - own, axis=-1)
+        apart[apart == 0] = np.inf
+        if len(part) > 1:
+            other = np.where(np.isfinite(apart.min(axis=1)), apart.argmin(axis=1), np.arange(len(part)))
+            share = (GOLDEN * (1 + part) % 1)[:, None]
+            origins[part] += share * (own[other] - own)
+    return origins
 
 
 def mask_uncovered_cells(m: Model, views: tuple[View, ...], job: Job) -> None:

@@ -180,7 +180,20 @@ def test_points_in_a_camera_or_behind_it_give_no_sparse_depth(tmp_path: Path) ->
     before = {(n, view) for n, views in enumerate(seen) for view in views if len(views) > 2 and (xyz[n] - centres[view]) @ cameras[view].forward > 1e-9}
     assert {(0, 0), (0, 1), (0, 2)} <= before
     assert not {(1, 0), (2, 1)} & before
-    assert rays(points)[0] == sorted(before)
+    half = len(before)
+    found, every = rays(points)
+    assert len(found) == 2 * half  # as many from cameras as from between them
+    real = every.origins[:half]
+    apart = np.linalg.norm(real[:, None] - centres, axis=-1)
+    assert sorted(zip([n for n, _ in sorted(before)], apart.argmin(axis=1), strict=True)) == sorted(before)
+    np.testing.assert_allclose(apart.min(axis=1), 0, atol=1e-6)
+    for (point, view), origin in zip(sorted(before), every.origins[half:], strict=True):
+        others = [centres[other] for n, other in before if n == point and other != view]
+        nearest = min(others, key=lambda other: float(np.linalg.norm(other - centres[view])), default=centres[view])
+        way, done = nearest - centres[view], origin - centres[view]
+        np.testing.assert_allclose(np.cross(way, done), 0, atol=1e-5)
+        assert -1e-6 <= way @ done <= way @ way + 1e-6
+    assert np.abs(every.origins[half:] - real).max() > 0.01
     only = SparsePoints(np.repeat(cameras[0].centre[None], 1, axis=0), points.rgb[:1], points.error[:1], ((0, 0, 0),))
     assert rays(only) == ([], None)
 
