@@ -72,7 +72,7 @@ class BakeSettings:
     max_mib: Annotated[float, Meta(gt=0.0)] | Auto = setting(
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
-        " 36 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed; less where voxels as fine as pixels"
+        " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed; less where voxels as fine as pixels"
         " resolve are fewer.",
         unit="MiB",
     )
@@ -106,11 +106,10 @@ class BakeSettings:
     density_lr: NonNegative = setting(0.3, "Learning rate of the refinement for the logarithm of a voxel's optical thickness.", advanced=True)
     sh_lr: NonNegative = setting(0.1, "Learning rate of the refinement for the spherical harmonics.", advanced=True)
     view_dependent_lr_ratio: Fraction | Auto = setting(
-        "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 1 for objects with alpha, 0.2 in unbounded scenes.", advanced=True
+        "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 0.2 in contracted space, else 1.", advanced=True
     )
-    total_variation: NonNegative | Auto = setting(
-        "auto", "Weight of the total variation of the logarithm of the optical thickness between a voxel and those beside it; auto: by the kind of scene.",
-        advanced=True,
+    total_variation: NonNegative = setting(
+        0.01, "Weight of the total variation of the logarithm of the optical thickness between a voxel and those beside it.", advanced=True
     )
     lr_final_ratio: Fraction = setting(0.1, "Ratio to which the learning rates of the refinement fall exponentially.", advanced=True)
     licence: str = setting("", "Licence text to write into the asset.")

@@ -55,12 +55,13 @@ class PatchGrid:
         while True:
             patches = max(1, round(count / self.mean_pixels))
             tile = rng.integers(len(self), size=patches) if cumulative is None else np.searchsorted(cumulative, rng.random(patches), side="right")
-            drawn = self._patches(np.minimum(tile, len(self) - 1), rng.integers(self.side, size=(2, patches)))
+            drawn = self.drawn_from(np.minimum(tile, len(self) - 1), rng)
             if len(drawn.tile):
                 return drawn
 
-    def _patches(self, tile: np.ndarray, back: np.ndarray) -> Patches:
-        """The patches that begin so many rows and columns (2, P) before the corner of their tile."""
+    def drawn_from(self, tile: np.ndarray, rng: np.random.Generator) -> Patches:
+        """Of each tile (P,) one of its patches, at random; those without a pixel are left out."""
+        back = rng.integers(self.side, size=(2, len(tile)))
         view = np.searchsorted(self.first, tile, side="right") - 1
         row, column = np.divmod(tile - self.first[view], self.columns[view])
         step = np.arange(self.side)

@@ -81,6 +81,8 @@ def save(job: Job, point: Point) -> None:
     tensors["coordinates"] = voxel_coordinates(state.tree)
     if state.tree.outer:
         tensors["cascades"] = voxel_cascades(state.tree)
+    if state.errors is not None:
+        tensors["errors"] = state.errors
     tensors["about"] = about_of(point)
     with atomic(job.work / CHECKPOINT, durable=False) as temporary:
         save_file(tensors, str(temporary), metadata={"sha256": digest_of(tensors)})
@@ -102,12 +104,13 @@ def digest_of(tensors: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | None = None) -> Point | None:
+def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | None = None, cells: int | None = None) -> Point | None:
     """The last checkpoint of a refinement of this tree with these phases; None where there is none that fits, and one that does not is removed.
 
     tree    as it was baked
     stated  the schedule
     hold    of a phase whose number of steps follows from the time that they take; None: all of them are stated
+    cells   of the error map; None: there is none
     """
     from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
 
@@ -117,11 +120,12 @@ def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | N
     try:
         found = _read(path)
         about, schedule, kept = check(found, tree, stated, hold)
+        errors = _errors(found, about.step, cells)
         splits = count_splits(stated.phases[: about.phase])
         values = np.array(found["density"]), np.array(found["sh"])
         fitted = _split_tree(tree, splits, found, *values) if splits else _with_values(tree, kept, *values)
         density, sh, visits = (np.array(found[name]) for name in MOMENTS)
-        state = RefinementState(fitted, density, sh, visits, about.step)
+        state = RefinementState(fitted, density, sh, visits, about.step, errors)
     except (OSError, ValueError, RecursionError) as error:
         job.warn(unusable(path, error))
         remove(path)
@@ -143,6 +147,16 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     if digest_of(found) != written:
         raise ValueError("its values are not those that its SHA-256 was made of")
     return found
+
+
+def _errors(found: Mapping[str, np.ndarray], step: int, cells: int | None) -> np.ndarray | None:
+    """The errors of an error map of so many cells; ValueError where they are missing, or none."""
+    if cells is None or (step == 0 and "errors" not in found):
+        return None
+    errors = found.get("errors")
+    if errors is None or errors.dtype != np.float32 or errors.shape != (2, cells) or not np.isfinite(errors).all():
+        raise ValueError(f"'errors' is missing, or no float32 {(2, cells)}")
+    return np.array(errors)
 
 
 def _with_values(tree: NerfTree, kept: np.ndarray, density: np.ndarray, sh: np.ndarray) -> NerfTree:

@@ -26,6 +26,7 @@ PACKED_COPIES = 1  # and while codes are chosen and fitted: the tree's own, thos
 # its distance to the next one; of a brick's voxel: greatest weight, three times while they grow, and its number; of a training pixel that visibility is
 # measured on: its number, or of whole scenes the field's samples along its ray, twice while they are joined; of a ray of a refinement step: its records.
 VOXEL, CELL, BRICK_VOXEL, VISIBILITY_RAY, SCENE_RAY, REFINEMENT_RAY = 130, 20, 16, 64, 400, 5000
+ERROR_CELL = 48  # bytes of a cell of the error map: two errors, chances, factors and numbers of tiles, and what is made of these
 MAX_SHARES = 16  # of the rays, each with the greatest weights of all voxels: efficientnerf.backends.numba.tree.contributions
 
 
@@ -62,6 +63,8 @@ def needed(
     stored    whether the pixels are in a file
     whole     whether a whole scene is baked
     """
+    from efficientnerf.asset.refinement.error_map import MAX_CELLS
+    from efficientnerf.asset.refinement.fit import PATCH_SIDE
     from efficientnerf.settings import given
 
     pixels = pixels_needed(views, channels, stored=stored)
@@ -71,6 +74,7 @@ def needed(
         "voxels": max(voxels_needed(voxels, (degree + 1) ** 2, packed=settings.layout == "packed"), pixels["reading images"] + pixels["directions of pixels"]),
         "the grid": CELL * cells + BRICK_VOXEL * settings.brick_size**3 * bricks,
         "rays": (SCENE_RAY if whole else VISIBILITY_RAY) * rays + REFINEMENT_RAY * settings.refine_rays_per_batch,
+        "the error map": ERROR_CELL * min(MAX_CELLS, count_pixels(tuple(views)) // PATCH_SIDE),
         "the field": 3 * 4 * parameters(trained) + DENSITY_VOXEL * (given(trained.occupancy_resolution) or 192) ** 3 // 4,
         "libraries": libraries(device),
     })  # fmt: skip

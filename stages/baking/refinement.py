@@ -44,8 +44,7 @@ ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
 MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, 6  # see `refinement_steps`
-TOTAL_VARIATION, SCENE_TOTAL_VARIATION, NDC_TOTAL_VARIATION = 1e-5, 0.0, 0.0  # bake.total_variation: with a constant background, of whole scenes, in NDC
-UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
+SCENE_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio of whole scenes
 
 Room = Callable[[int], int]  # voxels that the asset holds on its grids, which were split so often
 
@@ -126,11 +125,11 @@ class Refinement:
             return
         ratio = given(settings.view_dependent_lr_ratio)
         if ratio is None:
-            ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if state.tree.background is None else 1.0
+            ratio = SCENE_VIEW_DEPENDENT_LR_RATIO if _is_whole(state.tree) else 1.0
         run = fit.optimise(
             state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
             fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed, view_dependent_lr_ratio=ratio,
-            rule=Rule(total_variation=total_variation(settings, state.tree)),
+            rule=Rule(total_variation=settings.total_variation),
         )  # fmt: skip
         step_began = clock()
         for error in run:
@@ -186,11 +185,13 @@ def refined(
     samples  of the field, for whole scenes: what was dropped wrongly is restored by them
     """
     from efficientnerf.asset.refinement import fit
+    from efficientnerf.asset.refinement.error_map import count_cells
+    from efficientnerf.training.patches import PatchGrid
 
     settings = job.settings
     splits = count_splits(phases)
     most = min(len(tree.density_values) * 4**splits, room(splits))
-    steps, seconds = refinement_steps(settings, most, tree.background is not None), given(settings.time_budget)
+    steps, seconds = refinement_steps(settings, most, whole=_is_whole(tree)), given(settings.time_budget)
     report: dict[str, Any] = {"psnr_before": None, "psnr_after": None, "voxels_baked": len(tree.density_values)}
     sample = min(ERROR_RAYS, 4 * len(targets.pixels))
     targets = targets_on_device(job, tree, targets, splits, room)
@@ -207,7 +208,8 @@ def refined(
         finish += packing_seconds(most, count_cores(), per_ray, settings.refine_rays_per_batch, weighed, sample)
     schedule = stated_schedule(phases, steps) if seconds is None else RefinementSchedule(phases)
     baked = None if samples is None else _without_harmonics(tree, capped=bool(steps))
-    point = _first_point(job, tree, schedule, stopwatch, timed=seconds is not None, capped=bool(steps))
+    cells = None if targets.on_device else count_cells(PatchGrid(targets.host_pixels, fit.PATCH_SIDE))
+    point = _first_point(job, tree, schedule, stopwatch, cells, timed=seconds is not None, capped=bool(steps))
     log = RefinementLog(
         job.work / BakeOutputs.log, point.state.step, point.schedule.fraction(point.state.step), stopwatch, _previews(job, s, point, targets), clock
     )  # fmt: skip
@@ -225,11 +227,11 @@ def refined(
     return tree, report
 
 
-def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, *, timed: bool, capped: bool) -> Point:
+def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int | None, *, timed: bool, capped: bool) -> Point:
     """Where an earlier attempt stopped, or else the beginning."""
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 
-    found = checkpoint.restored(job, tree, schedule, HOLD if timed else None)
+    found = checkpoint.restored(job, tree, schedule, HOLD if timed else None, cells)
     if found is None:
         return Point(initial_state(tree, MAX_INITIAL_THICKNESS if capped else math.inf), schedule)
     stopwatch.set(found.seconds)
@@ -287,7 +289,7 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets, splits: int = 
     if splits and room is not None:
         voxels = max(voxels, min(voxels * 8**splits, most_children(room(splits))))
     bricks = -(-len(tree.voxel_index) * voxels // max(len(tree.density_values), 1))
-    needed = needed_on_device(voxels, tree.harmonics_count, bricks, cells, tree.brick, smooth=total_variation(job.settings, tree) > 0)
+    needed = needed_on_device(voxels, tree.harmonics_count, bricks, cells, tree.brick, smooth=job.settings.total_variation > 0)
     needed += voxels * bool(tree.outer)  # the cascade of each voxel
     if targets.pixels.images is not None:
         needed += targets.pixels.images.nbytes
@@ -300,18 +302,14 @@ def targets_on_device(job: Job, tree: NerfTree, targets: Targets, splits: int = 
     return targets
 
 
-def total_variation(settings: BakeSettings, tree: NerfTree) -> float:
-    """The weight of the total variation, bake.total_variation or that of the kind of scene."""
-    if (stated := given(settings.total_variation)) is not None:
-        return stated
-    if tree.ndc is not None:
-        return NDC_TOTAL_VARIATION
-    return TOTAL_VARIATION if tree.background is not None else SCENE_TOTAL_VARIATION
+def _is_whole(tree: NerfTree) -> bool:
+    """Whether it is of a whole scene, in contracted space."""
+    return tree.background is None and tree.ndc is None
 
 
-def refinement_steps(settings: BakeSettings, voxels: int, constant_background: bool) -> int:
-    """Steps of the refinement of so many voxels, of a scene with a constant background or without one."""
+def refinement_steps(settings: BakeSettings, voxels: int, *, whole: bool) -> int:
+    """Steps of the refinement of so many voxels, of a whole scene or of another."""
     if (stated := given(settings.refine_steps)) is not None:
         return stated
-    per_voxel = STEP_RAYS_PER_VOXEL if constant_background else SCENE_STEP_RAYS_PER_VOXEL
+    per_voxel = SCENE_STEP_RAYS_PER_VOXEL if whole else STEP_RAYS_PER_VOXEL
     return max(MIN_STEPS, math.ceil(per_voxel * voxels / settings.refine_rays_per_batch))

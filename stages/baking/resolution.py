@@ -27,7 +27,7 @@ MAX_MIB = 38
 # Of whole scenes: cascades at most; the share of what the field shows that may lie beyond the last one, in the environment map; coarse cells of all of them.
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
-NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 36, 24, 56
+NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
 MIN_FILL = 0.93  # of the size that is used, at least
 MAX_TRIES = 4
 

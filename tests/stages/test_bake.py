@@ -314,10 +314,10 @@ def test_a_chosen_resolution_is_that_of_the_pixels_or_of_the_budget(inputs: dict
 
 def test_steps_of_the_fit_follow_the_voxels_of_cut_out_objects_and_what_was_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
     chosen = BakeSettings(refine_rays_per_batch=1000)
-    assert [refinement.refinement_steps(chosen, voxels, True) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
-    assert [refinement.refinement_steps(chosen, voxels, False) for voxels in (1, 10**6)] == [320, 6000]
+    assert [refinement.refinement_steps(chosen, voxels, whole=False) for voxels in (1, 21_333, 21_400, 10**6)] == [320, 320, 321, 15000]
+    assert [refinement.refinement_steps(chosen, voxels, whole=True) for voxels in (1, 10**6)] == [320, 6000]
     asked = dataclasses.replace(chosen, refine_steps=7)
-    assert {refinement.refinement_steps(asked, 10**7, cut_out) for cut_out in (True, False)} == {7}
+    assert {refinement.refinement_steps(asked, 10**7, whole=cut_out) for cut_out in (True, False)} == {7}
     made = job(tmp_path, dataclasses.replace(QUICK, refine_steps=None, refine_rays_per_batch=256), **inputs)
     run(made)
     report = json.loads((made.out / "report.json").read_text())["optimisation"]

@@ -10,10 +10,11 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
+from efficientnerf.asset.refinement.error_map import ErrorMap
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
-from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
+from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.walk import tree_grid
@@ -50,7 +51,8 @@ def optimise(
     cells, buffer = cells_of(tree_grid(state.tree)), RecordBuffer()
     values = values_of(cells, state.density, state.sh)
     patches = PatchGrid(targets.host_pixels, patch_side)
-    chances = probabilities(tiles_met(state.tree, patches))
+    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors)
+    state.errors = error_map.errors
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
     moments = Moments(*none, state.square_density, state.square_sh, state.visits)
     neighbours = neighbours_of(cells, len(state.density)) if rule.total_variation > 0 else NO_NEIGHBOURS
@@ -59,10 +61,10 @@ def optimise(
     rates[3:] *= view_dependent_lr_ratio
     while state.step < until:
         number = state.step + 1
-        drawn = patches.draw(rays, step_rng(seed, number), chances)
-        origins, directions, wanted = targets.of(drawn.pixels)
+        drawn = error_map.draw(rays, step_rng(seed, number))
+        origins, directions, wanted = targets.of(drawn.patches.pixels)
         start, along, bases = in_voxels(state.tree, origins, directions)
-        first = drawn.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
+        first = drawn.patches.first if patches.angle <= MAX_PACKET_ANGLE else packets_of(len(start))
         loss, records = gradients.forward_backward(
             cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer, min_weight=rule.min_weight
         )
@@ -73,7 +75,7 @@ def optimise(
         )  # fmt: skip
         step(records, values, moments, hyperparameters, neighbours)
         state.step = number
-        yield float(loss.mean()) / 3
+        yield error_map.record(number, drawn, loss) / 3
 
 
 def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:

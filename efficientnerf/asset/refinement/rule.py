@@ -10,7 +10,7 @@ from dataclasses import dataclass
 class Rule:
     """The formulas are those of `efficientnerf.backends.numba.tree_training.steps`; a weight of 0 leaves a term out.
 
-    total_variation  weight of the squared differences between the logarithms of a voxel's and its neighbours' optical thickness
+    total_variation  share, of the density's learning rate, of the differences between the logarithms of a voxel's and its neighbours' optical thickness
     sparsity         weight of the sum of the opacities of voxels
     entropy          weight of the entropy of these opacities
     min_weight       weight below which samples of a ray absorb, and have neither a colour nor a gradient

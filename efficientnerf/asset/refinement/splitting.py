@@ -26,7 +26,7 @@ def split(state: RefinementState, keep: np.ndarray) -> RefinementState:
     state.to_host()
     tree = split_tree(state.tree, keep)
     count = len(tree.density_values)
-    return RefinementState(tree, np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.int32), state.step)
+    return RefinementState(tree, np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.int32), state.step, state.errors)
 
 
 def split_tree(tree: NerfTree, keep: np.ndarray) -> NerfTree:

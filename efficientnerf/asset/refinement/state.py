@@ -26,6 +26,7 @@ class RefinementState:
 
     square_*      (N,) running means of the squared gradients by the logarithm of a voxel's optical thickness, and by its harmonics
     visits        (N,) number of steps in which a voxel had a gradient
+    errors        of the error map (`efficientnerf.asset.refinement.error_map.ErrorMap`); None before the first step on the CPU
     device_state  the arrays on the device where steps are taken; `fetch` copies them here
     """
 
@@ -34,6 +35,7 @@ class RefinementState:
     square_sh: np.ndarray
     visits: np.ndarray
     step: int = 0
+    errors: np.ndarray | None = None
     device_state: DeviceState | None = None
 
     def fetch(self) -> None:
@@ -80,6 +82,6 @@ def initial_state(tree: NerfTree, max_thickness: float = np.inf) -> RefinementSt
 
 def subset_state(state: RefinementState, keep: np.ndarray, tree: NerfTree) -> RefinementState:
     """The state of `tree`, which is `state.tree` after `to_host` with the voxels `keep`, (N,) bool, alone, in their order."""
-    return RefinementState(tree, **{name: getattr(state, name)[keep] for name in MOMENTS}, step=state.step)
+    return RefinementState(tree, **{name: getattr(state, name)[keep] for name in MOMENTS}, step=state.step, errors=state.errors)
 
 

@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from efficientnerf.backends.numba.tree_training.steps import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS
+from efficientnerf.backends.numba.tree_training.steps import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, fixed_point_scale
 
@@ -61,7 +61,7 @@ class Neighbours(NamedTuple):
 
 @triton.jit
 def _total_variation(v, met, thickness, side, weight, before, beside, min_thickness):  # type: ignore[no-untyped-def]
-    """Gradient of the term by the logarithm of the optical thickness."""
+    """Share `weight` of the differences of the logarithm of the optical thickness to those of the neighbours."""
     here, slope = tl.log(thickness), tl.zeros_like(thickness)
     for face in tl.static_range(6):
         other = tl.load(beside + 6 * v + face, met, other=-1)
@@ -103,14 +103,14 @@ def _step(  # type: ignore[no-untyped-def]
         # By the logarithm of the optical thickness, which is at least a little, so that density can grow from nothing.
         depth = tl.maximum(tl.load(density + v, met, other=0.0) * side, min_thickness)
         g = tl.load(sum_thickness + v, met, other=0).to(tl.float32) * unit * depth
-        if SMOOTH:
-            g += _total_variation(v, met, depth, side, total_variation, before, beside, min_thickness)
         g += _of_opacity(depth, sparsity, entropy)
         square = decay * tl.load(square_density + v, met, other=0.0) + (1 - decay) * g * g
         if MOMENTUM:
             g = momentum * tl.load(mean_density + v, met, other=0.0) + (1 - momentum) * g
             tl.store(mean_density + v, g, met)
         change = density_rate * ahead * g / (tl.sqrt(square * correction) + epsilon)
+        if SMOOTH:
+            change += _total_variation(v, met, depth, side, total_variation, before, beside, min_thickness)
         tl.store(density + v, tl.minimum(tl.maximum(depth * tl.exp(-change), min_thickness), max_thickness) / side, met)
         tl.store(square_density + v, square, met)
         tl.store(sum_thickness + v, tl.zeros_like(v), met)
@@ -143,7 +143,7 @@ def step(
     _step[(blocks(voxels, VOXELS_PER_PROGRAM),)](
         *values, *sums, *moments, *neighbours, stamp, g.cascade_of, g.cascades.place, voxels, number, min(h.terms, g.terms), 1 / fixed_point_scale(rays),
         *map(float, (g.voxel, h.density_rate, h.sh_rate, h.view_share, h.decay, math.log(h.decay), h.epsilon, h.momentum, math.log(h.momentum or 1.0))),
-        *map(float, (h.total_variation, h.sparsity, h.entropy, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS,
+        *map(float, (min(h.density_rate * h.total_variation, MOST_VARIATION), h.sparsity, h.entropy, MIN_THICKNESS, MAX_THICKNESS)), MAX_VISITS,
         CASCADES=g.cascades.grids, MOMENTUM=h.momentum > 0, SMOOTH=h.total_variation > 0, WIDTH=3 * g.terms, ROW=g.row,
         BLOCK=VOXELS_PER_PROGRAM, num_warps=4,
     )  # fmt: skip

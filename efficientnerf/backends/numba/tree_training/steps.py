@@ -3,11 +3,12 @@
 RMSprop, or Adam (Kingma and Ba 2015) where there is a momentum, with bias corrections by how often a voxel was met. The second moment of a voxel's harmonics is
 the mean of its coefficients'. Plenoxels (Fridovich-Keil et al. 2022) are optimised with RMSprop. N voxels, K harmonics, L cascades, B bricks.
 
-A step minimises the rays' losses and, of each voxel that they met, with tau its optical thickness and n over the voxels beyond its faces that are stored,
+A step minimises the rays' losses and, of each voxel that they met, with tau its optical thickness,
 
-    total_variation sum_n (log tau - log tau_n)^2 / 2  +  sparsity (1 - exp(-tau))  +  entropy H(1 - exp(-tau)),    H(a) = -a log a - (1 - a) log(1 - a)
+    sparsity (1 - exp(-tau))  +  entropy H(1 - exp(-tau)),    H(a) = -a log a - (1 - a) log(1 - a).
 
-where tau_n are those before the step.
+Then it takes  density_rate total_variation sum_n (log tau - log tau_n)  from log tau, n over the voxels beyond its faces that are stored and tau_n before the
+step: the gradient of half the squared differences, apart from the moments as the weight decay of AdamW (Loshchilov and Hutter 2019) is.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
 
 MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
 MAX_VISITS = 60000
+MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
 AHEAD = 8  # voxels whose values are fetched before their turn
 
 
@@ -182,14 +184,19 @@ def _gather(number, terms, records, following, gradient):  # type: ignore[no-unt
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _regularised(place, slope, thickness, voxel, neighbours, h):  # type: ignore[no-untyped-def]
-    """The gradient by the logarithm of a voxel's optical thickness with those of the regularisers."""
-    if h.total_variation > 0:
-        here = np.log(thickness)
-        for face in range(6):
-            other = _neighbour(place, face, neighbours)
-            if other >= 0:
-                slope += h.total_variation * (here - np.log(max(neighbours.density[other] * voxel, MIN_THICKNESS)))
+def _beyond_neighbours(place, thickness, voxel, neighbours):  # type: ignore[no-untyped-def]
+    """Gradient of the total variation by the logarithm of a voxel's optical thickness."""
+    here, slope = np.log(thickness), 0.0
+    for face in range(6):
+        other = _neighbour(place, face, neighbours)
+        if other >= 0:
+            slope += here - np.log(max(neighbours.density[other] * voxel, MIN_THICKNESS))
+    return slope
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _regularised(slope, thickness, h):  # type: ignore[no-untyped-def]
+    """The gradient by the logarithm of a voxel's optical thickness with those of sparsity and entropy."""
     if h.sparsity > 0:
         slope += h.sparsity * thickness * np.exp(-thickness)
     if h.entropy > 0:
@@ -207,7 +214,7 @@ def _update(v, by_density, gradient, terms, values, moments, neighbours, h, of_s
     correction, voxel = np.float64(of_square[min(visits, len(of_square) - 1)]), h.sides[h.cascades[v]]
     # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
     thickness = max(values.density[v] * voxel, MIN_THICKNESS)
-    slope = _regularised(values.places[v], by_density / voxel * thickness, thickness, voxel, neighbours, h)
+    slope = _regularised(by_density / voxel * thickness, thickness, h)
     square = decay * moments.square_density[v] + (1 - decay) * slope * slope
     moments.square_density[v] = square
     ahead = 1.0
@@ -216,6 +223,8 @@ def _update(v, by_density, gradient, terms, values, moments, neighbours, h, of_s
         slope = momentum * moments.density[v] + (1 - momentum) * slope
         moments.density[v] = slope
     change = h.density_rate * ahead * slope / (np.sqrt(square * correction) + epsilon)
+    if h.total_variation > 0:
+        change += min(h.density_rate * h.total_variation, MOST_VARIATION) * _beyond_neighbours(values.places[v], thickness, voxel, neighbours)
     new_density = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel
     values.density[v] = values.dense[values.places[v]] = new_density
     row, rates = values.sh[v], h.sh_rates

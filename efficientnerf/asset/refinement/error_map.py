@@ -1,0 +1,119 @@
+"""Patches drawn by an error map: where the errors of earlier rays were large, more rays are drawn.
+
+Müller et al. 2022 ("instant-ngp") draw training pixels so. T tiles (`efficientnerf.training.patches`), P patches, R rays.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from efficientnerf.training.patches import Patches, PatchGrid
+
+MAX_CELLS = 2**22
+INTERVAL = 32  # steps after which the chances are set again
+MEMORY = 0.5  # of the running mean, kept by each new error
+MOST = 4.0  # times the mean that the root of a cell's error counts, at most: what nothing can learn should not take all rays
+
+
+class Drawn(NamedTuple):
+    """Patches, and the factor (P,) of each one's loss in an unbiased mean over all tiles."""
+
+    patches: Patches
+    factor: np.ndarray
+
+
+def _cells(patches: PatchGrid, tiles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns (V,) of cells of so many tiles a side."""
+    return -(-patches.rows // tiles), -(-patches.columns // tiles)
+
+
+def tiles_of_cell(patches: PatchGrid) -> int:
+    """Tiles along the side of a cell."""
+    tiles = 1
+    while count_cells(patches, tiles) > MAX_CELLS:
+        tiles *= 2
+    return tiles
+
+
+def count_cells(patches: PatchGrid, tiles: int | None = None) -> int:
+    """C, of cells of so many tiles a side; None: `tiles_of_cell`."""
+    rows, columns = _cells(patches, tiles_of_cell(patches) if tiles is None else tiles)
+    return int((rows * columns).sum())
+
+
+class ErrorMap:
+    """Chances of the tiles of a grid, in cells of so many tiles a side that there are MAX_CELLS at most.
+
+    errors  (2, C) float32, C cells: the running mean of a cell's error, negative before its first; and that by which the chances were set. With these the map
+            goes on where another one stopped.
+    """
+
+    def __init__(self, patches: PatchGrid, met: np.ndarray | None = None, errors: np.ndarray | None = None) -> None:
+        """met: (T,) bool of the tiles that may be drawn, or None: all. ValueError where `errors` are those of another grid."""
+        self.patches, self.tiles = patches, tiles_of_cell(patches)
+        self.rows, self.columns = _cells(patches, self.tiles)
+        self.first = np.concatenate([[0], np.cumsum(self.rows * self.columns)]).astype(np.int64)
+        cells = int(self.first[-1])
+        self.errors = np.full((2, cells), -1, np.float32) if errors is None else errors
+        if self.errors.shape != (2, cells) or self.errors.dtype != np.float32:
+            raise ValueError(f"errors {self.errors.shape} {self.errors.dtype}: expected {(2, cells)} float32")
+        self.met = np.bincount(self._cell(np.arange(len(patches)) if met is None else np.flatnonzero(met)), minlength=cells)
+        self._set_chances()
+
+    def _cell(self, tile: np.ndarray) -> np.ndarray:
+        if self.tiles == 1:
+            return tile
+        view = np.searchsorted(self.patches.first, tile, side="right") - 1
+        row, column = np.divmod(tile - self.patches.first[view], self.patches.columns[view])
+        found: np.ndarray = self.first[view] + row // self.tiles * self.columns[view] + column // self.tiles
+        return found
+
+    def _set_chances(self) -> None:
+        """Chances in proportion to the root of the error and the number of tiles that may be drawn; of a cell without an error yet, as of the mean."""
+        known = (self.errors[1] >= 0) & (self.met > 0)
+        root = np.sqrt(np.maximum(self.errors[1], 0), dtype=np.float32)
+        mean = np.average(root[known], weights=self.met[known]) if known.any() else 0.0
+        chance = np.where(known, np.minimum(root, MOST * mean), mean) if mean > 0 else np.ones(len(root))
+        cumulative = np.cumsum(chance * self.met, dtype=np.float64)
+        self.cumulative = cumulative / cumulative[-1]
+        # Were all tiles alike, each would have one chance of its number.
+        with np.errstate(divide="ignore"):
+            self.factor = np.where(chance > 0, cumulative[-1] / (chance * self.met.sum()), 0).astype(np.float32)
+
+    def draw(self, count: int, rng: np.random.Generator) -> Drawn:
+        """Patches of about `count` pixels, at least one, with replacement; none is empty."""
+        while True:
+            number = max(1, round(count / self.patches.mean_pixels))
+            cell = np.minimum(np.searchsorted(self.cumulative, rng.random(number), side="right"), len(self.cumulative) - 1)
+            drawn = self.patches.drawn_from(self._tile(cell, rng), rng)
+            if len(drawn.tile):
+                return Drawn(drawn, self.factor[self._cell(drawn.tile)])
+
+    def _tile(self, cell: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """A random tile of each cell."""
+        if self.tiles == 1:
+            return cell
+        view = np.searchsorted(self.first, cell, side="right") - 1
+        row, column = np.divmod(cell - self.first[view], self.columns[view])
+        places = []
+        for at, most in ((row, self.patches.rows[view]), (column, self.patches.columns[view])):
+            begin = self.tiles * at
+            places.append(begin + (rng.random(len(cell)) * np.minimum(self.tiles, most - begin)).astype(np.int64))
+        found: np.ndarray = self.patches.first[view] + places[0] * self.patches.columns[view] + places[1]
+        return found
+
+    def record(self, step: int, drawn: Drawn, loss: np.ndarray) -> float:
+        """Take in the losses (R,) of the rays of a step's patches; where several are in a cell the greatest counts. The mean that all tiles would have."""
+        patches = drawn.patches
+        total = np.add.reduceat(loss, patches.first[:-1])
+        mean, cell = total / np.diff(patches.first), self._cell(patches.tile)
+        old = self.errors[0, cell]
+        new = np.where(old < 0, mean, MEMORY * old + (1 - MEMORY) * mean).astype(np.float32)
+        self.errors[0, cell] = -1
+        np.maximum.at(self.errors[0], cell, new)
+        if step % INTERVAL == 0:
+            self.errors[1] = self.errors[0]
+            self._set_chances()
+        return float((total * drawn.factor).sum() / len(loss))

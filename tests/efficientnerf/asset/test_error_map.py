@@ -1,0 +1,92 @@
+"""The error map: tiles with larger errors are drawn more often, their mean stays unbiased, and a map goes on where another one stopped."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.refinement import error_map
+from efficientnerf.asset.refinement.error_map import INTERVAL, MOST, Drawn, ErrorMap, count_cells
+from efficientnerf.training.patches import PatchGrid
+from tests.efficientnerf.small_views import views
+
+
+def chances(drawn_by: ErrorMap) -> np.ndarray:
+    return np.diff(drawn_by.cumulative, prepend=0)
+
+
+def test_before_any_error_tiles_are_alike() -> None:
+    grid = PatchGrid(views(), 2)
+    met = np.arange(len(grid)) % 3 == 0
+    made = ErrorMap(grid, met)
+    np.testing.assert_allclose(chances(made), met / met.sum(), atol=1e-12)
+    drawn = made.draw(400, np.random.default_rng(0))
+    assert met[drawn.patches.tile].all()
+    np.testing.assert_allclose(drawn.factor, 1, rtol=1e-6)
+
+
+def test_chances_are_the_roots_of_errors_limited_and_the_mean_is_unbiased() -> None:
+    grid = PatchGrid(views(), 2)
+    rng = np.random.default_rng(1)
+    errors = np.stack([rng.random(len(grid)), rng.random(len(grid)) ** 4]).astype(np.float32)
+    errors[1, 2], errors[1, 5] = 1e4, -1  # far above the others; not known
+    made = ErrorMap(grid, None, errors)
+    root = np.sqrt(np.maximum(errors[1], 0))
+    mean = root[errors[1] >= 0].mean()
+    wanted = np.minimum(np.where(errors[1] < 0, mean, root), MOST * mean)
+    np.testing.assert_allclose(chances(made), wanted / wanted.sum(), rtol=1e-5, atol=1e-12)
+    values = rng.random(len(grid))
+    there = chances(made) > 0
+    np.testing.assert_allclose((chances(made) * made.factor * values)[there].sum(), values[there].sum() / len(grid), rtol=1e-5)
+
+
+def test_recorded_errors_are_running_means_of_which_the_greatest_counts() -> None:
+    grid = PatchGrid(views(), 2)
+    made = ErrorMap(grid)
+    drawn = made.draw(60, np.random.default_rng(2))
+    loss = np.arange(len(drawn.patches.pixels), dtype=np.float64)
+    total = [loss[a:b].sum() for a, b in zip(drawn.patches.first[:-1], drawn.patches.first[1:], strict=True)]
+    assert made.record(1, drawn, loss) == pytest.approx(loss.mean())
+    made.record(INTERVAL, drawn, 3 * loss)
+    for tile in set(drawn.patches.tile):
+        here = drawn.patches.tile == tile
+        means = np.array(total)[here] / np.diff(drawn.patches.first)[here]
+        assert made.errors[0, tile] == pytest.approx((0.5 * means.max() + 0.5 * 3 * means).max(), rel=1e-6)
+    np.testing.assert_array_equal(made.errors[0], made.errors[1])
+    assert (made.errors[0] >= 0).sum() == len(set(drawn.patches.tile))
+    assert chances(made).max() > 1.3 / len(grid)
+
+
+def test_a_map_goes_on_where_another_one_stopped() -> None:
+    grid = PatchGrid(views(), 2)
+    rng = np.random.default_rng(3)
+    whole = ErrorMap(grid)
+    for step in range(1, 2 * INTERVAL):
+        drawn = whole.draw(50, np.random.default_rng(step))
+        whole.record(step, drawn, rng.random(len(drawn.patches.pixels)))
+    resumed = ErrorMap(grid, None, whole.errors.copy())
+    np.testing.assert_array_equal(resumed.cumulative, whole.cumulative)
+    assert not np.array_equal(whole.errors[0], whole.errors[1])
+
+
+def test_large_grids_have_cells_of_several_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = PatchGrid(views(), 1)
+    assert count_cells(grid) == len(grid)
+    monkeypatch.setattr(error_map, "MAX_CELLS", 20)
+    assert count_cells(grid) <= 20
+    made = ErrorMap(grid)
+    assert made.tiles > 1
+    drawn = made.draw(40_000, np.random.default_rng(4))
+    found = np.bincount(drawn.patches.tile, minlength=len(grid))
+    assert found.max() < 2 * found[found > 0].mean()  # all tiles are about as probable
+    assert len(np.flatnonzero(found)) == len(set(drawn.patches.tile)) > 0.95 * (grid.pixels.width * grid.pixels.height).sum()
+    with pytest.raises(ValueError, match="expected"):
+        ErrorMap(grid, None, np.zeros((2, len(grid)), np.float32))
+
+
+def test_what_no_pixel_shows_is_never_drawn() -> None:
+    grid = PatchGrid(views([None, np.zeros((9, 4), bool), None]), 2)
+    made = ErrorMap(grid)
+    drawn = made.draw(500, np.random.default_rng(5))
+    assert isinstance(drawn, Drawn)
+    assert set(grid.pixels.view_of(drawn.patches.pixels)) == {0, 2}
