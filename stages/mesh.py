@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -15,7 +15,7 @@ from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
-from stages.meshing.check import asset_views, checked, shown_by, warning_of
+from stages.meshing.check import asset_views, checked, level_of, shown_by, warning_of
 
 if TYPE_CHECKING:
     from efficientnerf.surface.agreement import AssetView
@@ -37,7 +37,9 @@ class MeshSettings:
         advanced=True,
     )
     max_faces: Annotated[int, Meta(ge=100)] = setting(200_000, "Most faces of the mesh, which is decimated to this many.")
-    density_threshold: float | Auto = setting("auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.")
+    density_threshold: float | Auto = setting(
+        "auto", "Density at which the surface lies, per unit of the training frame; auto: where the surface has the silhouettes of the asset."
+    )
     min_component: Fraction = setting(
         0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
     )
@@ -56,19 +58,25 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
     seen = asset_views(tree, progress)
     if views is not None:
         views += seen
+    threshold = given(settings.density_threshold)
+
+    def tick() -> None:
+        progress(1, 1, PARTS[0])
+
     try:
-        return scene_surface(
+        mesh = scene_surface(
             tree,
-            given(settings.density_threshold),
+            level_of(tree, threshold, seen, tick),
             faces=settings.max_faces,
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             viewpoints=orbit_points(tree.metadata),
-            shown=shown_by(seen, float(tree.voxel), lambda: progress(1, 1, PARTS[0])),
+            shown=shown_by(seen, float(tree.voxel), tick),
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"mesh: {error}. {remedy('mesh', given(settings.density_threshold))}") from error
+        raise StageFailed(f"mesh: {error}. {remedy('mesh', threshold)}") from error
+    return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"})
 
 
 def whole_progress(progress: Callable[[int, int, str], None], grids: int = 1) -> Callable[[int, int, str], None]:

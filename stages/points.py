@@ -14,7 +14,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import PointsInputs, PointsOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.mesh import PARTS, orbit_points, remedy, whole_progress
-from stages.meshing.check import asset_views, shown_by
+from stages.meshing.check import asset_views, level_of, shown_by
 
 if TYPE_CHECKING:
     from efficientnerf.surface.mesh import PointCloud
@@ -30,7 +30,7 @@ class PointsSettings:
     )
     num_points: PositiveInt = setting(200_000, "Number of points.")
     density_threshold: float | Auto = setting(
-        "auto", "Density at which the surface lies, per unit of the training frame; auto: found from the densities.", advanced=True
+        "auto", "Density at which the surface lies, per unit of the training frame; auto: where the surface has the silhouettes of the asset.", advanced=True
     )
     min_component: Fraction = setting(
         0.0, "Area below which connected components get no points, as a fraction of the largest one's; nor do those that no view shows.", advanced=True
@@ -47,16 +47,20 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
 
     progress = whole_progress(progress, 1 + len(tree.outer))
     views = asset_views(tree, progress)
+
+    def tick() -> None:
+        progress(1, 1, PARTS[0])
+
     try:
         cloud = scene_points(
             tree,
             settings.num_points,
-            given(settings.density_threshold),
+            level_of(tree, given(settings.density_threshold), views, tick),
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             seed=settings.seed,
             viewpoints=orbit_points(tree.metadata),
-            shown=shown_by(views, float(tree.voxel), lambda: progress(1, 1, PARTS[0])),
+            shown=shown_by(views, float(tree.voxel), tick),
             progress=progress,
         )
     except NoSurface as error:

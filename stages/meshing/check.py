@@ -86,3 +86,15 @@ def shown_by(views: list[AssetView], voxel: float, tick: Callable[[], None]) -> 
             yield view
 
     return lambda vertices, faces, component: shown_pixels(vertices, faces, component, ticking(), voxel)
+
+
+def level_of(tree: NerfTree, threshold: float | None, views: list[AssetView], tick: Callable[[], None]) -> float | None:
+    """The density of the surface: what is given, else that which has the asset's silhouettes; None for nested grids, each of which has its own. Raises
+    NoSurface."""
+    from efficientnerf.surface.isosurface import automatic_threshold
+    from efficientnerf.surface.level import silhouette_level
+    from efficientnerf.surface.volume import volume_of
+
+    if threshold is not None or tree.outer:
+        return threshold
+    return silhouette_level(tree, views[::2], automatic_threshold(volume_of(tree)), tick)
