@@ -43,7 +43,9 @@ class MeshSettings:
     min_component: Fraction = setting(
         0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
     )
-    smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(10, "Iterations of Taubin smoothing, which keeps the volume.", advanced=True)
+    smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
+        10, "Iterations of Taubin smoothing, which keeps the volume; as many, up to six, of smoothing normals follow, which keeps edges.", advanced=True
+    )
 
 
 def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None) -> Mesh:
@@ -177,4 +179,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}", **facts)
 
 
-STAGE = Stage(name="mesh", version=3, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)
+STAGE = Stage(name="mesh", version=4, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

@@ -89,4 +89,4 @@ def run(job: Job) -> None:
     job.say(f"{len(cloud.positions)} points", points=len(cloud.positions))
 
 
-STAGE = Stage(name="points", version=3, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)
+STAGE = Stage(name="points", version=4, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)

@@ -22,6 +22,7 @@ from efficientnerf.surface.mesh import (
     sample,
     separate,
     smooth,
+    smooth_normals,
     tidy,
     vertex_normals,
 )
@@ -32,6 +33,7 @@ Shown = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # vertices, 
 ViewDirections = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 LARGEST_SIDE = 4096  # voxels along a side of a grid that is baked
 BLOCK = 64  # voxels a side that are in memory at a time
+NORMAL_ROUNDS = 6  # of smoothing normals, at most as many as of smoothing. docs/experiments/surface.md
 SHOWN = 1.0  # pixel of all views together that a component has to show
 CHUNK = 1 << 16  # points whose colours are looked up at a time
 
@@ -360,7 +362,7 @@ def surface(
     threshold      density per world unit of the surface; None: `automatic_threshold`
     faces          budget that it is decimated to
     min_component  components with less than this share of the largest one's area are removed
-    rounds         of smoothing
+    rounds         of smoothing, which keeps the volume; as many, up to NORMAL_ROUNDS, of smoothing normals, which keeps edges
     viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
     shown          how much views of the world show of components: those that they do not show are removed; None: hollows and what is in them are
     progress       called with (done, total, text); what it raises stops the work
@@ -375,6 +377,8 @@ def surface(
     facts["faces_before_decimation"] = len(triangles)
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # what decimation cut off
+    if len(triangles):
+        vertices = np.clip(smooth_normals(vertices, triangles, min(rounds, NORMAL_ROUNDS)), vertices.min(0), vertices.max(0))
     normals = vertex_normals(vertices, triangles)
     colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
     mesh = Mesh(vertices, triangles, normals, colours, facts)

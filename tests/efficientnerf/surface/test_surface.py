@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
 from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface, points, surface, surface_colours
-from efficientnerf.surface.mesh import Mesh, decimate, face_areas, face_volumes, moved, sample, separate, smooth, tidy, topology
+from efficientnerf.surface.mesh import Mesh, decimate, face_areas, face_vectors, face_volumes, moved, sample, separate, smooth, smooth_normals, tidy, topology
 
 LEVEL = 40.0
 NOBODY = np.zeros((0, 3))
@@ -212,3 +213,35 @@ def test_colours_are_looked_up_in_chunks() -> None:
 
 def _shape(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.vertices, mesh.faces
+
+
+def normal_errors(vertices: np.ndarray, faces: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Degrees between the normals of faces and the true ones."""
+    vectors = face_vectors(vertices, faces)
+    return np.degrees(np.arccos(np.clip((vectors * truth).sum(1) / np.linalg.norm(vectors, axis=1), -1, 1)))
+
+
+def test_smoothed_normals_lose_noise_and_keep_edges() -> None:
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    for _ in range(4):
+        box = box.subdivide()
+    vertices, faces, truth = np.asarray(box.vertices), np.asarray(box.faces), np.asarray(box.face_normals)
+    noisy = vertices + np.random.default_rng(0).normal(scale=0.006, size=vertices.shape)
+    smoothed = smooth_normals(noisy, faces, 6)
+    before, after = normal_errors(noisy, faces, truth), normal_errors(smoothed, faces, truth)
+    assert after.mean() < 0.4 * before.mean()
+    at_edge = (np.abs(vertices[faces]).max(1) > 0.499).sum(1) > 1  # faces that reach an edge of the box
+    assert after[at_edge].mean() < 0.5 * before[at_edge].mean()
+    assert np.abs(smoothed - vertices).max() < 0.03
+    rounded = smooth(noisy, faces, 6)
+    assert after[at_edge].mean() < 0.7 * normal_errors(rounded, faces, truth)[at_edge].mean()
+
+
+def test_smoothing_normals_leaves_a_plane_and_takes_no_rounds_for_nothing() -> None:
+    x, y = np.meshgrid(np.linspace(0, 1, 12), np.linspace(0, 1, 12))
+    plane = np.stack([x.ravel(), y.ravel(), 0.2 * x.ravel()], 1)
+    at = (np.arange(11)[:, None] * 12 + np.arange(11)).ravel()
+    faces = np.concatenate([np.stack([at, at + 1, at + 12], 1), np.stack([at + 1, at + 13, at + 12], 1)])
+    np.testing.assert_allclose(smooth_normals(plane, faces, 8), plane, atol=1e-12)
+    assert smooth_normals(plane, faces, 0) is plane
+    assert len(smooth_normals(plane[:0], faces[:0], 3)) == 0
