@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.errors import UsageError
 from workflows.asset import WORKFLOW
-from workflows.budget import MIN_BAKE, MIN_TRAIN, TRAIN_SHARE, share_budget
+from workflows.budget import MIN_BAKE, MIN_TRAIN, PHOTOGRAPHS_TRAIN_SHARE, TRAIN_SHARE, share_budget
 from workflows.cli.request import Options, plan_run
 
 
@@ -19,20 +19,25 @@ def source(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
+SHARES = {"blender": TRAIN_SHARE, "llff": TRAIN_SHARE, "photographs": PHOTOGRAPHS_TRAIN_SHARE, "colmap": PHOTOGRAPHS_TRAIN_SHARE, None: PHOTOGRAPHS_TRAIN_SHARE}
+
+
+@pytest.mark.parametrize("source_format", SHARES)
 @pytest.mark.parametrize("seconds", [0.5, 10.0, MIN_TRAIN + MIN_BAKE, 36.0, 60.0, 240.0, 600.0, 1e5])
-def test_both_parts_make_up_the_budget(seconds: float) -> None:
-    parts = share_budget(seconds)
+def test_both_parts_make_up_the_budget(seconds: float, source_format: str | None) -> None:
+    parts = share_budget(seconds, source_format)
     assert sum(parts.values()) == pytest.approx(seconds)
     assert min(parts.values()) > 0
     if seconds >= MIN_TRAIN + MIN_BAKE:
         assert parts["train"] >= MIN_TRAIN - 1e-9
         assert parts["bake"] >= MIN_BAKE - 1e-9
     if seconds >= 240:
-        assert parts["train"] == pytest.approx(TRAIN_SHARE * seconds)
+        assert parts["train"] == pytest.approx(SHARES[source_format] * seconds)
 
 
-def test_longer_budgets_shorten_no_part() -> None:
-    parts = [share_budget(float(seconds)) for seconds in range(1, 300)]
+@pytest.mark.parametrize("source_format", ["blender", "photographs"])
+def test_longer_budgets_shorten_no_part(source_format: str) -> None:
+    parts = [share_budget(float(seconds), source_format) for seconds in range(1, 300)]
     for stage in ("train", "bake"):
         times = [part[stage] for part in parts]
         assert times == sorted(times)
@@ -44,6 +49,22 @@ def test_options_become_settings_of_both_stages(source: Path, tmp_path: Path) ->
     assert settings["bake"]["max_mib"] == 7
     unset = plan_run(tmp_path / "run", WORKFLOW, Options(source=source, preset="tiny")).run.settings
     assert (unset["train"]["time_budget"], unset["bake"]["time_budget"], unset["bake"]["max_mib"]) == ("off", "off", "auto")
+
+
+def test_the_share_follows_the_format_of_the_source(source: Path, tmp_path: Path) -> None:
+    """Detected or stated; a source that is no data set is refused where it is read, not here."""
+    posed = tmp_path / "posed"
+    (posed / "train").mkdir(parents=True)
+    (posed / "transforms_train.json").write_text('{"camera_angle_x": 1.0, "frames": []}', encoding="utf-8")
+    empty = tmp_path / "empty"
+    (empty / "nothing").mkdir(parents=True)
+
+    def share(folder: Path, **more: object) -> float:
+        planned = plan_run(tmp_path / "run", WORKFLOW, Options(source=folder, preset="tiny", budget="10m", **more))  # type: ignore[arg-type]
+        return float(planned.run.settings["train"]["time_budget"]) / 600
+
+    assert share(source) == share(empty) == PHOTOGRAPHS_TRAIN_SHARE
+    assert share(posed) == share(source, format="llff") == TRAIN_SHARE
 
 
 @pytest.mark.parametrize(("options", "words"), [({"budget": "0s"}, r"--budget 0s: train\.time_budget"), ({"target_mib": 0}, r"--target-mib 0: bake\.max_mib")])

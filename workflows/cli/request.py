@@ -112,7 +112,8 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         if value is not None:
             settings.put("poses", name, [value], origin)
     if options.budget is not None:
-        for stage, seconds in share_budget(seconds_of(options.budget)).items():
+        parts = share_budget(seconds_of(options.budget), _format(settings, _source(options.source, standing)))
+        for stage, seconds in parts.items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
@@ -128,6 +129,21 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         resume_text=resume_command,
     )
     return Plan(run, standing is None, run.device or "auto", limit, warnings, lambda: plan_run(path, workflow, options))
+
+
+def _format(settings: Settings, source: Path | None) -> str | None:
+    """The format that a source will be read as; None where it cannot be, which the stage poses reports."""
+    from stages.io.importers import detect
+
+    stated = settings.resolved()["poses"]
+    if stated.format != "auto":
+        return str(stated.format)
+    if source is None:
+        return None
+    try:
+        return detect(source, stated.allow_outside)
+    except (BadInput, OSError):
+        return None
 
 
 def _memory(given: str | None, standing: Run | None, warnings: list[str]) -> tuple[int | None, Limit | None]:
