@@ -90,10 +90,11 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     from numba import get_num_threads
 
     from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
+    from efficientnerf.asset.refinement.error_map import ErrorMap
     from efficientnerf.asset.refinement.host import DECAY, EPSILON, in_voxels, packet_bases
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
     from efficientnerf.asset.refinement.targets import step_rng
-    from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
+    from efficientnerf.asset.refinement.tiles import tiles_met
     from efficientnerf.backends.numba.tree.walk import tree_grid
     from efficientnerf.backends.numba.tree_training import gradients
     from efficientnerf.backends.numba.tree_training.packets import cells_of
@@ -103,7 +104,7 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     tree, targets = loaded(run)
     state = initial_state(tree, MAX_INITIAL_THICKNESS)
     cells, buffer, patches = cells_of(tree_grid(tree)), gradients.RecordBuffer(), PatchGrid(targets.pixels, side)
-    values, chances = values_of(cells, state.density, state.sh), probabilities(tiles_met(tree, patches))
+    values, error_map = values_of(cells, state.density, state.sh), ErrorMap(patches, tiles_met(tree, patches))
     width = state.sh.shape[1]
     moments = Moments(np.zeros(0, np.float32), np.zeros((0, width), np.float32), state.square_density, state.square_sh, state.visits)
     rule = Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, np.full(width, 0.01, np.float32), DECAY, EPSILON)
@@ -111,7 +112,7 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     counts, number, until = [], 0, time.perf_counter() + seconds
 
     def drawn() -> Any:
-        found = patches.draw(rays, step_rng(0, number), chances)
+        found = error_map.draw(rays, step_rng(0, number)).patches
         origins, directions, wanted = targets.of(found.pixels)
         start, along, bases = in_voxels(tree, origins, directions)
         return found.first, start, along, packet_bases(bases, found.first), values.dense, values.sh, wanted, buffer

@@ -47,20 +47,8 @@ class PatchGrid:
         y, x = (np.minimum(at * self.side + self.side // 2, sides[view] - 1) for at, sides in ((row, self.pixels.height), (column, self.pixels.width)))
         return self.pixels.offsets[view] + y * self.pixels.width[view] + x
 
-    def draw(self, count: int, rng: np.random.Generator, cumulative: np.ndarray | None = None) -> Patches:
-        """Patches of about `count` pixels, at least one, with replacement; none is empty.
-
-        cumulative  (T,) sums of the tiles' probabilities, to one at the last; None: all are alike
-        """
-        while True:
-            patches = max(1, round(count / self.mean_pixels))
-            tile = rng.integers(len(self), size=patches) if cumulative is None else np.searchsorted(cumulative, rng.random(patches), side="right")
-            drawn = self.drawn_from(np.minimum(tile, len(self) - 1), rng)
-            if len(drawn.tile):
-                return drawn
-
     def drawn_from(self, tile: np.ndarray, rng: np.random.Generator) -> Patches:
-        """Of each tile (P,) one of its patches, at random; those without a pixel are left out."""
+        """Of each tile (P,) one of its patches, at random; those without a pixel are left out, so that none is empty."""
         back = rng.integers(self.side, size=(2, len(tile)))
         view = np.searchsorted(self.first, tile, side="right") - 1
         row, column = np.divmod(tile - self.first[view], self.columns[view])

@@ -104,13 +104,13 @@ def digest_of(tensors: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | None = None, cells: int | None = None) -> Point | None:
+def restored(job: Job, tree: NerfTree, stated: RefinementSchedule, hold: int | None = None, *, cells: int) -> Point | None:
     """The last checkpoint of a refinement of this tree with these phases; None where there is none that fits, and one that does not is removed.
 
     tree    as it was baked
     stated  the schedule
     hold    of a phase whose number of steps follows from the time that they take; None: all of them are stated
-    cells   of the error map; None: there is none
+    cells   of the error map
     """
     from efficientnerf.asset.refinement.state import MOMENTS, RefinementState
 
@@ -149,9 +149,9 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _errors(found: Mapping[str, np.ndarray], step: int, cells: int | None) -> np.ndarray | None:
+def _errors(found: Mapping[str, np.ndarray], step: int, cells: int) -> np.ndarray | None:
     """The errors of an error map of so many cells; ValueError where they are missing, or none."""
-    if cells is None or (step == 0 and "errors" not in found):
+    if step == 0 and "errors" not in found:
         return None
     errors = found.get("errors")
     if errors is None or errors.dtype != np.float32 or errors.shape != (2, cells) or not np.isfinite(errors).all():

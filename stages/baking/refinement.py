@@ -208,7 +208,7 @@ def refined(
         finish += packing_seconds(most, count_cores(), per_ray, settings.refine_rays_per_batch, weighed, sample)
     schedule = stated_schedule(phases, steps) if seconds is None else RefinementSchedule(phases)
     baked = None if samples is None else _without_harmonics(tree, capped=bool(steps))
-    cells = None if targets.on_device else count_cells(PatchGrid(targets.host_pixels, fit.PATCH_SIDE))
+    cells = count_cells(PatchGrid(targets.host_pixels, fit.PATCH_SIDE))
     point = _first_point(job, tree, schedule, stopwatch, cells, timed=seconds is not None, capped=bool(steps))
     log = RefinementLog(
         job.work / BakeOutputs.log, point.state.step, point.schedule.fraction(point.state.step), stopwatch, _previews(job, s, point, targets), clock
@@ -227,11 +227,11 @@ def refined(
     return tree, report
 
 
-def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int | None, *, timed: bool, capped: bool) -> Point:
+def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, *, timed: bool, capped: bool) -> Point:
     """Where an earlier attempt stopped, or else the beginning."""
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
 
-    found = checkpoint.restored(job, tree, schedule, HOLD if timed else None, cells)
+    found = checkpoint.restored(job, tree, schedule, HOLD if timed else None, cells=cells)
     if found is None:
         return Point(initial_state(tree, MAX_INITIAL_THICKNESS if capped else math.inf), schedule)
     stopwatch.set(found.seconds)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.errors import UsageError
@@ -55,7 +57,8 @@ def test_the_share_follows_the_format_of_the_source(source: Path, tmp_path: Path
     """Detected or stated; a source that is no data set is refused where it is read, not here."""
     posed = tmp_path / "posed"
     (posed / "train").mkdir(parents=True)
-    (posed / "transforms_train.json").write_text('{"camera_angle_x": 1.0, "frames": []}', encoding="utf-8")
+    frame = {"file_path": "./train/r_0", "transform_matrix": np.eye(4).tolist()}
+    (posed / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": [frame]}), encoding="utf-8")
     empty = tmp_path / "empty"
     (empty / "nothing").mkdir(parents=True)
 

@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from efficientnerf.asset.refinement.error_map import INTERVAL, Drawn, ErrorMap
 from efficientnerf.asset.refinement.host import DECAY, EPSILON, MAX_PACKET_ANGLE
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
-from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
+from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training.packets import cells_of
@@ -34,10 +35,13 @@ from efficientnerf.training.readback import LAG
 class DeviceArrays:
     """A state's arrays on a device, by name (`efficientnerf.asset.refinement.state.STATE`), and the sums of the gradients.
 
-    smooth  whether steps have a total variation
+    error_map  takes in the losses of steps, some steps after these
+    smooth     whether steps have a total variation
     """
 
-    def __init__(self, state: RefinementState, device: torch.device, *, smooth: bool = False) -> None:
+    def __init__(self, state: RefinementState, device: torch.device, error_map: ErrorMap, *, smooth: bool = False) -> None:
+        self.error_map, self.error = error_map, 0.0
+        self.pending: deque[tuple[Drawn, Tensor, Any]] = deque()
         self.values: dict[str, Tensor] = {name: torch.from_numpy(np.ascontiguousarray(getattr(state, name))).to(device) for name in STATE}
         self.grid = device_grid(state.tree, device)
         count, width = state.sh.shape
@@ -50,8 +54,17 @@ class DeviceArrays:
         self.moments = Moments(none, none, *(self.values[name] for name in MOMENTS))
 
     def to_host(self) -> dict[str, np.ndarray]:
-        """The arrays on the host."""
+        """The arrays on the host; all losses are recorded then."""
+        self.record(0)
         return {name: values.cpu().numpy() for name, values in self.values.items()}
+
+    def record(self, left: int) -> None:
+        """Take in the losses of all steps but so many of the last; `error` is the mean of a channel, of the last of them."""
+        while len(self.pending) > left:
+            drawn, loss, arrived = self.pending.popleft()
+            if arrived is not None:
+                arrived.synchronize()
+            self.error = self.error_map.record(drawn, loss.numpy()) / 3
 
     def step(self, number: int, rays: Rays, wanted: Any, hyperparameters: Hyperparameters, min_weight: float = 0.0, first: Tensor | None = None) -> Tensor:
         """Losses (R,) of the rays before the step.
@@ -106,30 +119,29 @@ def optimise(
     """See `efficientnerf.asset.refinement.fit.optimise`. Steps are counted as soon as they are launched; the error is that of LAG steps before."""
     assert isinstance(targets.pixels, DevicePixels)
     state.fetch()
-    state.device_state = arrays = DeviceArrays(state, targets.pixels.device, smooth=rule.total_variation > 0)
     patches = PatchGrid(targets.host_pixels, patch_side)
-    chances = probabilities(tiles_met(state.tree, patches))
-    pending: deque[tuple[Tensor, Any]] = deque()
-    error = None
+    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors)
+    state.errors = error_map.errors
+    state.device_state = arrays = DeviceArrays(state, targets.pixels.device, error_map, smooth=rule.total_variation > 0)
+    begin = state.step
     while state.step < until:
         number = state.step + 1
-        drawn = patches.draw(rays, step_rng(seed, number), chances)
-        origins, directions, wanted = targets.of(drawn.pixels)
-        first = targets.pixels.to_device(packets_within(drawn.first, tree_packets.RAYS)) if patches.angle <= MAX_PACKET_ANGLE else None
+        if state.step % INTERVAL == 0:
+            arrays.record(0)
+            error_map.set_chances()
+        drawn = error_map.draw(rays, step_rng(seed, number))
+        origins, directions, wanted = targets.of(drawn.patches.pixels)
+        first = targets.pixels.to_device(packets_within(drawn.patches.first, tree_packets.RAYS)) if patches.angle <= MAX_PACKET_ANGLE else None
         factor = fall(number)
         hyperparameters = Hyperparameters(
             density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, DECAY, EPSILON, total_variation=rule.total_variation, sparsity=rule.sparsity,
             entropy=rule.entropy, terms=rule.terms(number, state.tree.harmonics_count),
         )  # fmt: skip
         loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters, rule.min_weight, first)
-        pending.append(to_host_async(loss.mean() / 3))
+        arrays.pending.append((drawn, *to_host_async(loss)))
         state.step = number
-        if error is None or len(pending) > LAG:
-            value, arrived = pending.popleft()
-            if arrived is not None:
-                arrived.synchronize()
-            error = float(value)
-        yield error
+        arrays.record(0 if number == begin + 1 else LAG)
+        yield arrays.error
 
 
 def values_of(tree: NerfTree, device: torch.device) -> tuple[DeviceGrid, Tensor, Tensor]:

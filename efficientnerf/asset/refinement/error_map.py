@@ -104,16 +104,18 @@ class ErrorMap:
         found: np.ndarray = self.patches.first[view] + places[0] * self.patches.columns[view] + places[1]
         return found
 
-    def record(self, step: int, drawn: Drawn, loss: np.ndarray) -> float:
-        """Take in the losses (R,) of the rays of a step's patches; where several are in a cell the greatest counts. The mean that all tiles would have."""
+    def set_chances(self) -> None:
+        """Draw by the errors that are recorded."""
+        self.errors[1] = self.errors[0]
+        self._set_chances()
+
+    def record(self, drawn: Drawn, loss: np.ndarray) -> float:
+        """Take in the losses (R,) of the rays of patches; where several are in a cell the greatest counts. The mean that all tiles would have."""
         patches = drawn.patches
-        total = np.add.reduceat(loss, patches.first[:-1])
+        total = np.add.reduceat(loss, patches.first[:-1], dtype=np.float64)
         mean, cell = total / np.diff(patches.first), self._cell(patches.tile)
         old = self.errors[0, cell]
         new = np.where(old < 0, mean, MEMORY * old + (1 - MEMORY) * mean).astype(np.float32)
         self.errors[0, cell] = -1
         np.maximum.at(self.errors[0], cell, new)
-        if step % INTERVAL == 0:
-            self.errors[1] = self.errors[0]
-            self._set_chances()
         return float((total * drawn.factor).sum() / len(loss))

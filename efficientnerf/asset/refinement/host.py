@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
-from efficientnerf.asset.refinement.error_map import ErrorMap
+from efficientnerf.asset.refinement.error_map import INTERVAL, ErrorMap
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
@@ -61,6 +61,8 @@ def optimise(
     rates[3:] *= view_dependent_lr_ratio
     while state.step < until:
         number = state.step + 1
+        if state.step % INTERVAL == 0:
+            error_map.set_chances()
         drawn = error_map.draw(rays, step_rng(seed, number))
         origins, directions, wanted = targets.of(drawn.patches.pixels)
         start, along, bases = in_voxels(state.tree, origins, directions)
@@ -75,7 +77,7 @@ def optimise(
         )  # fmt: skip
         step(records, values, moments, hyperparameters, neighbours)
         state.step = number
-        yield error_map.record(number, drawn, loss) / 3
+        yield error_map.record(drawn, loss) / 3
 
 
 def total_loss(tree: NerfTree, bundles: Iterable[Bundle]) -> float:

@@ -26,7 +26,7 @@ class RefinementState:
 
     square_*      (N,) running means of the squared gradients by the logarithm of a voxel's optical thickness, and by its harmonics
     visits        (N,) number of steps in which a voxel had a gradient
-    errors        of the error map (`efficientnerf.asset.refinement.error_map.ErrorMap`); None before the first step on the CPU
+    errors        of the error map (`efficientnerf.asset.refinement.error_map.ErrorMap`); None before the first step
     device_state  the arrays on the device where steps are taken; `fetch` copies them here
     """
 

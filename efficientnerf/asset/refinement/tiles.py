@@ -38,8 +38,3 @@ def tiles_met(tree: NerfTree, patches: PatchGrid) -> np.ndarray | None:
         origins, directions = patches.pixels.bundle(patches.centres(np.arange(part.start, part.stop)))[:2]
         come_near((origins.astype(np.float64) - tree.bounds_min) / cell, directions.astype(np.float64), leap, met[part])
     return None if met.mean() > MOST_MET or not met.any() else met
-
-
-def probabilities(chosen: np.ndarray | None) -> np.ndarray | None:
-    """(T,) sums of the probabilities of tiles, (T,) bool of which the chosen ones are alike; None: of all."""
-    return None if chosen is None else np.cumsum(chosen) / np.count_nonzero(chosen)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.refinement import error_map
-from efficientnerf.asset.refinement.error_map import INTERVAL, MOST, Drawn, ErrorMap, count_cells
+from efficientnerf.asset.refinement.error_map import MOST, Drawn, ErrorMap, count_cells
 from efficientnerf.training.patches import PatchGrid
 from tests.efficientnerf.small_views import views
 
@@ -46,8 +46,10 @@ def test_recorded_errors_are_running_means_of_which_the_greatest_counts() -> Non
     drawn = made.draw(60, np.random.default_rng(2))
     loss = np.arange(len(drawn.patches.pixels), dtype=np.float64)
     total = [loss[a:b].sum() for a, b in zip(drawn.patches.first[:-1], drawn.patches.first[1:], strict=True)]
-    assert made.record(1, drawn, loss) == pytest.approx(loss.mean())
-    made.record(INTERVAL, drawn, 3 * loss)
+    assert made.record(drawn, loss) == pytest.approx(loss.mean())
+    made.record(drawn, 3 * loss)
+    assert (made.errors[1] < 0).all()
+    made.set_chances()
     for tile in set(drawn.patches.tile):
         here = drawn.patches.tile == tile
         means = np.array(total)[here] / np.diff(drawn.patches.first)[here]
@@ -61,9 +63,11 @@ def test_a_map_goes_on_where_another_one_stopped() -> None:
     grid = PatchGrid(views(), 2)
     rng = np.random.default_rng(3)
     whole = ErrorMap(grid)
-    for step in range(1, 2 * INTERVAL):
+    for step in range(20):
+        if step == 12:
+            whole.set_chances()
         drawn = whole.draw(50, np.random.default_rng(step))
-        whole.record(step, drawn, rng.random(len(drawn.patches.pixels)))
+        whole.record(drawn, rng.random(len(drawn.patches.pixels)))
     resumed = ErrorMap(grid, None, whole.errors.copy())
     np.testing.assert_array_equal(resumed.cumulative, whole.cumulative)
     assert not np.array_equal(whole.errors[0], whole.errors[1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from efficientnerf.asset.refinement.tiles import probabilities, tiles_met
+from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
@@ -38,7 +38,7 @@ def test_every_patch_with_a_ray_that_meets_the_tree_is_of_a_tile_that_does() -> 
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(5):
-        drawn = grid.draw(20000, rng)
+        drawn = grid.drawn_from(rng.integers(len(grid), size=round(20000 / grid.mean_pixels)), rng)
         origins, directions = grid.pixels.bundle(drawn.pixels)[:2]
         hit = render_rays(tree, origins, directions).opacity > 0
         any_hit = np.logical_or.reduceat(hit, drawn.first[:-1])
@@ -62,8 +62,3 @@ def test_rays_along_the_axes_and_past_the_box() -> None:
 
 def test_all_tiles_of_nested_trees() -> None:
     assert tiles_met(random_cascades(1), PatchGrid(pixels([pose(0.0, 0.3)]), SIDE)) is None
-    assert probabilities(None) is None
-
-
-def test_probabilities_of_chosen_tiles() -> None:
-    np.testing.assert_allclose(probabilities(np.array([False, True, True, False, True])), [0, 1 / 3, 2 / 3, 2 / 3, 1])

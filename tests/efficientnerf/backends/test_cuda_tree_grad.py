@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from efficientnerf.asset.cascades import cascade_grids, nested, voxel_cascades
+from efficientnerf.asset.refinement.error_map import ErrorMap
 from efficientnerf.asset.refinement.fit import error, max_weights, optimise
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.schedule import exponential_fall
@@ -20,6 +21,7 @@ from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.training.device_pixels import DevicePixels
+from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.pixels import Pixels
 from tests.efficientnerf.balls import BOUNDS, cameras, photograph, pixels
 from tests.efficientnerf.device import DEVICE
@@ -193,13 +195,14 @@ def test_the_room_that_a_fit_takes_is_known_before(*, smooth: bool) -> None:
     from stages.baking.memory import needed_on_device
 
     tree = random_tree(4, shape=(5, 5, 5), brick=4, degree=2, share=0.5)
-    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE), smooth=smooth)
+    errors = ErrorMap(PatchGrid(pixels(2, 8), 4))
+    arrays = device.DeviceArrays(initial_state(tree), torch.device(DEVICE), errors, smooth=smooth)
     tensors = [*arrays.values.values(), *arrays.neighbours, arrays.by_thickness, arrays.by_sh, arrays.stamp, arrays.grid.index, arrays.grid.grid]
     taken = sum(t.numel() * t.element_size() for t in tensors)
     # The grid is there once then; three times while it is sent.
     needed = needed_on_device(len(tree.density_values), 9, len(tree.voxel_index), tree.brick_index.size, 4, smooth=smooth)
     assert needed == taken + 8 * tree.brick_index.size
-    nest = device.DeviceArrays(initial_state(random_cascades(4)), torch.device(DEVICE)).grid
+    nest = device.DeviceArrays(initial_state(random_cascades(4)), torch.device(DEVICE), errors).grid
     assert nest.grid.numel() == 3 * 4**3
     assert len(nest.cascade_of) == len(random_cascades(4).density_values)
 

@@ -1,4 +1,4 @@
-"""Patches of pixels: every usable pixel as probable as any other, whatever the sizes of views; tiles drawn as probable as was said."""
+"""Patches of pixels: every usable pixel as probable as any other, whatever the sizes of views."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ from tests.efficientnerf.small_views import views
 
 
 class EveryPatch:
-    """A generator that draws all tiles, each with all of its patches, once."""
+    """A generator of the places of all patches of so many tiles, given side^2 times each."""
 
     def __init__(self, tiles: int, side: int) -> None:
-        back = np.stack(np.divmod(np.arange(side**2), side))
-        self.drawn = [np.repeat(np.arange(tiles), side**2), np.tile(back, tiles)]
+        self.back = np.tile(np.stack(np.divmod(np.arange(side**2), side)), tiles)
 
     def integers(self, most: int, size: object) -> np.ndarray:
-        return self.drawn.pop(0)
+        return self.back
 
 
 @pytest.mark.parametrize("side", [1, 2, 4, 16])
 def test_every_pixel_lies_in_as_many_patches(side: int) -> None:
     grid = PatchGrid(views(), side)
-    found = grid.draw(10, EveryPatch(len(grid), side))  # type: ignore[arg-type]
+    found = grid.drawn_from(np.repeat(np.arange(len(grid)), side**2), EveryPatch(len(grid), side))  # type: ignore[arg-type]
     np.testing.assert_array_equal(np.bincount(found.pixels, minlength=len(grid.pixels)), side**2)
     assert grid.angle == pytest.approx(side / 9, rel=0.15)
     assert grid.mean_pixels == pytest.approx(len(grid.pixels) / len(grid))
@@ -33,7 +32,8 @@ def test_pixels_of_a_patch_are_neighbours_in_one_view_and_masks_hold() -> None:
     keep = np.random.default_rng(0).random((9, 4)) < 0.4
     pixels = views([None, keep, np.zeros((3, 1), bool)])
     grid = PatchGrid(pixels, 3)
-    found = grid.draw(4000, np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    found = grid.drawn_from(rng.integers(len(grid), size=round(4000 / grid.mean_pixels)), rng)
     assert abs(len(found.pixels) - 4000) < 400
     assert (np.diff(found.first) > 0).all()
     assert found.first[-1] == len(found.pixels)
@@ -45,12 +45,3 @@ def test_pixels_of_a_patch_are_neighbours_in_one_view_and_masks_hold() -> None:
         y, x = np.divmod(found.pixels[a:b] - pixels.offsets[view], pixels.width[view])
         assert np.ptp(x) < 3
         assert np.ptp(y) < 3
-
-
-def test_tiles_are_drawn_as_probable_as_was_said() -> None:
-    grid = PatchGrid(views(), 2)
-    chances = np.zeros(len(grid))
-    chances[[3, 8]] = 0.25, 0.75
-    found = grid.draw(3000, np.random.default_rng(2), np.cumsum(chances))
-    assert set(found.tile) == {3, 8}
-    assert (found.tile == 8).mean() == pytest.approx(0.75, abs=0.05)

@@ -36,6 +36,7 @@ def some_state(tree: NerfTree, pruned: bool) -> RefinementState:
     for name in STATE:
         values = getattr(state, name)
         values[:] = rng.integers(1, 100, values.shape)
+    state.errors = rng.random((2, 5), np.float32)
     state.step = 7 if pruned else 3
     return state
 
@@ -46,12 +47,13 @@ def test_a_checkpoint_gives_the_state_back(pruned: bool, tmp_path: Path) -> None
     state = some_state(tree, pruned)
     point = Point(state, SCHEDULE, int(pruned), Pruned(0.25, 0.125, 7) if pruned else None)
     checkpoint.save(job(tmp_path), point)
-    found = checkpoint.restored(job(tmp_path), tree, SCHEDULE)
+    found = checkpoint.restored(job(tmp_path), tree, SCHEDULE, cells=5)
     assert found is not None
     again = found.state
     assert (again.step, found.phase, found.pruned) == (state.step, point.phase, point.pruned)
     for name in STATE:
         np.testing.assert_array_equal(getattr(again, name), getattr(state, name))
+    np.testing.assert_array_equal(again.errors, state.errors)
     for name in ("brick_index", "voxel_index", "environment"):
         np.testing.assert_array_equal(getattr(again.tree, name), getattr(state.tree, name))
     for one, other in zip(again.tree.outer, state.tree.outer, strict=True):
@@ -81,3 +83,25 @@ def test_cascades_of_another_tree_are_told(pruned: bool, change: Callable[[dict[
     change(tensors)
     with pytest.raises(ValueError, match=r"voxels|cascades"):
         checkpoint.check(tensors, tree, SCHEDULE)
+
+
+ERRORS: dict[str, Callable[[dict[str, np.ndarray]], Any]] = {
+    "missing": lambda tensors: tensors.pop("errors"),
+    "of other cells": lambda tensors: tensors.update(errors=np.zeros((2, 6), np.float32)),
+    "wide": lambda tensors: tensors.update(errors=tensors["errors"].astype(np.float64)),
+    "no numbers": lambda tensors: tensors.update(errors=np.full((2, 5), np.nan, np.float32)),
+}
+
+
+@pytest.mark.parametrize("change", ERRORS.values(), ids=ERRORS)
+def test_errors_of_another_map_are_told(change: Callable[[dict[str, np.ndarray]], Any], tmp_path: Path) -> None:
+    from safetensors.numpy import load_file, save_file
+
+    tree, made = random_cascades(3), job(tmp_path)
+    checkpoint.save(made, Point(some_state(tree, False), SCHEDULE))
+    path = made.work / checkpoint.CHECKPOINT
+    tensors = load_file(path)
+    change(tensors)
+    save_file(tensors, path, metadata={"sha256": checkpoint.digest_of(tensors)})
+    assert checkpoint.restored(made, tree, SCHEDULE, cells=5) is None
+    assert not path.exists()

@@ -139,6 +139,7 @@ def some_state(tree: NerfTree, phase: int) -> RefinementState:
     for name in STATE:
         values = getattr(state, name)
         values[:] = rng.integers(1, 100, values.shape)
+    state.errors = rng.random((2, 5), np.float32)
     state.step = (2, 4, 12)[phase]
     return state
 
@@ -154,7 +155,7 @@ def test_a_checkpoint_gives_the_state_of_any_phase_back(tree: Callable[[], NerfT
     made, baked = job(tmp_path, None), tree()
     point = Point(some_state(baked, phase), TWELVE, phase, Pruned(0.5, 0.25, 3) if phase else None, 20.0, 10.0)
     checkpoint.save(made, point)
-    found = checkpoint.restored(made, baked, TWELVE)
+    found = checkpoint.restored(made, baked, TWELVE, cells=5)
     assert found is not None
     assert (found.state.step, found.phase, found.pruned, found.seconds, found.began) == (point.state.step, phase, point.pruned, 20.0, 10.0)
     for name in STATE:
@@ -188,6 +189,6 @@ def test_voxels_of_another_split_are_told(tree: Callable[[], NerfTree], change: 
     tensors = load_file(path)
     tensors["coordinates"] = np.ascontiguousarray(change(tensors["coordinates"]))
     save_file(tensors, path, metadata={"sha256": checkpoint.digest_of(tensors)})
-    assert checkpoint.restored(made, baked, TWELVE) is None
+    assert checkpoint.restored(made, baked, TWELVE, cells=5) is None
     assert [event["event"] for event in events] == ["warning"]
     assert not path.exists()
