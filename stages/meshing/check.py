@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from efficientnerf.surface.mesh import Mesh
 
 CAPTURED, ORBIT = 12, 12  # cameras
-LONGER_SIDE = 400  # of the images, pixels
+LONGER_SIDE, PIXELS_PER_VOXEL = 400, 2  # of the images, pixels, at most; and for each voxel along the longest side
 WARNED = 0.03  # share of pixels missed or added, from which the stage says so
 PICTURED = 3  # views in the picture: those that agree least
 
@@ -27,8 +27,9 @@ def check_cameras(tree: NerfTree) -> list[Camera]:
     from stages.framing.captured import captured_of
 
     captured = captured_of(tree.metadata)
-    width, height = (LONGER_SIDE, 3 * LONGER_SIDE // 4) if captured is None else (captured.width, captured.height)
-    scale = LONGER_SIDE / max(width, height)
+    longer = min(LONGER_SIDE, PIXELS_PER_VOXEL * max(tree.resolution))
+    width, height = (longer, max(1, 3 * longer // 4)) if captured is None else (captured.width, captured.height)
+    scale = longer / max(width, height)
     size = max(1, round(width * scale)), max(1, round(height * scale))
     out = turntable_cameras(tree, frames=ORBIT, width=size[0], height=size[1])
     if captured is not None:

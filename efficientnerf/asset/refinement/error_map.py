@@ -12,6 +12,7 @@ import numpy as np
 from efficientnerf.training.patches import Patches, PatchGrid
 
 MAX_CELLS = 2**22
+PART = 2**20  # tiles that are counted at a time
 INTERVAL = 32  # steps after which the chances are set again
 MEMORY = 0.5  # of the running mean, kept by each new error
 MOST = 4.0  # times the mean that the root of a cell's error counts, at most: what nothing can learn should not take all rays
@@ -59,8 +60,17 @@ class ErrorMap:
         self.errors = np.full((2, cells), -1, np.float32) if errors is None else errors
         if self.errors.shape != (2, cells) or self.errors.dtype != np.float32:
             raise ValueError(f"errors {self.errors.shape} {self.errors.dtype}: expected {(2, cells)} float32")
-        self.met = np.bincount(self._cell(np.arange(len(patches)) if met is None else np.flatnonzero(met)), minlength=cells)
+        self.met = self._count_met(met)
         self._set_chances()
+
+    def _count_met(self, met: np.ndarray | None) -> np.ndarray:
+        """(C,) tiles of each cell that may be drawn; a part of the tiles at a time, for there may be many."""
+        counts = np.zeros(len(self.errors[0]), np.int64)
+        for begin in range(0, len(self.patches), PART):
+            end = min(begin + PART, len(self.patches))
+            tile = np.arange(begin, end) if met is None else begin + np.flatnonzero(met[begin:end])
+            np.add.at(counts, self._cell(tile), 1)
+        return counts
 
     def _cell(self, tile: np.ndarray) -> np.ndarray:
         if self.tiles == 1:
