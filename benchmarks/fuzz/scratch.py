@@ -20,6 +20,7 @@ from benchmarks.fuzz.reader import Opened, Reader
 QUICK = {"iterations": 13, "sample_batch_size": 256, "log2_hashmap_size": 8, "occupancy_resolution": 4}
 
 STEP = 5  # of the checkpoints
+CELLS = 6  # of the error map
 
 
 @cache
@@ -249,7 +250,7 @@ def _refinement() -> tuple[Any, Any]:
 
     tree = tiny()
     state = initial_state(tree, 1.0)
-    state.step = STEP
+    state.step, state.errors = STEP, np.full((2, CELLS), 0.25, np.float32)
     return tree, state
 
 
@@ -290,7 +291,7 @@ def open_refinement(folder: Path) -> Opened:
 
     def read(data: bytes) -> None:
         (job.work / checkpoint.CHECKPOINT).write_bytes(data)
-        found = checkpoint.restored(job, tree, stated_schedule(PHASES, 2 * STEP))
+        found = checkpoint.restored(job, tree, stated_schedule(PHASES, 2 * STEP), cells=CELLS)
         assert found is None or 0 <= found.state.step <= 2 * STEP, "a step out of range"
 
     return Opened(read)

@@ -66,6 +66,7 @@ def mixed(results: list[np.ndarray], towards: list[np.ndarray]) -> float:
 
 
 def check(case: Case, operation: Operation, device: str) -> None:
+    BUFFERS.clear()  # of earlier tensors, whose places these may have
     inputs = placed(case, device)
     found = case.call(operation, **inputs)
     wanted = case.loop(**exact(case))
