@@ -106,7 +106,7 @@ class BakeSettings:
     density_lr: NonNegative = setting(0.3, "Learning rate of the refinement for the logarithm of a voxel's optical thickness.", advanced=True)
     sh_lr: NonNegative = setting(0.1, "Learning rate of the refinement for the spherical harmonics.", advanced=True)
     view_dependent_lr_ratio: Fraction | Auto = setting(
-        "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 0.2 in contracted space, else 1.", advanced=True
+        "auto", "Ratio of the learning rate of view-dependent harmonics to sh_lr; auto: 1 for objects with alpha, 0.2 in unbounded scenes.", advanced=True
     )
     total_variation: NonNegative = setting(
         0.01, "Weight of the total variation of the logarithm of the optical thickness between a voxel and those beside it.", advanced=True

@@ -44,7 +44,7 @@ ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
 MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, 6  # see `refinement_steps`
-SCENE_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio of whole scenes
+UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
 Room = Callable[[int], int]  # voxels that the asset holds on its grids, which were split so often
 
@@ -125,7 +125,7 @@ class Refinement:
             return
         ratio = given(settings.view_dependent_lr_ratio)
         if ratio is None:
-            ratio = SCENE_VIEW_DEPENDENT_LR_RATIO if _is_whole(state.tree) else 1.0
+            ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if state.tree.background is None else 1.0
         run = fit.optimise(
             state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
             fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed, view_dependent_lr_ratio=ratio,
