@@ -11,6 +11,20 @@ import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
+class Texture:
+    """Pictures on the faces of a mesh.
+
+    coordinates  (F, 3, 2) float64 of each face's corners, 0-1: u to the right, v up from the lower edge, as OBJ and USD count
+    colours      (S, S, 3) uint8 sRGB, the top row first
+    normals      (S, S, 3) uint8 normal map in tangent space, y up as glTF's, or None
+    """
+
+    coordinates: np.ndarray
+    colours: np.ndarray
+    normals: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """A triangle mesh with colours.
 
@@ -19,6 +33,7 @@ class Mesh:
     normals  (V, 3) float64 unit, outward
     colours  (V, 3) float32 sRGB, 0-1
     facts    how it was made (threshold, what was removed), for reports
+    texture  pictures on its faces, or None: its colours are those of the vertices
     """
 
     vertices: np.ndarray
@@ -26,6 +41,7 @@ class Mesh:
     normals: np.ndarray
     colours: np.ndarray
     facts: dict[str, object] = field(default_factory=dict)
+    texture: Texture | None = None
 
 
 @dataclass(frozen=True, eq=False)
