@@ -16,7 +16,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -174,6 +174,32 @@ def atomic(path: Path, *, durable: bool = True) -> Iterator[Path]:
         raise
     if durable:
         sync_folder(path.parent)
+
+
+@contextmanager
+def atomic_together(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """As `atomic`, for files of one folder that belong together: none appears before all are written and synced, and the last one appears last.
+
+    Where a rename fails, those that were not there before go again; files that were replaced by then stay replaced.
+    """
+    temporaries: list[Path] = []
+    new: list[Path] = []
+    try:
+        for path in paths:
+            temporaries.append(_created_beside(path))
+        yield temporaries
+        for temporary in temporaries:
+            sync_file(temporary)
+        for temporary, path in zip(temporaries, paths, strict=True):
+            if not exists(path):
+                new.append(path)
+            rename(temporary, path)
+        sync_folder(paths[-1].parent)
+    except BaseException:
+        for each in (*temporaries, *new):
+            with contextlib.suppress(OSError):  # the error in flight is the one to report
+                each.unlink(missing_ok=True)
+        raise
 
 
 def _created_beside(path: Path) -> Path:

@@ -14,7 +14,7 @@ from workflows.cli.output import plain
 from workflows.cli.progress import size
 from workflows.cli.target import ASSET, describe_asset, is_run, open_run
 
-MESHES = tuple(dict.fromkeys((*MESH_EXPORTERS, *POINT_EXPORTERS)))
+MESHES = tuple(dict.fromkeys(each.extension for each in (*MESH_EXPORTERS.values(), *POINT_EXPORTERS.values()) if each.extra is None))  # trimesh reads these
 
 
 def describe(path: Path) -> dict[str, Any]:

@@ -1,37 +1,70 @@
 """Meshes and points as files, one module per format. The tables say which formats there are, by extension.
 
-Every exporter is called as `write(what, path, frame)`: a mesh or points in the capture's frame, the file, and what is known of that frame.
-It raises BadInput, before anything is written, for what would make a broken file.
+Every exporter is called as `write(what, path, frame)`: a mesh or points in the capture's frame, the file, and what is known of that frame; those of meshes
+whose format keeps textures take `picture`, "png" or "jpeg", too. It raises BadInput, before anything is written, for what would make a broken file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from efficientnerf.surface.mesh import Mesh, PointCloud
-    from stages.io.exporters.writing import SourceFrame
+from typing import Any
 
 
-def _of(module: str, function: str) -> Callable[[Any, Path, SourceFrame], None]:
-    """The function of a module of this package, imported when it is called."""
+@dataclass(frozen=True)
+class Format:
+    """What a format of meshes or points is.
 
-    def write(what: Any, path: Path, frame: SourceFrame) -> None:
-        getattr(import_module(f"{__name__}.{module}"), function)(what, path, frame)
+    extension  with its dot
+    keeps      of a mesh or of points
+    loses      what it has no place for
+    opened_by  programs
+    module     of this package, and its function: write
+    textures   whether it keeps textures, and takes `picture`
+    extra      of the package efficientnerf, that has to be installed for it
+    beside     whether a texture lies in files beside it: `companions` of its module
+    """
 
-    return write
+    extension: str
+    keeps: str
+    loses: str
+    opened_by: str
+    module: str
+    function: str
+    textures: bool = False
+    extra: str | None = None
+    beside: bool = False
+
+    def write(self, what: Any, path: Path, frame: Any, **options: Any) -> None:
+        """`options`: picture, of formats that keep textures. The module is imported now."""
+        getattr(import_module(f"{__name__}.{self.module}"), self.function)(what, path, frame, **options)
+
+    def __call__(self, what: Any, path: Path, frame: Any, **options: Any) -> None:
+        self.write(what, path, frame, **options)
+
+    def companions(self, path: Path, picture: str = "png", normal_map: bool = False) -> list[Path]:
+        """The files that it writes beside `path` where the mesh has a texture."""
+        found: list[Path] = import_module(f"{__name__}.{self.module}").companions(path, picture, normal_map) if self.beside else []
+        return found
 
 
-def _mesh(module: str) -> Callable[[Mesh, Path, SourceFrame], None]:
-    return _of(module, "write_mesh")
+_MESHES = (
+    Format(".ply", "shape, normals, colours of vertices; the capture's frame", "the texture", "MeshLab, CloudCompare, Blender", "ply", "write_mesh"),
+    Format(".glb", "shape, normals, texture or colours of vertices; y up; unlit", "the capture's axes (kept as a matrix in its extras)",
+           "Blender, Unity, Unreal, Godot, three.js, Windows", "glb", "write_mesh", textures=True),
+    Format(".obj", "shape, normals, texture (a .mtl and a picture beside it) or colours of vertices; the capture's frame", "that it is unlit",
+           "nearly everything", "obj", "write_mesh", textures=True, beside=True),
+    Format(".usdz", "shape, normals, texture or colours of vertices, in one file; y up; unlit", "the capture's axes (kept as a matrix)",
+           "iOS and macOS, Blender, Houdini, Omniverse", "usd", "write_usdz", textures=True, extra="usd"),
+    Format(".usdc", "the same, its picture beside it", "the capture's axes (kept as a matrix)", "Blender, Houdini, Omniverse, Maya", "usd", "write_usdc",
+           textures=True, extra="usd", beside=True),
+    Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices, the unit", "slicers for 3D printing, CAD", "stl", "write_mesh"),
+)  # fmt: skip
+_POINTS = (
+    Format(".ply", "places, normals, colours; the capture's frame", "nothing", "MeshLab, CloudCompare, Blender", "ply", "write_points"),
+    Format(".xyz", "places, colours, normals, as text; the capture's frame", "nothing", "CloudCompare, spreadsheets", "xyz", "write_points"),
+)
 
-
-def _points(module: str) -> Callable[[PointCloud, Path, SourceFrame], None]:
-    return _of(module, "write_points")
-
-
-MESH_EXPORTERS = {".ply": _mesh("ply"), ".glb": _mesh("glb"), ".obj": _mesh("obj")}
-POINT_EXPORTERS = {".ply": _points("ply"), ".xyz": _points("xyz")}
+MESH_EXPORTERS: dict[str, Format] = {each.extension: each for each in _MESHES}
+POINT_EXPORTERS: dict[str, Format] = {each.extension: each for each in _POINTS}

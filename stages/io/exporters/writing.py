@@ -12,7 +12,9 @@ import numpy as np
 from efficientnerf.geometry.cameras import Similarity
 from efficientnerf.surface.mesh import Mesh, PointCloud
 from pipeline.errors import BadInput
-from pipeline.files import atomic
+from pipeline.files import atomic, atomic_together
+
+MOST_TEXELS = 16384  # along a side of a texture: what graphics cards show
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +51,27 @@ def check_mesh(mesh: Mesh, path: Path) -> None:
     if not len(mesh.faces):
         raise BadInput(f"{path}: the mesh has no faces. Lower the threshold (`--set mesh.density_threshold=...`) or train longer.")
     _check_finite({"vertices": mesh.vertices, "normals": mesh.normals, "colours": mesh.colours}, path)
+    _check_texture(mesh, path)
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise BadInput(f"{path}: faces name vertices {mesh.faces.min()} to {mesh.faces.max()}, expected 0 to {len(mesh.vertices) - 1}. Make the mesh again.")
+
+
+def _check_texture(mesh: Mesh, path: Path) -> None:
+    texture = mesh.texture
+    if texture is None:
+        return
+    if texture.coordinates.shape != (len(mesh.faces), 3, 2):
+        raise BadInput(f"{path}: texture coordinates of shape {texture.coordinates.shape}, expected {(len(mesh.faces), 3, 2)}. Make the texture again.")
+    corners = texture.coordinates.reshape(-1, 2)
+    _check_finite({"texture coordinates": corners}, path)
+    if corners.min() < 0 or corners.max() > 1:
+        raise BadInput(f"{path}: texture coordinates from {corners.min():g} to {corners.max():g}, expected 0 to 1. Make the texture again.")
+    for picture in (texture.colours, *(() if texture.normals is None else (texture.normals,))):
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not 1 <= min(picture.shape[:2]) <= max(picture.shape[:2]) <= MOST_TEXELS:
+            raise BadInput(
+                f"{path}: a texture of {picture.dtype} in shape {picture.shape}, expected (H, W, 3) uint8 of at most {MOST_TEXELS} a side. "
+                "Make the texture again."
+            )
 
 
 def check_points(points: PointCloud, path: Path) -> None:
@@ -78,3 +99,11 @@ def write_parts(path: Path, parts: Iterable[bytes | memoryview]) -> None:
     """Write a file of parts made one after the other, atomically."""
     with atomic(path) as temporary, open(temporary, "wb") as file:
         file.writelines(parts)
+
+
+def write_files(files: Mapping[Path, Iterable[bytes | memoryview]]) -> None:
+    """Write files of one folder that belong together, each of parts; the last, which refers to the others, appears last. See `atomic_together`."""
+    with atomic_together([*files]) as temporaries:
+        for temporary, parts in zip(temporaries, files.values(), strict=True):
+            with open(temporary, "wb") as file:
+                file.writelines(parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import struct
 import warnings
@@ -69,7 +70,7 @@ def glb_document(path: Path) -> tuple[dict, bytes]:
 def accessor(document: dict, blob: bytes, index: int) -> np.ndarray:
     entry = document["accessors"][index]
     view = document["bufferViews"][entry["bufferView"]]
-    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[entry["type"]]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[entry["type"]]
     kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[entry["componentType"]]
     assert view["byteOffset"] % 4 == 0
     assert entry["count"] * width * np.dtype(kind).itemsize == view["byteLength"]
@@ -95,11 +96,32 @@ def read_by_numpy(path: Path) -> Read:
     return rows[:, :3], rows[:, 6:], rows[:, 3:6] / 255, None
 
 
-READERS: dict[str, Callable[[Path], Read]] = {".ply": read_by_trimesh, ".obj": read_by_trimesh, ".glb": read_glb, ".xyz": read_by_numpy}
+def read_by_usd(path: Path) -> Read:
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/surface/mesh"))
+    back = np.array(stage.GetRootLayer().customLayerData["usdFromCapture"]).reshape(3, 3)
+    linear = np.array(UsdGeom.PrimvarsAPI(shape).GetPrimvar("displayColor").Get())
+    srgb = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+    faces = np.array(shape.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
+    return np.array(shape.GetPointsAttr().Get()) @ back, np.array(shape.GetNormalsAttr().Get()) @ back, srgb, faces
+
+
+READERS: dict[str, Callable[[Path], Read]] = {".ply": read_by_trimesh, ".obj": read_by_trimesh, ".glb": read_glb, ".xyz": read_by_numpy,
+                                              ".usdz": read_by_usd, ".usdc": read_by_usd}  # fmt: skip
+NEEDS_USD = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="usd-core is not installed: pip install 'efficientnerf[usd]'")
+EXTENSIONS = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in MESH_EXPORTERS]
 
 
 @pytest.mark.parametrize("frame", [Z_UP, Y_DOWN], ids=["z up", "y down"])
-@pytest.mark.parametrize(("table", "extension"), [*(("mesh", each) for each in MESH_EXPORTERS), *(("points", each) for each in POINT_EXPORTERS)])
+@pytest.mark.parametrize(
+    ("table", "extension"),
+    [
+        *(pytest.param("mesh", each, marks=NEEDS_USD if each.startswith(".usd") else ()) for each in READERS if each in MESH_EXPORTERS),
+        *(("points", each) for each in POINT_EXPORTERS),
+    ],
+)
 def test_others_read_what_was_written(table: str, extension: str, frame: SourceFrame, tmp_path: Path) -> None:
     path, mesh = tmp_path / f"thing{extension}", block()
     if table == "mesh":
@@ -111,7 +133,7 @@ def test_others_read_what_was_written(table: str, extension: str, frame: SourceF
         vertices, normals, colours, faces = READERS[extension](path)
     np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
     np.testing.assert_allclose(normals, mesh.normals, atol=2e-5)
-    np.testing.assert_allclose(colours, mesh.colours, atol=0.5 / 255 + 1e-6 if extension != ".glb" else 2e-4)
+    np.testing.assert_allclose(colours, mesh.colours, atol=0.5 / 255 + 1e-6 if extension in (".ply", ".obj", ".xyz") else 2e-4)
     if table == "mesh":
         np.testing.assert_array_equal(faces, mesh.faces)
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
@@ -164,7 +186,7 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("extension", MESH_EXPORTERS)
+@pytest.mark.parametrize("extension", EXTENSIONS)
 @pytest.mark.parametrize("flaw", BROKEN)
 def test_broken_meshes_are_refused(extension: str, flaw: str, tmp_path: Path) -> None:
     mesh, message = BROKEN[flaw]
@@ -184,7 +206,7 @@ def test_broken_points_are_refused(extension: str, tmp_path: Path) -> None:
         POINT_EXPORTERS[extension](replace(cloud(), normals=np.full((8, 3), np.nan)), tmp_path / "a", Z_UP)
 
 
-@pytest.mark.parametrize("extension", MESH_EXPORTERS)
+@pytest.mark.parametrize("extension", EXTENSIONS)
 def test_a_failed_write_leaves_what_was_there(extension: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / f"a{extension}"
     path.write_bytes(b"older")

@@ -72,7 +72,7 @@ def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--to", "ball.stl"], 2, ".ply, .glb, .obj"),
+        (["--to", "ball.fbx"], 2, ".ply, .glb, .obj, .usdz, .usdc, .stl"),
         (["--to", "ball.obj", "--points"], 2, ".ply, .xyz"),
         (["--to", "no/where/ball.ply"], 2, "does not exist"),
         (["--to", "cameras.json"], 2, "has no cameras"),
