@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import struct
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,25 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import Similarity
-from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
+from efficientnerf.surface.mesh import Mesh, PointCloud
 from pipeline.errors import BadInput
 from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from stages.io.exporters.glb import gltf_from_capture
 from stages.io.exporters.writing import SourceFrame, source_frame
-
-Z_UP = SourceFrame(Similarity.identity())
-Y_DOWN = SourceFrame(Similarity(0.5, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([1.0, 2, 3])), metric=True)
-
-
-def block() -> Mesh:
-    """A box of 1 x 2 x 3 with its corner at (1, 1, 1), its colours from black to white."""
-    corners = np.array([[x, y, z] for x in (0.0, 1) for y in (0.0, 1) for z in (0.0, 1)])
-    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([part for a, b, c, d in sides for part in ((a, b, c), (a, c, d))])
-    vertices = corners * [1, 2, 3] + 1
-    colours = np.array([[0, 0, 0], [1, 1, 1], [0.5, 0.25, 0.75], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.02, 0.03, 0.04], [0.9, 0.5, 0.1]], np.float32)
-    return Mesh(vertices, faces, vertex_normals(vertices, faces), colours)
+from tests.stages.io.meshes import NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
 
 
 def cloud() -> PointCloud:
@@ -51,30 +35,6 @@ def read_by_trimesh(path: Path) -> Read:
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(6)
     return np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals), mesh.visual.vertex_colors[:, :3] / 255, np.asarray(mesh.faces)
-
-
-def glb_document(path: Path) -> tuple[dict, bytes]:
-    data = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    assert kind == b"JSON"
-    assert size % 4 == 0
-    document = json.loads(data[20 : 20 + size])
-    binary, kind = struct.unpack_from("<I4s", data, 20 + size)
-    assert kind == b"BIN\0"
-    assert binary == document["buffers"][0]["byteLength"] == len(data) - 28 - size
-    return document, data[28 + size :]
-
-
-def accessor(document: dict, blob: bytes, index: int) -> np.ndarray:
-    entry = document["accessors"][index]
-    view = document["bufferViews"][entry["bufferView"]]
-    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[entry["type"]]
-    kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[entry["componentType"]]
-    assert view["byteOffset"] % 4 == 0
-    assert entry["count"] * width * np.dtype(kind).itemsize == view["byteLength"]
-    return np.frombuffer(blob, kind, entry["count"] * width, view["byteOffset"]).reshape(-1, width)
 
 
 def read_glb(path: Path) -> Read:
@@ -110,7 +70,6 @@ def read_by_usd(path: Path) -> Read:
 
 READERS: dict[str, Callable[[Path], Read]] = {".ply": read_by_trimesh, ".obj": read_by_trimesh, ".glb": read_glb, ".xyz": read_by_numpy,
                                               ".usdz": read_by_usd, ".usdc": read_by_usd}  # fmt: skip
-NEEDS_USD = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="usd-core is not installed: pip install 'efficientnerf[usd]'")
 EXTENSIONS = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in MESH_EXPORTERS]
 
 

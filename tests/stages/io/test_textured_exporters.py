@@ -19,7 +19,7 @@ from efficientnerf.surface.mesh import Mesh, Texture
 from pipeline.errors import BadInput, UsageError
 from stages.io.exporters import MESH_EXPORTERS
 from stages.io.exporters.textures import open_faces, plain_stem, split_at_seams
-from tests.stages.io.test_exporters import NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
+from tests.stages.io.meshes import NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
 
 SIDE = 48
 
