@@ -86,7 +86,7 @@ class EvaluateOutputs(Outputs):
     stage = "evaluate"
     metrics = Name("metrics.json")  # PSNR, SSIM, gap, holes, floaters, LPIPS: means, and of each view
     contact_sheet = Name("contact_sheet.png")
-    strip_worst = Name("strip_worst.png")  # photograph, network, asset; as many of the three as there are views
+    strip_worst = Name("strip_worst.png")  # photograph, network, asset, mesh; as many of the three as there are views
     strip_median = Name("strip_median.png")
     strip_best = Name("strip_best.png")
     captured_path = Name("captured_path.mp4")
@@ -109,7 +109,10 @@ class MeshOutputs(Outputs):
 
     stage = "mesh"
     ply = Name("mesh.ply")  # the capture's frame
-    glb = Name("mesh.glb")  # y up
+    glb = Name("mesh.glb")  # y up, the texture inside
+    obj = Name("mesh.obj")  # the capture's frame
+    material = Name("mesh.mtl")  # of the OBJ, where there is a texture
+    texture = Name("mesh.png")  # the same
     preview = Name("preview.png")
     check = Name("check.png")  # where it differs most from the asset: opacity, mesh, what is missed and added
     report = Name("report.json")  # counts, topology, bounds, area, volume, agreement with the asset
@@ -135,6 +138,7 @@ class BakeInputs:
 
 @dataclass(frozen=True)
 class EvaluateInputs:
+    mesh: MeshOutputs
     bake: BakeOutputs
     train: TrainOutputs
     poses: PosesOutputs

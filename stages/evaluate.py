@@ -1,9 +1,9 @@
-"""The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field and of the baked asset on the test views, and what parts the two.
+"""The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field, the baked asset and the mesh on the test views, and what parts the first two.
 
-    metrics.json       "network" (the field) and "asset": means over the views; "gap", "holes", "floaters": the asset against the network; "views": the metrics
-                       of each (stages.evaluation.summary, stages.evaluation.comparison)
+    metrics.json       "network" (the field), "asset" and "mesh": means over the views; "gap", "holes", "floaters": the asset against the network; "views": the
+                       metrics of each (stages.evaluation.summary, stages.evaluation.comparison, stages.evaluation.mesh)
     contact_sheet.png  ground truth, field and asset, with their errors
-    strip_*.png        photograph, network and asset at full size: the worst, the median and the best view
+    strip_*.png        photograph, network, asset and mesh at full size: the worst, the median and the best view
     captured_path.mp4  the asset along the captured cameras
 
 The field is slow to render. Only some views are rendered with it, and of these every n-th pixel along each side, through the pixel's own centre: the
@@ -28,13 +28,14 @@ import numpy as np
 from msgspec import Meta
 
 from efficientnerf.settings import Auto, Off, PositiveInt, given, setting
-from pipeline.files import write_json
+from pipeline.files import read_json, write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.evaluation.asset import EvaluatedAsset, evaluated
 from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES, evaluate_view
 from stages.evaluation.findings import findings
+from stages.evaluation.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
 from stages.evaluation.strips import STRIP_RAYS, strip_views, write_strips
 from stages.evaluation.summary import in_words, quality, summary
 from stages.evaluation.video import write_captured_path
@@ -70,7 +71,7 @@ class EvaluateSettings:
         advanced=True,
     )
     strips: Literal["on", "off"] = setting(
-        "on", "Whether photograph, network and asset are shown side by side at full size, for the worst, the median and the best view."
+        "on", "Whether photograph, network, asset and mesh are shown side by side at full size, for the worst, the median and the best view."
     )
     captured_path_frames: Annotated[int, Meta(ge=1, le=9999)] | Off = setting(90, "Number of frames of the video along the captured cameras; off: none.")
     lpips: Literal["off", "alex", "vgg", "both"] = setting("off", "Network of LPIPS, where that is measured too; its weights are files of their own.")
@@ -95,7 +96,8 @@ def run(job: Job) -> None:
 
     tree = format.load(inputs.bake.asset).to(job.device)
     _refuse_large_views(tree, inputs, job)
-    evaluate(evaluated(tree), tree, load_field, job)
+    region = read_json(inputs.mesh.report).get("region", "foreground")
+    evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region))
 
 
 def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> None:
@@ -110,16 +112,16 @@ def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> Non
     rays = MAX_FIELD_IMAGE_SIZE**2 if scale is None else math.ceil(scale**2 * most)
     if job.settings.strips == "on":
         rays = max(rays, min(most, STRIP_RAYS))
-    refuse_what_does_not_fit(
-        job, views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, job.device), "Lower poses.max_image_size or bake.max_mib."
-    )
+    need = views_needed(tree, cameras, rays, inputs.train.field.stat().st_size, job.device, mesh=mesh_bytes(inputs.mesh))
+    refuse_what_does_not_fit(job, need, "Lower poses.max_image_size or bake.max_mib.")
 
 
-def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job) -> None:
+def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job, mesh: EvaluatedMesh) -> None:
     """Write metrics, pictures and video. Metrics and thumbnails of each view are kept in job.work, so that a kill costs at most one view.
 
     tree        the asset's
     load_field  returns a FieldRenderer; called only where one is needed
+    mesh        made of the asset
     """
     from stages.io.refined_cameras import load_scene
 
@@ -146,13 +148,13 @@ def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], jo
         if measured is None:
             field = load_field() if with_field or not surrounded else None
             measured, images = evaluate_view(
-                asset, field, scene, view, job, with_field=with_field, stride=stride if with_field or rest is None else rest, perceptual=perceptual
+                asset, mesh, field, scene, view, job, with_field=with_field, stride=stride if with_field or rest is None else rest, perceptual=perceptual
             )
             note(done, measured, _save_thumbnails(images, job.work, k) if with_field else ())
         figures.append(measured)
     job.progress(len(views), len(views))
-    strips = write_strips(asset, load_field, scene, views, strip_views(figures), job, warn) if settings.strips == "on" else []
-    metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips)
+    strips = write_strips(asset, mesh, load_field, scene, views, strip_views(figures), job, warn) if settings.strips == "on" else []
+    metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips, mesh=mesh.facts)
     write_json(EvaluateOutputs(job.out).metrics, metrics)
     _write_sheet(metrics, drawn, job)
     frames = given(settings.captured_path_frames)
@@ -186,6 +188,8 @@ def _check(
         raise ValueError("no metrics of this view")
     if with_field and not ({*names, *SAMPLE_SHARES, "floaters"} <= network.keys() and {*GAP} <= measured["gap"].keys()):
         raise ValueError("no metrics of the field")
+    if not {*FIGURES} <= measured["mesh"].keys():
+        raise ValueError("no metrics of the mesh")
     if not all(isinstance(measured[name], int | float | None) for name in ("holes", "floaters")):
         raise ValueError("no metrics of the asset against the field")
     if with_field and composited and not {*QUALITY} <= measured["asset_with_network_background"].keys():
@@ -224,4 +228,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=2, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)
+STAGE = Stage(name="evaluate", version=3, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)

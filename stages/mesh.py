@@ -1,4 +1,4 @@
-"""The mesh stage: the asset's surface as PLY in the capture's frame and as GLB, a report, and a preview."""
+"""The mesh stage: the asset's surface as PLY and OBJ in the capture's frame and as GLB, a report, and a preview."""
 
 from __future__ import annotations
 
@@ -165,11 +165,11 @@ def run(job: Job) -> None:
     write_png(render_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides), outputs.preview)
     job.safe_point()
     mesh = in_capture(found, frame)
-    for path in (outputs.ply, outputs.glb):
+    for path in (outputs.ply, outputs.glb, outputs.obj):
         MESH_EXPORTERS[path.suffix](mesh, path, frame)
     agreed, picture = checked(found, seen, job.safe_point)
     write_png(picture, outputs.check)
-    report = describe(mesh, frame) | agreed
+    report = describe(mesh, frame) | {"region": job.settings.region} | agreed
     write_json(outputs.report, report)
     if (doubt := warning_of(report)) is not None:
         job.warn(doubt)
@@ -179,4 +179,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}", **facts)
 
 
-STAGE = Stage(name="mesh", version=4, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)
+STAGE = Stage(name="mesh", version=5, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

@@ -26,9 +26,9 @@ NAMES = (
     "poses",  # the source -> cameras, images, sparse points
     "train",  # poses -> field, density voxels
     "bake",  # train, poses -> asset.nerftree
-    "evaluate",  # bake, train, poses -> PSNR and SSIM of the network and of the asset
+    "mesh",  # bake -> PLY, GLB, OBJ
+    "evaluate",  # mesh, bake, train, poses -> PSNR and SSIM of the network, of the asset and of the mesh
     "turntable",  # bake -> frames, video, EXR
-    "mesh",  # bake -> PLY, GLB
     "points",  # bake -> PLY
 )
 STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}").STAGE for name in NAMES)

@@ -25,6 +25,7 @@ REPORTS = {
     "mesh/report.json": {"vertices": 10, "faces": 20, "watertight": True, "area": 1.5, "bounds": [[0, 0, 0], [1, 1, 1]]},
     "evaluate/metrics.json": {
         "split": "test", "network": {"psnr": 24.5, "ssim": 0.8}, "asset": {"psnr": 23.5, "ssim": 0.75},
+        "mesh": {"psnr": 22.5, "ssim": 0.7, "psnr_vertex_colours": 21.5, "faces": 100},
         "gap": {"psnr": -1.0, "ssim": -0.05, "psnr_colour_fitted": -0.75}, "holes": 0.02, "floaters": 0.03,
         "strips": [{"which": "worst", "view": "img_0.png", "network": {"psnr": 24.5, "ssim": 0.8}, "asset": {"psnr": 23.5, "ssim": 0.75}}],
         "views": [{"name": "img_0.png", "network": {"psnr": 24.5, "ssim": 0.8}, "asset": {"psnr": 23.5, "ssim": 0.75}, "gap": {"psnr": -1.0, "ssim": None},

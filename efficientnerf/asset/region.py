@@ -1,6 +1,6 @@
 """The foreground region of a tree: what of a whole scene is its subject, chosen when it is rendered or exported.
 
-`foreground` and `cropped` return a tree with less in it, which everything downstream takes as any other.
+`foreground`, `surroundings` and `cropped` return a tree with less in it, which everything downstream takes as any other.
 
 B bricks, N stored voxels.
 """
@@ -74,14 +74,23 @@ def voxel_centres(tree: NerfTree) -> np.ndarray:
 def foreground(tree: NerfTree) -> NerfTree:
     """The tree with what lies in its region alone: no other voxels, opacity faded in the region's band, no environment, no outer cascades that would be
     empty. The result has no region: all of it is foreground. A tree without a region is returned as it is."""
-    region = tree.region
-    if region is None:
-        return tree
+    return tree if tree.region is None else _restricted(tree, _foreground_share(tree, tree.region))
+
+
+def surroundings(tree: NerfTree, all_is_foreground: bool = False) -> NerfTree:
+    """The tree with what does not lie in its region: the rest of the opacity in the region's band, and the environment. Of a tree without a region, or if all
+    is foreground, its environment alone."""
+    share = np.zeros(len(tree.density_values)) if tree.region is None or all_is_foreground else 1 - _foreground_share(tree, tree.region)
+    return replace(_restricted(tree, share), environment=tree.environment)
+
+
+def _foreground_share(tree: NerfTree, region: Region) -> np.ndarray:
+    """(N,) how much of the opacity of each voxel belongs to the tree's region."""
     share = inside_share(region, voxel_centres(tree))
     if region.bricks is not None:
         brick, local = np.nonzero(tree.voxel_index >= 0)
         share[tree.voxel_index[brick, local]] *= np.asarray(region.bricks, bool)[brick]
-    return _restricted(tree, share)
+    return share
 
 
 def cropped(tree: NerfTree, corners: np.ndarray, world_from_capture: Similarity) -> NerfTree:

@@ -20,13 +20,13 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.evaluation.asset import EvaluatedAsset, over_field, render_asset
+from stages.evaluation.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
 from stages.evaluation.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.io.scene import Scene, View
 
 if TYPE_CHECKING:
     from efficientnerf.evaluation.lpips import Lpips
 
-MAX_PSNR = 100.0  # decibels, of equal images: JSON has no infinity
 HOLE, SOLID = 0.5, 0.95
 FLOATER_RAYS = 4096
 QUALITY = ("psnr", "ssim", "psnr_in_box", "psnr_colour_fitted")
@@ -35,7 +35,8 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 
 def evaluate_view(
-    asset: EvaluatedAsset, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int, perceptual: Mapping[str, Lpips] | None = None
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
+    perceptual: Mapping[str, Lpips] | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
@@ -61,6 +62,8 @@ def evaluate_view(
     metrics["asset"] = {**compare(image, truth, inside), **size, **lpips_metrics(perceptual or {}, image, truth)}
     if unbounded and asset.inner is None:
         metrics["asset"]["background_scale"] = 1.0 / stride
+    drawn, plain, covered = mesh_image(mesh, asset, scene, view, seen, stride)
+    metrics["mesh"] = mesh_metrics(clipped(drawn, job, f"{view.name}: the mesh"), clipped(plain, job, f"{view.name}: the mesh"), covered, image, truth)
     if with_field and seen is not None:
         small = truth.subsampled(stride)
         render = clipped(seen.colour, job, f"{view.name}: the field")

@@ -1,7 +1,7 @@
-"""Picture strips "photograph | network | asset" at full size, of the worst, the median and the best view by the asset's PSNR.
+"""Picture strips "photograph | network | asset | mesh" at full size, of the worst, the median and the best view by the asset's PSNR.
 
-The network renders every pixel of these views, or every n-th along both sides of views of more than STRIP_RAYS pixels; photograph and asset are shown at the
-same pixels. The figures of a strip are those of what it shows.
+The network renders every pixel of these views, or every n-th along both sides of views of more than STRIP_RAYS pixels; the others are shown at the same
+pixels. The figures of a strip are those of what it shows.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pipeline.stage import Job
 from stages.artifacts import EvaluateOutputs, PosesOutputs
 from stages.evaluation.asset import EvaluatedAsset, render_asset
 from stages.evaluation.comparison import clipped, compare
+from stages.evaluation.mesh import EvaluatedMesh, mesh_image
 from stages.evaluation.summary import quality
 from stages.evaluation.views import ground_truth, stride_for, subsample, subsample_camera
 from stages.io.scene import Scene, View
@@ -38,7 +39,8 @@ def strip_views(figures: Sequence[Mapping[str, Any]]) -> list[tuple[str, int]]:
 
 
 def write_strips(
-    asset: EvaluatedAsset, load_field: Callable[[], Any], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]], job: Job, warn: Warn
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, load_field: Callable[[], Any], scene: Scene, views: Sequence[View], chosen: Sequence[tuple[str, int]],
+    job: Job, warn: Warn,
 ) -> list[dict[str, Any]]:
     """Write the strips of the chosen views; returns their entries of metrics.json. A strip is kept in job.work, so that a kill costs at most one."""
     entries: list[dict[str, Any]] = []
@@ -50,7 +52,7 @@ def write_strips(
         entry = noted(done, dict[str, Any], warn, partial(_check, picture, views[k]))
         if entry is None:
             stride = stride_for([views[k]], STRIP_RAYS)
-            entry = _write_strip(asset, load_field(), scene, views[k], stride, picture, job)
+            entry = _write_strip(asset, mesh, load_field(), scene, views[k], stride, picture, job)
             rays += entry["width"] * entry["height"]
             note(done, entry, [picture])
         path = EvaluateOutputs(job.out).strip(which)
@@ -62,7 +64,9 @@ def write_strips(
     return entries
 
 
-def _write_strip(asset: EvaluatedAsset, field: Any, scene: Scene, view: View, stride: int, path: Path, job: Job) -> dict[str, Any]:
+def _write_strip(
+    asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, stride: int, path: Path, job: Job
+) -> dict[str, Any]:
     from stages.figures.plots import contact_sheet
 
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
@@ -70,9 +74,11 @@ def _write_strip(asset: EvaluatedAsset, field: Any, scene: Scene, view: View, st
     truth = truth.subsampled(stride)
     network = clipped(seen.colour, job, f"{view.name}: the field")
     image = subsample(clipped(render_asset(asset, scene, view, seen, stride)[0], job, f"{view.name}: the asset"), stride)
-    found = {name: {key: compare(picture, truth, None)[key] for key in FIGURES} for name, picture in (("network", network), ("asset", image))}
-    pictures: list[np.ndarray | None] = [truth.colour, network, image]
-    labels = [f"photograph {view.name}", *(f"{name} {quality(found[name])}" for name in ("network", "asset"))]
+    drawn = subsample(clipped(mesh_image(mesh, asset, scene, view, seen, stride)[0], job, f"{view.name}: the mesh"), stride)
+    shown = {"network": network, "asset": image, "mesh": drawn}
+    found = {name: {key: compare(picture, truth, None)[key] for key in FIGURES} for name, picture in shown.items()}
+    pictures: list[np.ndarray | None] = [truth.colour, *shown.values()]
+    labels = [f"photograph {view.name}", *(f"{name} {quality(found[name])}" for name in shown)]
     contact_sheet([pictures], [labels], path, thumbnail=max(image.shape[:2]))
     return {"view": view.name, **found, "width": image.shape[1], "height": image.shape[0]}
 
@@ -81,7 +87,8 @@ def _check(picture: Path, view: View, entry: Mapping[str, Any], outputs: Collect
     """Raises where this is no strip of the view, or its picture is missing or can't be read."""
     from stages.io.png import read_png
 
-    if entry["view"] != view.name or not all({*FIGURES} <= entry[name].keys() for name in ("network", "asset")) or min(entry["width"], entry["height"]) < 1:
+    names = ("network", "asset", "mesh")
+    if entry["view"] != view.name or not all({*FIGURES} <= entry[name].keys() for name in names) or min(entry["width"], entry["height"]) < 1:
         raise ValueError("no strip of this view")
     if picture.name not in outputs or read_png(picture).shape[2] != 3:
         raise ValueError(f"{picture.name} is missing")

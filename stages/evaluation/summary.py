@@ -3,6 +3,7 @@
 network, asset  means over their views of PSNR (in decibels, as published), SSIM and the rest; `scale`: of the pixel grid
 asset.on_network_views         those of the views that the network was rendered for
 asset_with_network_background  cascade 0 of a whole scene's asset between what the field shows before and behind its box; null for other assets
+mesh            means over the views of what `stages.evaluation.mesh` measures, and how many faces and texels the mesh has
 gap, holes, floaters           means over the views that the network was rendered for (`stages.evaluation.comparison`)
 strips          the views whose pictures stand beside, with the figures of these
 views           the metrics of each view
@@ -15,18 +16,21 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES
+from stages.evaluation.mesh import FIGURES
 
 FORMAT = 1
 
 
 def summary(
-    figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, perceptual: Sequence[str] = (), strips: Sequence[dict[str, Any]] = ()
+    figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, mesh: Mapping[str, Any], perceptual: Sequence[str] = (),
+    strips: Sequence[dict[str, Any]] = (),
 ) -> dict[str, Any]:
     """The document of metrics.json.
 
     figures     the metrics of each view
     stride      of the network's renders
     background  stride of the surroundings that the field renders for the other views; None: no view has such
+    mesh        facts about the mesh
     perceptual  names of LPIPS metrics
     """
     drawn = [view for view in figures if view["network"] is not None]
@@ -42,6 +46,7 @@ def summary(
         "split": split,
         "network": network,
         "asset": asset,
+        "mesh": {**means([view["mesh"] for view in figures], FIGURES), **mesh, "views": len(figures), "scale": 1.0},
         "asset_with_network_background": {**means(composited), "views": len(composited), "background_scale": 1.0 / stride} if composited else None,
         "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
         **means(drawn, ("holes", "floaters")),
@@ -67,7 +72,7 @@ def quality(found: Mapping[str, Any]) -> str:
 
 def in_words(metrics: Mapping[str, Any]) -> str:
     """The means in one line."""
-    parts = [f"network {quality(metrics['network'])}", f"asset {quality(metrics['asset'])}"]
+    parts = [f"{name} {quality(metrics[name])}" for name in ("network", "asset", "mesh")]
     if metrics["gap"]["psnr"] is not None:
         parts.append(f"gap {metrics['gap']['psnr']:+.2f} dB")
     for name in ("holes", "floaters"):

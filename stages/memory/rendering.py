@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 # Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of a
 # test view with its photograph, renders, errors and windows of SSIM.
 TREE, FRAME, COMPARED = 3, 100, 160
+DRAWN = 120  # bytes of a pixel of a view in which the mesh is drawn, four samples each
 BAND = 160 * MIB  # rays at a time where each is rendered on its own
 FIELD = 150  # bytes of a ray through the field, with what lies before and behind the box
 FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose density voxels prune nothing yet
@@ -38,17 +39,19 @@ def frames_needed(tree: NerfTree, pixels: int, device: str = "cpu") -> Need:
     })  # fmt: skip
 
 
-def views_needed(tree: NerfTree, cameras: Sequence[Camera], rays: int, field: int, device: str = "cpu") -> Need:
+def views_needed(tree: NerfTree, cameras: Sequence[Camera], rays: int, field: int, device: str = "cpu", mesh: int = 0) -> Need:
     """What it takes to compare renders with photographs, one at a time.
 
     rays   through the field, of one view at most
     field  bytes of the field's file
+    mesh   bytes of the mesh that is measured
     """
     most = max((camera.width * camera.height for camera in cameras), default=0)
     return Need({
-        "a view": most * COMPARED,
+        "a view": most * (COMPARED + DRAWN),
+        "the mesh": mesh,
         "its rays": rays * FIELD + FIELD_BLOCK,
-        "the asset": tree_bytes(tree) * (2 if tree.outer else 1),  # cascade 0 alone, too
+        "the asset": tree_bytes(tree) * (3 if tree.outer else 1),  # cascade 0 alone, and what surrounds the mesh
         "the field": 3 * field,
         "libraries": libraries(device),
     })  # fmt: skip

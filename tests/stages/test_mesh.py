@@ -59,7 +59,7 @@ def test_the_mesh_lies_in_the_captures_frame(ball: Path, tmp_path: Path) -> None
     events: list[dict] = []
     settings = MeshSettings(max_faces=4000, density_threshold=150.0)
     stage.run(Job(settings=settings, inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work", report=events.append))
-    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["check.png", "mesh.glb", "mesh.ply", "preview.png", "report.json"]
+    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["check.png", "mesh.glb", "mesh.obj", "mesh.ply", "preview.png", "report.json"]
     mesh = trimesh.load(tmp_path / "out" / "mesh.ply", process=False)
     centre = WORLD_FROM_CAPTURE.inverse().points(np.zeros(3))
     np.testing.assert_allclose(mesh.bounds.mean(0), centre, atol=0.05)

@@ -73,7 +73,7 @@ def _describe_run(path: Path) -> dict[str, Any]:
         "preset": run.preset,
         "stages": {decision.stage: decision.state for decision in survey(STAGES, run)},
         "artifacts": artifacts(run.path),
-        "quality": {name: quality[name] for name in ("network", "asset") if name in quality},
+        "quality": {name: quality[name] for name in ("network", "asset", "mesh") if name in quality},
         "damaged": damaged,
     }
     if PosesOutputs.of_run(path).scene.is_file():

@@ -33,24 +33,37 @@ class NetworkQuality(Quality):
     floaters: float | None = None
 
 
+class MeshQuality(Quality):
+    """Those of the mesh in its texture; in the colours of its vertices; on the pixels that it covers, and the asset's on the same."""
+
+    psnr_vertex_colours: float | None = None
+    ssim_vertex_colours: float | None = None
+    psnr_covered: float | None = None
+    asset_psnr_covered: float | None = None
+    faces: int | None = None
+    texture_size: int | None = None
+
+
 class ViewQuality(msgspec.Struct):
-    """The figures of one view, of the network and of the asset."""
+    """The figures of one view, of the network, of the asset and of the mesh."""
 
     name: str = ""
     network: Quality | None = None
     asset: Quality | None = None
+    mesh: Quality | None = None
     gap: Quality | None = None
     holes: float | None = None
     floaters: float | None = None
 
 
 class Strip(msgspec.Struct):
-    """A picture of photograph, network and asset: of which view, and the figures of what it shows."""
+    """A picture of photograph, network, asset and mesh: of which view, and the figures of what it shows."""
 
     which: str = ""
     view: str = ""
     network: Quality | None = None
     asset: Quality | None = None
+    mesh: Quality | None = None
 
 
 class Metrics(msgspec.Struct):
@@ -59,6 +72,7 @@ class Metrics(msgspec.Struct):
     split: str = "test"
     network: NetworkQuality | None = None
     asset: Quality | None = None
+    mesh: MeshQuality | None = None
     asset_with_network_background: Quality | None = None
     gap: Quality | None = None
     holes: float | None = None

@@ -37,8 +37,11 @@ TURNTABLE, MESH, POINTS = TurntableOutputs.of_run(RUN), MeshOutputs.of_run(RUN),
 DOWNLOADS = (
     (BAKE.asset, "the baked asset"),
     (TURNTABLE.video, "turntable, H.264"),
-    (MESH.glb, "mesh, y up"),
-    (MESH.ply, "mesh, the capture's frame"),
+    (MESH.glb, "mesh with its texture, y up"),
+    (MESH.obj, "mesh, the capture's frame"),
+    (MESH.material, "its material"),
+    (MESH.texture, "its texture"),
+    (MESH.ply, "mesh with colours of its vertices, the capture's frame"),
     (POINTS.ply, "point cloud"),
     (POSES.scene, "cameras and splits"),
     (EVALUATE.captured_path, "the asset along the captured cameras, H.264"),
@@ -194,15 +197,21 @@ def _views(found: Metrics | None) -> list[tuple[str, ...]]:
     """A row of figures for each view that was measured."""
     views = found.views if found is not None else []
     return [
-        (view.name, *_figures(view.network), *_figures(view.asset), _figures(view.gap, "+")[0], _share(view.holes), _share(view.floaters)) for view in views
-    ]
+        (view.name, *_figures(view.network), *_figures(view.asset), _figures(view.mesh)[0], _figures(view.gap, "+")[0], _share(view.holes),
+         _share(view.floaters)) for view in views
+    ]  # fmt: skip
 
 
 def _means(found: Metrics | None) -> list[tuple[str, ...]]:
     """A row of means for each of what was measured: PSNR, SSIM, PSNR with fitted colours."""
     if found is None:
         return []
-    rows = (("network", found.network, ""), ("asset", found.asset, ""), ("asset minus network, on the same pixels", found.gap, "+"),
+    mesh = found.mesh
+    vertices = None if mesh is None else Quality(mesh.psnr_vertex_colours, mesh.ssim_vertex_colours)
+    on_mesh = [None if mesh is None else Quality(psnr) for psnr in ((mesh.psnr_covered, mesh.asset_psnr_covered) if mesh is not None else (None, None))]
+    rows = (("network", found.network, ""), ("asset", found.asset, ""), ("mesh, unlit, before the asset's surroundings", mesh, ""),
+            ("mesh in the colours of its vertices", vertices, ""), ("mesh, on the pixels that it covers", on_mesh[0], ""),
+            ("asset, on the same pixels", on_mesh[1], ""), ("asset minus network, on the same pixels", found.gap, "+"),
             ("asset's innermost box before the network's surroundings", found.asset_with_network_background, ""))  # fmt: skip
     return [
         (name, *_figures(quality, sign), "" if quality.psnr_colour_fitted is None else f"{quality.psnr_colour_fitted:{sign}.2f}")
@@ -217,9 +226,9 @@ def _strips(found: Metrics | None) -> list[tuple[Path, str]]:
     for which, path in (("worst", EVALUATE.strip_worst), ("median", EVALUATE.strip_median), ("best", EVALUATE.strip_best)):
         strip, caption = named.get(which), f"The {which} view"
         if strip is not None:
-            network, asset = (", ".join(f"{value} {unit}" for value, unit in zip(_figures(q), ("dB", "SSIM"), strict=True) if value) for q in
-                              (strip.network, strip.asset))  # fmt: skip
-            caption += f", {strip.view}: photograph | network {network} | asset {asset}"
+            network, asset, mesh = (", ".join(f"{value} {unit}" for value, unit in zip(_figures(q), ("dB", "SSIM"), strict=True) if value) for q in
+                                    (strip.network, strip.asset, strip.mesh))  # fmt: skip
+            caption += f", {strip.view}: photograph | network {network} | asset {asset}" + (f" | mesh {mesh}" if mesh else "")
         entries.append((path, caption))
     return entries
 

@@ -28,13 +28,14 @@ ARTIFACTS = {
     "strip_best": EvaluateOutputs.of_run(RUN).strip_best,
     "turntable": TurntableOutputs.of_run(RUN).video,
     "mesh_glb": MeshOutputs.of_run(RUN).glb,
+    "mesh_obj": MeshOutputs.of_run(RUN).obj,
     "mesh_ply": MeshOutputs.of_run(RUN).ply,
     "points": PointsOutputs.of_run(RUN).ply,
     "report": RUN / "report.html",
 }
 TITLES = {
-    "asset": "asset", "captured_path": "video", "strip_worst": "strip", "turntable": "turntable", "mesh_glb": "mesh", "mesh_ply": "mesh", "points": "points",
-    "report": "report",
+    "asset": "asset", "captured_path": "video", "strip_worst": "strip", "turntable": "turntable", "mesh_glb": "mesh", "mesh_obj": "mesh", "mesh_ply": "mesh",
+    "points": "points", "report": "report",
 }  # fmt: skip
 
 
@@ -87,11 +88,11 @@ def in_words(run: Path, outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def quality_in_words(found: Metrics | None) -> str | None:
-    """`network 24.13 dB PSNR, 0.812 SSIM; asset ...`, on how many views."""
+    """`network 24.13 dB PSNR, 0.812 SSIM; asset ...; mesh ...`, on how many views."""
     if found is None:
         return None
     parts = []
-    for name, part in (("network", found.network), ("asset", found.asset)):
+    for name, part in (("network", found.network), ("asset", found.asset), ("mesh", found.mesh)):
         if part is not None and part.psnr is not None and part.ssim is not None:
             parts.append(f"{name} {part.psnr:.2f} dB PSNR, {part.ssim:.3f} SSIM")
     count = len(found.views)

@@ -9,15 +9,15 @@ import numpy as np
 from efficientnerf.surface.mesh import Mesh, PointCloud
 from stages.io.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, bytes_from_srgb, check_mesh, check_points, write_parts
 
-_VERTEX = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((name, "u1") for name in ("red", "green", "blue"))])
-_FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])
+VERTEX = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((name, "u1") for name in ("red", "green", "blue"))])
+FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])
 _NAMES = {"<f4": "float", "|u1": "uchar"}
 
 
 def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> None:
     """Write a mesh in the capture's frame. Raises BadInput."""
     check_mesh(mesh, path)
-    faces = np.empty(len(mesh.faces), _FACE)
+    faces = np.empty(len(mesh.faces), FACE)
     faces["count"], faces["vertex_indices"] = 3, mesh.faces
     header = _header(len(mesh.vertices), frame) + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     write_parts(path, [header.encode("ascii"), _vertices(mesh.vertices, mesh.normals, mesh.colours), faces.tobytes()])
@@ -31,14 +31,14 @@ def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS
 
 
 def _header(count: int, frame: SourceFrame) -> str:
-    properties = "".join(f"property {_NAMES[_VERTEX[name].str]} {name}\n" for name in _VERTEX.names or ())
+    properties = "".join(f"property {_NAMES[VERTEX[name].str]} {name}\n" for name in VERTEX.names or ())
     up = " ".join(f"{value:.9g}" for value in frame.up + 0.0)
     unit = "metre" if frame.metric else "unknown"
     return f"ply\nformat binary_little_endian 1.0\ncomment frame of the capture; up {up}; unit {unit}\nelement vertex {count}\n{properties}"
 
 
 def _vertices(positions: np.ndarray, normals: np.ndarray, colours: np.ndarray) -> bytes:
-    rows = np.empty(len(positions), _VERTEX)
+    rows = np.empty(len(positions), VERTEX)
     for column, name in enumerate(("x", "y", "z")):
         rows[name], rows["n" + name] = positions[:, column], normals[:, column]
     for column, name in enumerate(("red", "green", "blue")):

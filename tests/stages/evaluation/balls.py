@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from PIL import Image
 
 from efficientnerf.geometry.cameras import Camera, Similarity
+from efficientnerf.surface.mesh import Mesh
 from pipeline.stage import Job
 from stages.evaluate import EvaluateSettings, evaluate
+from stages.evaluation.mesh import evaluated_mesh
 from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.exporters.frames import frame_from_rendering
@@ -22,6 +25,16 @@ from tests.fakes import WHITE, BallField, BallTree
 
 TREE = BallTree()
 WIDTH, HEIGHT = 60, 44
+
+
+def ball_mesh(tree: BallTree = TREE, subdivisions: int = 3) -> Mesh:
+    """The surface of a ball, with the ball's colours at its vertices."""
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=tree.radius)
+    vertices = np.asarray(ball.vertices) + tree.centre
+    return Mesh(vertices, np.asarray(ball.faces), np.asarray(ball.vertices) / tree.radius, tree.colour(vertices))
+
+
+BALL_MESH = evaluated_mesh(ball_mesh(), None)
 
 
 def make_scene(folder: Path, splits: str, *, background: tuple[float, float, float] | None = WHITE, masked: bool = False) -> Path:
@@ -62,7 +75,7 @@ def job_in(folder: Path, poses: Path, chosen: EvaluateSettings | None = None, ou
 
 
 def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, **more: Any) -> None:
-    evaluate(tree.evaluated(**more), tree, load_field, job)
+    evaluate(tree.evaluated(**more), tree, load_field, job, BALL_MESH)
 
 
 def figures_of(job: Job) -> dict[str, Any]:

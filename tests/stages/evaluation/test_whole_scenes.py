@@ -25,7 +25,7 @@ from stages.framing.camera_paths import pose_on_sphere
 from stages.io.png import write_png
 from stages.io.scene import Orbit, Scene, View, save
 from tests.efficientnerf.trees import random_cascades
-from tests.stages.evaluation.balls import TREE, figures_of, job_in, settings
+from tests.stages.evaluation.balls import BALL_MESH, TREE, figures_of, job_in, settings
 
 
 def reference_image(tree: NerfTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
@@ -88,7 +88,7 @@ def test_a_whole_scene_is_rendered_by_itself_and_over_the_network_too(tmp_path: 
     poses = photographed(tree, tmp_path / "poses", 3)
     field = ReferenceField(tree)
     job = job_in(tmp_path, poses, settings(field_views=2, strips="on"))
-    evaluate(whole_asset(tree), TREE, lambda: field, job)
+    evaluate(whole_asset(tree), TREE, lambda: field, job, BALL_MESH)
     found = figures_of(job)
     assert found["asset"]["psnr"] > 50
     assert found["asset"]["views"] == 3
@@ -107,7 +107,7 @@ def test_a_whole_scene_without_its_surroundings_shows_it(tmp_path: Path) -> None
     poses = photographed(tree, tmp_path / "poses", 2)
     bare = subset(tree, voxel_cascades(tree) == 0)
     job = job_in(tmp_path, poses)
-    evaluate(whole_asset(bare), TREE, lambda: ReferenceField(tree), job)
+    evaluate(whole_asset(bare), TREE, lambda: ReferenceField(tree), job, BALL_MESH)
     found = figures_of(job)
     assert found["gap"]["psnr"] < -5
     assert found["holes"] > 0.05

@@ -42,7 +42,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     train.run(job(folder / "train", settings(**QUICK), poses=scene))
     inputs = {"poses": scene, "train": folder / "train/out"}
     bake.run(job(folder / "bake", BakeSettings(resolution=16, samples_per_voxel=1, refine_steps=1, weight_threshold=0.0), **inputs))
-    return {**inputs, "bake": folder / "bake/out"}
+    return {**inputs, "bake": folder / "bake/out", "mesh": folder / "none"}  # refused before a mesh is looked at
 
 
 def limited(made: Job, size: int, events: list[dict[str, Any]] | None = None) -> Job:

@@ -1,0 +1,98 @@
+"""The mesh that the stage `mesh` has written, read again: the file of shared vertices, and the texture of the GLB."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from efficientnerf.surface.mesh import Mesh, Texture
+from pipeline.errors import CorruptArtifact
+from stages.artifacts import MeshOutputs
+from stages.io.exporters.ply import FACE, VERTEX
+from stages.io.exporters.writing import MOST_TEXELS
+
+MOST_BYTES = 2**32  # of a file that is read
+
+
+def read_mesh(outputs: MeshOutputs) -> Mesh:
+    """The mesh in the capture's frame, as the files hold it: single precision, colours of 8 bits. Raises CorruptArtifact where they are not as the stage
+    writes them."""
+    vertices, faces = _read_ply(outputs.ply)
+    positions = np.stack([vertices[name] for name in ("x", "y", "z")], 1).astype(np.float64)
+    normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
+    colours = np.stack([vertices[name] for name in ("red", "green", "blue")], 1) / np.float32(255)
+    return Mesh(positions, faces, normals, colours, texture=_read_texture(outputs.glb, faces, positions))
+
+
+def _refuse(path: Path, why: str) -> NoReturn:
+    raise CorruptArtifact(f"{path}: {why}. Make the mesh again.", (str(path),))
+
+
+def _data(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            _refuse(path, f"larger than {MOST_BYTES} bytes")
+        return path.read_bytes()
+    except OSError as error:
+        _refuse(path, error.strerror or str(error))
+
+
+def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of VERTEX, and faces (F, 3) int64."""
+    head, found, body = _data(path).partition(b"end_header\n")
+    counts = {}
+    for line in head.decode("ascii", "replace").splitlines() if found else ():
+        words = line.split()
+        if len(words) == 3 and words[0] == "element" and words[2].isdigit():
+            counts[words[1]] = int(words[2])
+    if counts.keys() != {"vertex", "face"} or len(body) != counts["vertex"] * VERTEX.itemsize + counts["face"] * FACE.itemsize:
+        _refuse(path, "not as it was written")
+    vertices = np.frombuffer(body, VERTEX, counts["vertex"])
+    faces = np.frombuffer(body, FACE, counts["face"], vertices.nbytes)["vertex_indices"].astype(np.int64)
+    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+        _refuse(path, "its faces name vertices that it does not have")
+    return vertices, faces
+
+
+def _read_texture(path: Path, faces: np.ndarray, positions: np.ndarray) -> Texture | None:
+    """The texture of a GLB of these faces, in their order; None where it has none."""
+    data = _data(path)
+    try:
+        size = struct.unpack_from("<I", data, 12)[0]
+        document, blob = json.loads(data[20 : 20 + size]), data[28 + size :]
+        (primitive,) = document["meshes"][0]["primitives"]
+        if "TEXCOORD_0" not in primitive["attributes"]:
+            return None
+        corners = _accessor(document, blob, primitive["indices"], "<u4", 1).reshape(-1, 3).astype(np.int64)
+        coordinates = _accessor(document, blob, primitive["attributes"]["TEXCOORD_0"], "<f4", 2).astype(np.float64) * [1, -1] + [0, 1]
+        places = _accessor(document, blob, primitive["attributes"]["POSITION"], "<f4", 3)
+        turn = np.array(document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"], np.float64)[:3, :3]
+        pictures = [_picture(document, blob, image) for image in document["images"]]
+        same = corners.shape == faces.shape and np.allclose(places[corners] @ turn, positions[faces], rtol=1e-5, atol=1e-5 * float(np.abs(positions).max()))
+        texture = Texture(np.clip(coordinates[corners], 0, 1), *pictures[:2])
+    except (ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
+        _refuse(path, f"not as it was written ({type(error).__name__})")
+    if not same:
+        _refuse(path, "its faces are not those of the PLY beside it")
+    return texture
+
+
+def _accessor(document: Any, blob: bytes, index: int, kind: str, width: int) -> np.ndarray:
+    entry = document["accessors"][index]
+    view = document["bufferViews"][entry["bufferView"]]
+    return np.frombuffer(blob, kind, entry["count"] * width, view["byteOffset"]).reshape(-1, width)
+
+
+def _picture(document: Any, blob: bytes, image: Any) -> np.ndarray:
+    from PIL import Image
+
+    view = document["bufferViews"][image["bufferView"]]
+    with Image.open(io.BytesIO(blob[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]), formats=("PNG", "JPEG")) as opened:
+        if max(opened.size) > MOST_TEXELS or opened.mode != "RGB":
+            raise ValueError("no texture of ours")
+        return np.asarray(opened)
