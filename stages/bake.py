@@ -49,6 +49,7 @@ class BakeSettings:
     lookup: Literal["trilinear", "nearest"] = setting(
         "trilinear", "Value of a point in the asset: interpolated from the voxels around it (trilinear), or that of its own voxel (nearest).", advanced=True
     )
+    step_size: Annotated[float, Meta(ge=0.25, le=1.0)] = setting(1.0, "Distance between the samples of a ray through the asset, voxels.", advanced=True)
     max_resolution: Annotated[int, Meta(ge=32, le=4096)] | Auto = setting(
         "auto", "Most voxels along the longest side where resolution is auto; auto: 1024, or as many as 2^24 coarse cells of all cascades allow.", advanced=True
     )
@@ -223,7 +224,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=10,
+    version=11,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

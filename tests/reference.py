@@ -263,7 +263,7 @@ def tree_colour(tree: Any, point: np.ndarray, basis: Sequence[float]) -> list[fl
 
 
 def tree_ray(tree: Any, origin: np.ndarray, direction: np.ndarray) -> tuple[list[float], float, float]:
-    """Premultiplied colour, opacity and depth (distance at which half of the light is gone, or infinity) of one ray, every half voxel."""
+    """Premultiplied colour, opacity and depth (distance at which half of the light is gone, or infinity) of one ray."""
     start = (np.asarray(origin, np.float64) - tree.bounds_min) / tree.voxel
     enter, leave = 0.0, math.inf
     for n in range(3):
@@ -275,14 +275,14 @@ def tree_ray(tree: Any, origin: np.ndarray, direction: np.ndarray) -> tuple[list
         enter, leave = max(enter, crossings[0]), min(leave, crossings[1])
     basis = harmonics(direction, tree.degree)
     light, colour, depth, k = 1.0, [0.0, 0.0, 0.0], math.inf, 0
-    while (t := enter + (k + 0.5) * 0.5) < leave:
+    while (t := enter + (k + 0.5) * tree.step_size) < leave:
         point = start + t * np.asarray(direction)
         sigma = tree_density(tree, point)
         if sigma > 0:
-            alpha = 1 - math.exp(-sigma * 0.5 * tree.voxel)
+            alpha = 1 - math.exp(-sigma * tree.step_size * tree.voxel)
             colour = [c + light * alpha * s for c, s in zip(colour, tree_colour(tree, point, basis), strict=True)]
             if math.isinf(depth) and light * (1 - alpha) <= 0.5:
-                depth = (t - 0.25) * tree.voxel + math.log(2 * light) / sigma
+                depth = (t - tree.step_size / 2) * tree.voxel + math.log(2 * light) / sigma
             light *= 1 - alpha
         k += 1
     return colour, 1 - light, depth

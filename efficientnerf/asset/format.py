@@ -19,9 +19,9 @@ from efficientnerf.asset.file import packed, whole_scene
 from efficientnerf.asset.file.container import DTYPES, METADATA_KEY, FormatError, Header, write_whole
 from efficientnerf.asset.file.layouts import LAYOUTS
 from efficientnerf.asset.file.memory import check_memory, needed
-from efficientnerf.asset.file.metadata import MAJOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of
+from efficientnerf.asset.file.metadata import MAJOR, STEP_MINOR, STRUCTURE, check_metadata, layout_name, layout_of, lookup_of, ndc_of, step_size_of
 from efficientnerf.asset.file.serialisation import WRITERS, written_as
-from efficientnerf.asset.tree import NerfTree
+from efficientnerf.asset.tree import STEP_SIZE, NerfTree
 
 __all__ = ["LAYOUTS", "WRITERS", "FormatError", "contents", "describe", "load", "save", "serialize"]
 
@@ -39,13 +39,14 @@ def serialize(tree: NerfTree, layout: str | None = None) -> bytes:
     tensors = {whole_scene.occupancy_name(n): whole_scene.bits(cascade.brick_index >= 0) for n, cascade in enumerate(cascades_of(tree))} | written.tensors
     whole, more = _whole_scene(tree)
     name, minor = layout_name(written.layout, ndc=tree.ndc is not None, nested="cascades" in whole, lookup=tree.lookup)
-    minor = max(minor, LAYOUTS[written.layout].minor, 0 if tree.region is None else whole_scene.MINOR)
+    minor = max(minor, LAYOUTS[written.layout].minor, 0 if tree.region is None else whole_scene.MINOR, 0 if tree.step_size == STEP_SIZE else STEP_MINOR)
     meta = {
         **{key: value for key, value in tree.metadata.items() if key not in STRUCTURE},
         "format": "nerftree",
         "format_version": f"{MAJOR}.{minor}",
         "layout": name,
         **({} if tree.lookup == "trilinear" else {"lookup": tree.lookup}),
+        **({} if tree.step_size == STEP_SIZE else {"step_size": tree.step_size}),
         **({} if tree.ndc is None else {"ndc": tree.ndc.to_json()}),
         "shape": list(tree.shape),
         "brick": tree.brick,
@@ -212,6 +213,7 @@ def load(path: str | Path) -> NerfTree:
         metadata={key: value for key, value in meta.items() if key not in STRUCTURE},
         ndc=ndc_of(name, meta),
         lookup=lookup_of(name, meta),
+        step_size=step_size_of(name, meta),
         outer=tuple(cascades[1:]),
         environment=environment,
         region=region,
@@ -272,6 +274,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         "bounds": {"min": low, "max": [a + n * voxel for a, n in zip(low, resolution, strict=True)]},
         "background": meta["background"],
         "lookup": lookup_of(header.name, meta),
+        "step_size": step_size_of(header.name, meta),
         **({} if ndc_of(header.name, meta) is None else {"ndc": meta["ndc"]}),
         **_whole_scene_facts(meta),
     }

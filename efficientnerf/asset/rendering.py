@@ -245,7 +245,7 @@ def render_reference(tree: NerfTree, origins: Tensor, directions: Tensor, densit
         start = (origins - torch.as_tensor(cascade.bounds_min, device=device, dtype=dtype)) / cascade.voxel
         met = begin < end
         enter, leave = torch.where(met, begin, 0) / cascade.voxel, torch.where(met, end, 0) / cascade.voxel
-        step = 0.5
+        step = tree.step_size
         most = 2 * sum(grid.resolution) + 4  # samples of a ray through the grid; distances far beyond it are rounded to more
         count = max(0, int(torch.ceil((leave - enter).clamp(min=0).max() / step).clamp(max=most).item()) + 1) if len(enter) else 0
         for k in range(count):

@@ -28,6 +28,7 @@ from efficientnerf.geometry.ndc import WORLD, Frame, Ndc
 from efficientnerf.rendering.harmonics import harmonics_count
 
 LOOKUPS = ("trilinear", "nearest")
+STEP_SIZE, MIN_STEP, MAX_STEP = 0.5, 0.25, 1.0  # voxels: where nothing else is stated, and what may be
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +49,7 @@ class NerfTree:
     ndc          the reference camera whose normalised device coordinates are the frame, or None: the frame is the world
     lookup       value of a point: "trilinear", from the eight voxels around it; or "nearest", the values of the voxel that holds it, nothing
                  where that one is not stored (EfficientNeRF, section 4.1, has the field trained on such coordinates)
+    step_size    distance between the samples of a ray, voxels: 0.25 to 1
     outer        the cascades around this grid, which is cascade 0, where the tree holds a whole scene (`efficientnerf.asset.cascades`). The arrays of bricks
                  and voxels are those of all cascades, one after the other
     environment  (H, 2 H, 3) float32 sRGB colours by direction of what lies beyond all cascades (`efficientnerf.rendering.environment`), or None
@@ -70,6 +72,7 @@ class NerfTree:
     device: str = "cpu"
     ndc: Ndc | None = None
     lookup: str = "trilinear"
+    step_size: float = STEP_SIZE
     outer: tuple[Cascade, ...] = ()
     environment: np.ndarray | None = None
     region: Region | None = None
@@ -78,6 +81,8 @@ class NerfTree:
     def __post_init__(self) -> None:
         if self.lookup not in LOOKUPS:
             raise ValueError(f"lookup {self.lookup!r}; expected one of {', '.join(LOOKUPS)}")
+        if not MIN_STEP <= self.step_size <= MAX_STEP:
+            raise ValueError(f"step size {self.step_size!r}; expected {MIN_STEP} to {MAX_STEP}")
 
     @cached_property
     def sh(self) -> np.ndarray:
@@ -158,6 +163,7 @@ def tree_from_voxels(
     metadata: dict[str, Any] | None = None,
     ndc: Ndc | None = None,
     lookup: str = "trilinear",
+    step_size: float = STEP_SIZE,
 ) -> NerfTree:
     """Build a tree from a list of voxels.
 
@@ -199,6 +205,7 @@ def tree_from_voxels(
         metadata=dict(metadata or {}),
         ndc=ndc,
         lookup=lookup,
+        step_size=step_size,
     )
 
 

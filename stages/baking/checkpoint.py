@@ -181,7 +181,7 @@ def _split_tree(tree: NerfTree, splits: int, found: Mapping[str, np.ndarray], de
         here = of == n if tree.outer else slice(None)
         trees.append(tree_from_voxels(
             (x * finer, y * finer, z * finer), cascade.voxel / finer, cascade.bounds_min, at[here], density[here], sh[here].reshape(-1, sh.shape[1] // 3, 3),
-            brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup,
+            brick=tree.brick, background=tree.background, metadata=tree.metadata, ndc=tree.ndc, lookup=tree.lookup, step_size=tree.step_size,
         ))  # fmt: skip
     made = replace(nested(trees, tree.environment), region=tree.region) if tree.outer else replace(trees[0], region=tree.region)
     if (np.diff(of.astype(np.int16)) < 0).any() or not np.array_equal(voxel_coordinates(made), at):

@@ -71,7 +71,7 @@ def baked_tree(job: Job, m: Any, s: Scene, plan: Plan, metadata: dict[str, Any])
             density = density_as_seen(density, plan.seen[n], voxel)
         one = tree_from_voxels(
             shape, voxel, low, indices, density, sh,
-            brick=settings.brick_size, background=s.background, metadata=metadata, ndc=plan.space.ndc, lookup=settings.lookup,
+            brick=settings.brick_size, background=s.background, metadata=metadata, ndc=plan.space.ndc, lookup=settings.lookup, step_size=settings.step_size,
         )  # fmt: skip
         trees.append(one)
     return trees[0] if plan.samples is None else replace(nested(trees, plan.environment), region=plan.region)

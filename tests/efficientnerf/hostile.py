@@ -162,6 +162,10 @@ HOSTILE: dict[str, tuple[Callable[[], bytes], str]] = {
     "nearest by its word alone": (lambda: meta_with(lookup="nearest"), "'lookup' is nearest; expected trilinear in layout sparse"),
     "a lookup of no name": (lambda: meta_with(lookup="cubic"), "'lookup' is cubic; expected trilinear"),
     "a lookup of numbers": (lambda: meta_with(layout="nearest-sparse", lookup=[1]), r"'lookup' is \[1\]; expected nearest"),
+    # the step
+    "a step of nothing": (lambda: meta_with(step_size=0), "'step_size' is 0; expected a number from 0.25 to 1"),
+    "a step of no number": (lambda: meta_with(step_size="half"), "'step_size' is half; expected a number"),
+    "a step beyond a voxel": (lambda: meta_with(step_size=1.5), "'step_size' is 1.5; expected a number"),
     "prefixes the wrong way round": (lambda: meta_with(layout="ndc-nearest-sparse", lookup="nearest"), "layout ndc-nearest-sparse; this build reads"),
     "nearest, but no reference camera": (lambda: meta_with(layout="nearest-ndc-sparse", lookup="nearest"), "'ndc' is None; expected an object"),
     "a reference camera as wide as the sky": (lambda: reference(width=1e30), "2 f / w and 2 f / h are 8e-28 and .*; expected 1e-06 to 1e\\+06"),

@@ -115,9 +115,9 @@ class Tree:
     def ray(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, float]:
         light, colour = 1.0, np.zeros(3)
         for grid, enter, leave in self.parts(origin, direction):
-            n = 0
-            while (t := enter + (n + 0.5) * grid.voxel / 2) < leave:
-                alpha = 1 - math.exp(-self.density(origin + t * direction, grid) * grid.voxel / 2)
+            n, step = 0, self.meta.get("step_size", 0.5) * grid.voxel
+            while (t := enter + (n + 0.5) * step) < leave:
+                alpha = 1 - math.exp(-self.density(origin + t * direction, grid) * step)
                 if alpha > 0:
                     colour = colour + light * alpha * self.colour(origin + t * direction, direction, grid)
                 light *= 1 - alpha

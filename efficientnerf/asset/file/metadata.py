@@ -9,6 +9,7 @@ import numpy as np
 from efficientnerf.asset.file.checks import FARTHEST, coarse_shape, number, numbers
 from efficientnerf.asset.file.container import FormatError
 from efficientnerf.asset.file.whole_scene import MAX_CELLS, MINOR, NEAREST_PREFIX, NESTED_PREFIX, check_whole_scene
+from efficientnerf.asset.tree import MAX_STEP, MIN_STEP, STEP_SIZE
 from efficientnerf.geometry.ndc import NUMBERS, Ndc
 from efficientnerf.rendering.harmonics import MAX_DEGREE
 
@@ -17,9 +18,10 @@ STEEPEST = 1e6  # of the reference camera's field of view, and of a spiral's
 NDC_PREFIX = "ndc-"  # of layouts whose grid lies in normalised device coordinates: a reader that does not know them must not render it
 NDC_MINOR = 2  # the version that brought them
 NEAREST_MINOR = 3
+STEP_MINOR = 6  # the version that brought `step_size`
 STRUCTURE = {
     "format", "format_version", "layout", "shape", "brick", "voxel", "bounds_min", "sh_degree", "sh_convention", "sh_groups", "colour_space",
-    "background", "sha256", "ndc", "lookup", "cascades", "environment", "region", "packed",
+    "background", "sha256", "ndc", "lookup", "step_size", "cascades", "environment", "region", "packed",
 }  # fmt: skip
 
 
@@ -69,6 +71,11 @@ def lookup_of(name: str, meta: dict[str, Any]) -> str:
     if found != expected:
         raise FormatError(f"{name}: metadata 'lookup' is {str(found)[:60]}; expected {expected} in layout {str(meta.get('layout'))[:60]}")
     return expected
+
+
+def step_size_of(name: str, meta: dict[str, Any]) -> float:
+    """Distance between the samples of a ray, voxels."""
+    return float(number(name, meta, "step_size", MIN_STEP, MAX_STEP, whole=False)) if "step_size" in meta else STEP_SIZE
 
 
 def ndc_of(name: str, meta: dict[str, Any]) -> Ndc | None:
@@ -137,6 +144,7 @@ def check_metadata(name: str, meta: dict[str, Any], layouts: tuple[str, ...]) ->
     if meta["background"] is not None:
         numbers(name, meta, "background", 3, 0, 1)
     lookup_of(name, meta)
+    step_size_of(name, meta)
     check_whole_scene(name, meta)
     ndc = ndc_of(name, meta)
     unit = float(meta["voxel"]) if ndc is None else ndc.near

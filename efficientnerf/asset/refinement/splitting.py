@@ -52,7 +52,7 @@ def _split_grid(tree: NerfTree, keep: np.ndarray, here: np.ndarray, number: int)
     x, y, z = grid.shape
     return tree_from_voxels(
         (2 * x, 2 * y, 2 * z), grid.voxel / 2, grid.bounds_min, children, density, sh, brick=grid.brick, background=grid.background, metadata=grid.metadata,
-        ndc=grid.ndc, lookup=grid.lookup,
+        ndc=grid.ndc, lookup=grid.lookup, step_size=grid.step_size,
     )  # fmt: skip
 
 

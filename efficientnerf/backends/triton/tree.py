@@ -43,12 +43,14 @@ class DeviceCascades(NamedTuple):
     shapes  (L, 3) int32 coarse cells of each
     first   (L,) int64 where each one's cells begin
     place   (L, 4) float32 corner, and side of a voxel, voxels of cascade 0
+    step    distance between samples, voxels
     """
 
     shape: tuple[int, int, int]
     shapes: Tensor
     first: Tensor
     place: Tensor
+    step: float
 
     @property
     def grids(self) -> int:
@@ -67,7 +69,7 @@ def device_cascades(tree: NerfTree, device: str | torch.device) -> DeviceCascade
     place = [(*((cascade.bounds_min - tree.bounds_min) / tree.voxel), cascade.voxel / tree.voxel) for cascade in cascades]
     shapes = torch.tensor([cascade.shape for cascade in cascades], dtype=torch.int32, device=device)
     first = torch.tensor(np.cumsum([0, *sizes[:-1]]), dtype=torch.int64, device=device)
-    return DeviceCascades(tree.shape, shapes, first, torch.tensor(np.asarray(place), dtype=torch.float32, device=device))
+    return DeviceCascades(tree.shape, shapes, first, torch.tensor(np.asarray(place), dtype=torch.float32, device=device), tree.step_size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +184,7 @@ def _launch(
     density, index, sh = (x if len(x) else x.new_zeros(1, x.shape[1]) for x in (t.density, t.index, t.sh))
     render[(programs,)](
         *(buffers or (out.colour, out.colour, out.colour)), t.grid, *t.cascades.arrays, density, index, sh, *out,
-        count, *size, *t.cascades.shape, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
+        count, *size, *t.cascades.shape, t.cascades.step, float(t.voxel), *camera, *(float(x) for x in background or (0, 0, 0)),
         PINHOLE=buffers is None, OVER=background is not None, NEAREST=t.nearest, CASCADES=t.cascades.grids, BRICK=t.brick, K=t.terms,
         ROW=t.sh.shape[1], WIDE=wide, HIGH=high, num_warps=WARPS[t.sh.shape[1]] * min(2, t.cascades.grids),
     )  # fmt: skip

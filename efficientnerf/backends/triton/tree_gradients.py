@@ -26,7 +26,7 @@ from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree import DeviceCascades, brick_arrays, device_cascades
-from efficientnerf.backends.triton.tree_march import STEP, Cascades, colour_of, corner_place, corner_weight, interpolate_harmonics, march_cascades
+from efficientnerf.backends.triton.tree_march import Cascades, colour_of, corner_place, corner_weight, interpolate_harmonics, march_cascades
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, store_vec3, zeros_vec3
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _thickness(index, density, sample, voxel, BRICK: tl.constexpr, NEAREST: tl.c
     for n in tl.static_range(1 if NEAREST else 8):
         place = tl.load(index + corner_place(sample.corner, n, BRICK), sample.inside, other=-1)
         sigma += corner_weight(sample.fraction, n) * tl.load(density + place, place >= 0, other=0.0)
-    return sigma * (STEP * voxel * sample.unit)
+    return sigma * (sample.step * voxel * sample.unit)
 
 
 @triton.jit
@@ -173,12 +173,12 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
 
 @triton.jit
 def _forward(  # type: ignore[no-untyped-def]
-    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, rays, nx, ny, nz, voxel, min_weight,
+    origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, rays, nx, ny, nz, step, voxel, min_weight,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Premultiplied colour (R, 3) and final transmittance (R,) of rays."""
     r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
     scene = Scene(index, density, sh, voxel, min_weight, basis, tl.arange(0, ROW))
     start = Forward(tl.full((BLOCK,), 1.0, tl.float32), zeros_vec3(BLOCK))
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)
@@ -209,7 +209,7 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
         stored = voxel >= 0
         scaled = tl.where(stored, corner_weight(sample.fraction, n), 0.0) * sums.scale  # by the sum of the stored ones, the others' may be beyond any integer
         tl.store(sums.stamp + voxel, sums.number, stored)
-        tl.atomic_add(sums.thickness + voxel, (scaled * by_depth * STEP).to(tl.int64), stored, sem="relaxed")
+        tl.atomic_add(sums.thickness + voxel, (scaled * by_depth * sample.step).to(tl.int64), stored, sem="relaxed")
         row = sums.sh + voxel[:, None] * (3 * K) + column[None, :]
         tl.atomic_add(row, (scaled[:, None] * by_column).to(tl.int64), stored[:, None] & (column < 3 * sums.terms)[None, :], sem="relaxed")
     return Backward(after, behind)
@@ -218,12 +218,12 @@ def _add_gradients(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 @triton.jit(do_not_specialize=["number", "terms"])
 def _backward(  # type: ignore[no-untyped-def]
     origins, directions, views, owner, shapes, first, place, index, density, sh, colour, transmittance, grad_colour, grad_opacity, sum_thickness, sum_sh, stamp,
-    rays, nx, ny, nz, voxel, min_weight, number, terms, scale,
+    rays, nx, ny, nz, step, voxel, min_weight, number, terms, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Adds `scale` times the gradients by the voxels' optical thickness (N,) and harmonics (N, 3 K), as integers; stamps the voxels that rays meet."""
     r, live, origin, direction, basis = _rays(origins, directions, views, rays, K, ROW, BLOCK)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
     scene = Scene(index, density, sh, voxel, min_weight, basis, tl.arange(0, ROW))
     behind = load_vec3(colour, r, live)
     by_colour = load_vec3(grad_colour, r, live)
@@ -247,13 +247,13 @@ def _raise_maximum(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.conste
 
 @triton.jit
 def _max_contributions(  # type: ignore[no-untyped-def]
-    origins, directions, owner, shapes, first, place, index, density, transmittance, maximum, rays, nx, ny, nz, voxel,
+    origins, directions, owner, shapes, first, place, index, density, transmittance, maximum, rays, nx, ny, nz, step, voxel,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Raises `maximum` (N,) to what voxels contribute to rays."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = r < rays
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
     origin, direction = load_vec3(origins, r, live), load_vec3(directions, r, live)
     given = (index, density, voxel, tl.load(transmittance + r, live, other=0.0), maximum)
     march_cascades(cascades, origin, direction, live, given, Absorption(tl.full((BLOCK,), 1.0, tl.float32)), _raise_maximum, CASCADES, BRICK, NEAREST, 0, 0)
@@ -272,8 +272,8 @@ def forward(g: DeviceGrid, rays: Rays, density: Tensor, sh: Tensor, *, min_weigh
     count = len(rays.origins)
     colour, transmittance = torch.empty(count, 3, device=density.device), torch.empty(count, device=density.device)
     _forward[(blocks(count, g.rays),)](
-        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, colour, transmittance, count, *g.cascades.shape, float(g.voxel), float(min_weight),
-        NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
+        *rays, g.grid, *g.cascades.arrays, g.index, density, sh, colour, transmittance, count, *g.cascades.shape, g.cascades.step, float(g.voxel),
+        float(min_weight), NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
     return colour, transmittance
 
@@ -300,7 +300,7 @@ def backward(
     count = len(rays.origins)
     _backward[(blocks(count, g.rays),)](
         *rays, g.grid, *g.cascades.arrays, g.index, density, sh, *outputs, *(part.contiguous() for part in by), *sums, stamp,
-        count, *g.cascades.shape, float(g.voxel), float(min_weight), number, min(terms, g.terms), fixed_point_scale(count),
+        count, *g.cascades.shape, g.cascades.step, float(g.voxel), float(min_weight), number, min(terms, g.terms), fixed_point_scale(count),
         NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, BLOCK=g.rays, num_warps=SHAPES[g.row][1],
     )  # fmt: skip
 
@@ -309,6 +309,7 @@ def max_contributions(g: DeviceGrid, rays: Rays, density: Tensor, transmittance:
     """Raise `maximum` (N,) to the greatest contributions of voxels to rays, which reach the box with `transmittance` (R,)."""
     count = len(rays.origins)
     _max_contributions[(blocks(count, RAYS_PER_PROGRAM),)](
-        rays.origins, rays.directions, g.grid, *g.cascades.arrays, g.index, density, transmittance, maximum, count, *g.cascades.shape, float(g.voxel),
+        rays.origins, rays.directions, g.grid, *g.cascades.arrays, g.index, density, transmittance, maximum, count, *g.cascades.shape,
+        g.cascades.step, float(g.voxel),
         NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, BLOCK=RAYS_PER_PROGRAM, num_warps=1,
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """Rays marched through a NerfTree by the CUDA kernels (Triton): the one loop over samples, and what a sample finds in the tree.
 
-Rays are sampled as `efficientnerf/asset/FORMAT.md` says, sections 6 and 9: every half voxel, nothing in empty coarse cells, and a ray in such a cell
+Rays are sampled as `efficientnerf/asset/FORMAT.md` says, sections 6 and 9: nothing in empty coarse cells, and a ray in such a cell
 skips to the end of the empty cube around it. Coordinates are in voxels. `grid` and `index`: see `efficientnerf.backends.triton.tree.DeviceTree`.
 Offsets that grow with the tree have 64 bits: 1536^3 cells are more than 2^31.
 
@@ -19,7 +19,6 @@ import triton.language as tl
 
 from efficientnerf.backends.triton.vectors import Vec3, along, sigmoid
 
-STEP = tl.constexpr(0.5)  # of a voxel
 STOP = tl.constexpr(1e-3)  # transmittance at which a ray ends
 
 
@@ -35,6 +34,7 @@ class Cascades(NamedTuple):
     """owner  pointer to the coarse cells of all grids, as in Grid
     shape     of cascade 0, as in Grid
     others    of L cascades, pointers, see `efficientnerf.backends.triton.tree.DeviceCascades`: shapes, first, place
+    step      between samples, voxels
     """
 
     owner: Any
@@ -42,12 +42,14 @@ class Cascades(NamedTuple):
     shapes: Any
     first: Any
     place: Any
+    step: Any
 
 
 class Ray(NamedTuple):
     """origin, direction (unit), inverse (1 / direction) Vec3; enter, leave: distances between which it is in the grid, enter >= 0.
 
     unit  side of a voxel of the grid, voxels of cascade 0
+    step  between samples, voxels
     """
 
     origin: Any
@@ -56,11 +58,13 @@ class Ray(NamedTuple):
     enter: Any
     leave: Any
     unit: Any
+    step: Any
 
 
 class Sample(NamedTuple):
     """distance  along the ray
     unit         of distances and steps, voxels of cascade 0
+    step         to the next sample, voxels
     inside       whether it lies in a brick
     corner       place of its lowest corner in the arrays of bricks with border
     parity       whether that corner's coordinates in the grid are odd: 4 for x, 2 for y, 1 for z
@@ -69,6 +73,7 @@ class Sample(NamedTuple):
 
     distance: Any
     unit: Any
+    step: Any
     inside: Any
     corner: Any
     parity: Any
@@ -86,7 +91,7 @@ def _slab(o, d, high):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def ray_in_grid(grid, origin, direction, unit, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
+def ray_in_grid(grid, origin, direction, unit, step, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
     """A Ray from its origin and direction, voxel coordinates."""
     ix, ax, bx = _slab(origin.x, direction.x, grid.shape.x * BRICK)
     iy, ay, by = _slab(origin.y, direction.y, grid.shape.y * BRICK)
@@ -94,7 +99,7 @@ def ray_in_grid(grid, origin, direction, unit, BRICK: tl.constexpr):  # type: ig
     enter = tl.maximum(tl.maximum(ax, ay), tl.maximum(az, 0.0))
     # No ray is longer in the grid than its sides together, but where distances far beyond it are rounded: so its samples are bounded, too.
     longest = (grid.shape.x + grid.shape.y + grid.shape.z) * BRICK + 2.0
-    return Ray(origin, direction, Vec3(ix, iy, iz), enter, tl.minimum(tl.minimum(tl.minimum(bx, by), bz), enter + longest), unit)
+    return Ray(origin, direction, Vec3(ix, iy, iz), enter, tl.minimum(tl.minimum(tl.minimum(bx, by), bz), enter + longest), unit, step)
 
 
 @triton.jit
@@ -148,7 +153,7 @@ def _place_in_brick(point, cell, brick, BRICK: tl.constexpr, NEAREST: tl.constex
 @triton.jit
 def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  # type: ignore[no-untyped-def]
     """The `k`-th Sample of rays, and the number of the next one."""
-    t = ray.enter + (k.to(tl.float32) + 0.5) * STEP
+    t = ray.enter + (k.to(tl.float32) + 0.5) * ray.step
     point = along(ray.origin, ray.direction, t)
     cell = _cells_of(grid, point, BRICK)
     owner = _owner(grid, cell, alive)
@@ -156,15 +161,15 @@ def _sample(grid, ray, k, alive, BRICK: tl.constexpr, NEAREST: tl.constexpr):  #
     radius = -tl.minimum(owner, 0)
     exit_y, exit_z = _cube_exit(o.y, d.y, inverse.y, cell.y, radius, BRICK), _cube_exit(o.z, d.z, inverse.z, cell.z, radius, BRICK)
     exit = tl.minimum(_cube_exit(o.x, d.x, inverse.x, cell.x, radius, BRICK), tl.minimum(exit_y, exit_z))
-    after = tl.minimum(tl.maximum(tl.ceil((tl.minimum(exit, ray.leave) - ray.enter) / STEP - 0.5), 0.0), 1e9).to(tl.int32)
+    after = tl.minimum(tl.maximum(tl.ceil((tl.minimum(exit, ray.leave) - ray.enter) / ray.step - 0.5), 0.0), 1e9).to(tl.int32)
     corner, parity, fraction = _place_in_brick(point, cell, tl.maximum(owner, 0), BRICK, NEAREST)
-    return Sample(t, ray.unit, alive & (owner >= 0), corner, parity, fraction), tl.where(owner < 0, tl.maximum(k + 1, after), k + 1)
+    return Sample(t, ray.unit, ray.step, alive & (owner >= 0), corner, parity, fraction), tl.where(owner < 0, tl.maximum(k + 1, after), k + 1)
 
 
 @triton.jit
 def _in_grid(ray, k):  # type: ignore[no-untyped-def]
     """Whether sample `k` lies in the grid."""
-    return ray.enter + (k.to(tl.float32) + 0.5) * STEP < ray.leave
+    return ray.enter + (k.to(tl.float32) + 0.5) * ray.step < ray.leave
 
 
 @triton.jit
@@ -205,7 +210,7 @@ def in_cascade(point, corner, unit):  # type: ignore[no-untyped-def]
 def _ray_in_cascade(cascades, n, origin, direction, BRICK: tl.constexpr):  # type: ignore[no-untyped-def]
     """The Grid of cascade n and rays in it."""
     grid, corner, unit = cascade_grid(cascades, n)
-    return grid, ray_in_grid(grid, in_cascade(origin, corner, unit), direction, unit, BRICK)
+    return grid, ray_in_grid(grid, in_cascade(origin, corner, unit), direction, unit, cascades.step, BRICK)
 
 
 @triton.jit
@@ -216,7 +221,7 @@ def march_cascades(  # type: ignore[no-untyped-def]
     """`march` through all parts of rays: part p lies in cascade |L - 1 - p|, before or behind the box that is cut out of that."""
     if CASCADES == 1:
         grid = Grid(cascades.owner, cascades.shape)
-        state = march(grid, ray_in_grid(grid, origin, direction, 1.0, BRICK), live, scene, state, VISIT, BRICK, NEAREST, K, COLUMNS)
+        state = march(grid, ray_in_grid(grid, origin, direction, 1.0, cascades.step, BRICK), live, scene, state, VISIT, BRICK, NEAREST, K, COLUMNS)
     else:
         OUTERMOST: tl.constexpr = CASCADES - 1
         for part in range(2 * CASCADES - 1):
@@ -226,7 +231,7 @@ def march_cascades(  # type: ignore[no-untyped-def]
             meets = inner.leave > inner.enter
             leave = tl.where((part < OUTERMOST) & meets, 0.5 * inner.enter, ray.leave)
             enter = tl.where(part > OUTERMOST, tl.where(meets, 0.5 * inner.leave, ray.leave), ray.enter)
-            through = Ray(ray.origin, ray.direction, ray.inverse, enter, leave, ray.unit)
+            through = Ray(ray.origin, ray.direction, ray.inverse, enter, leave, ray.unit, ray.step)
             state = march(grid, through, live & (state.transmittance >= STOP), scene, state, VISIT, BRICK, NEAREST, K, COLUMNS)
     return state
 

@@ -4,8 +4,8 @@
 a packet are the mean of its rays', as on the CPU, so that a voxel has one colour in it, and gets gradients by its density and three arguments of sigmoids.
 
 A ray holds, in registers, the eight voxels that its last sample lies between: one in each *slot*, by the parity of a voxel's coordinates. The next sample,
-half a voxel on, finds most of them there again. A voxel that comes into a slot is shaded for all rays of the packet that hold it; one that leaves it hands the
-sum of its gradients to another ray that holds it, and only the last one adds to memory. docs/experiments/tree-training-kernels.md
+a voxel on at most, finds many of them there again. A voxel that comes into a slot is shaded for all rays of the packet that hold it; one that leaves it hands
+the sum of its gradients to another ray that holds it, and only the last one adds to memory. docs/experiments/tree-training-kernels.md
 
 Order of sums: samples of a ray front to back; rays of a packet as Triton reduces its lanes; packets in fixed point, which no order changes. So the same
 packets give the same bytes, on one kind of device and one version of Triton, in whatever order they come.
@@ -25,7 +25,7 @@ from torch import Tensor
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, Scene, Sums, Upstream, by_sample, fixed_point_scale
-from efficientnerf.backends.triton.tree_march import STEP, Cascades, march_cascades
+from efficientnerf.backends.triton.tree_march import Cascades, march_cascades
 from efficientnerf.backends.triton.vectors import Vec3, add_scaled, load_vec3, sigmoid, zeros_vec3
 
 RAYS = 16  # of a program
@@ -134,7 +134,7 @@ def _met(scene, sums, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
     voxel, weight = _corners(scene.index, sample, before.voxel, BRICK, NEAREST)
     new = voxel != before.voxel
     density = tl.where(new, tl.load(scene.density + voxel, new & (voxel >= 0), other=0.0), before.density)
-    thickness = tl.sum(weight * density, 1) * (STEP * scene.voxel * sample.unit)
+    thickness = tl.sum(weight * density, 1) * (sample.step * scene.voxel * sample.unit)
     after = state.transmittance * tl.exp(-thickness)
     light = state.transmittance - after
     visible = (thickness > 0) & (light >= scene.min_weight)
@@ -209,7 +209,7 @@ def _gather(given, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K:
     behind, by_depth, by_rgb = by_sample(by, state.behind, s.weight, s.colour, s.after)
     red, green, blue = g.colour.x + s.shares * by_rgb.x[:, None], g.colour.y + s.shares * by_rgb.y[:, None], g.colour.z + s.shares * by_rgb.z[:, None]
     shows = tl.sum(s.shares, 1) > 0
-    thickness = g.thickness + weight * tl.where(shows, by_depth * STEP, 0.0)[:, None]
+    thickness = g.thickness + weight * tl.where(shows, by_depth * sample.step, 0.0)[:, None]
     return Backward(s.after, behind, held, Gathered(Vec3(red, green, blue), thickness))
 
 
@@ -228,7 +228,7 @@ def _loss(colour, left, seen, behind, arriving, opacity, opacity_weight):  # typ
 @triton.jit(do_not_specialize=["number", "terms"])
 def _packets(  # type: ignore[no-untyped-def]
     first_ray, origins, directions, views, seen, background, arriving, opacity, owner, shapes, first, place, index, density, sh, loss, sum_thickness, sum_sh,
-    stamp, nx, ny, nz, voxel, min_weight, opacity_weight, number, terms, scale,
+    stamp, nx, ny, nz, step, voxel, min_weight, opacity_weight, number, terms, scale,
     NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr, ROW: tl.constexpr, RAYS: tl.constexpr,
 ):  # fmt: skip
     """Losses (R,) of a packet's rays; adds `scale` times the gradients of their sum by optical thickness (N,) and harmonics (N, 3 K), as integers."""
@@ -241,7 +241,7 @@ def _packets(  # type: ignore[no-untyped-def]
     basis = tl.sum(tl.where(live[:, None], bases, 0.0), 0) / (end - begin).to(tl.float32)
     scene = Scene(index, density, sh, voxel, min_weight, basis, column)
     sums = Sums(sum_thickness, sum_sh, stamp, number, terms, scale)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
     one = tl.full((RAYS,), 1.0, tl.float32)
     seen_through = march_cascades(
         cascades, origin, direction, live, (scene, sums), Forward(one, zeros_vec3(RAYS), _nothing_held(RAYS)), _composite, CASCADES, BRICK, NEAREST, K, ROW
@@ -270,7 +270,8 @@ def loss_and_gradients(
     if len(first) > 1:
         seen = (part.float().contiguous() for part in targets[:4])
         _packets[(len(first) - 1,)](
-            first, *rays, *seen, g.grid, *g.cascades.arrays, g.index, density, sh, loss, *sums, stamp, *g.cascades.shape, float(g.voxel), float(min_weight),
+            first, *rays, *seen, g.grid, *g.cascades.arrays, g.index, density, sh, loss, *sums, stamp, *g.cascades.shape, g.cascades.step,
+            float(g.voxel), float(min_weight),
             float(targets.opacity_weight), number, min(terms, g.terms), fixed_point_scale(count),
             NEAREST=g.nearest, CASCADES=g.cascades.grids, BRICK=g.brick, K=g.terms, ROW=g.row, RAYS=RAYS, num_warps=WARPS[g.row],
         )  # fmt: skip

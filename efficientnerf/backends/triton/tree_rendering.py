@@ -13,7 +13,6 @@ import triton.language as tl
 
 from efficientnerf.backends.triton.harmonics import basis_columns
 from efficientnerf.backends.triton.tree_march import (
-    STEP,
     Cascades,
     Grid,
     cascade_grid,
@@ -83,7 +82,7 @@ def _pixel_rays(camera, width, height, WIDE: tl.constexpr, HIGH: tl.constexpr): 
 def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr, K: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
     """Add a sample to the State of its rays."""
     sigma = interpolate_density(scene.density, sample.corner, sample.fraction, sample.inside, BRICK, NEAREST)
-    alpha = 1 - tl.exp(-sigma * (STEP * scene.voxel * sample.unit))
+    alpha = 1 - tl.exp(-sigma * (sample.step * scene.voxel * sample.unit))
     pending = state.pending_weight + state.transmittance * alpha
     visible = sample.inside & (pending > MIN_WEIGHT) & (sigma > 0)
     colour = state.colour
@@ -94,7 +93,7 @@ def _composite(scene, sample, state, BRICK: tl.constexpr, NEAREST: tl.constexpr,
         pending = tl.where(visible, 0.0, pending)
     after = state.transmittance * (1 - alpha)
     crossing = sample.inside & (state.transmittance > 0.5) & (after <= 0.5)
-    at_half = (sample.distance - 0.5 * STEP) * sample.unit + tl.log(2 * tl.maximum(state.transmittance, 0.5)) / (tl.maximum(sigma, 1e-20) * scene.voxel)
+    at_half = (sample.distance - 0.5 * sample.step) * sample.unit + tl.log(2 * tl.maximum(state.transmittance, 0.5)) / (tl.maximum(sigma, 1e-20) * scene.voxel)
     return State(after, pending, colour, tl.where(crossing, at_half, state.depth))
 
 
@@ -129,7 +128,7 @@ def _surface_normal(cascades, density, p, live, CASCADES: tl.constexpr, BRICK: t
 @triton.jit
 def render(  # type: ignore[no-untyped-def]
     origins, directions, views, owner, shapes, first, place, density, index, sh, colour, opacity, depth, normal,
-    rays, width, height, nx, ny, nz, voxel, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, red, green, blue,
+    rays, width, height, nx, ny, nz, step, voxel, ox, oy, oz, r00, r01, r02, r10, r11, r12, r20, r21, r22, fx, fy, cx, cy, red, green, blue,
     PINHOLE: tl.constexpr, OVER: tl.constexpr, NEAREST: tl.constexpr, CASCADES: tl.constexpr, BRICK: tl.constexpr, K: tl.constexpr,
     ROW: tl.constexpr, WIDE: tl.constexpr, HIGH: tl.constexpr,
 ):  # fmt: skip
@@ -151,7 +150,7 @@ def render(  # type: ignore[no-untyped-def]
         origin = load_vec3(origins, r, live)
         cosine = tl.full((BLOCK,), 1.0, tl.float32)
         basis = basis_columns(load_vec3(views, r, live), column % K, K)
-    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place)
+    cascades = Cascades(owner, Vec3(nx, ny, nz), shapes, first, place, step)
     start = State(tl.full((BLOCK,), 1.0, tl.float32), tl.zeros((BLOCK,), tl.float32), zeros_vec3(BLOCK), tl.full((BLOCK,), float("inf"), tl.float32))
     scene = Scene(density, index, sh, voxel, basis, column)
     end = march_cascades(cascades, origin, direction, live, scene, start, _composite, CASCADES, BRICK, NEAREST, K, ROW)

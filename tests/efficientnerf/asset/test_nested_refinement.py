@@ -53,8 +53,9 @@ def test_values_and_gradients_are_those_of_autograd(count: int, brick: int, degr
         assert (by_density[voxel_cascades(tree) == n] != 0).mean() > 0.1
 
 
-def test_the_loss_is_that_of_the_render_over_the_environment() -> None:
-    tree = random_cascades(2, degree=2)
+@pytest.mark.parametrize("step_size", [0.5, 1.0])
+def test_the_loss_is_that_of_the_render_over_the_environment(step_size: float) -> None:
+    tree = replace(random_cascades(2, degree=2), step_size=step_size)
     origins, directions = nested_rays(tree, 200)
     seen = seen_at_random(200, 0.0)._replace(background=behind(tree, directions), transmittance=np.ones(200))
     colour, _ = render_reference(tree, *tensors(origins, directions))
@@ -75,9 +76,9 @@ def test_samples_beyond_a_buffer_are_composited_too() -> None:
     np.testing.assert_allclose(colour, wanted, atol=1e-3)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_nearest_renders_match_the_reference(count: int) -> None:
-    tree = replace(random_cascades(count, count=count, brick=4, degree=2, lookup="nearest"), environment=None)
+@pytest.mark.parametrize(("count", "step_size"), [(1, 0.5), (1, 1.0), (2, 0.5), (3, 0.7)])
+def test_nearest_renders_match_the_reference(count: int, step_size: float) -> None:
+    tree = replace(random_cascades(count, count=count, brick=4, degree=2, lookup="nearest"), environment=None, step_size=step_size)
     origins, directions = nested_rays(tree, 400)
     colour, opacity, depth, _ = render_nearest(tree, origins, directions)
     wanted, wanted_opacity = render_reference(tree, *tensors(origins, directions))

@@ -43,9 +43,9 @@ def agree(ours: Rendering, theirs: Rendering, faces: float = 0.0) -> None:
     assert (turned > 0.05).mean() <= max(faces, 0.02)
 
 
-@pytest.mark.parametrize(("brick", "degree"), [(1, 0), (4, 2), (2, 4)])
-def test_rays_are_those_of_the_torch_function(brick: int, degree: int) -> None:
-    tree = random_tree(brick, brick=brick, degree=degree)
+@pytest.mark.parametrize(("brick", "degree", "step_size"), [(1, 0, 0.5), (4, 2, 1.0), (2, 4, 0.5)])
+def test_rays_are_those_of_the_torch_function(brick: int, degree: int, step_size: float) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, step_size=step_size)
     origins, directions = rays_at(tree, 240)
     colour, opacity = render_reference(tree, *tensors(origins, directions))
     found = device_rays(tree, origins, directions)

@@ -19,9 +19,10 @@ from tests.efficientnerf.balls import pose, untrained
 from tests.efficientnerf.trees import TREES, looking, random_tree, rays_at, tensors, uniform_tree
 
 
+@pytest.mark.parametrize("step_size", [0.3, 0.5, 1.0])
 @pytest.mark.parametrize(("brick", "degree"), TREES)
-def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
-    tree = random_tree(brick, brick=brick, degree=degree)
+def test_the_kernel_is_the_torch_function(brick: int, degree: int, step_size: float) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, step_size=step_size)
     origins, directions = rays_at(tree, 400)
     colour, opacity = render_reference(tree, *tensors(origins, directions))
     seen = render_rays(tree, origins, directions)
@@ -32,10 +33,11 @@ def test_the_kernel_is_the_torch_function(brick: int, degree: int) -> None:
     assert seen.opacity.max() > 0.8
 
 
+@pytest.mark.parametrize("step_size", [0.5, 1.0])
 @pytest.mark.parametrize("lookup", LOOKUPS)
 @pytest.mark.parametrize(("brick", "degree"), TREES[1:4])
-def test_the_torch_function_is_the_loop(brick: int, degree: int, lookup: str) -> None:
-    tree = random_tree(brick, brick=brick, degree=degree, lookup=lookup)
+def test_the_torch_function_is_the_loop(brick: int, degree: int, lookup: str, step_size: float) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, lookup=lookup, step_size=step_size)
     origins, directions = rays_at(tree, 24)
     colour, opacity = render_reference(tree, *tensors(origins, directions))
     depth = render_rays(tree, origins, directions).depth

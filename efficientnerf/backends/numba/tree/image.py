@@ -87,7 +87,7 @@ def render_batch(  # type: ignore[no-untyped-def]
         rays = ray_pointers(batch)
         scene = Scene(
             cascades, packed_pointers(packed, brick, 0), pointer(packed.grids), pointer(packed.places), pointer(views.direction), views.direction_rate,
-            pointer(views.min_distance), pointer(views.density_scale), views.degree,
+            pointer(views.min_distance), pointer(views.density_scale), views.step, views.degree,
         )  # fmt: skip
         _render_runs(worker, threads, budget, progress, height, tile, rays, background, scene, pointer(view_colours[1:]), voxel, scratch, outputs)
     left = 0

@@ -12,7 +12,6 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import EXP2_COEFFICIENTS, fmuladd
 
-STEP = 0.5  # voxels
 EARLY_STOP = 1e-3  # transmittance at which a ray may end
 PACKED_EARLY_STOP = 5e-4  # transmittance at which a ray ends here; the rest of the tolerance is left to view colours
 MIN_COLOUR_WEIGHT = 1e-4  # weight below which no colour is looked up; it is added to that of the next sample that has one

@@ -11,7 +11,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.march import EARLY_STOP, STEP
+from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.queries import normal_at
 from efficientnerf.backends.numba.tree.walk import SampleBuffer, tree_grid, walk_on, walk_pointers
 from efficientnerf.rendering.harmonics import basis_numpy
@@ -46,7 +46,7 @@ def _composite(count, buffer, tree, basis, sh, rgb, colour):  # type: ignore[no-
         for c in range(3):
             colour[c] += weight * rgb[c]
         if before - weight <= 0.5 < before:
-            step = STEP * (buffer.length[n] / tree.step_length)  # of the cascade, voxels of cascade 0
+            step = tree.step * (buffer.length[n] / tree.step_length)  # of the cascade, voxels of cascade 0
             half = buffer.distance[n] - 0.5 * step + np.log(2 * before) / (tree.density[voxel] * buffer.length[n]) * step
     return half
 

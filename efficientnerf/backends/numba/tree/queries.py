@@ -135,7 +135,7 @@ def _grids(tree: NerfTree, points: np.ndarray) -> Iterator[tuple[np.ndarray | sl
     for n, cascade in enumerate(cascades):
         chosen = slice(None) if owner is None else np.flatnonzero(owner == n)
         grid = TreeGrid(
-            tree.brick, cascade.brick_index, tree.voxel_index, np.zeros((1, 1, 1), np.uint8), float(cascade.voxel), tree.lookup == "nearest"
+            tree.brick, cascade.brick_index, tree.voxel_index, np.zeros((1, 1, 1), np.uint8), 1.0, float(cascade.voxel), tree.lookup == "nearest"
         )  # fmt: skip
         yield chosen, _voxel_coordinates(tree, cascade, points[chosen]), grid
 

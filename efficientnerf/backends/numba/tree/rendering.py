@@ -13,7 +13,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.image import TILE, WORK, downsample, render_batch
-from efficientnerf.backends.numba.tree.march import LOG2E, STEP
+from efficientnerf.backends.numba.tree.march import LOG2E
 from efficientnerf.backends.numba.tree.packed import brick_ranges, bricks_of, packed_of
 from efficientnerf.backends.numba.tree.ray_batch import RayBatch
 from efficientnerf.backends.numba.tree.surroundings import add_environment
@@ -88,9 +88,9 @@ def _views(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray)
     ratio, shift = packed_of(tree).places[:, 0], packed_of(tree).places[:, 1:]
     matrix = np.broadcast_to(view_direction[:, :3], (len(ratio), 3, 3))  # directions may have any length: per voxel of each cascade
     at_zero = view_direction[:, 3] / ratio[:, None] - np.einsum("ij,lj->li", view_direction[:, :3], shift)
-    scale = np.array([np.float32(STEP * cascade.voxel * LOG2E) for cascade in cascades_of(tree)], np.float32)
+    scale = np.array([np.float32(tree.step_size * cascade.voxel * LOG2E) for cascade in cascades_of(tree)], np.float32)
     direction = np.concatenate([matrix, at_zero[..., None]], axis=2)
-    return Views(direction, float(np.linalg.norm(view_direction[:, :3], 2)), min_distance, scale, tree.degree)
+    return Views(direction, float(np.linalg.norm(view_direction[:, :3], 2)), min_distance, scale, float(tree.step_size), tree.degree)
 
 
 def _min_distance(tree: NerfTree) -> np.ndarray:

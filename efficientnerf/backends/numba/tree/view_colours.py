@@ -49,6 +49,7 @@ class View(NamedTuple):
                     of the samples beside it: harmonics are summed at each of them. Infinity where rays have no common point, minus infinity
                     where no voxel is so near.
     density_scale   float32 factor of densities
+    step            distance between samples, voxels
     degree          of the harmonics
     """
 
@@ -56,6 +57,7 @@ class View(NamedTuple):
     direction_rate: float
     min_distance: float
     density_scale: np.float32
+    step: float
     degree: int
 
 
@@ -66,6 +68,7 @@ class Views(NamedTuple):
     direction_rate: float
     min_distance: np.ndarray
     density_scale: np.ndarray
+    step: float
     degree: int
 
 
@@ -274,7 +277,7 @@ def compute_view_colours(first, end, cascade, packed, brick, direction, cone, de
     cube = brick * brick * brick
     for task in numba.prange((end - first + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
         steps, stored, basis = np.zeros(3 * (cube + 15), np.float32), np.empty((2, cube), np.int64), np.empty(16 * MOST_HARMONICS, np.float32)
-        grid, view = packed_pointers(packed, brick, cascade), View(pointer(direction), 0.0, 0.0, density_scale, degree)
+        grid, view = packed_pointers(packed, brick, cascade), View(pointer(direction), 0.0, 0.0, density_scale, 0.0, degree)
         _voxel_steps(brick, view.direction, pointer(steps))
         # From a ray to a normal's block one voxel, through that block and to the middle of the brick beside it; and one for rounding.
         half, reach = 0.5 * brick, np.sqrt(3.0) * (1.5 * brick + 1) + 2

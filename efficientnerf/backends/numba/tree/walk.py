@@ -15,7 +15,6 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.leaps import leaps
-from efficientnerf.backends.numba.tree.march import STEP
 
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
@@ -24,7 +23,8 @@ if TYPE_CHECKING:
 class TreeGrid(NamedTuple):
     """Structure of a tree; see `NerfTree`.
 
-    step_length        of STEP voxels of cascade 0, units of the frame
+    step               distance between samples, voxels
+    step_length        the same in cascade 0, units of the frame
     nearest            whether the lookup is nearest, else trilinear
     outer_shape        (L - 1, 3) int64 coarse cells of the cascades after the first
     outer_first        (L - 1,) int64 where each one's cells begin in the next two
@@ -37,6 +37,7 @@ class TreeGrid(NamedTuple):
     brick_index: np.ndarray
     voxel_index: np.ndarray
     leap: np.ndarray
+    step: float
     step_length: float
     nearest: bool = False
     outer_shape: np.ndarray = np.zeros((0, 3), np.int64)
@@ -51,7 +52,7 @@ class TreeGrid(NamedTuple):
         """Samples on a ray, at most."""
         sizes = [self.brick_index.shape, *self.outer_shape.tolist()]
         # Each outer cascade may begin its samples anew behind the one that is cut out of it.
-        return sum(most_samples(*(side * self.brick for side in size)) for size in sizes) + 2 * len(self.outer_shape)
+        return sum(most_samples(*(side * self.brick for side in size), self.step) for size in sizes) + 2 * len(self.outer_shape)
 
 
 class WalkPointers(NamedTuple):
@@ -70,6 +71,7 @@ class WalkPointers(NamedTuple):
     voxel_index: Any
     leap: Any
     density: Any
+    step: float
     step_length: float
     nearest: bool
     cascades: int
@@ -106,7 +108,8 @@ class SampleBuffer(NamedTuple):
 def tree_grid(tree: NerfTree) -> TreeGrid:
     """The structure of a tree, with its cascades."""
     outer = _outer_grids(tree) if tree.outer else ()
-    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, float(STEP * tree.voxel), tree.lookup == "nearest", *outer)
+    step = float(tree.step_size)
+    return TreeGrid(tree.brick, tree.brick_index, tree.voxel_index, tree.leap, step, float(step * tree.voxel), tree.lookup == "nearest", *outer)
 
 
 def _outer_grids(tree: NerfTree) -> tuple[np.ndarray, ...]:
@@ -125,9 +128,9 @@ def _outer_grids(tree: NerfTree) -> tuple[np.ndarray, ...]:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def most_samples(nx, ny, nz):  # type: ignore[no-untyped-def]
-    """Samples on a ray through a grid of so many voxels, at most. Distances far beyond the grid are rounded to more than that."""
-    return int(np.ceil(np.sqrt(nx * nx + ny * ny + nz * nz) / STEP)) + 2
+def most_samples(nx, ny, nz, step):  # type: ignore[no-untyped-def]
+    """Samples on a ray through a grid of so many voxels, `step` apart, at most. Distances far beyond the grid are rounded to more than that."""
+    return int(np.ceil(np.sqrt(nx * nx + ny * ny + nz * nz) / step)) + 2
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -136,7 +139,7 @@ def walk_pointers(grid, density):  # type: ignore[no-untyped-def]
     nx, ny, nz = grid.brick_index.shape
     return WalkPointers(
         grid.brick, grid.voxel_index.shape[1], nx, ny, nz, pointer(grid.brick_index), pointer(grid.voxel_index), pointer(grid.leap), pointer(density),
-        grid.step_length, grid.nearest, 1 + len(grid.outer_first), 0, pointer(grid.outer_shape), pointer(grid.outer_first),
+        grid.step, grid.step_length, grid.nearest, 1 + len(grid.outer_first), 0, pointer(grid.outer_shape), pointer(grid.outer_first),
         pointer(grid.outer_brick_index), pointer(grid.outer_leap), pointer(grid.outer_corner), pointer(grid.outer_scale),
     )  # fmt: skip
 
@@ -147,8 +150,8 @@ def outer_grid(tree, n):  # type: ignore[no-untyped-def]
     m = n - 1
     return WalkPointers(
         tree.brick, tree.cube, tree.outer_shape[3 * m], tree.outer_shape[3 * m + 1], tree.outer_shape[3 * m + 2], tree.outer_brick_index, tree.voxel_index,
-        tree.outer_leap, tree.density, tree.step_length * tree.outer_scale[m], tree.nearest, 1, tree.outer_first[m], tree.outer_shape, tree.outer_first,
-        tree.outer_brick_index, tree.outer_leap, tree.outer_corner, tree.outer_scale,
+        tree.outer_leap, tree.density, tree.step, tree.step_length * tree.outer_scale[m], tree.nearest, 1, tree.outer_first[m], tree.outer_shape,
+        tree.outer_first, tree.outer_brick_index, tree.outer_leap, tree.outer_corner, tree.outer_scale,
     )  # fmt: skip
 
 
@@ -250,11 +253,11 @@ def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, tree, scale, stop, buffer, count,
     ix = 1 / dx if dx != 0 else 1e30
     iy = 1 / dy if dy != 0 else 1e30
     iz = 1 / dz if dz != 0 else 1e30
-    last = int(np.floor(min((t1 - t0) / STEP, most_samples(nx, ny, nz)))) + 1
+    last = int(np.floor(min((t1 - t0) / tree.step, most_samples(nx, ny, nz, tree.step)))) + 1
     while k < last:
         if count == buffer.capacity:
             return count, transmittance, k
-        t = t0 + (k + 0.5) * STEP
+        t = t0 + (k + 0.5) * tree.step
         if t >= t1:
             break
         u, v, w = ox + t * dx, oy + t * dy, oz + t * dz
@@ -273,7 +276,7 @@ def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, tree, scale, stop, buffer, count,
                 fy = 1e30
             if dz == 0:
                 fz = 1e30
-            k = max(k + 1, int(np.ceil((min(fx, fy, fz) - t0) / STEP - 0.5)))
+            k = max(k + 1, int(np.ceil((min(fx, fy, fz) - t0) / tree.step - 0.5)))
             continue
         k += 1
         sigma = _lookup_nearest(u, v, w, tree, buffer, count) if tree.nearest else _lookup_trilinear(u, v, w, tree, buffer, count)

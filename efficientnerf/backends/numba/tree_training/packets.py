@@ -18,7 +18,6 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.march import STEP
 from efficientnerf.backends.numba.tree.walk import TreeGrid, box_distances, most_samples
 from efficientnerf.backends.numba.tree_training.scalars import absorbed, cast_like
 from efficientnerf.backends.numba.tree_training.tasks import prefetch
@@ -31,7 +30,8 @@ SLACK = 1e-3  # voxels by which a clear way ends early, so that no rounding make
 class Cells(NamedTuple):
     """Structure of a tree, all cascades alike; see `TreeGrid`.
 
-    step_length  of STEP voxels of cascade 0, units of the frame
+    step         distance between samples, voxels
+    step_length  the same in cascade 0, units of the frame
     brick_index  (C,) int32, leap (C,) uint8
     shape        (L, 3) int64 coarse cells
     first        (L,) int64 where a cascade's cells begin
@@ -41,6 +41,7 @@ class Cells(NamedTuple):
 
     brick: int
     nearest: bool
+    step: float
     step_length: float
     voxel_index: np.ndarray
     brick_index: np.ndarray
@@ -60,6 +61,7 @@ class TreePointers(NamedTuple):
     absent: int
     inverse: float
     nearest: bool
+    step: float
     step_length: float
     one: Any
     cascades: int
@@ -123,7 +125,7 @@ def cells_of(grid: TreeGrid) -> Cells:
     index = np.concatenate([grid.brick_index.reshape(-1), grid.outer_brick_index]) if several else np.ascontiguousarray(grid.brick_index).reshape(-1)
     leap = np.concatenate([grid.leap.reshape(-1), grid.outer_leap]) if several else np.ascontiguousarray(grid.leap).reshape(-1)
     corner, scale = np.concatenate([np.zeros((1, 3)), grid.outer_corner]), np.concatenate([np.ones(1), grid.outer_scale])
-    return Cells(grid.brick, grid.nearest, grid.step_length, np.ascontiguousarray(grid.voxel_index), index, leap, shape, first, corner, scale)
+    return Cells(grid.brick, grid.nearest, grid.step, grid.step_length, np.ascontiguousarray(grid.voxel_index), index, leap, shape, first, corner, scale)
 
 
 def voxel_places(cells: Cells, voxels: int) -> np.ndarray:
@@ -146,7 +148,7 @@ def dense_densities(cells: Cells, places: np.ndarray, density: np.ndarray) -> np
 def tree_pointers(cells, density):  # type: ignore[no-untyped-def]
     """See `TreePointers`."""
     return TreePointers(
-        cells.brick, cells.brick * cells.brick * cells.brick, cells.voxel_index.size, 1.0 / cells.brick, cells.nearest, cells.step_length,
+        cells.brick, cells.brick * cells.brick * cells.brick, cells.voxel_index.size, 1.0 / cells.brick, cells.nearest, cells.step, cells.step_length,
         density.dtype.type(1), len(cells.first), pointer(cells.voxel_index), pointer(cells.brick_index), pointer(cells.leap), pointer(cells.shape),
         pointer(cells.first), pointer(cells.corner), pointer(cells.scale), pointer(density),
     )  # fmt: skip
@@ -295,13 +297,13 @@ def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, clear, cascade, tree, stop, min_w
     ix = 1 / dx if dx != 0 else 1e30
     iy = 1 / dy if dy != 0 else 1e30
     iz = 1 / dz if dz != 0 else 1e30
-    last = int(np.floor(min((t1 - t0) / STEP, most_samples(sx, sy, sz)))) + 1
+    last = int(np.floor(min((t1 - t0) / tree.step, most_samples(sx, sy, sz, tree.step)))) + 1
     entry, ea, eb, ec = np.int64(-1), -2, -2, -2
     count, k = packet.state[SAMPLES], 0
     if clear > t0:
-        k = int(min((clear - t0) / STEP, float(last)))  # no later than the first sample behind it
+        k = int(min((clear - t0) / tree.step, float(last)))  # no later than the first sample behind it
     while k < last:
-        t = t0 + (k + 0.5) * STEP
+        t = t0 + (k + 0.5) * tree.step
         if t >= t1:
             break
         u, v, w = ox + t * dx, oy + t * dy, oz + t * dz
@@ -320,7 +322,7 @@ def _walk_part(ox, oy, oz, dx, dy, dz, t0, t1, clear, cascade, tree, stop, min_w
                 fy = 1e30
             if dz == 0:
                 fz = 1e30
-            k = max(k + 1, int(np.ceil((min(fx, fy, fz) - t0) / STEP - 0.5)))
+            k = max(k + 1, int(np.ceil((min(fx, fy, fz) - t0) / tree.step - 0.5)))
             continue
         k += 1
         x, y, z, fx, fy, fz = int(u), int(v), int(w), 0.0, 0.0, 0.0
@@ -389,7 +391,7 @@ def clear_distance(begin, end, origins, directions, tree):  # type: ignore[no-un
         c = min(max(int((oz + t * dz) * tree.inverse), 0), nz - 1)
         # All that is nearer than so many cells to this one is empty, along each axis.
         ahead = ((int(tree.leap[(a * ny + b) * nz + c]) - 1) * brick - apart - t * spread) / speed - SLACK
-        if ahead < STEP:
+        if ahead < tree.step:
             return t
         t += ahead
     return most if most > 0 else np.inf

@@ -10,7 +10,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import add_scaled4, advanced, load4, pack4, sigmoid, store4
-from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP, STEP, exp2_neg
+from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP, exp2_neg
 from efficientnerf.backends.numba.tree.packets.lanes import (
     bits_of,
     broadcast16,
@@ -161,10 +161,10 @@ def _mix_harmonics(lane, grid, view, floats, ints):  # type: ignore[no-untyped-d
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _half_distance(lane, floats):  # type: ignore[no-untyped-def]
+def _half_distance(lane, view, floats):  # type: ignore[no-untyped-def]
     """Distance at which the transmittance falls to one half, within a ray's sample."""
     within = np.log2(2 * floats[TRANSMITTANCE + lane]) / floats[SAMPLE + 4 * lane] - _HALF
-    floats[HALF_DISTANCE + lane] = floats[DISTANCE + lane] + within * np.float32(STEP)
+    floats[HALF_DISTANCE + lane] = floats[DISTANCE + lane] + within * np.float32(view.step)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -217,7 +217,7 @@ def composite(ready, near, shared, grid, view, colours, floats, ints):  # type: 
     store16(floats, LOOKUPS, load16(floats, LOOKUPS) + select16(mask_of(alone), _NONE, used))
     left = bits_of((after <= _HALF) & (before > _HALF))
     while left != 0:
-        _half_distance(lowest_bit(left), floats)
+        _half_distance(lowest_bit(left), view, floats)
         left &= left - 1
     store16(floats, TRANSMITTANCE, after)
     return bits_of(after < np.float32(PACKED_EARLY_STOP))

@@ -3,7 +3,7 @@
 Each ray goes on to its next sample of which one of the eight voxels has density; when half of them are at one, or have none left, these are composited
 together. Were all waited for, the gaps between surfaces that rays cross would be crossed one after the other: docs/experiments/renderer.md
 
-All rays sample at t = t_enter + (k + 1/2) STEP, whatever is skipped and whatever the other lanes do: neither changes any value.
+All rays sample at t = t_enter + (k + 1/2) step, whatever is skipped and whatever the other lanes do: neither changes any value.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import popcount
-from efficientnerf.backends.numba.tree.march import PARALLEL, SKIP_MARGIN, STEP
+from efficientnerf.backends.numba.tree.march import PARALLEL, SKIP_MARGIN
 from efficientnerf.backends.numba.tree.packets.composite import composite
 from efficientnerf.backends.numba.tree.packets.lanes import (
     abs16,
@@ -49,7 +49,6 @@ from efficientnerf.backends.numba.tree.packets.layout import (
 )
 
 _HALF, _ONE, _NONE, _FAR = np.float32(0.5), np.float32(1), np.float32(0), np.float32(1e30)
-_STEP, _PER_STEP = np.float32(STEP), np.float32(1 / STEP)
 _SKIP = np.float32(0.5 + SKIP_MARGIN)
 
 
@@ -85,7 +84,7 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
     entry, voxels.
 
     shared  whether rays beside each other are neighbours
-    view    see `View`; its density scale is STEP, in units of the frame, times log2(e)
+    view    see `View`; its density scale is the step, in units of the frame, times log2(e)
     """
     ex, ey, ez = load16(floats, ENTRY_X), load16(floats, ENTRY_Y), load16(floats, ENTRY_Z)
     dx, dy, dz = load16(floats, ALONG_X), load16(floats, ALONG_Y), load16(floats, ALONG_Z)
@@ -95,6 +94,7 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
     slope_x, never_x, ahead_x, beside_x = _axis(dx)
     slope_y, never_y, ahead_y, beside_y = _axis(dy)
     slope_z, never_z, ahead_z, beside_z = _axis(dz)
+    step, per_step = np.float32(view.step), np.float32(1 / view.step)
     most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)
     some_near = view.min_distance > -np.inf
     # Integers are kept as float32: conversions would lengthen the dependency chain from step to step.
@@ -107,7 +107,7 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
         enters = lanes & (k >= until)
         entering = bits_of(enters)
         if entering != 0:
-            s = (k + _HALF) * _STEP
+            s = (k + _HALF) * step
             a = min16(max16(floor16((ex + s * dx) * per_brick), _NONE), most_x)
             e = min16(max16(floor16((ey + s * dy) * per_brick), _NONE), most_y)
             c = min16(max16(floor16((ez + s * dz) * per_brick), _NONE), most_z)
@@ -119,7 +119,7 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
             tx = ((a + beside_x + far * ahead_x) * width - ex) * slope_x + never_x
             ty = ((e + beside_y + far * ahead_y) * width - ey) * slope_y + never_y
             tz = ((c + beside_z + far * ahead_z) * width - ez) * slope_z + never_z
-            then = min16(max16(ceil16(min16(tx, min16(ty, tz)) * _PER_STEP - _SKIP), k + _ONE), last)
+            then = min16(max16(ceil16(min16(tx, min16(ty, tz)) * per_step - _SKIP), k + _ONE), last)
             full = enters & (leap == 0)
             until = select16(enters, then, until)
             k = select16(enters & (leap > 0), then, k)
@@ -133,7 +133,7 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
                     close = (close & ~filled) | (filled & bits_of(_near(a, e, c, grid, view)))
         inside = lanes & (k < until)
         if bits_of(inside) != 0:
-            s = (k + _HALF) * _STEP
+            s = (k + _HALF) * step
             x, y, z = bx + s * dx, by + s * dy, bz + s * dz
             voxel = to_int16(floor16(x) * layer + floor16(y) * row + floor16(z))
             word = gather16(grid.has_density, select16(inside, owner * words + (voxel >> 5), 0))

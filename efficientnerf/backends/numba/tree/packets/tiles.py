@@ -8,7 +8,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import advanced
-from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP, STEP
+from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
 from efficientnerf.backends.numba.tree.normals import add_normals
 from efficientnerf.backends.numba.tree.packets.layout import (
     ALONG_X,
@@ -78,6 +78,7 @@ class Scene(NamedTuple):
     direction_rate: float
     min_distance: Any
     density_scale: Any
+    step: float
     degree: int
 
 
@@ -147,7 +148,7 @@ def _cascade(n, scene):  # type: ignore[no-untyped-def]
         advanced(base.brick_index, first), base.voxel_index, base.density, base.terms, base.coded, base.sh, base.base, base.base_table, base.codes,
         base.groups, base.palette, base.entries, base.code_columns,
     )  # fmt: skip
-    return grid, View(advanced(scene.direction, 12 * n), scene.direction_rate, scene.min_distance[n], scene.density_scale[n], scene.degree)
+    return grid, View(advanced(scene.direction, 12 * n), scene.direction_rate, scene.min_distance[n], scene.density_scale[n], scene.step, scene.degree)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -227,11 +228,11 @@ def _part_of(part, lane, places):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _begin_part(part, count, clear, grid, scratch):  # type: ignore[no-untyped-def]
+def _begin_part(part, count, clear, grid, step, scratch):  # type: ignore[no-untyped-def]
     """Lays out the parts of rays in a cascade, their beginnings rounded to float32 as the samples are; returns whether there are any."""
     floats, places, some = scratch.floats, scratch.rays, False
     nx, ny, nz = grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick
-    most = most_samples(nx, ny, nz)
+    most = most_samples(nx, ny, nz, step)
     for lane in range(PACKET):
         floats[FIRST + lane] = floats[LAST + lane] = np.float32(0)
         if lane >= count or floats[TRANSMITTANCE + lane] < np.float32(PACKED_EARLY_STOP):
@@ -239,15 +240,15 @@ def _begin_part(part, count, clear, grid, scratch):  # type: ignore[no-untyped-d
         t0, t1 = _part_of(part, lane, places)
         if not t1 > t0:
             continue
-        last = int(np.ceil(min((t1 - t0) / STEP - 0.5, most)))
+        last = int(np.ceil(min((t1 - t0) / step - 0.5, most)))
         dx, dy, dz = places[DIRECTION + lane], places[DIRECTION + 16 + lane], places[DIRECTION + 32 + lane]
         ox, oy, oz = in_cascade(places[ORIGIN + lane], places[ORIGIN + 16 + lane], places[ORIGIN + 32 + lane], grid)
         # From so far away that rounding hides the grid nothing is seen: samples, which go on from the first, would lie beside the bricks.
-        s = max(last - 0.5, 0.0) * STEP
+        s = max(last - 0.5, 0.0) * step
         x, y, z = ox + t0 * dx, oy + t0 * dy, oz + t0 * dz
         if not (_in_box(x, y, z, nx, ny, nz) and _in_box(x + s * dx, y + s * dy, z + s * dz, nx, ny, nz)):
             continue
-        begin = int(min(max((clear - t0) / STEP - 0.5, 0.0), last))
+        begin = int(min(max((clear - t0) / step - 0.5, 0.0), last))
         floats[ENTRY_X + lane], floats[ENTRY_Y + lane], floats[ENTRY_Z + lane] = np.float32(x), np.float32(y), np.float32(z)
         floats[FIRST + lane], floats[LAST + lane], places[BEGIN + lane] = np.float32(begin), np.float32(last), t0
         some = some or begin < last
@@ -280,7 +281,7 @@ def _render_packet(tile, rays, scene, colours, with_normal, scratch):  # type: i
         if clear == np.inf:
             continue
         grid, view = _cascade(n, scene)
-        if _begin_part(part, count, clear, grid, scratch):
+        if _begin_part(part, count, clear, grid, scene.step, scratch):
             march(tile.low - tile.top > 1, grid, view, colours, scratch.floats, scratch.ints)
             _end_part(count, grid, with_normal, scratch)
 
