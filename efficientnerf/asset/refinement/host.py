@@ -20,8 +20,9 @@ from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.steps import NO_NEIGHBOURS, Hyperparameters, Moments, neighbours_of, step, values_of
+from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.patches import PatchGrid
 
@@ -55,7 +56,7 @@ def optimise(
     state.errors = error_map.errors
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
     moments = Moments(*none, state.square_density, state.square_sh, state.visits)
-    neighbours = neighbours_of(cells, len(state.density)) if rule.total_variation > 0 else NO_NEIGHBOURS
+    neighbours = neighbours_of(cells) if rule.total_variation > 0 else NO_NEIGHBOURS
     sides, cascades = cascade_sides(state.tree), voxel_cascades(state.tree)
     rates = np.full(state.sh.shape[1], sh_lr, np.float32)
     rates[3:] *= view_dependent_lr_ratio

@@ -17,8 +17,9 @@ from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
+from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Hyperparameters, neighbours_of, step, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Hyperparameters, step, sum_gradients, values_of
 from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
@@ -185,7 +186,7 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     cells = cells_of(tree_grid(tree))
     old = np.log(plain.density.astype(np.float64) * voxel_sides(tree))
     for o, more in ((plain, {}), (smooth, {"total_variation": weight})):
-        step(records_of(tree, o, 1), values_of(cells, o.density, o.sh), empty_moments(o, adam=False), rule_of(tree, o, **more), neighbours_of(cells, len(old)))
+        step(records_of(tree, o, 1), values_of(cells, o.density, o.sh), empty_moments(o, adam=False), rule_of(tree, o, **more), neighbours_of(cells))
     np.testing.assert_array_equal(plain.square_density, smooth.square_density)
     moved = np.log(plain.density / smooth.density)
     np.testing.assert_array_equal(moved[plain.visits == 0], 0)
@@ -206,6 +207,6 @@ def test_total_variation_smooths_what_was_met_alone(made: Callable[[], NerfTree]
     before = o.density.copy()
     values = values_of(cells_of(tree_grid(tree)), o.density, o.sh)
     step(records_of(tree, o, 2), values, empty_moments(o, adam=False), rule_of(tree, o, total_variation=1e6),
-         neighbours_of(cells_of(tree_grid(tree)), len(o.density)))  # fmt: skip
+         neighbours_of(cells_of(tree_grid(tree))))  # fmt: skip
     np.testing.assert_array_equal(o.density[o.visits == 0], before[o.visits == 0])
     assert (o.density != before)[o.visits > 0].mean() > 0.8

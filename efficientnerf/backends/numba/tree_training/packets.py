@@ -138,8 +138,8 @@ def voxel_places(cells: Cells, voxels: int) -> np.ndarray:
 
 
 def dense_densities(cells: Cells, places: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Densities of all voxels of all bricks, 0 where none is stored, with a brick of zeros at the end."""
-    dense = np.zeros(cells.voxel_index.size + cells.brick**3, density.dtype)
+    """Densities of all voxels of all bricks, -0 where none is stored, with a brick of these at the end."""
+    dense = np.full(cells.voxel_index.size + cells.brick**3, -0.0, density.dtype)
     dense[places] = density
     return dense
 

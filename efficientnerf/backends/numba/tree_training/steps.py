@@ -14,14 +14,17 @@ step: the gradient of half the squared differences, apart from the moments as th
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import fmuladd, pointer
+from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, lowest_bit, store16
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
+from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
 from efficientnerf.backends.numba.tree_training.packets import Cells, dense_densities, voxel_places
+from efficientnerf.backends.numba.tree_training.rows import LANES, channels_from, load_first16, multiply_add16, padded, rows_of, store_first16, sum16
 from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
 
 MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invisible, and opaque
@@ -100,57 +103,48 @@ def values_of(cells: Cells, density: np.ndarray, sh: np.ndarray) -> Values:
     return Values(density, sh, places, dense_densities(cells, places, density))
 
 
-class Neighbours(NamedTuple):
-    """Bricks beside bricks, for total variation; without rows where there is none.
+class StepPointers(NamedTuple):
+    """What a step of one voxel reads and writes: pointers to arrays of records, values, moments and hyperparameters, and
 
-    density  (N,) before the step
-    around   (B, 6) int32 bricks beyond the faces -x, x, -y, y, -z, z of a brick, -1 where none is stored
+    bases          (P, padded) of `rows_of`
+    following      of `_link`
+    row            (padded,) the gradient by a voxel's coefficients
+    stride, width  3 K, and three times the coefficients that have gradients
+    of_*           `corrections` of the moments, and the last one of these
     """
 
-    density: np.ndarray
-    around: np.ndarray
-    voxel_index: np.ndarray
+    numbers: Any
+    gradient: Any
+    bases: Any
+    following: Any
+    row: Any
+    stride: int
+    width: int
+    padded: int
+    density: Any
+    sh: Any
+    places: Any
+    dense: Any
+    mean_density: Any
+    mean_sh: Any
+    square_density: Any
+    square_sh: Any
+    visits: Any
+    sides: Any
+    cascades: Any
+    rates: Any
+    of_square: Any
+    of_square_end: int
+    of_mean: Any
+    of_mean_end: int
+    around: Any
     brick: int
 
 
-def neighbours_of(cells: Cells, voxels: int) -> Neighbours:
-    """Of a tree of so many voxels. Those of different cascades are no neighbours."""
-    around = np.full((len(cells.voxel_index), 6), -1, np.int32)
-    for shape, first in zip(cells.shape.tolist(), cells.first.tolist(), strict=True):
-        index = cells.brick_index[first : first + int(np.prod(shape))].reshape(shape)
-        padded = np.pad(index, 1, constant_values=-1)
-        for face in range(6):
-            shift = [slice(1, -1)] * 3
-            shift[face // 2] = slice(2, None) if face % 2 else slice(None, -2)
-            around[index[index >= 0], face] = padded[tuple(shift)][index >= 0]
-    return Neighbours(np.zeros(voxels, np.float32), around, cells.voxel_index, cells.brick)
-
-
-NO_NEIGHBOURS = Neighbours(np.zeros(0, np.float32), np.zeros((0, 6), np.int32), np.zeros((0, 1), np.int32), 1)
-
-
 @numba.njit(cache=True, error_model="numpy")
-def _neighbour(place, face, neighbours):  # type: ignore[no-untyped-def]
-    """The voxel beyond a face of the one at a place, -1 where none is stored."""
-    brick = neighbours.brick
-    cube = brick * brick * brick
-    owner, at = place // cube, place % cube
-    stride = brick * brick if face < 2 else brick if face < 4 else 1
-    x = at // stride % brick
-    if face & 1:
-        if x + 1 < brick:
-            return neighbours.voxel_index[owner, at + stride]
-        other, at = neighbours.around[owner, face], at - (brick - 1) * stride
-    else:
-        if x > 0:
-            return neighbours.voxel_index[owner, at - stride]
-        other, at = neighbours.around[owner, face], at + (brick - 1) * stride
-    return neighbours.voxel_index[other, at] if other >= 0 else np.int32(-1)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _link(low, chunks, slab, records, head, following):  # type: ignore[no-untyped-def]
-    """Lists of the records of each voxel of a bin, in their order: head[v - low], and following[n], where n counts the records of the bin."""
+def _link(low, chunks, slab, records, head, following, some):  # type: ignore[no-untyped-def]
+    """Lists of the records of each voxel of a bin, in their order: head[v - low], and following[n], where n counts the records of the bin; a bit of `some` for
+    each voxel that has any."""
     number = 0
     for chunk in range(chunks):
         number += records.begin[chunk, slab + 1] - records.begin[chunk, slab]
@@ -162,36 +156,51 @@ def _link(low, chunks, slab, records, head, following):  # type: ignore[no-untyp
             v = records.numbers[at, 0] - low
             following[number, 0], following[number, 1] = at, head[v]
             head[v] = number
+            some[v >> 6] |= np.int64(1) << (v & 63)
     return 0
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _gather(number, terms, records, following, gradient):  # type: ignore[no-untyped-def]
-    """Sum of the records of a list into `gradient` (3 terms,); returns that by density."""
-    by_density = 0.0
-    gradient[: 3 * terms] = 0
-    while number >= 0:
-        at = following[number, 0]
-        red, green, blue = records.gradient[at, 0], records.gradient[at, 1], records.gradient[at, 2]
-        by_density += records.gradient[at, 3]
-        basis = records.basis[records.numbers[at, 1]]
-        for k in range(terms):
-            gradient[3 * k] = fmuladd(basis[k], red, gradient[3 * k])
-            gradient[3 * k + 1] = fmuladd(basis[k], green, gradient[3 * k + 1])
-            gradient[3 * k + 2] = fmuladd(basis[k], blue, gradient[3 * k + 2])
-        number = following[number, 1]
-    return by_density
+def _link_all(low, slab, records, head, following, some):  # type: ignore[no-untyped-def]
+    """`_link` with as much room as it needs: `following`, or a larger one."""
+    more = _link(low, records.begin.shape[0], slab, records, head, following, some)
+    if more > 0:
+        following = np.empty((2 * more, 2), np.int64)
+        _link(low, records.begin.shape[0], slab, records, head, following, some)
+    return following
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _beyond_neighbours(place, thickness, voxel, neighbours):  # type: ignore[no-untyped-def]
-    """Gradient of the total variation by the logarithm of a voxel's optical thickness."""
-    here, slope = np.log(thickness), 0.0
-    for face in range(6):
-        other = _neighbour(place, face, neighbours)
-        if other >= 0:
-            slope += here - np.log(max(neighbours.density[other] * voxel, MIN_THICKNESS))
-    return slope
+def _take_voxels(some, met):  # type: ignore[no-untyped-def]
+    """Numbers of the bits that are set, into `met`; returns how many, and sets none."""
+    count = 0
+    for word in range(len(some)):
+        bits = some[word]
+        some[word] = 0
+        while bits != 0:
+            met[count] = 64 * word + lowest_bit(bits)
+            bits &= bits - 1
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _gather(number, p):  # type: ignore[no-untyped-def]
+    """Sum of the records of a list into `p.row`; returns that by density, and the sum of the squares of the row."""
+    by_density, squares, n = 0.0, broadcast16(np.float32(0)), number
+    while n >= 0:
+        by_density += p.gradient[4 * p.following[2 * n] + 3]
+        n = p.following[2 * n + 1]
+    for j in range(0, p.padded, LANES):
+        total, n = broadcast16(np.float32(0)), number
+        while n >= 0:
+            at = p.following[2 * n]
+            basis = load16(p.bases, p.padded * np.int64(p.numbers[2 * at + 1]) + j)
+            total = multiply_add16(basis, channels_from(p.gradient, 4 * at, j), total)
+            n = p.following[2 * n + 1]
+        squares = multiply_add16(total, total, squares)
+        store16(p.row, j, total)
+    return by_density, np.float64(sum16(squares))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -206,128 +215,142 @@ def _regularised(slope, thickness, h):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _update(v, by_density, gradient, terms, values, moments, neighbours, h, of_square, of_mean):  # type: ignore[no-untyped-def]
-    """A step of one voxel; of_square, of_mean: `corrections` of the moments."""
+def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
+    """A step of one voxel, whose gradient by coefficients is `p.row` and the sum of its squares `squares`."""
     decay, epsilon, momentum = h.decay, h.epsilon, h.momentum
-    visits = min(moments.visits[v] + 1, MAX_VISITS)
-    moments.visits[v] = visits
-    correction, voxel = np.float64(of_square[min(visits, len(of_square) - 1)]), h.sides[h.cascades[v]]
+    visits = min(np.int64(p.visits[v]) + 1, MAX_VISITS)
+    p.visits[v] = np.int32(visits)
+    correction, voxel = np.float64(p.of_square[min(visits, p.of_square_end)]), p.sides[p.cascades[v]]
     # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
-    thickness = max(values.density[v] * voxel, MIN_THICKNESS)
+    thickness = max(p.density[v] * voxel, MIN_THICKNESS)
     slope = _regularised(by_density / voxel * thickness, thickness, h)
-    square = decay * moments.square_density[v] + (1 - decay) * slope * slope
-    moments.square_density[v] = square
+    square = decay * p.square_density[v] + (1 - decay) * slope * slope
+    p.square_density[v] = np.float32(square)
     ahead = 1.0
     if momentum > 0:
-        ahead = np.float64(of_mean[min(visits, len(of_mean) - 1)])
-        slope = momentum * moments.density[v] + (1 - momentum) * slope
-        moments.density[v] = slope
+        ahead = np.float64(p.of_mean[min(visits, p.of_mean_end)])
+        slope = momentum * p.mean_density[v] + (1 - momentum) * slope
+        p.mean_density[v] = np.float32(slope)
     change = h.density_rate * ahead * slope / (np.sqrt(square * correction) + epsilon)
     if h.total_variation > 0:
-        change += min(h.density_rate * h.total_variation, MOST_VARIATION) * _beyond_neighbours(values.places[v], thickness, voxel, neighbours)
-    new_density = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel
-    values.density[v] = values.dense[values.places[v]] = new_density
-    row, rates = values.sh[v], h.sh_rates
-    red = green = blue = gradient.dtype.type(0)  # three sums, as one would wait for itself
-    for k in range(terms):
-        red = fmuladd(gradient[3 * k], gradient[3 * k], red)
-        green = fmuladd(gradient[3 * k + 1], gradient[3 * k + 1], green)
-        blue = fmuladd(gradient[3 * k + 2], gradient[3 * k + 2], blue)
-    square = decay * moments.square_sh[v] + (1 - decay) * (red + green + blue) / (3 * terms)
-    moments.square_sh[v] = square
-    scale = gradient.dtype.type(ahead / (np.sqrt(square * correction) + epsilon))
-    if momentum > 0:
-        running, old, new = moments.sh[v], gradient.dtype.type(momentum), gradient.dtype.type(1 - momentum)
-        for j in range(3 * terms):
-            running[j] = old * running[j] + new * gradient[j]
-            row[j] = fmuladd(-scale * rates[j], running[j], row[j])
-    else:
-        for j in range(3 * terms):
-            row[j] = fmuladd(-scale * rates[j], gradient[j], row[j])
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _link_all(low, slab, records, head, following):  # type: ignore[no-untyped-def]
-    """`_link` with as much room as it needs: `following`, or a larger one."""
-    more = _link(low, records.begin.shape[0], slab, records, head, following)
-    if more > 0:
-        following = np.empty((2 * more, 2), np.int64)
-        _link(low, records.begin.shape[0], slab, records, head, following)
-    return following
+        share = min(h.density_rate * h.total_variation, MOST_VARIATION)
+        change += share * differences(p.places[v], thickness, voxel, MIN_THICKNESS, p.brick, p.dense, p.around)
+    p.density[v] = np.float32(min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel)
+    square = decay * p.square_sh[v] + (1 - decay) * squares / p.width
+    p.square_sh[v] = np.float32(square)
+    scale = np.float32(-ahead / (np.sqrt(square * correction) + epsilon))
+    for j in range(0, p.width, LANES):
+        by, at, count = load16(p.row, j), v * p.stride + j, p.width - j
+        if momentum > 0:
+            by = load_first16(p.mean_sh, at, count) * np.float32(momentum) + by * np.float32(1 - momentum)
+            store_first16(p.mean_sh, at, by, count)
+        store_first16(p.sh, at, multiply_add16(load16(p.rates, j) * scale, by, load_first16(p.sh, at, count)), count)
 
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _fetch(v, values, moments):  # type: ignore[no-untyped-def]
-    """Bring what a step of a voxel reads into the caches."""
-    width = values.sh.shape[1]
-    prefetch(pointer(values.density), v)
-    prefetch(pointer(moments.square_density), v)
-    prefetch(pointer(moments.square_sh), v)
-    prefetch(pointer(moments.visits), v)
-    for j in range(0, width, 16):
-        prefetch(pointer(values.sh), v * width + j)
-    prefetch(pointer(values.sh), v * width + width - 1)
+def _fetch(v, number, p):  # type: ignore[no-untyped-def]
+    """Bring what a step of a voxel with such a first record reads into the caches."""
+    prefetch(p.density, v)
+    prefetch(p.square_density, v)
+    prefetch(p.square_sh, v)
+    prefetch(p.visits, v)
+    prefetch(p.dense, p.places[v])
+    prefetch(p.gradient, 4 * p.following[2 * number])
+    for j in range(0, p.stride, 16):
+        prefetch(p.sh, v * p.stride + j)
+    prefetch(p.sh, v * p.stride + p.stride - 1)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _step_pointers(records, rows, following, row, values, moments, neighbours, h, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
+    """See `StepPointers`."""
+    return StepPointers(
+        pointer(records.numbers), pointer(records.gradient), pointer(rows), pointer(following), pointer(row), values.sh.shape[1], width, rows.shape[1],
+        pointer(values.density), pointer(values.sh), pointer(values.places), pointer(values.dense), pointer(moments.density), pointer(moments.sh),
+        pointer(moments.square_density), pointer(moments.square_sh), pointer(moments.visits), pointer(h.sides), pointer(h.cascades), pointer(rates),
+        pointer(of_square), len(of_square) - 1, pointer(of_mean), len(of_mean) - 1, pointer(neighbours.around), neighbours.brick,
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _step_bins(task, records, values, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
     """Takes bins until none is left."""
     bins, size = records.begin.shape[1] - 1, 1 << BIN_BITS
-    terms, met = min(hyperparameters.terms, values.sh.shape[1] // 3), np.empty(size + 1, np.int64)
-    head, following, gradient = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64), np.empty(values.sh.shape[1], values.sh.dtype)
+    met, some, row = np.empty(size, np.int64), np.zeros(size >> 6, np.int64), np.empty(rows.shape[1], np.float32)
+    head, following = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64)
     slab = take_next(pointer(task))
     while slab < bins:
         low = slab << BIN_BITS
-        following = _link_all(low, slab, records, head, following)
-        count = 0
-        for n in range(min(len(values.density) - low, size)):
-            met[count] = n
-            count += 1 if head[n] >= 0 else 0
+        following = _link_all(low, slab, records, head, following, some)
+        p = _step_pointers(records, rows, following, row, values, moments, neighbours, h, rates, of_square, of_mean, width)
+        count = _take_voxels(some, met)
         for n in range(count):
             v = low + met[n]
+            if n + 2 * AHEAD < count:
+                prefetch(p.places, low + met[n + 2 * AHEAD])
             if n + AHEAD < count:
-                _fetch(low + met[n + AHEAD], values, moments)
-            by_density = _gather(head[v - low], terms, records, following, gradient)
-            head[v - low] = -1
-            _update(v, by_density, gradient, terms, values, moments, neighbours, hyperparameters, of_square, of_mean)
+                _fetch(low + met[n + AHEAD], head[met[n + AHEAD]], p)
+            by_density, squares = _gather(head[met[n]], p)
+            head[met[n]] = -1
+            _update(v, by_density, squares, p, h)
         slab = take_next(pointer(task))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _step(workers, task, records, values, moments, neighbours, hyperparameters, of_square, of_mean):  # type: ignore[no-untyped-def]
+def _step(workers, task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
     for _ in numba.prange(workers):
-        _step_bins(task, records, values, moments, neighbours, hyperparameters, of_square, of_mean)
+        _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_square, of_mean, width)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _copy_bins(task, records, values):  # type: ignore[no-untyped-def]
+    """Copies the densities of voxels that have records to where rays find them, until no bin is left."""
+    bins, chunks = records.begin.shape[1] - 1, records.begin.shape[0]
+    slab = take_next(pointer(task))
+    while slab < bins:
+        for chunk in range(chunks):
+            for at in range(records.begin[chunk, slab], records.begin[chunk, slab + 1]):
+                v = records.numbers[at, 0]
+                values.dense[values.places[v]] = values.density[v]
+        slab = take_next(pointer(task))
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _copy(workers, task, records, values):  # type: ignore[no-untyped-def]
+    for _ in numba.prange(workers):
+        _copy_bins(task, records, values)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _sum_gradients(records, grad_density, grad_sh):  # type: ignore[no-untyped-def]
     bins, terms, size = records.begin.shape[1] - 1, grad_sh.shape[1] // 3, 1 << BIN_BITS
-    head, following, gradient = np.full(size, -1, np.int64), np.empty((1024, 2), np.int64), np.empty(grad_sh.shape[1], grad_sh.dtype)
     for slab in range(bins):
-        low = slab << BIN_BITS
-        following = _link_all(low, slab, records, head, following)
-        for v in range(low, min(len(grad_density), low + size)):
-            number = head[v - low]
-            if number >= 0:
-                head[v - low] = -1
-                grad_density[v] += _gather(number, terms, records, following, gradient)
-                grad_sh[v] += gradient
+        for chunk in range(records.begin.shape[0]):
+            for at in range(records.begin[chunk, slab], records.begin[chunk, slab + 1]):
+                v, basis = records.numbers[at, 0], records.basis[records.numbers[at, 1]]
+                grad_density[v] += records.gradient[at, 3]
+                for k in range(terms):
+                    for channel in range(3):
+                        grad_sh[v, 3 * k + channel] += basis[k] * records.gradient[at, channel]
 
 
 def step(
     records: Records, values: Values, moments: Moments, hyperparameters: Hyperparameters, neighbours: Neighbours = NO_NEIGHBOURS
 ) -> None:
-    """A step for the voxels that the records name; the others stay.
+    """A step for the voxels that the records name; the others stay. float32.
 
         s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
         p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
     """
-    if hyperparameters.total_variation > 0:
-        np.copyto(neighbours.density, values.density)
+    h, count = hyperparameters, records.begin.shape[1] - 1
+    terms = min(h.terms, values.sh.shape[1] // 3)
+    rows, rates, workers = rows_of(records.basis, terms), np.zeros(padded(3 * terms), np.float32), min(numba.get_num_threads(), count)
+    rates[: 3 * terms] = h.sh_rates[: 3 * terms]
     _step(
-        min(numba.get_num_threads(), records.begin.shape[1] - 1), np.zeros(1, np.int64), records, values, moments, neighbours, hyperparameters,
-        corrections(hyperparameters.decay), corrections(hyperparameters.momentum),
-    )  # fmt: skip
+        workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum), 3 * terms
+    )
+    # Not before all bins are done: total variation is that of the densities before the step.
+    _copy(workers, np.zeros(1, np.int64), records, values)
 
 
 def sum_gradients(records: Records, grad_density: np.ndarray, grad_sh: np.ndarray) -> None:
