@@ -22,6 +22,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import fmuladd, pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
+from efficientnerf.backends.numba.tree_training.corners import add_spread, mixed
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
     FIRST_BLOCKS,
@@ -136,32 +137,11 @@ def _fill_colours(basis, terms, sh, tree, packet):  # type: ignore[no-untyped-de
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _shade(n, packet):  # type: ignore[no-untyped-def]
     """Colour of a sample, sigmoids of what is interpolated between the corners that are stored; kept in `packet.shade`."""
-    colour, slots, weights = packet.colour, packet.slots, packet.weights
-    at = 4 * np.int64(slots[8 * n])
-    w = weights[8 * n]
-    red, green, blue, total = w * colour[at], w * colour[at + 1], w * colour[at + 2], w * colour[at + 3]
-    for corner in range(1, 8):
-        at = 4 * np.int64(slots[8 * n + corner])
-        w = weights[8 * n + corner]
-        red += w * colour[at]
-        green += w * colour[at + 1]
-        blue += w * colour[at + 2]
-        total += w * colour[at + 3]
+    red, green, blue, total = mixed(packet.colour, packet.slots, packet.weights, 8 * n)
     inverse = cast_like(1, total) / total if total > 0 else 0 * total
     r, g, b = sigmoid(red * inverse), sigmoid(green * inverse), sigmoid(blue * inverse)
     packet.shade[4 * n], packet.shade[4 * n + 1], packet.shade[4 * n + 2], packet.shade[4 * n + 3] = r, g, b, inverse
     return r, g, b
-
-
-@numba.njit(cache=True, forceinline=True, error_model="numpy")
-def _add_gradient(n, red, green, blue, density, packet):  # type: ignore[no-untyped-def]
-    """Adds a sample's gradients to those of its eight slots."""
-    gradient, slots, weights = packet.gradient, packet.slots, packet.weights
-    for corner in range(8):
-        at = 4 * np.int64(slots[8 * n + corner])
-        w = weights[8 * n + corner]
-        a, b, c, d = gradient[at] + w * red, gradient[at + 1] + w * green, gradient[at + 2] + w * blue, gradient[at + 3] + w * density
-        gradient[at], gradient[at + 1], gradient[at + 2], gradient[at + 3] = a, b, c, d
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -194,9 +174,9 @@ def _composite_ray(ray, begin, end, left, targets, packet):  # type: ignore[no-u
         green += weight * g
         blue += weight * b
         scale = weight * inverse
-        _add_gradient(
-            n, kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)), kind(by_blue * scale * b * (1 - b)),
-            kind(by_depth * light[3 * n + 2]), packet,
+        add_spread(
+            packet.gradient, packet.slots, packet.weights, 8 * n, kind(by_red * scale * r * (1 - r)), kind(by_green * scale * g * (1 - g)),
+            kind(by_blue * scale * b * (1 - b)), kind(by_depth * light[3 * n + 2]),
         )  # fmt: skip
     return loss
 
