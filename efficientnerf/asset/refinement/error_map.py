@@ -15,6 +15,7 @@ MAX_CELLS = 2**22
 PART = 2**20  # tiles that are counted at a time
 INTERVAL = 32  # steps after which the chances are set again
 MEMORY = 0.5  # of the running mean, kept by each new error
+UNIFORM = 0.1  # share of the patches that are drawn from all tiles alike, so that no error is believed for ever; docs/experiments/tree-training.md
 MOST = 4.0  # times the mean that the root of a cell's error counts, at most: what nothing can learn should not take all rays
 
 
@@ -81,16 +82,17 @@ class ErrorMap:
         return found
 
     def _set_chances(self) -> None:
-        """Chances in proportion to the root of the error and the number of tiles that may be drawn; of a cell without an error yet, as of the mean."""
+        """Chances of tiles that may be drawn: the share UNIFORM for all alike, the rest in proportion to the root of the error, of a cell without one as of the
+        mean."""
         known = (self.errors[1] >= 0) & (self.met > 0)
         root = np.sqrt(np.maximum(self.errors[1], 0), dtype=np.float32)
         mean = np.average(root[known], weights=self.met[known]) if known.any() else 0.0
         chance = np.where(known, np.minimum(root, MOST * mean), mean) if mean > 0 else np.ones(len(root))
+        chance += UNIFORM / (1 - UNIFORM) * np.average(chance, weights=self.met)
         cumulative = np.cumsum(chance * self.met, dtype=np.float64)
         self.cumulative = cumulative / cumulative[-1]
         # Were all tiles alike, each would have one chance of its number.
-        with np.errstate(divide="ignore"):
-            self.factor = np.where(chance > 0, cumulative[-1] / (chance * self.met.sum()), 0).astype(np.float32)
+        self.factor = (cumulative[-1] / (chance * self.met.sum())).astype(np.float32)
 
     def draw(self, count: int, rng: np.random.Generator) -> Drawn:
         """Patches of about `count` pixels, at least one, with replacement; none is empty."""

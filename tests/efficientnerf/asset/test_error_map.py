@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.refinement import error_map
-from efficientnerf.asset.refinement.error_map import MOST, Drawn, ErrorMap, count_cells
+from efficientnerf.asset.refinement.error_map import MOST, UNIFORM, Drawn, ErrorMap, count_cells
 from efficientnerf.training.patches import PatchGrid
 from tests.efficientnerf.small_views import views
 
@@ -34,10 +34,32 @@ def test_chances_are_the_roots_of_errors_limited_and_the_mean_is_unbiased() -> N
     root = np.sqrt(np.maximum(errors[1], 0))
     mean = root[errors[1] >= 0].mean()
     wanted = np.minimum(np.where(errors[1] < 0, mean, root), MOST * mean)
-    np.testing.assert_allclose(chances(made), wanted / wanted.sum(), rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(chances(made), UNIFORM / len(grid) + (1 - UNIFORM) * wanted / wanted.sum(), rtol=1e-5, atol=1e-12)
     values = rng.random(len(grid))
-    there = chances(made) > 0
-    np.testing.assert_allclose((chances(made) * made.factor * values)[there].sum(), values[there].sum() / len(grid), rtol=1e-5)
+    np.testing.assert_allclose((chances(made) * made.factor * values).sum(), values.sum() / len(grid), rtol=1e-5)
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-30, 1e30])
+@pytest.mark.parametrize("tiles", [None, 20])
+def test_no_tile_with_rays_is_left_out_for_its_error(error: float, tiles: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever was recorded of it, and of the others: it is drawn again, so that its error is renewed."""
+    if tiles is not None:
+        monkeypatch.setattr(error_map, "MAX_CELLS", tiles)
+    grid = PatchGrid(views(), 2)
+    met = np.arange(len(grid)) % 7 != 0
+    errors = np.full((2, count_cells(grid)), 0.3, np.float32)
+    errors[1, ::2] = error
+    made = ErrorMap(grid, met if tiles is None else None, errors)
+    assert (chances(made) >= 0.999 * UNIFORM * made.met / made.met.sum()).all()
+    assert (chances(made)[made.met == 0] == 0).all()
+    assert chances(made).sum() == pytest.approx(1)
+    values = np.random.default_rng(6).random(len(made.met))
+    np.testing.assert_allclose((chances(made) * made.factor * values).sum(), (values * made.met).sum() / made.met.sum(), rtol=1e-5)
+    if error == 0:
+        drawn = made.draw(20_000, np.random.default_rng(7))
+        made.record(drawn, np.full(len(drawn.patches.pixels), 0.3))
+        made.set_chances()
+        assert (made.errors[1, ::2] > 0)[(made.met > 0)[::2]].mean() > 0.95
 
 
 def test_recorded_errors_are_running_means_of_which_the_greatest_counts() -> None:

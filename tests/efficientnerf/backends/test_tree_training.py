@@ -14,12 +14,13 @@ from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_si
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import initial_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
+from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
-from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
+from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Hyperparameters, step, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Hyperparameters, Values, step, sum_gradients, values_of
 from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
@@ -130,6 +131,16 @@ def test_the_same_bytes_on_any_number_of_threads() -> None:
         np.testing.assert_array_equal(a, b)
 
 
+@numba.njit
+def _slope_at(place, thickness, side, least, brick, dense, around):  # type: ignore[no-untyped-def]
+    return differences(place, thickness, side, least, brick, pointer(dense), pointer(around))
+
+
+def slope_of(values: Values, beside: Neighbours, v: int, thickness: float, side: float) -> float:
+    found: float = _slope_at(values.places[v], thickness, side, MIN_THICKNESS, beside.brick, values.dense, beside.around)
+    return found
+
+
 def penalty(tree: NerfTree, log_thickness: np.ndarray, old: np.ndarray, met: np.ndarray, kind: str) -> float:
     """The term of weight one, over the voxels that were met, by the formula of the module; the neighbours' thickness is the old one."""
     thickness = np.exp(log_thickness)
@@ -198,6 +209,45 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
             by[v] += side
             ends.append(penalty(tree, by, old, np.arange(len(old)) == v, "total_variation"))
         assert moved[v] == pytest.approx(share * (ends[0] - ends[1]) / 2e-5, rel=2e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_rows_of_any_length_take_their_own_gradient_and_no_other(degree: int) -> None:
+    """Rows lie end to end, and the groups of sixteen numbers that a step works in reach beyond them."""
+    tree = random_tree(6, brick=2, degree=degree)
+    o = initial_state(tree)
+    records, before = records_of(tree, o, 1), o.sh.copy()
+    by_density, by_sh = np.zeros(o.density.shape), np.zeros(o.sh.shape)
+    sum_gradients(records, by_density, by_sh)
+    rule = rule_of(tree, o)
+    step(records, values_of(cells_of(tree_grid(tree)), o.density, o.sh), empty_moments(o, adam=False), rule)
+    met = o.visits > 0
+    assert 0 < met.sum() < len(met)
+    np.testing.assert_array_equal(o.sh[~met], before[~met])
+    size = np.sqrt((by_sh**2).mean(axis=1, keepdims=True))
+    np.testing.assert_allclose((before - o.sh)[met], (rule.sh_rates * by_sh / (size + 1e-12))[met], rtol=1e-3, atol=2e-6)
+    np.testing.assert_allclose(np.sqrt(o.square_sh / 0.1)[met], size[met, 0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("brick", [1, 3, 4])
+@pytest.mark.parametrize("made", [random_tree, random_cascades], ids=["one grid", "cascades"])
+def test_voxels_without_density_are_neighbours_and_absent_ones_are_not(made: Callable[..., NerfTree], brick: int) -> None:
+    tree = made(7, brick=brick, degree=0)
+    density = np.random.default_rng(0).uniform(1, 30, len(tree.density_values)).astype(np.float32)
+    density[::3] = 0
+    tree = replace(tree, density_values=density)
+    cells, sides = cells_of(tree_grid(tree)), voxel_sides(tree)
+    values, beside = values_of(cells, density, tree.sh.reshape(len(density), -1)), neighbours_of(cells)
+    thickness = np.maximum(density * sides, MIN_THICKNESS)
+    at = np.concatenate([voxel_coordinates(tree), voxel_cascades(tree)[:, None]], axis=1)
+    number = {tuple(place): n for n, place in enumerate(at.tolist())}
+    counts = []
+    for v in np.random.default_rng(1).choice(len(density), min(40, len(density)), replace=False):
+        found = [number.get(tuple((at[v] + way * np.eye(4, dtype=int)[axis]).tolist())) for axis in range(3) for way in (-1, 1)]
+        wanted = sum(np.log(thickness[v] / thickness[n]) for n in found if n is not None)
+        assert slope_of(values, beside, v, thickness[v], sides[v]) == pytest.approx(wanted, rel=1e-5, abs=1e-5)
+        counts.append(sum(n is not None for n in found))
+    assert max(counts) > min(counts)
 
 
 @pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])

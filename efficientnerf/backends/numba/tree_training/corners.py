@@ -14,8 +14,9 @@ CORNERS = 8
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
 
 
-def _corner(builder: Any, values: Any, slots: Any, weights: Any, at: Any, n: int) -> tuple[Any, Any]:
+def _corner(builder: Any, args: Any, n: int) -> tuple[Any, Any]:
     """Address of the group of corner n, and its weight four times."""
+    values, slots, weights, at = args[:4]
     index = builder.add(at, ir.Constant(_I64, n))
     slot = builder.shl(builder.sext(builder.load(builder.gep(slots, [index])), _I64), ir.Constant(_I64, 2))
     weight = splat(builder, builder.load(builder.gep(weights, [index])), 4)
@@ -34,7 +35,7 @@ def mixed(typing_context: Any, values: Any, slots: Any, weights: Any, at: Any) -
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         sums: list[Any] = [None, None]  # two chains, which do not wait for each other
         for n in range(CORNERS):
-            address, weight = _corner(builder, *args, n)
+            address, weight = _corner(builder, args, n)
             value, total = builder.load(address, align=_bytes(kind)), sums[n % 2]
             sums[n % 2] = builder.fmul(weight, value) if total is None else multiply_add(builder, weight, value, total)
         total = builder.fadd(*sums)
@@ -54,7 +55,7 @@ def add_spread(typing_context: Any, values: Any, slots: Any, weights: Any, at: A
         for n, number in enumerate(args[4:]):
             four = builder.insert_element(four, number, ir.Constant(_I32, n))
         for n in range(CORNERS):
-            address, weight = _corner(builder, *args[:4], n)
+            address, weight = _corner(builder, args, n)
             builder.store(multiply_add(builder, weight, four, builder.load(address, align=_bytes(kind))), address, align=_bytes(kind))
         return context.get_dummy_value()
 

@@ -218,7 +218,7 @@ def _regularised(slope, thickness, h):  # type: ignore[no-untyped-def]
 def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     """A step of one voxel, whose gradient by coefficients is `p.row` and the sum of its squares `squares`."""
     decay, epsilon, momentum = h.decay, h.epsilon, h.momentum
-    visits = min(np.int64(p.visits[v]) + 1, MAX_VISITS)
+    visits = np.int64(min(p.visits[v] + 1, MAX_VISITS))
     p.visits[v] = np.int32(visits)
     correction, voxel = np.float64(p.of_square[min(visits, p.of_square_end)]), p.sides[p.cascades[v]]
     # With respect to the logarithm of the optical thickness; at least MIN_THICKNESS, so that density may appear.
@@ -235,7 +235,8 @@ def _update(v, by_density, squares, p, h):  # type: ignore[no-untyped-def]
     if h.total_variation > 0:
         share = min(h.density_rate * h.total_variation, MOST_VARIATION)
         change += share * differences(p.places[v], thickness, voxel, MIN_THICKNESS, p.brick, p.dense, p.around)
-    p.density[v] = np.float32(min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS) / voxel)
+    thickness = min(max(thickness * np.exp(-change), MIN_THICKNESS), MAX_THICKNESS)
+    p.density[v] = np.float32(thickness / voxel)
     square = decay * p.square_sh[v] + (1 - decay) * squares / p.width
     p.square_sh[v] = np.float32(square)
     scale = np.float32(-ahead / (np.sqrt(square * correction) + epsilon))
@@ -323,7 +324,7 @@ def _copy(workers, task, records, values):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def _sum_gradients(records, grad_density, grad_sh):  # type: ignore[no-untyped-def]
-    bins, terms, size = records.begin.shape[1] - 1, grad_sh.shape[1] // 3, 1 << BIN_BITS
+    bins, terms = records.begin.shape[1] - 1, grad_sh.shape[1] // 3
     for slab in range(bins):
         for chunk in range(records.begin.shape[0]):
             for at in range(records.begin[chunk, slab], records.begin[chunk, slab + 1]):
