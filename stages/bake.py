@@ -112,6 +112,11 @@ class BakeSettings:
     total_variation: NonNegative = setting(
         0.01, "Weight of the total variation of the logarithm of the optical thickness between a voxel and those beside it.", advanced=True
     )
+    error_map: Annotated[float, Meta(ge=0.0, lt=1.0)] | Auto = setting(
+        "auto",
+        "Share of the refinement's rays that are drawn where earlier errors were large; auto: 0.9 with a constant background, 0 without.",
+        advanced=True,
+    )
     lr_final_ratio: Fraction = setting(0.1, "Ratio to which the learning rates of the refinement fall exponentially.", advanced=True)
     licence: str = setting("", "Licence text to write into the asset.")
 

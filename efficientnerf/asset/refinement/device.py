@@ -120,7 +120,7 @@ def optimise(
     assert isinstance(targets.pixels, DevicePixels)
     state.fetch()
     patches = PatchGrid(targets.host_pixels, patch_side)
-    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors)
+    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=rule.error_map)
     state.errors = error_map.errors
     state.device_state = arrays = DeviceArrays(state, targets.pixels.device, error_map, smooth=rule.total_variation > 0)
     begin = state.step

@@ -15,7 +15,6 @@ MAX_CELLS = 2**22
 PART = 2**20  # tiles that are counted at a time
 INTERVAL = 32  # steps after which the chances are set again
 MEMORY = 0.5  # of the running mean, kept by each new error
-UNIFORM = 0.1  # share of the patches that are drawn from all tiles alike, so that no error is believed for ever; docs/experiments/tree-training.md
 MOST = 4.0  # times the mean that the root of a cell's error counts, at most: what nothing can learn should not take all rays
 
 
@@ -52,9 +51,12 @@ class ErrorMap:
             goes on where another one stopped.
     """
 
-    def __init__(self, patches: PatchGrid, met: np.ndarray | None = None, errors: np.ndarray | None = None) -> None:
-        """met: (T,) bool of the tiles that may be drawn, or None: all. ValueError where `errors` are those of another grid."""
-        self.patches, self.tiles = patches, tiles_of_cell(patches)
+    def __init__(self, patches: PatchGrid, met: np.ndarray | None = None, errors: np.ndarray | None = None, *, share: float = 0.9) -> None:
+        """met: (T,) bool of the tiles that may be drawn, or None: all. ValueError where `errors` are those of another grid.
+
+        share  of the patches that are drawn by errors, the rest from all tiles alike; below 1, for else an error of nothing would be believed for ever
+        """
+        self.patches, self.tiles, self.share = patches, tiles_of_cell(patches), share
         self.rows, self.columns = _cells(patches, self.tiles)
         self.first = np.concatenate([[0], np.cumsum(self.rows * self.columns)]).astype(np.int64)
         cells = int(self.first[-1])
@@ -82,13 +84,13 @@ class ErrorMap:
         return found
 
     def _set_chances(self) -> None:
-        """Chances of tiles that may be drawn: the share UNIFORM for all alike, the rest in proportion to the root of the error, of a cell without one as of the
-        mean."""
+        """Chances of tiles that may be drawn: `share` of them in proportion to the root of the error, of a cell without one as of the mean; the rest for all
+        alike."""
         known = (self.errors[1] >= 0) & (self.met > 0)
         root = np.sqrt(np.maximum(self.errors[1], 0), dtype=np.float32)
         mean = np.average(root[known], weights=self.met[known]) if known.any() else 0.0
         chance = np.where(known, np.minimum(root, MOST * mean), mean) if mean > 0 else np.ones(len(root))
-        chance += UNIFORM / (1 - UNIFORM) * np.average(chance, weights=self.met)
+        chance = self.share * chance + (1 - self.share) * np.average(chance, weights=self.met)
         cumulative = np.cumsum(chance * self.met, dtype=np.float64)
         self.cumulative = cumulative / cumulative[-1]
         # Were all tiles alike, each would have one chance of its number.

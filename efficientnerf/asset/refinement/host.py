@@ -52,7 +52,7 @@ def optimise(
     cells, buffer = cells_of(tree_grid(state.tree)), RecordBuffer()
     values = values_of(cells, state.density, state.sh)
     patches = PatchGrid(targets.host_pixels, patch_side)
-    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors)
+    error_map = ErrorMap(patches, tiles_met(state.tree, patches), state.errors, share=rule.error_map)
     state.errors = error_map.errors
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
     moments = Moments(*none, state.square_density, state.square_sh, state.visits)

@@ -13,6 +13,7 @@ class Rule:
     total_variation  share, of the density's learning rate, of the differences between the logarithms of a voxel's and its neighbours' optical thickness
     sparsity         weight of the sum of the opacities of voxels
     entropy          weight of the entropy of these opacities
+    error_map        share of the rays that are drawn by the errors of earlier ones, below 1
     min_weight       weight below which samples of a ray absorb, and have neither a colour nor a gradient
     degree           highest degree of the harmonics that a step, by its number, moves; None: all
     """
@@ -20,6 +21,7 @@ class Rule:
     total_variation: float = 0.0
     sparsity: float = 0.0
     entropy: float = 0.0
+    error_map: float = 0.9
     min_weight: float = 0.0
     degree: Callable[[int], int] | None = None
 

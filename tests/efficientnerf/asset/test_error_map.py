@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.refinement import error_map
-from efficientnerf.asset.refinement.error_map import MOST, UNIFORM, Drawn, ErrorMap, count_cells
+from efficientnerf.asset.refinement.error_map import MOST, Drawn, ErrorMap, count_cells
 from efficientnerf.training.patches import PatchGrid
 from tests.efficientnerf.small_views import views
 
@@ -25,16 +25,17 @@ def test_before_any_error_tiles_are_alike() -> None:
     np.testing.assert_allclose(drawn.factor, 1, rtol=1e-6)
 
 
-def test_chances_are_the_roots_of_errors_limited_and_the_mean_is_unbiased() -> None:
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.9])
+def test_chances_are_the_roots_of_errors_limited_and_the_mean_is_unbiased(share: float) -> None:
     grid = PatchGrid(views(), 2)
     rng = np.random.default_rng(1)
     errors = np.stack([rng.random(len(grid)), rng.random(len(grid)) ** 4]).astype(np.float32)
     errors[1, 2], errors[1, 5] = 1e4, -1  # far above the others; not known
-    made = ErrorMap(grid, None, errors)
+    made = ErrorMap(grid, None, errors, share=share)
     root = np.sqrt(np.maximum(errors[1], 0))
     mean = root[errors[1] >= 0].mean()
     wanted = np.minimum(np.where(errors[1] < 0, mean, root), MOST * mean)
-    np.testing.assert_allclose(chances(made), UNIFORM / len(grid) + (1 - UNIFORM) * wanted / wanted.sum(), rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(chances(made), (1 - share) / len(grid) + share * wanted / wanted.sum(), rtol=1e-5, atol=1e-12)
     values = rng.random(len(grid))
     np.testing.assert_allclose((chances(made) * made.factor * values).sum(), values.sum() / len(grid), rtol=1e-5)
 
@@ -50,7 +51,7 @@ def test_no_tile_with_rays_is_left_out_for_its_error(error: float, tiles: int | 
     errors = np.full((2, count_cells(grid)), 0.3, np.float32)
     errors[1, ::2] = error
     made = ErrorMap(grid, met if tiles is None else None, errors)
-    assert (chances(made) >= 0.999 * UNIFORM * made.met / made.met.sum()).all()
+    assert (chances(made) >= 0.999 * (1 - made.share) * made.met / made.met.sum()).all()
     assert (chances(made)[made.met == 0] == 0).all()
     assert chances(made).sum() == pytest.approx(1)
     values = np.random.default_rng(6).random(len(made.met))
