@@ -152,6 +152,8 @@ class TurntableInputs:
 @dataclass(frozen=True)
 class MeshInputs:
     bake: BakeOutputs
+    train: TrainOutputs
+    poses: PosesOutputs
 
 
 @dataclass(frozen=True)

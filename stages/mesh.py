@@ -1,4 +1,4 @@
-"""The mesh stage: the asset's surface as PLY and OBJ in the capture's frame and as GLB, a report, and a preview."""
+"""The mesh stage: the asset's surface with a texture, as PLY and OBJ in the capture's frame and as GLB, a report, and a preview."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.meshing.check import asset_views, checked, level_of, shown_by, warning_of
+from stages.meshing.texture import facts_of, largest_photograph, textured
 
 if TYPE_CHECKING:
     from efficientnerf.surface.agreement import AssetView
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
 STEPS = 500  # of the progress of each
+SURFACE_SHARE = 0.7  # of the stage's time; the texture takes the rest
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,14 @@ class MeshSettings:
     )
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
         10, "Iterations of Taubin smoothing, which keeps the volume; as many, up to six, of smoothing normals follow, which keeps edges.", advanced=True
+    )
+    texture: Literal["auto", "photographs", "asset", "off"] = setting(
+        "auto",
+        "Where the texture's colours are from: the training photographs, blended (photographs), or the asset (asset); auto: photographs where they show the"
+        " mesh; off: colours at vertices alone.",
+    )
+    texture_size: Annotated[int, Meta(ge=256, le=8192)] = setting(
+        2048, "Most texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.", advanced=True
     )
 
 
@@ -151,12 +161,18 @@ def run(job: Job) -> None:
     from stages.memory.need import refuse_what_does_not_fit
     from stages.memory.surface import surface_needed
 
-    outputs = MeshOutputs(job.out)
-    tree = restricted(load(inputs_of(MeshInputs, job.inputs).bake.asset), job.settings.region)
+    outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
+    tree = restricted(load(inputs.bake.asset), settings.region)
     frame = source_frame(tree.metadata)
-    refuse_what_does_not_fit(job, surface_needed(tree), "Lower bake.max_mib or bake.resolution.")
+    need = surface_needed(tree, texture=0 if settings.texture == "off" else settings.texture_size, pixels=largest_photograph(inputs, settings.texture))
+    refuse_what_does_not_fit(job, need, "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
     seen: list[AssetView] = []
-    found = mesh_of(tree, job.settings, job.reached, seen)
+    share = 1.0 if settings.texture == "off" else SURFACE_SHARE
+    surface = mesh_of(tree, settings, lambda done, total, text: job.reached(share * done, total, text), seen)
+    found = textured(
+        surface, tree, inputs, settings.texture, settings.texture_size,
+        lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text),
+    )  # fmt: skip
     job.safe_point()
     orbit = tree.metadata.get("orbit", {})
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
@@ -176,7 +192,7 @@ def run(job: Job) -> None:
     if not report["watertight"]:
         job.warn(f"the mesh is not closed: {report['open_edges']} open and {report['non_manifold_edges']} non-manifold edges")
     facts = {name: report[name] for name in ("faces", "components", "watertight")}
-    job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}", **facts)
+    job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
 
 
-STAGE = Stage(name="mesh", version=5, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)
+STAGE = Stage(name="mesh", version=6, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

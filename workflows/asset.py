@@ -26,7 +26,7 @@ NAMES = (
     "poses",  # the source -> cameras, images, sparse points
     "train",  # poses -> field, density voxels
     "bake",  # train, poses -> asset.nerftree
-    "mesh",  # bake -> PLY, GLB, OBJ
+    "mesh",  # bake, train, poses -> PLY, GLB, OBJ
     "evaluate",  # mesh, bake, train, poses -> PSNR and SSIM of the network, of the asset and of the mesh
     "turntable",  # bake -> frames, video, EXR
     "points",  # bake -> PLY

@@ -16,8 +16,12 @@ if TYPE_CHECKING:
 VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
 
 
-def surface_needed(tree: NerfTree, points: int = 0) -> Need:
-    """What it takes to mesh a tree, and to spread so many points over the surface."""
+# Of a texel, with what it has seen of photographs; of a photograph's pixel with depth and edges.
+TEXEL, PHOTOGRAPH_PIXEL = 140, 60
+
+
+def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0) -> Need:
+    """What it takes to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels."""
     from efficientnerf.surface.isosurface import pool_of
     from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
 
@@ -29,4 +33,5 @@ def surface_needed(tree: NerfTree, points: int = 0) -> Need:
         "the asset": tree_bytes(tree),
         "libraries": libraries() + SURFACES,
     }
-    return Need(terms | ({"points": POINT * points} if points else {}))
+    optional = {"points": POINT * points, "the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels}
+    return Need(terms | {what: count for what, count in optional.items() if count})

@@ -12,11 +12,15 @@ import pytest
 from efficientnerf.asset import format
 from efficientnerf.asset.region import Region
 from efficientnerf.asset.tree import tree_from_voxels
-from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from pipeline.errors import Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
 from stages import mesh as stage
+from stages.artifacts import MeshInputs, inputs_of
+from stages.io.png import write_png
+from stages.io.scene import Orbit, Scene, View, save
 from stages.mesh import MeshSettings
+from stages.meshing.texture import textured
 
 # The capture lies on its side (y down), is four times as large as the training frame and somewhere else.
 WORLD_FROM_CAPTURE = Similarity(0.25, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([0.1, 0.2, 0.3]))
@@ -47,19 +51,57 @@ def bake_ball(folder: Path, density: float = 300.0) -> Path:
     return folder
 
 
+def photograph_ball(folder: Path, colours: tuple[tuple[float, ...], ...] = ((0.9, 0.5, 0.1), (0.1, 0.2, 0.8)), splits: tuple[str, ...] = ("train",)) -> Path:
+    """A scene (the artifact of poses) with photographs of that ball from eight sides, in two colours, above and below, on white. `splits` in turn."""
+    width, height = 64, 48
+    views = []
+    (folder / "images").mkdir(parents=True)
+    for number in range(8):
+        turn, height_of_camera = number * np.pi / 4, 1.0 if number % 2 else -1.0
+        centre = np.array([2.5 * np.cos(turn), 2.5 * np.sin(turn), height_of_camera])
+        forward = -centre / np.linalg.norm(centre)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(forward, right), forward, centre], 1)
+        camera = Camera(f"{number}.png", width, height, "SIMPLE_PINHOLE", (70.0, width / 2, height / 2), pose)
+        origins, directions = rays(camera)
+        along = -(origins * directions).sum(1)
+        apart = RADIUS**2 - (origins**2).sum(1) + along**2
+        up = (origins + (along - np.sqrt(np.maximum(apart, 0)))[:, None] * directions)[:, 2] > 0
+        shown = np.where((apart > 0)[:, None], np.where(up[:, None], colours[0], colours[1]), 1.0)
+        write_png(np.round(shown * 255).astype(np.uint8).reshape(height, width, 3), folder / "images" / camera.name)
+        source = replace(camera, world_from_camera=WORLD_FROM_CAPTURE.inverse().pose(pose))
+        views.append(View(f"images/{camera.name}", None, splits[number % len(splits)], camera, source, 0.5, 5.0))
+    orbit = Orbit((0.0, 0.0, 0.0), 3.0, 20.0, False, 0.0)
+    save(Scene("photographs", tuple(views), np.array([[-1.0] * 3, [1.0] * 3]), (1.0, 1.0, 1.0), WORLD_FROM_CAPTURE, orbit, metric=True), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return photograph_ball(tmp_path_factory.mktemp("photographed") / "poses")
+
+
+def inputs(bake: Path, poses: Path) -> dict[str, Path]:
+    """Of the stage: training refined no cameras."""
+    return {"bake": bake, "poses": poses, "train": poses}
+
+
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bake_ball(tmp_path_factory.mktemp("ball") / "bake")
 
 
-def test_the_mesh_lies_in_the_captures_frame(ball: Path, tmp_path: Path) -> None:
+def test_the_mesh_lies_in_the_captures_frame(ball: Path, photographed: Path, tmp_path: Path) -> None:
     import trimesh
     from PIL import Image
 
     events: list[dict] = []
-    settings = MeshSettings(max_faces=4000, density_threshold=150.0)
-    stage.run(Job(settings=settings, inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work", report=events.append))
-    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == ["check.png", "mesh.glb", "mesh.obj", "mesh.ply", "preview.png", "report.json"]
+    settings = MeshSettings(max_faces=4000, density_threshold=150.0, texture_size=256)
+    stage.run(Job(settings=settings, inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work", report=events.append))
+    files = ["check.png", "mesh.glb", "mesh.mtl", "mesh.obj", "mesh.ply", "mesh.png", "preview.png", "report.json"]
+    assert sorted(each.name for each in (tmp_path / "out").iterdir()) == files
     mesh = trimesh.load(tmp_path / "out" / "mesh.ply", process=False)
     centre = WORLD_FROM_CAPTURE.inverse().points(np.zeros(3))
     np.testing.assert_allclose(mesh.bounds.mean(0), centre, atol=0.05)
@@ -77,11 +119,13 @@ def test_the_mesh_lies_in_the_captures_frame(ball: Path, tmp_path: Path) -> None
     assert report["unit"] == "metre"
     np.testing.assert_allclose(report["bounds"], mesh.bounds, atol=1e-5)
     assert report["volume"] == pytest.approx(4 / 3 * np.pi * (RADIUS * 4) ** 3, rel=0.03)
-    assert [event["faces"] for event in events if "faces" in event] == [report["faces"]]
-    assert events[-1]["text"] == f"{report['faces']} faces in 1 component"
+    (said,) = (event for event in events if "faces" in event)
+    assert said["faces"] == report["faces"]
+    assert said["text"].startswith(f"{report['faces']} faces in 1 component, with a texture of 128x128, 9")
 
     standing = trimesh.load(tmp_path / "out" / "mesh.glb", force="mesh", process=False)
-    np.testing.assert_allclose(standing.vertices, mesh.vertices * [1, -1, -1], atol=1e-5)
+    corners = np.asarray(standing.vertices)[standing.faces]  # its vertices are split where the texture has seams
+    np.testing.assert_allclose(corners, (mesh.vertices * [1, -1, -1])[mesh.faces], atol=1e-5)
 
     preview = np.asarray(Image.open(tmp_path / "out" / "preview.png"))
     assert preview.shape == (840, 1680, 3)
@@ -89,27 +133,27 @@ def test_the_mesh_lies_in_the_captures_frame(ball: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(preview[320, 210], [26, 51, 204], atol=6)
 
 
-def test_the_same_asset_gives_the_same_bytes(ball: Path, tmp_path: Path) -> None:
+def test_the_same_asset_gives_the_same_bytes(ball: Path, photographed: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        stage.run(Job(settings=MeshSettings(max_faces=1000), inputs={"bake": ball}, out=tmp_path / name, work=tmp_path / "work"))
+        stage.run(Job(settings=MeshSettings(max_faces=1000), inputs=inputs(ball, photographed), out=tmp_path / name, work=tmp_path / "work"))
     for file in (tmp_path / "a").iterdir():
         assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes(), file.name
 
 
-def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, tmp_path: Path) -> None:
+def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, photographed: Path, tmp_path: Path) -> None:
     with pytest.raises(StageFailed, match=r"nowhere reaches 1e\+04.*Lower mesh.density_threshold"):
-        stage.run(Job(settings=MeshSettings(density_threshold=1e4), inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work"))
+        stage.run(Job(settings=MeshSettings(density_threshold=1e4), inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
 
 
-def test_an_empty_asset_names_the_remedy(tmp_path: Path) -> None:
+def test_an_empty_asset_names_the_remedy(photographed: Path, tmp_path: Path) -> None:
     bake = bake_ball(tmp_path / "bake", density=0.01)
     with pytest.raises(StageFailed, match="train longer"):
-        stage.run(Job(settings=MeshSettings(), inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
+        stage.run(Job(settings=MeshSettings(), inputs=inputs(bake, photographed), out=tmp_path / "out", work=tmp_path / "work"))
 
 
-def test_a_signal_stops_it(ball: Path, tmp_path: Path) -> None:
+def test_a_signal_stops_it(ball: Path, photographed: Path, tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
-        stage.run(Job(settings=MeshSettings(), inputs={"bake": ball}, out=tmp_path / "out", work=tmp_path / "work", stop=lambda: 2))
+        stage.run(Job(settings=MeshSettings(), inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work", stop=lambda: 2))
 
 
 def test_progress_never_goes_back(ball: Path) -> None:
@@ -130,10 +174,10 @@ def with_region(ball: Path, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize(("region", "lowest"), [("foreground", -0.2), ("all", -RADIUS)])
-def test_the_foreground_is_meshed_unless_all_is_asked_for(ball: Path, tmp_path: Path, region: str, lowest: float) -> None:
+def test_the_foreground_is_meshed_unless_all_is_asked_for(ball: Path, photographed: Path, tmp_path: Path, region: str, lowest: float) -> None:
     bake = with_region(ball, tmp_path / "bake")
     settings = MeshSettings(max_faces=3000, region=region)  # type: ignore[arg-type]
-    stage.run(Job(settings=settings, inputs={"bake": bake}, out=tmp_path / "out", work=tmp_path / "work"))
+    stage.run(Job(settings=settings, inputs=inputs(bake, photographed), out=tmp_path / "out", work=tmp_path / "work"))
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     corners = WORLD_FROM_CAPTURE.points(np.array(report["bounds"]))
     assert corners[:, 2].min() == pytest.approx(lowest, abs=0.06)
@@ -141,9 +185,43 @@ def test_the_foreground_is_meshed_unless_all_is_asked_for(ball: Path, tmp_path: 
     assert report["watertight"]
 
 
-def test_a_region_without_anything_is_said(ball: Path, tmp_path: Path) -> None:
+def test_a_region_without_anything_is_said(ball: Path, photographed: Path, tmp_path: Path) -> None:
     (tmp_path / "bake").mkdir()
     far = Region(np.array([[0.9, 0.9, 0.9], [0.95, 0.95, 0.95]]))
     format.save(replace(format.load(ball / "asset.nerftree"), region=far), tmp_path / "bake" / "asset.nerftree")
     with pytest.raises(UsageError, match="nothing of the asset lies in its foreground region"):
-        stage.run(Job(settings=MeshSettings(), inputs={"bake": tmp_path / "bake"}, out=tmp_path / "out", work=tmp_path / "work"))
+        stage.run(Job(settings=MeshSettings(), inputs=inputs(tmp_path / "bake", photographed), out=tmp_path / "out", work=tmp_path / "work"))
+
+
+@pytest.mark.parametrize(("choice", "above"), [("auto", (0.2, 0.9, 0.3)), ("photographs", (0.2, 0.9, 0.3)), ("asset", (0.9, 0.5, 0.1))])
+def test_the_texture_shows_what_was_asked_for(ball: Path, tmp_path: Path, choice: str, above: tuple[float, ...]) -> None:
+    poses = photograph_ball(tmp_path / "poses", ((0.2, 0.9, 0.3), (0.9, 0.1, 0.4)))
+    job = Job(settings=None, inputs=inputs(ball, poses), out=tmp_path / "out", work=tmp_path / "work")
+    tree = format.load(ball / "asset.nerftree")
+    surface = stage.mesh_of(tree, MeshSettings(max_faces=2000), lambda *each: None)
+    found = textured(surface, tree, inputs_of(MeshInputs, job.inputs), choice, 256, lambda *each: None)
+    assert found.texture is not None
+    side = len(found.texture.colours)
+    u, v = found.texture.coordinates.mean(1).T
+    shown = found.texture.colours[((1 - v) * side).astype(int), (u * side).astype(int)] / 255
+    top = found.vertices[found.faces].mean(1)[:, 2] > 0.25
+    np.testing.assert_allclose(np.median(shown[top], axis=0), above, atol=0.03)
+    assert np.abs(shown[top] - above).max(1).mean() < 0.05
+
+
+def test_held_back_photographs_are_not_looked_at(ball: Path, tmp_path: Path) -> None:
+    """Where all photographs but the training ones are gone, nothing changes."""
+    poses = photograph_ball(tmp_path / "poses", splits=("train", "test", "train", "val"))
+    settings = MeshSettings(max_faces=1000, texture_size=256)
+    stage.run(Job(settings=settings, inputs=inputs(ball, poses), out=tmp_path / "a", work=tmp_path / "work"))
+    for number in (1, 3, 5, 7):
+        (poses / "images" / f"{number}.png").unlink()
+    stage.run(Job(settings=settings, inputs=inputs(ball, poses), out=tmp_path / "b", work=tmp_path / "work"))
+    assert (tmp_path / "a" / "report.json").read_bytes() == (tmp_path / "b" / "report.json").read_bytes()
+    assert json.loads((tmp_path / "a" / "report.json").read_text())["texture_observed"] > 0.5
+
+
+def test_without_a_photograph_that_shows_it_the_asset_is_the_texture(ball: Path, tmp_path: Path) -> None:
+    poses = photograph_ball(tmp_path / "poses", splits=("test",))
+    stage.run(Job(settings=MeshSettings(max_faces=1000, texture_size=256), inputs=inputs(ball, poses), out=tmp_path / "out", work=tmp_path / "work"))
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["texture"] == "asset"

@@ -1,0 +1,228 @@
+"""Colours of texels from photographs: each texel keeps what the photographs that show it best show, and is given what most of these agree on.
+
+A photograph shows a texel where the mesh's depth says so, away from depth edges, from what masks leave out and from the photograph's borders: the mesh is
+never exact, and what lies behind an edge must not rub off on it. Its grade there is the area of its pixels that a texel covers (so that oblique, distant
+and coarse photographs count less), times the cosine to the normal, its sharpness and its distance from these edges. docs/experiments/textures.md
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from efficientnerf.backends.pieces import pieces
+from efficientnerf.geometry.cameras import Camera, project, resized
+from efficientnerf.surface.mesh import face_areas
+from efficientnerf.surface.rasteriser import MeshImage, mesh_image
+from efficientnerf.surface.texturing.atlas import Atlas, Texels
+
+KEPT = 12  # photographs that a texel remembers
+POWER = 0.5  # of grades, that colours are weighted by. docs/experiments/textures.md
+SCALE = 60.0  # of 255, by which colours differ of which one is an outlier. docs/experiments/textures.md
+VOTE = 1.5  # of the colour that the asset has, on which of the photographs is right, against the best of them
+TRUST = 0.002  # grade of the colour that the asset has
+REACH = 6.0  # pixels from an edge at which a photograph counts in full
+BORDER = 0.03  # of the longer side of a photograph, over which it fades out
+JUMP = 0.01  # of the inverse depth, at a depth edge
+SLACK = 0.01  # of its depth that a texel may lie behind what the mesh shows there
+FAINT = 250  # alpha under which a pixel shows something else, too
+FINER = 1.25  # texels on the side of a pixel
+FINEST = 2.0  # pixels of a photograph on the side of a texel from which it is reduced to half
+SHARP = 2.0  # times its sharpness over the median of all, at most 1, is what a photograph counts
+MIN_SAMPLES = 200  # vertices that a photograph has to show for its gains to be known
+GAIN = 0.02  # logarithm up to which a gain is left out: differences with the direction of view look the same
+MOST_GAIN = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """camera (of the mesh's frame), colours (H, W, 3) uint8 sRGB, usable (H, W) bool."""
+
+    camera: Camera
+    colours: np.ndarray
+    usable: np.ndarray
+
+
+def photograph(camera: Camera, image: np.ndarray, mask: np.ndarray | None = None) -> Photograph:
+    """A photograph as files have it: uint8 (H, W, 3), or (H, W, 4) with straight alpha; mask (H, W) bool, True: use."""
+    usable = np.ones(image.shape[:2], bool) if mask is None else np.array(mask, bool)
+    if image.shape[2] == 4:
+        usable[image[..., 3] < FAINT] = False
+    return Photograph(camera, np.ascontiguousarray(image[..., :3]), usable)
+
+
+def halved(photo: Photograph) -> Photograph:
+    """The photograph at half its size, each pixel the mean of four; usable where all are."""
+    height, width = photo.usable.shape[0] // 2 * 2, photo.usable.shape[1] // 2 * 2  # of odd sizes the last row or column is left out
+    colours = photo.colours[:height, :width].reshape(height // 2, 2, width // 2, 2, 3)
+    mean = ((colours.astype(np.uint16).sum((1, 3)) + 2) // 4).astype(np.uint8)
+    usable = np.asarray(photo.usable[:height, :width].reshape(height // 2, 2, width // 2, 2).all((1, 3)))
+    return Photograph(resized(replace(photo.camera, width=width, height=height), width // 2, height // 2), mean, usable)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a photograph is like on the mesh, before any texel sees it.
+
+    density    (F,) float32 pixels on the side of the square that a face is half of, where one of its vertices shows; zero elsewhere
+    sharpness  of what shows the mesh: how much of its detail is fine
+    gains      (3,) factors that bring its colours to those of the vertices
+    """
+
+    density: np.ndarray
+    sharpness: float
+    gains: np.ndarray
+
+
+def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours: np.ndarray, photo: Photograph) -> Survey:
+    """What a photograph is like on a mesh with normals (V, 3) and colours (V, 3) sRGB 0-1."""
+    seen = _seen(vertices, faces, normals, photo)
+    p = seen.pixels[faces]
+    edge, other = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    area = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0])
+    visible = np.zeros(len(vertices), bool)
+    at = np.flatnonzero(np.isfinite(seen.pixels).all(1) & (seen.depth > 0) & (seen.facing > 0.3))
+    column, row = np.floor(np.clip(seen.pixels[at], -1, 1e9)).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < photo.camera.width) & (row < photo.camera.height)
+    at, column, row = at[inside], column[inside], row[inside]
+    shown = (seen.depth[at] * seen.near[row, column] <= 1 + 2 * SLACK) & (seen.clear[row, column] >= 3.0)
+    visible[at[shown]] = True
+    density = np.where(visible[faces].any(1), np.sqrt(area), 0.0)
+    values = photo.colours[row[shown], column[shown]].astype(np.float64) / 255
+    return Survey(np.nan_to_num(density).astype(np.float32), _sharpness(photo, seen.clear), _gains(values, colours[at[shown]].astype(np.float64)))
+
+
+def texels_wanted(vertices: np.ndarray, faces: np.ndarray, density: np.ndarray) -> float:
+    """Texels for each unit of a mesh of which one covers a pixel of the photograph that shows a face best; infinite where none shows any.
+
+    density  (F,) the greatest of all photographs
+    """
+    areas = face_areas(vertices, faces)
+    known = (density > 0) & (areas > 0)
+    each = density[known] / np.sqrt(2 * areas[known])
+    return float(FINER * _weighted_median(each, areas[known])) if known.any() else np.inf
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    if not weights.sum() > 0:
+        return 0.0
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(sums, 0.5 * sums[-1])]])
+
+
+def _gains(values: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """(3,) factors from values (N, 3) to what is expected (N, 3): medians of ratios, without what is nearly black or white; what is small left out."""
+    good = ((values > 0.08) & (values < 0.92) & (expected > 0.08) & (expected < 0.92)).all(1)
+    if good.sum() < MIN_SAMPLES:
+        return np.ones(3)
+    found = np.median(np.log(expected[good] / values[good]), axis=0)
+    return np.asarray(np.exp(np.clip(np.sign(found) * np.maximum(np.abs(found) - GAIN, 0), -MOST_GAIN, MOST_GAIN)))
+
+
+def _sharpness(photo: Photograph, clear: np.ndarray) -> float:
+    """Variance of the Laplacian of what shows the mesh away from edges, over that of the photograph at half its size: the variance itself would tell what is
+    shown rather than how sharply."""
+    grey = photo.colours.astype(np.float32).mean(2)
+    height, width = grey.shape[0] // 2 * 2, grey.shape[1] // 2 * 2
+    half = grey[:height, :width].reshape(height // 2, 2, width // 2, 2).mean((1, 3))
+    fine, coarse = _laplacian_variance(grey, clear), _laplacian_variance(half, clear[:height:2, :width:2])
+    return fine / coarse if coarse > 0 else 0.0
+
+
+def _laplacian_variance(grey: np.ndarray, clear: np.ndarray) -> float:
+    if min(grey.shape) < 3:
+        return 0.0
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * grey[1:-1, 1:-1]
+    inner = clear[1:-1, 1:-1] >= 4
+    return float(laplacian[inner].var()) if inner.any() else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """pixels (V, 2) and depth (V,) of vertices, cosines (V,) of their normals, inverse depth (H, W) of the mesh, distance (H, W) from edges."""
+
+    pixels: np.ndarray
+    depth: np.ndarray
+    facing: np.ndarray
+    near: np.ndarray
+    clear: np.ndarray
+
+
+def _seen(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: Photograph) -> _Seen:
+    from efficientnerf.backends.numba.mesh.photographs import edge_distance
+
+    image: MeshImage = mesh_image(vertices, faces, photo.camera)
+    near = (np.float32(1) / image.depth).astype(np.float32)
+    clear = np.empty(near.shape, np.float32)
+    edge_distance(photo.usable, near, JUMP, np.float32(4 * REACH), clear)
+    clear = np.minimum(clear, _from_border(near.shape) * (REACH / max(BORDER * max(near.shape), REACH)))
+    pixels, depth = project(photo.camera, vertices)
+    away = photo.camera.centre - vertices
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
+    return _Seen(pixels, depth, (away * normals).sum(1).astype(np.float32), near, np.ascontiguousarray(clear, np.float32))
+
+
+def _from_border(shape: tuple[int, ...]) -> np.ndarray:
+    """(H, W) float32 pixels from the nearest border."""
+    row, column = np.arange(shape[0], dtype=np.float32), np.arange(shape[1], dtype=np.float32)
+    return np.minimum(np.minimum(row, row[::-1])[:, None], np.minimum(column, column[::-1]))
+
+
+@dataclass(eq=False)
+class PhotographTexture:
+    """Texels of a mesh that look at photographs, one after the other: `look` at each, then `colours`.
+
+    vertices, faces, normals  of the mesh, normals at its vertices
+    density    (F,) pixels on the side of each face, of the photograph that has most
+    sharpness  of each photograph, median
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    atlas: Atlas
+    density: np.ndarray
+    sharpness: float
+    kept: int = KEPT
+    seen: np.ndarray = field(init=False)
+    grades: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.texels.place)
+        self.seen = np.zeros((count, self.kept, 3), np.uint8)
+        self.grades = np.zeros((count, self.kept), np.float32)
+        self.density = np.ascontiguousarray(self.density, np.float32)
+
+    @property
+    def texels(self) -> Texels:
+        return self.atlas.texels
+
+    def texels_per_pixel(self) -> float:
+        """Texels on the side of a pixel, of the photograph that shows a face best; median over the surface that any shows, zero where none does."""
+        areas = face_areas(self.vertices, self.faces)
+        ratio = np.divide(self.atlas.scale * np.sqrt(2 * areas), self.density, out=np.zeros(len(areas)), where=self.density > 0)
+        return float(f"{_weighted_median(ratio, np.where(self.density > 0, areas, 0)):.4g}")
+
+    def look(self, photo: Photograph, found: Survey) -> None:
+        """Let all texels see a photograph."""
+        from efficientnerf.backends.numba.mesh.photographs import observe
+
+        seen = _seen(self.vertices, self.faces, self.normals, photo)
+        weight = np.float32(np.clip(SHARP * found.sharpness / self.sharpness, 0.05, 1.0)) if self.sharpness > 0 else np.float32(1)
+        gains = np.ascontiguousarray(found.gains, np.float32)
+        for part in pieces(len(self.faces), first=4096):
+            observe(
+                part.start, part.stop, self.texels.begin, self.texels.share, self.faces, seen.pixels, seen.depth, seen.facing, seen.near, seen.clear,
+                photo.colours, gains, np.float32(REACH), np.float32(SLACK), self.density, weight, self.seen, self.grades,
+            )  # fmt: skip
+
+    def colours(self, expected: np.ndarray, views: int = KEPT, power: float = POWER, scale: float = SCALE) -> tuple[np.ndarray, np.ndarray]:
+        """Colours of the texels (T, 3) uint8, and what share of each is from photographs (T,); `expected` (T, 3) uint8 where they show nothing."""
+        from efficientnerf.backends.numba.mesh.photographs import blend
+
+        out, known = np.empty((len(self.seen), 3), np.uint8), np.empty(len(self.seen), np.float32)
+        for part in pieces(len(self.seen), first=4096):
+            blend(part.start, part.stop, self.seen, self.grades, min(views, self.kept), power, scale, expected, VOTE, TRUST, out, known)
+        return out, known

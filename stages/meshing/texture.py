@@ -1,0 +1,101 @@
+"""The texture of a mesh: from the training photographs, one in memory at a time, or from the asset. Test and validation views are left for scores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.surface.mesh import Mesh
+    from efficientnerf.surface.texturing.photographs import Photograph
+    from stages.artifacts import MeshInputs
+    from stages.io.scene import View
+
+Progress = Callable[[int, int, str], None]
+
+
+def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, largest: int, progress: Progress) -> Mesh:
+    """A mesh of the training frame with a texture, and what is known of that beside its facts.
+
+    choice    "photographs", "asset", "off", or "auto": photographs where the training views show any of the mesh, else the asset
+    largest   texels along a side, at most
+    progress  is called often; what it raises stops the work
+    """
+    from efficientnerf.surface.texturing.asset import texture_of_asset
+
+    if choice == "off":
+        return mesh
+    if choice != "asset":
+        found = _from_photographs(mesh, inputs, largest, progress)
+        if found is not None and (choice == "photographs" or found.facts["texture_observed"]):
+            return found
+    return texture_of_asset(tree, mesh, largest=largest, progress=progress)
+
+
+def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Progress) -> Mesh | None:
+    """Textured by the training photographs; None where there are none."""
+    from efficientnerf.surface.mesh import Texture
+    from efficientnerf.surface.texturing.asset import interpolated
+    from efficientnerf.surface.texturing.atlas import atlas_of
+    from efficientnerf.surface.texturing.filling import texture_from
+    from efficientnerf.surface.texturing.photographs import PhotographTexture, survey, texels_wanted
+    from stages.io.refined_cameras import load_scene
+    from stages.io.scene import views_of
+
+    views = views_of(load_scene(inputs.poses.folder, inputs.train.folder), "train")
+    if not views:
+        return None
+    surveys, steps = [], 2 * len(views)
+    for number, photo in enumerate(photographs(inputs.poses.folder, views)):
+        progress(number, steps, "texture")
+        surveys.append(survey(mesh.vertices, mesh.faces, mesh.normals, mesh.colours, photo))
+    density = np.max([each.density for each in surveys], axis=0)
+    atlas = atlas_of(mesh.vertices, mesh.faces, texels_wanted(mesh.vertices, mesh.faces, density), largest)
+    sharpness = float(np.median([each.sharpness for each in surveys]))
+    texels = PhotographTexture(mesh.vertices, mesh.faces, mesh.normals, atlas, density, sharpness)
+    for number, photo in enumerate(photographs(inputs.poses.folder, views)):
+        progress(len(views) + number, steps, "texture")
+        texels.look(photo, surveys[number])
+    colours, known = texels.colours(interpolated(mesh, atlas))
+    progress(steps, steps, "texture")
+    facts = {
+        "texture": "photographs",
+        "texture_size": atlas.size,
+        "texture_charts": int(atlas.chart.max(initial=-1)) + 1,
+        "texture_observed": float(f"{(known >= 0.5).mean() if len(known) else 0.0:.4g}"),
+        "texels_per_pixel": texels.texels_per_pixel(),
+    }
+    return replace(mesh, texture=Texture(atlas.coordinates, texture_from(atlas, colours)), facts=mesh.facts | facts)
+
+
+def largest_photograph(inputs: MeshInputs, choice: str) -> int:
+    """Pixels of the largest photograph that a texture is made of; none where it is not made of any."""
+    from stages.io.scene import load, views_of
+
+    if choice in ("off", "asset"):
+        return 0
+    return max((view.camera.width * view.camera.height for view in views_of(load(inputs.poses.folder), "train")), default=0)
+
+
+def photographs(folder: Path, views: tuple[View, ...]) -> Iterator[Photograph]:
+    """The photographs of views, read when they are asked for."""
+    from efficientnerf.surface.texturing.photographs import photograph
+    from stages.io.scene import read_image, read_mask
+
+    for view in views:
+        yield photograph(view.camera, read_image(folder, view), read_mask(folder, view))
+
+
+def facts_of(report: dict[str, Any]) -> str:
+    """A few words on the texture for the user; none where there is none."""
+    if "texture_size" not in report:
+        return ""
+    side = report["texture_size"]
+    seen = f", {100 * report['texture_observed']:.0f} % of it from photographs" if "texture_observed" in report else ", from the asset"
+    return f", with a texture of {side}x{side}{seen}"

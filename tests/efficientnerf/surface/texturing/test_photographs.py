@@ -1,0 +1,174 @@
+"""Textures from photographs: known colours come back, and what spoils single photographs does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numba import get_num_threads, set_num_threads
+
+from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.surface.mesh import vertex_normals
+from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, halved, photograph, survey, texels_wanted
+
+from .shapes import ball, box, cameras, pattern, photographed, textured
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(((a - b) ** 2).mean()))
+
+
+@pytest.mark.parametrize("shape", [ball, box])
+def test_known_colours_come_back(shape: object) -> None:
+    vertices, faces = shape()  # type: ignore[operator]
+    atlas, colours, known = textured(vertices, faces, [photographed(vertices, faces, camera) for camera in cameras(10)])
+    truth = pattern(atlas.texels.values(vertices, faces))
+    assert (known > 0.9).mean() > 0.9
+    assert psnr(colours[known > 0.9], truth[known > 0.9]) > 35
+
+
+def test_the_background_does_not_rub_off() -> None:
+    vertices, faces = ball(3)
+    photos = [photographed(vertices, faces, camera, behind=0.0) for camera in cameras(10)]
+    atlas, colours, known = textured(vertices, faces, photos)
+    seen = known > 0.5
+    assert np.abs(colours - pattern(atlas.texels.values(vertices, faces)))[seen].max() < 0.15
+
+
+def test_what_passes_by_in_one_photograph_is_left_out() -> None:
+    vertices, faces = ball(3)
+    photos = [photographed(vertices, faces, camera) for camera in cameras(12)]
+    spoiled = photos[4].colours.copy()
+    spoiled[30:66, 30:66] = [255, 0, 0]
+    atlas, colours, known = textured(vertices, faces, [*photos[:4], replace(photos[4], colours=spoiled), *photos[5:]])
+    clean = textured(vertices, faces, photos)[1]
+    truth = pattern(atlas.texels.values(vertices, faces))
+    assert psnr(colours[known > 0.9], truth[known > 0.9]) > 30
+    assert np.abs(colours - clean).mean() < 0.01
+
+
+def test_a_photograph_of_another_exposure_is_corrected() -> None:
+    vertices, faces = ball(4)
+    photos = [photographed(vertices, faces, camera) for camera in cameras(8)]
+    dark = replace(photos[2], colours=np.round(photos[2].colours * 0.7).astype(np.uint8))
+    found = survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), dark)
+    np.testing.assert_allclose(found.gains, 1 / 0.7, rtol=0.05)
+    kept = survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), photos[2])
+    np.testing.assert_allclose(kept.gains, 1, atol=1e-9)  # small differences are not touched
+    atlas, colours, known = textured(vertices, faces, [*photos[:2], dark, *photos[3:]])
+    truth = pattern(atlas.texels.values(vertices, faces))
+    assert psnr(colours[known > 0.9], truth[known > 0.9]) > 33
+
+
+def test_a_face_that_is_hidden_gets_nothing() -> None:
+    """A small box before a large one: where it stands in the way of the only camera the large one stays as was expected."""
+    camera = cameras(1)[0]
+    back, faces = box((1.0, 1.0, 1.0))
+    front = 0.35 * back + 0.55 * camera.centre / np.linalg.norm(camera.centre) * 2
+    vertices, both = np.concatenate([back, front]), np.concatenate([faces, faces + len(back)])
+    photo = photographed(vertices, both, camera, lambda points: np.where(np.linalg.norm(points, axis=1, keepdims=True) > 0.87, [1.0, 0, 0], [0, 0, 1.0]))
+    atlas, colours, known = textured(vertices, both, [photo])
+    points, own = atlas.texels.values(vertices, both), atlas.texels.face < 12
+    # Towards the camera, is the front box in between?
+    pixels, _ = project(camera, points)
+    red = photo.colours[np.clip(pixels[:, 1], 0, 95).astype(int), np.clip(pixels[:, 0], 0, 95).astype(int), 0] > 128
+    assert (known[own & red] < 0.01).all()
+    assert (colours[own & (known > 0.9)][:, 0] < 0.1).all()
+    assert (known[own] > 0.9).any()
+    assert (known[~own] > 0.9).any()
+
+
+def test_masks_and_alpha_are_kept_to() -> None:
+    vertices, faces = ball(3)
+    camera = cameras(1)[0]
+    photo = photographed(vertices, faces, camera)
+    left = np.arange(96) < 48
+    alpha = np.where(left, np.uint8(255), np.uint8(249)) * np.ones((96, 1), np.uint8)
+    for spoiled in (photograph(camera, photo.colours, np.tile(left, (96, 1))), photograph(camera, np.dstack([photo.colours, alpha]))):
+        atlas, _, known = textured(vertices, faces, [spoiled])
+        pixels, _ = project(camera, atlas.texels.values(vertices, faces))
+        assert known[pixels[:, 0] > 48].max() == 0
+        assert known[pixels[:, 0] < 40].max() > 0.9
+
+
+def away(camera: Camera) -> Camera:
+    """The camera turned round."""
+    pose = camera.world_from_camera.copy()
+    pose[:3, [0, 2]] *= -1
+    return replace(camera, world_from_camera=pose)
+
+
+def test_photographs_of_nothing_leave_what_is_expected() -> None:
+    vertices, faces = ball(2)
+    white = np.full((96, 96, 3), 255, np.uint8)
+    for photos in (
+        [Photograph(away(camera), white, np.ones((96, 96), bool)) for camera in cameras(3)],
+        [Photograph(camera, white, np.zeros((96, 96), bool)) for camera in cameras(3)],
+    ):
+        _, colours, known = textured(vertices, faces, photos, expected=(10, 20, 30))
+        assert (known == 0).all()
+        np.testing.assert_array_equal(np.unique(np.round(colours * 255), axis=0), [[10, 20, 30]])
+
+
+def test_a_blurred_photograph_counts_less() -> None:
+    vertices, faces = ball(3)
+    normals = vertex_normals(vertices, faces)
+    fine = lambda points: 0.5 + 0.4 * np.sign(np.sin(25 * points))  # noqa: E731
+    photo = photographed(vertices, faces, cameras(1)[0], fine)
+    kernel = np.ones(5) / 5
+    blurred = np.apply_along_axis(np.convolve, 0, np.apply_along_axis(np.convolve, 1, photo.colours.astype(float), kernel, "same"), kernel, "same")
+    soft = replace(photo, colours=blurred.astype(np.uint8))
+    sharp_one, soft_one = (survey(vertices, faces, normals, pattern(vertices), each).sharpness for each in (photo, soft))
+    assert soft_one < 0.5 * sharp_one
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_same_bytes_on_any_number_of_threads(threads: int) -> None:
+    vertices, faces = ball(3)
+    photos = [photographed(vertices, faces, camera) for camera in cameras(5)]
+    before = get_num_threads()
+    first = textured(vertices, faces, photos)[1]
+    try:
+        set_num_threads(min(threads, before))
+        again = textured(vertices, faces, photos)[1]
+    finally:
+        set_num_threads(before)
+    np.testing.assert_array_equal(first, again)
+
+
+def test_halved_photographs_show_the_same_places() -> None:
+    camera = replace(cameras(1, size=97)[0], height=95)
+    ramp = np.linspace(0, 255, 97) * np.ones((95, 1))
+    photo = Photograph(camera, np.repeat(ramp[..., None], 3, 2).astype(np.uint8), np.ones((95, 97), bool))
+    half = halved(photo)
+    assert half.colours.shape == (47, 48, 3)
+    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.3
+    np.testing.assert_allclose(project(half.camera, points)[0], project(camera, points)[0] / 2, atol=1e-6)
+    row, column = 20, 30
+    assert abs(int(half.colours[row, column, 0]) - float(photo.colours[2 * row : 2 * row + 2, 2 * column : 2 * column + 2, 0].mean())) <= 1
+
+
+def test_a_texel_is_as_large_as_a_pixel() -> None:
+    vertices, faces = ball(4)
+    camera = cameras(1)[0]
+    found = survey(vertices, faces, vertex_normals(vertices, faces), pattern(vertices), photographed(vertices, faces, camera))
+    nearest = 1.1 * 96 / (3.2 - 1)  # pixels for each unit of the surface that faces the camera
+    assert 0.5 * nearest < texels_wanted(vertices, faces, found.density) / 1.25 < nearest
+    assert np.isinf(texels_wanted(vertices, faces, np.zeros(len(faces))))
+
+
+def test_many_photographs_keep_the_best() -> None:
+    """A texel keeps no more than so many: those of the highest grades, whatever the order they come in."""
+    vertices, faces = ball(2)
+    photos = [photographed(vertices, faces, camera) for camera in cameras(12)]
+    normals, found = vertex_normals(vertices, faces), []
+    for order in (1, -1):
+        surveys = [survey(vertices, faces, normals, pattern(vertices), photo) for photo in photos]
+        atlas = textured(vertices, faces, photos[:1])[0]
+        texels = PhotographTexture(vertices, faces, normals, atlas, np.max([each.density for each in surveys], axis=0), 1.0, kept=3)
+        for photo, each in list(zip(photos, surveys))[::order]:
+            texels.look(photo, each)
+        assert (np.diff(texels.grades, axis=1) <= 0).all()
+        found.append(texels.grades)
+    np.testing.assert_array_equal(*found)
