@@ -29,6 +29,7 @@ SLACK = 0.01  # of its depth that a texel may lie behind what the mesh shows the
 FAINT = 250  # alpha under which a pixel shows something else, too
 FINER = 1.25  # texels on the side of a pixel
 FINEST = 2.0  # pixels of a photograph on the side of a texel from which it is reduced to half
+SMALLEST_PHOTOGRAPH = 16  # pixels along a side, to which it is reduced
 SHARP = 2.0  # times its sharpness over the median of all, at most 1, is what a photograph counts
 MIN_SAMPLES = 200  # vertices that a photograph has to show for its gains to be known
 GAIN = 0.02  # logarithm up to which a gain is left out: differences with the direction of view look the same
@@ -188,12 +189,15 @@ class PhotographTexture:
     kept: int = KEPT
     seen: np.ndarray = field(init=False)
     grades: np.ndarray = field(init=False)
+    halvings: int = field(init=False)  # of photographs, before texels look at them: several of whose pixels lie in a texel
 
     def __post_init__(self) -> None:
         count = len(self.texels.place)
         self.seen = np.zeros((count, self.kept, 3), np.uint8)
         self.grades = np.zeros((count, self.kept), np.float32)
         self.density = np.ascontiguousarray(self.density, np.float32)
+        ratio = self.texels_per_pixel()
+        self.halvings = max(0, int(np.floor(np.log(1 / ratio) / np.log(FINEST) + 1e-9))) if ratio > 0 else 0
 
     @property
     def texels(self) -> Texels:
@@ -209,13 +213,17 @@ class PhotographTexture:
         """Let all texels see a photograph."""
         from efficientnerf.backends.numba.mesh.photographs import observe
 
+        done = 0
+        while done < self.halvings and min(photo.usable.shape) >= 2 * SMALLEST_PHOTOGRAPH:
+            photo, done = halved(photo), done + 1
         seen = _seen(self.vertices, self.faces, self.normals, photo)
         weight = np.float32(np.clip(SHARP * found.sharpness / self.sharpness, 0.05, 1.0)) if self.sharpness > 0 else np.float32(1)
         gains = np.ascontiguousarray(found.gains, np.float32)
+        density = self.density / np.float32(2**done)
         for part in pieces(len(self.faces), first=4096):
             observe(
                 part.start, part.stop, self.texels.begin, self.texels.share, self.faces, seen.pixels, seen.depth, seen.facing, seen.near, seen.clear,
-                photo.colours, gains, np.float32(REACH), np.float32(SLACK), self.density, weight, self.seen, self.grades,
+                photo.colours, gains, np.float32(REACH), np.float32(SLACK), density, weight, self.seen, self.grades,
             )  # fmt: skip
 
     def colours(self, expected: np.ndarray, views: int = KEPT, power: float = POWER, scale: float = SCALE) -> tuple[np.ndarray, np.ndarray]:

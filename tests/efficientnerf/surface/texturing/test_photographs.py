@@ -149,6 +149,18 @@ def test_halved_photographs_show_the_same_places() -> None:
     assert abs(int(half.colours[row, column, 0]) - float(photo.colours[2 * row : 2 * row + 2, 2 * column : 2 * column + 2, 0].mean())) <= 1
 
 
+def test_a_texel_sees_all_pixels_that_lie_in_it() -> None:
+    """Photographs that are finer than the texture: a chequered pattern of pixels becomes its mean, not either colour."""
+    vertices, faces = ball(3)
+    photos = []
+    for camera in cameras(6, size=192):
+        photo = photographed(vertices, faces, camera, lambda points: np.full((len(points), 3), 0.5))
+        y, x = np.mgrid[:192, :192]
+        photos.append(replace(photo, colours=np.repeat(np.where((x + y) % 2, np.uint8(255), np.uint8(0))[..., None], 3, axis=2)))
+    _, colours, known = textured(vertices, faces, photos, size=64)
+    assert np.abs(colours[known > 0.95] - 0.5).max() < 0.06
+
+
 def test_a_texel_is_as_large_as_a_pixel() -> None:
     vertices, faces = ball(4)
     camera = cameras(1)[0]
