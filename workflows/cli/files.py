@@ -13,24 +13,30 @@ from workflows.cli.options import common_options, crop_option, folder_type, forc
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.geometry.cameras import Camera
-    from pipeline.executors.memory import Limit
     from stages.turntable import TurntableSettings
     from workflows.cli.resolve import Settings
 
-CAMERAS = ".json"
+TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
 REGIONS = ("foreground", "all")  # efficientnerf.asset.region.REGIONS, which a test compares; that import is heavy
 Crop = tuple[float, float, float, float, float, float] | None
 
 
 @click.command(short_help="Write meshes, points or cameras in other formats.")
-@click.argument("what", metavar="RUN|ASSET", type=folder_type)
+@click.argument("what", metavar="RUN|ASSET", required=False, type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
-@click.option("--to", "first", required=True, metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
+@click.option("--to", "first", metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
+@click.option("--list", "as_list", is_flag=True, help="All formats: what they keep and lose, what they need, who opens them.")
 @click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
 @click.option(
     "--region", type=click.Choice(REGIONS), help="The subject (foreground) or the whole scene (all); by default mesh.region or points.region: foreground."
 )
 @crop_option
+@click.option("--faces", metavar="20k|100k|500k|N", help="Most faces of the mesh, in place of mesh.max_faces.")
+@click.option(
+    "--texture", type=click.Choice(TEXTURES), help="From the training photographs or the asset, in place of mesh.texture; off: colours of vertices alone."
+)
+@click.option("--texture-size", metavar="N", help="Most texels along a side, in place of mesh.texture_size.")
+@click.option("--jpeg", is_flag=True, help="Textures as JPEG instead of PNG: smaller files.")
 @force_option
 @memory_option
 @set_option
@@ -38,109 +44,48 @@ Crop = tuple[float, float, float, float, float, float] | None
 @quiet_option
 @common_options
 def export(
-    what: Path,
-    first: Path,
-    more: tuple[Path, ...],
-    as_points: bool,
-    region: str | None,
-    crop: Crop,
-    force: bool,
-    memory: str | None,
-    sets: tuple[str, ...],
-    as_json: bool,
-    quiet: bool,
+    what: Path | None, first: Path | None, more: tuple[Path, ...], as_list: bool, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool,
+    **given: Any,
 ) -> None:
-    """Write the surface of RUN or ASSET as .ply, .glb or .obj, with --points as .ply or .xyz; or the cameras of RUN as .json (nerfstudio).
+    """Write the surface of RUN or ASSET as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl, with --points as .ply or .xyz; or the cameras of RUN
+    as .json (nerfstudio).
 
-    Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. Settings of the stages mesh and points
-    apply: '--set mesh.max_faces=...'.
+    Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. What the run's stage mesh has made with
+    the same settings is taken from there. Settings of the stages mesh and points apply: '--set mesh.max_faces=...'.
     """
     from pipeline.errors import UsageError
-    from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
-    from workflows.cli.output import closing, write_json
-    from workflows.destination import check_files
+    from workflows import exporting
+    from workflows.cli.output import closing, listing, write_json
 
-    files, limit = [first, *more], memory_limit(memory)
-    known = [*(POINT_EXPORTERS if as_points else MESH_EXPORTERS), CAMERAS]
-    for path in files:
-        if path.suffix.lower() not in known:
-            kind = "points" if as_points else "a mesh"
-            raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
-    check_files(files, force=force, inputs=[what])
-    cameras = [path for path in files if path.suffix.lower() == CAMERAS]
-    surfaces = [path for path in files if path not in cameras]
-    written: list[dict[str, Any]] = []
+    if as_list:
+        rows = exporting.formats()
+        if as_json:
+            write_json({"event": "summary", "ok": True, "formats": rows, "exit_code": 0})
+        else:
+            listing(*exporting.formats_in_words(rows))
+        return
+    if what is None or first is None:
+        raise UsageError("Give a run or an asset, and --to FILE. 'enerf export --list' names the formats.")
+    faces, size, jpeg = (given.pop(name) for name in ("faces", "texture_size", "jpeg"))
+    asked = exporting.Export(what, (first, *more), limit=memory_limit(memory), picture="jpeg" if jpeg else "png", **given)
+    exporting.check(asked)
+    options = [] if faces is None else [f"mesh.max_faces={exporting.faces_from_text(faces)}"]
+    options += [] if size is None else [f"mesh.texture_size={size}"]
     with _shown(as_json, quiet) as show:
-        for path in cameras:
-            written.append({"path": str(path.absolute()), "cameras": _export_cameras(what, path, force)})
-        if surfaces:
-            written += _export_surface(what, surfaces, as_points, (region, crop), force, limit, sets, show)
+        written = exporting.export_cameras(asked)
+        written += exporting.export_surface(asked, _settings_for(what, (*sets, *options), _surface_stages()), _progress("export", show))
     if as_json:
         write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
     elif not quiet:
         for entry in written:
-            facts = ", ".join(f"{value} {name}" for name, value in entry.items() if name != "path")
-            closing(f"{entry['path']}  ({facts})")
+            facts = ", ".join(f"{value} {name}" for name, value in entry.items() if name not in ("path", "beside"))
+            closing(f"{entry['path']}  ({facts})", *(f"{each}  (belongs to it)" for each in entry.get("beside", ())))
 
 
-def _export_cameras(what: Path, path: Path, force: bool) -> int:
-    from pipeline.errors import BadInput
-    from stages.artifacts import PosesOutputs
-    from stages.io import scene
-    from stages.io.exporters import cameras
-    from workflows.cli.target import is_run, open_run
-    from workflows.destination import writing
-
-    poses = PosesOutputs(open_run(what).folder("poses")) if is_run(what) else PosesOutputs(what)
-    if not poses.scene.is_file():
-        raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
-    found = scene.load(poses.folder)
-    with writing(path, force=force):
-        cameras.write(found, path)
-    return len(found.views)
-
-
-def _export_surface(
-    what: Path,
-    files: list[Path],
-    as_points: bool,
-    part: tuple[str | None, Crop],
-    force: bool,
-    limit: Limit | None,
-    sets: tuple[str, ...],
-    show: Callable[[dict[str, Any]], None],
-) -> list[dict[str, Any]]:
+def _surface_stages() -> dict[str, type]:
     from stages import mesh, points
-    from stages.framing.restriction import restricted
-    from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
-    from stages.io.exporters.writing import source_frame
-    from stages.memory.need import refuse_more_than
-    from stages.memory.surface import surface_needed
-    from workflows.cli.target import load_asset
-    from workflows.destination import writing
 
-    settings = _settings_for(what, sets, {"mesh": mesh.MeshSettings, "points": points.PointsSettings}).resolved()
-    progress = _progress("export", show)
-    region, crop = part
-    usual = settings["points" if as_points else "mesh"].region if crop is None else "all"
-    tree = restricted(load_asset(what), region or usual, crop)
-    frame = source_frame(tree.metadata)
-    number = settings["points"].num_points if as_points else 0
-    remedy = f"Lower points.num_points ({number})." if as_points else "Take an asset of fewer voxels: enerf convert --resolution."
-    refuse_more_than(limit, str(what), surface_needed(tree, number), remedy)
-    if as_points:
-        cloud = points.points_of(tree, settings["points"], frame, progress)
-        for path in files:
-            with writing(path, force=force):
-                POINT_EXPORTERS[path.suffix.lower()](cloud, path, frame)
-        facts: dict[str, Any] = {"points": len(cloud.positions)}
-    else:
-        found = mesh.in_capture(mesh.mesh_of(tree, settings["mesh"], progress), frame)
-        for path in files:
-            with writing(path, force=force):
-                MESH_EXPORTERS[path.suffix.lower()](found, path, frame)
-        facts = {"vertices": len(found.vertices), "faces": len(found.faces)}
-    return [{"path": str(path.absolute()), **facts} for path in files]
+    return {"mesh": mesh.MeshSettings, "points": points.PointsSettings}
 
 
 def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> Settings:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import typing
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +18,14 @@ from efficientnerf.asset.cascades import cascade_grids, nested
 from efficientnerf.asset.region import Region
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import UsageError
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from stages.mesh import MeshSettings
 from tests.workflows.command import Result
-from workflows.cli.files import REGIONS
+from workflows.cli.files import REGIONS, TEXTURES
+from workflows.exporting import faces_from_text
 
 Enerf = Callable[..., Result]
 SCALE = 0.5
@@ -61,6 +67,69 @@ def test_meshes_lie_in_the_frame_of_the_capture(enerf: Enerf, ball: Path, tmp_pa
         np.testing.assert_allclose(found["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 0.6 / SCALE, atol=0.1)
 
 
+def test_a_texture_of_the_asset_in_all_formats(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    """The ball is red. Nothing is written twice: OBJ and USDC share their picture."""
+    names = ["ball.glb", "ball.obj", "ball.stl", *(["ball.usdz", "ball.usdc"] if find_spec("pxr") else [])]
+    result = enerf("export", ball, "--to", *(tmp_path / name for name in names), "--faces", "0.5k", "--texture-size", 256, "--json")
+    assert result.code == 0, result.err
+    written = {Path(entry["path"]).name: entry for entry in result.objects[-1]["written"]}
+    assert sorted(written) == sorted(names)
+    assert sorted([*names, "ball.mtl", "ball.png"]) == sorted(path.name for path in tmp_path.iterdir())
+    assert [Path(each).name for each in written["ball.obj"]["beside"]] == ["ball.png", "ball.mtl"]
+    assert "texels a side" not in written["ball.stl"]
+    assert 100 < written["ball.glb"]["faces"] <= 500
+    assert written["ball.glb"]["texels a side"] <= 256
+    picture = np.asarray(Image.open(tmp_path / "ball.png"))
+    dark, bright = 255 / (1 + np.exp(8 * 0.2820948)), 255 / (1 + np.exp(-8 * 0.2820948))
+    np.testing.assert_allclose(np.median(picture[picture.any(-1)], axis=0), [bright, dark, dark], atol=3)
+    for name in names[:3]:
+        np.testing.assert_allclose(enerf("inspect", tmp_path / name, "--json").object["bounds"], np.array([[-1.0] * 3, [1.0] * 3]) * 1.2, atol=0.1)
+    again = enerf("export", ball, "--to", tmp_path / "other.obj", "--texture", "off", "--faces", 500)
+    assert again.code == 0, again.err
+    assert not (tmp_path / "other.mtl").exists()
+
+
+def test_an_obj_replaces_none_of_its_three_files_without_force(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    for name in ("ball.obj", "ball.mtl", "ball.png"):
+        (tmp_path / name).write_text("mine", encoding="utf-8")
+        result = enerf("export", ball, "--to", tmp_path / "ball.obj")
+        assert result.code == 2
+        assert f"{tmp_path / name}: exists" in result.err
+        assert [each.name for each in tmp_path.iterdir()] == [name]
+        (tmp_path / name).unlink()
+    for name in ("ball.obj", "ball.mtl", "ball.jpg"):
+        (tmp_path / name).write_text("mine", encoding="utf-8")
+    result = enerf("export", ball, "--to", tmp_path / "ball.obj", "--force", "--jpeg", "--faces", 500, "--texture-size", 256)
+    assert result.code == 0, result.err
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["ball.jpg", "ball.mtl", "ball.obj"]
+    assert (tmp_path / "ball.jpg").read_bytes()[:2] == b"\xff\xd8"
+    assert "map_Kd ball.jpg" in (tmp_path / "ball.mtl").read_text("ascii")
+
+
+def test_the_list_names_every_format(enerf: Enerf) -> None:
+    lines = enerf("export", "--list").out.splitlines()
+    rows = enerf("export", "--list", "--json").objects[-1]["formats"]
+    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, ".json"}
+    assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
+    assert sum("pip install 'efficientnerf[usd]'" in line for line in lines) == 2
+    assert len(lines) == 4 * len(rows)
+
+
+def test_the_textures_that_can_be_asked_for_are_those_that_there_are() -> None:
+    assert typing.get_args(typing.get_type_hints(MeshSettings)["texture"]) == TEXTURES
+
+
+@pytest.mark.parametrize(("text", "expected"), [("20k", 20_000), ("0.5K", 500), ("1m", 1_000_000), ("150000", 150_000)])
+def test_faces_may_be_given_in_thousands(text: str, expected: int) -> None:
+    assert faces_from_text(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "k", "-5", "1e6", "nan", "inf", "0", "5kk", "٣k", "1_000"])
+def test_what_is_no_number_of_faces(text: str) -> None:
+    with pytest.raises(UsageError, match="--faces"):
+        faces_from_text(text)
+
+
 def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     result = enerf("export", ball, "--points", "--to", tmp_path / "ball.ply", tmp_path / "ball.xyz", "--set", "points.num_points=300")
     assert result.code == 0, result.err
@@ -81,6 +150,11 @@ def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
         (["--to", "ball.ply", "--points", "--set", "points.num_points=1000000000"], 2, "Lower points.num_points (1000000000)"),
         (["--to", "ball.ply", "--memory", "much"], 2, "expected a size, as in 512m, 8g or 1.5GiB"),
         (["--to", "ball.ply", "--set", "mesh.density_threshold=1e9"], 3, "Lower mesh.density_threshold"),
+        (["--to", "ball.glb", "--texture", "photographs"], 2, "holds no photographs. Give a run with its cameras, or --texture asset."),
+        (["--to", "ball.stl", "--texture", "asset"], 2, "None of the files keeps a texture"),
+        (["--to", "ball.ply", "--jpeg"], 2, "None of the files keeps a texture"),
+        (["--to", "ball.glb", "--faces", "many"], 2, "expected a number of faces, such as 20k"),
+        (["--to", "ball.glb", "--texture-size", "100"], 2, "mesh.texture_size"),
         ([], 2, "--to"),
     ],
 )

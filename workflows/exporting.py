@@ -1,0 +1,247 @@
+"""What `enerf export` does: the surface of a run or of an asset as files, taken from the run's stage `mesh` where that has made the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import BadInput, UsageError
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, Format
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.surface.mesh import Mesh
+    from pipeline.executors.memory import Limit
+    from stages.io.exporters.writing import SourceFrame
+    from stages.mesh import MeshSettings
+    from workflows.cli.resolve import Settings
+
+CAMERAS = ".json"
+Box = tuple[float, float, float, float, float, float]
+Progress = Callable[[int, int, str], None]
+Written = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Export:
+    """What is asked for.
+
+    what       a run or an asset
+    files      to write, by extension; those that are there only if `force`
+    as_points  points instead of a mesh
+    region, crop  of the asset; None: as the settings say
+    texture    of the mesh; None: what the settings say where a file keeps one, else none
+    picture    how textures are stored
+    limit      of memory
+    """
+
+    what: Path
+    files: tuple[Path, ...]
+    as_points: bool = False
+    region: str | None = None
+    crop: Box | None = None
+    force: bool = False
+    texture: str | None = None
+    picture: str = "png"
+    limit: Limit | None = None
+
+    def format(self, path: Path) -> Format:
+        return (POINT_EXPORTERS if self.as_points else MESH_EXPORTERS)[path.suffix.lower()]
+
+    @property
+    def surfaces(self) -> list[Path]:
+        """The files that hold the surface; the others hold cameras."""
+        return [path for path in self.files if path.suffix.lower() != CAMERAS]
+
+    @property
+    def keeps_textures(self) -> bool:
+        return any(self.format(path).textures for path in self.surfaces)
+
+
+def faces_from_text(text: str) -> int:
+    """20k, 0.1m or a plain number. UsageError for anything else."""
+    digits, factor = text.strip().lower(), 1.0
+    if digits[-1:] in ("k", "m"):
+        digits, factor = digits[:-1], {"k": 1e3, "m": 1e6}[digits[-1]]
+    try:
+        count = float(digits) * factor
+    except ValueError:
+        count = 0.0
+    if not 1 <= count <= 2**31 or not digits.replace(".", "", 1).isascii() or not digits.replace(".", "", 1).isdigit():
+        raise UsageError(f"--faces {text}: expected a number of faces, such as 20k, 100k, 500k or 150000.")
+    return round(count)
+
+
+def check(export: Export) -> None:
+    """Raise UsageError for what cannot be written, before anything is done."""
+    from stages.io.exporters.usd import refuse_without_usd
+    from workflows.destination import check_files
+
+    known = [*(POINT_EXPORTERS if export.as_points else MESH_EXPORTERS), CAMERAS]
+    for path in export.files:
+        if path.suffix.lower() not in known:
+            kind = "points" if export.as_points else "a mesh"
+            raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
+    asked = export.texture not in (None, "off") or export.picture != "png"
+    if asked and not export.keeps_textures:
+        raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
+    for path in export.surfaces:
+        if export.format(path).extra == "usd":
+            refuse_without_usd(path)
+    beside = [] if export.texture == "off" else [each for path in export.surfaces for each in export.format(path).companions(path, export.picture)]
+    check_files([*export.files, *dict.fromkeys(beside)], force=export.force, inputs=[export.what])
+
+
+def export_cameras(export: Export) -> list[Written]:
+    """The cameras of a run."""
+    from stages.artifacts import PosesOutputs
+    from stages.io import scene
+    from stages.io.exporters import cameras
+    from workflows.cli.target import is_run, open_run
+    from workflows.destination import writing
+
+    written, what = [], export.what
+    for path in (path for path in export.files if path not in export.surfaces):
+        poses = PosesOutputs(open_run(what).folder("poses")) if is_run(what) else PosesOutputs(what)
+        if not poses.scene.is_file():
+            raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
+        found = scene.load(poses.folder)
+        with writing(path, force=export.force):
+            cameras.write(found, path)
+        written.append({"path": str(path.absolute()), "cameras": len(found.views)})
+    return written
+
+
+def export_surface(export: Export, settings: Settings, progress: Progress) -> list[Written]:
+    """The surface as points or as a mesh. `settings` holds those of the stages mesh and points, with which it is made."""
+    from stages.framing.restriction import restricted
+    from stages.io.exporters.writing import source_frame
+    from workflows.cli.target import load_asset
+    from workflows.destination import writing
+
+    if not export.surfaces:
+        return []
+    resolved = settings.resolved()
+    wanted = resolved["points" if export.as_points else "mesh"]
+    region = export.region or (wanted.region if export.crop is None else "all")
+    wanted = replace(wanted, region=region)
+    if not export.as_points:
+        wanted = replace(wanted, texture=(export.texture or wanted.texture) if export.keeps_textures else "off")
+        made = None if export.crop is not None else _made_by_the_stage(export.what, wanted, export.keeps_textures)
+        if made is not None:
+            return _write_mesh(export, *made)
+    tree = restricted(load_asset(export.what), region, export.crop)
+    frame = source_frame(tree.metadata)
+    if not export.as_points:
+        return _write_mesh(export, _meshed(export, tree, frame, wanted, progress), frame)
+    from stages.points import points_of
+
+    _refuse_what_does_not_fit(export, tree, f"Lower points.num_points ({wanted.num_points}).", points=wanted.num_points)
+    cloud = points_of(tree, wanted, frame, progress)
+    for path in export.surfaces:
+        with writing(path, force=export.force):
+            export.format(path)(cloud, path, frame)
+    return [{"path": str(path.absolute()), "points": len(cloud.positions)} for path in export.surfaces]
+
+
+def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: int) -> None:
+    from stages.memory.need import refuse_more_than
+    from stages.memory.surface import surface_needed
+
+    refuse_more_than(export.limit, str(export.what), surface_needed(tree, **needed), remedy)
+
+
+def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -> tuple[Mesh, SourceFrame] | None:
+    """The mesh that the run's stage `mesh` has made, if that is what is wanted; its texture may be left out."""
+    from efficientnerf.asset.format import describe
+    from pipeline.decide import decide
+    from pipeline.stage import settings_dict, settings_from
+    from stages.artifacts import BakeOutputs, MeshOutputs
+    from stages.io.exporters.writing import source_frame
+    from stages.mesh import STAGE, MeshSettings
+    from stages.meshing.files import read_mesh
+    from workflows.cli.target import is_run, open_run
+
+    if not is_run(what):
+        return None
+    run = open_run(what)
+    decision = decide(STAGE, run)
+    if not decision.fresh or decision.manifest is None:
+        return None
+    made = settings_from(MeshSettings, decision.manifest.request.settings, where=STAGE.name)
+    same = settings_dict(replace(made, texture="off", texture_size=2048)) == settings_dict(replace(wanted, texture="off", texture_size=2048))
+    if not same or (wanted.texture != "off" and (made.texture, made.texture_size) != (wanted.texture, wanted.texture_size)):
+        return None
+    mesh = read_mesh(MeshOutputs.of_run(what))
+    frame = source_frame(describe(BakeOutputs.of_run(what).asset))
+    return mesh if wanted.texture != "off" or not keeps_textures else replace(mesh, texture=None), frame
+
+
+def _meshed(export: Export, tree: NerfTree, frame: SourceFrame, wanted: MeshSettings, progress: Progress) -> Mesh:
+    """The mesh of a tree in the capture's frame, textured as its settings say."""
+    from stages.meshing.texture import largest_photograph, textured
+
+    from stages.artifacts import BakeOutputs, MeshInputs, PosesOutputs, TrainOutputs
+    from stages.mesh import SURFACE_SHARE, in_capture, mesh_of
+    from workflows.cli.target import is_run
+
+    has_photographs = is_run(export.what) and PosesOutputs.of_run(export.what).scene.is_file()
+    if wanted.texture == "photographs" and not has_photographs:
+        raise UsageError(f"{export.what}: holds no photographs. Give a run with its cameras, or --texture asset.")
+    choice = "asset" if wanted.texture == "auto" and not has_photographs else wanted.texture
+    inputs = MeshInputs(*(kind.of_run(export.what) for kind in (BakeOutputs, TrainOutputs, PosesOutputs)))  # type: ignore[arg-type]
+    side = 0 if choice == "off" else wanted.texture_size
+    remedy = "Take an asset of fewer voxels (enerf convert --resolution)" + (", or a smaller texture (--texture-size)." if side else ".")
+    _refuse_what_does_not_fit(export, tree, remedy, texture=side, pixels=largest_photograph(inputs, choice))
+    share = 1.0 if choice == "off" else SURFACE_SHARE
+
+    def surface(done: int, total: int, text: str) -> None:
+        progress(round(1000 * share * done / max(total, 1)), 1000, text)
+
+    def texture(done: int, total: int, text: str) -> None:
+        progress(round(1000 * (share + (1 - share) * done / max(total, 1))), 1000, text)
+
+    return in_capture(textured(mesh_of(tree, wanted, surface), tree, inputs, choice, wanted.texture_size, texture), frame)
+
+
+def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:
+    from workflows.destination import check_free, writing
+
+    written: list[Written] = []
+    beside: set[Path] = set()
+    normal_map = mesh.texture is not None and mesh.texture.normals is not None
+    for path in export.surfaces:
+        kind = export.format(path)
+        others = [] if mesh.texture is None else kind.companions(path, export.picture, normal_map)
+        for each in others:
+            if each not in beside:  # else of another file of these, and the same
+                check_free(each, force=export.force)
+        with writing(path, force=export.force):
+            kind(mesh, path, frame, **({"picture": export.picture} if kind.textures else {}))
+        side = 0 if mesh.texture is None or not kind.textures else max(mesh.texture.colours.shape[:2])
+        entry: Written = {"path": str(path.absolute()), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+        entry |= {"texels a side": side} if side else {}
+        written.append(entry | ({"beside": [str(each.absolute()) for each in others]} if others else {}))
+        beside |= {*others}
+    return written
+
+
+def formats() -> list[dict[str, Any]]:
+    """All formats with what they keep and lose, the extra that they need, and who opens them."""
+    rows: list[dict[str, Any]] = []
+    for kind, table in (("mesh", MESH_EXPORTERS), ("points", POINT_EXPORTERS)):
+        for each in table.values():
+            rows.append({"extension": each.extension, "of": kind, "keeps": each.keeps, "loses": each.loses, "extra": each.extra, "opened_by": each.opened_by})
+    cameras = {"keeps": "cameras and their lenses, of a run", "loses": "the surface", "extra": None, "opened_by": "nerfstudio, instant-ngp, gsplat"}
+    return [*rows, {"extension": CAMERAS, "of": "cameras", **cameras}]
+
+
+def formats_in_words(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """As lines of a listing."""
+    lines = []
+    for row in rows:
+        lines.append(f"{row['extension']:<6} {row['of']}" + ("" if row["extra"] is None else f"; needs: pip install 'efficientnerf[{row['extra']}]'"))
+        lines += [f"       {name:<7} {row[key]}" for name, key in (("keeps", "keeps"), ("loses", "loses"), ("opens", "opened_by"))]
+    return lines
