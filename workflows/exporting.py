@@ -181,10 +181,9 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
 
 def _meshed(export: Export, tree: NerfTree, frame: SourceFrame, wanted: MeshSettings, progress: Progress) -> Mesh:
     """The mesh of a tree in the capture's frame, textured as its settings say."""
-    from stages.meshing.texture import largest_photograph, textured
-
     from stages.artifacts import BakeOutputs, MeshInputs, PosesOutputs, TrainOutputs
     from stages.mesh import SURFACE_SHARE, in_capture, mesh_of
+    from stages.meshing.texture import largest_photograph, textured
     from workflows.cli.target import is_run
 
     has_photographs = is_run(export.what) and PosesOutputs.of_run(export.what).scene.is_file()

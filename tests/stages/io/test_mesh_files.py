@@ -1,0 +1,92 @@
+"""The mesh of a run, read again from its files: what was written, or a word about what is wrong."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.surface.mesh import Mesh, Texture
+from pipeline.errors import CorruptArtifact
+from stages.artifacts import MeshOutputs
+from stages.io.exporters import MESH_EXPORTERS
+from stages.meshing.files import read_mesh
+from tests.stages.io.meshes import Y_DOWN, block
+
+
+def textured() -> Mesh:
+    """The block with a texture of noise at places that differ from corner to corner."""
+    rng = np.random.default_rng(0)
+    return replace(block(), texture=Texture(rng.random((12, 3, 2)).round(3), rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)))
+
+
+def written(folder: Path, mesh: Mesh) -> MeshOutputs:
+    folder.mkdir(exist_ok=True)
+    outputs = MeshOutputs(folder)
+    for path in (outputs.ply, outputs.glb):
+        MESH_EXPORTERS[path.suffix](mesh, path, Y_DOWN)
+    return outputs
+
+
+@pytest.mark.parametrize("mesh", [block(), textured()], ids=["vertex colours", "texture"])
+def test_what_is_read_is_what_was_written(mesh: Mesh, tmp_path: Path) -> None:
+    found = read_mesh(written(tmp_path, mesh))
+    np.testing.assert_allclose(found.vertices, mesh.vertices, rtol=1e-6)
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    np.testing.assert_allclose(found.normals, mesh.normals, atol=1e-6)
+    np.testing.assert_allclose(found.colours, mesh.colours, atol=0.5 / 255 + 1e-6)
+    assert (found.texture is None) == (mesh.texture is None)
+    if mesh.texture is not None and found.texture is not None:
+        np.testing.assert_allclose(found.texture.coordinates, mesh.texture.coordinates, atol=1e-6)
+        np.testing.assert_array_equal(found.texture.colours, mesh.texture.colours)
+
+
+def test_reading_and_writing_again_changes_no_byte(tmp_path: Path) -> None:
+    first = written(tmp_path / "a", textured())
+    again = written(tmp_path / "b", read_mesh(first))
+    assert first.ply.read_bytes() == again.ply.read_bytes()
+    found, other = read_mesh(first), read_mesh(again)
+    assert found.texture is not None
+    assert other.texture is not None
+    np.testing.assert_allclose(found.texture.coordinates, other.texture.coordinates, atol=1e-7)
+
+
+def rewritten(path: Path, change: Callable[[dict], None]) -> None:
+    """The JSON part of a GLB, changed."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    path.write_bytes(data[:12] + struct.pack("<I", len(text)) + data[16:20] + text + data[20 + size :])
+
+
+SPOILT: dict[str, Callable[[MeshOutputs], object]] = {
+    "no ply": lambda outputs: outputs.ply.unlink(),
+    "no glb": lambda outputs: outputs.glb.unlink(),
+    "a ply cut off": lambda outputs: outputs.ply.write_bytes(outputs.ply.read_bytes()[:-5]),
+    "an empty ply": lambda outputs: outputs.ply.write_bytes(b""),
+    "a ply of large numbers": lambda outputs: outputs.ply.write_bytes(outputs.ply.read_bytes().replace(b"element face 12", b"element face 99999999999999")),
+    "faces beyond the vertices": lambda outputs: outputs.ply.write_bytes(outputs.ply.read_bytes()[:-4] + struct.pack("<i", 8)),
+    "an empty glb": lambda outputs: outputs.glb.write_bytes(b""),
+    "a glb cut off": lambda outputs: outputs.glb.write_bytes(outputs.glb.read_bytes()[:-2000]),
+    "a glb of another mesh": lambda outputs: MESH_EXPORTERS[".glb"](replace(textured(), vertices=block().vertices * 2), outputs.glb, Y_DOWN),
+    "no meshes": lambda outputs: rewritten(outputs.glb, lambda document: document.pop("meshes")),
+    "an accessor out of range": lambda outputs: rewritten(outputs.glb, lambda document: document["accessors"][2].update(count=10**9)),
+    "no picture": lambda outputs: rewritten(outputs.glb, lambda document: document["images"].clear()),
+    "a picture elsewhere": lambda outputs: rewritten(outputs.glb, lambda document: document["images"][0].update(bufferView=0)),
+}
+
+
+@pytest.mark.parametrize("how", SPOILT)
+def test_damaged_files_are_said(how: str, tmp_path: Path) -> None:
+    outputs = written(tmp_path, textured())
+    SPOILT[how](outputs)
+    with pytest.raises(CorruptArtifact, match="Make the mesh again"):
+        read_mesh(outputs)
