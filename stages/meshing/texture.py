@@ -21,21 +21,21 @@ Progress = Callable[[int, int, str], None]
 
 
 def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, largest: int, progress: Progress) -> Mesh:
-    """A mesh of the training frame with a texture, and what is known of that beside its facts.
+    """A mesh of the training frame with a texture, the colours of its vertices from that, and what is known of it beside its facts.
 
     choice    "photographs", "asset", "off", or "auto": photographs where the training views show any of the mesh, else the asset
     largest   texels along a side, at most
     progress  is called often; what it raises stops the work
     """
+    from efficientnerf.surface.shading import vertex_colours
     from efficientnerf.surface.texturing.asset import texture_of_asset
 
     if choice == "off":
         return mesh
-    if choice != "asset":
-        found = _from_photographs(mesh, inputs, largest, progress)
-        if found is not None and (choice == "photographs" or found.facts["texture_observed"]):
-            return found
-    return texture_of_asset(tree, mesh, largest=largest, progress=progress)
+    found = None if choice == "asset" else _from_photographs(mesh, inputs, largest, progress)
+    if found is None or (choice != "photographs" and not found.facts["texture_observed"]):
+        found = texture_of_asset(tree, mesh, largest=largest, progress=progress)
+    return replace(found, colours=vertex_colours(found))  # docs/experiments/texture.md
 
 
 def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Progress) -> Mesh | None:
