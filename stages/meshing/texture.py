@@ -35,7 +35,7 @@ def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, larges
     found = None if choice == "asset" else _from_photographs(mesh, inputs, largest, progress)
     if found is None or (choice != "photographs" and not found.facts["texture_observed"]):
         found = texture_of_asset(tree, mesh, largest=largest, progress=progress)
-    return replace(found, colours=vertex_colours(found))  # docs/experiments/texture.md
+    return replace(found, colours=vertex_colours(found))  # docs/experiments/vertex-colours.md
 
 
 def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Progress) -> Mesh | None:
