@@ -114,7 +114,7 @@ class BakeSettings:
     )
     error_map: Annotated[float, Meta(ge=0.0, lt=1.0)] | Auto = setting(
         "auto",
-        "Share of the refinement's rays that are drawn where earlier errors were large; auto: 0.9 with a constant background, 0 without.",
+        "Share of the refinement's rays that are drawn where earlier errors were large; auto: 0.9, 0 in forward-facing scenes.",
         advanced=True,
     )
     lr_final_ratio: Fraction = setting(0.1, "Ratio to which the learning rates of the refinement fall exponentially.", advanced=True)

@@ -44,7 +44,7 @@ ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
 MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, 6  # see `refinement_steps`
-ERROR_MAP = 0.9  # bake.error_map with a constant background; docs/experiments/tree-training.md
+ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
 Room = Callable[[int], int]  # voxels that the asset holds on its grids, which were split so often
@@ -124,12 +124,11 @@ class Refinement:
         phase, end = point.schedule.phases[number].name, point.schedule.begin(number + 1)
         if state.step >= end:
             return
-        unbounded = state.tree.background is None
         ratio, share = given(settings.view_dependent_lr_ratio), given(settings.error_map)
         if ratio is None:
-            ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if unbounded else 1.0
+            ratio = UNBOUNDED_VIEW_DEPENDENT_LR_RATIO if state.tree.background is None else 1.0
         if share is None:
-            share = 0.0 if unbounded else ERROR_MAP
+            share = 0.0 if state.tree.ndc is not None else ERROR_MAP
         run = fit.optimise(
             state, self.targets, until=end, rays=settings.refine_rays_per_batch, density_lr=settings.density_lr, sh_lr=settings.sh_lr,
             fall=lambda step: settings.lr_final_ratio ** point.schedule.fraction(step), seed=settings.seed, view_dependent_lr_ratio=ratio,
