@@ -10,7 +10,8 @@ import torch
 from gpu_kernels import copy_rate, milliseconds, orbit
 
 from efficientnerf.asset.refinement import device as refinement
-from efficientnerf.asset.refinement.host import DECAY, EPSILON, in_voxels, packet_bases
+from efficientnerf.asset.refinement.host import in_voxels, packet_bases
+from efficientnerf.asset.refinement.rule import DECAY, EPSILON
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients

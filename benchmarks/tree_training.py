@@ -89,16 +89,17 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     import numpy as np
     from numba import get_num_threads
 
-    from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
     from efficientnerf.asset.refinement.error_map import ErrorMap
-    from efficientnerf.asset.refinement.host import DECAY, EPSILON, in_voxels, packet_bases
+    from efficientnerf.asset.refinement.host import in_voxels, packet_bases
+    from efficientnerf.asset.refinement.rule import Rule
     from efficientnerf.asset.refinement.state import MAX_INITIAL_THICKNESS, initial_state
     from efficientnerf.asset.refinement.targets import step_rng
     from efficientnerf.asset.refinement.tiles import tiles_met
     from efficientnerf.backends.numba.tree.walk import tree_grid
     from efficientnerf.backends.numba.tree_training import gradients
+    from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
     from efficientnerf.backends.numba.tree_training.packets import cells_of
-    from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, step, values_of
+    from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
     from efficientnerf.training.patches import PatchGrid
 
     tree, targets = loaded(run)
@@ -107,7 +108,8 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     values, error_map = values_of(cells, state.density, state.sh), ErrorMap(patches, tiles_met(tree, patches))
     width = state.sh.shape[1]
     moments = Moments(np.zeros(0, np.float32), np.zeros((0, width), np.float32), state.square_density, state.square_sh, state.visits)
-    rule = Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, np.full(width, 0.01, np.float32), DECAY, EPSILON)
+    rule = Rule(total_variation=0.01).hyperparameters(1, tree.harmonics_count, density_lr=0.1, sh_lr=0.01, view_share=1.0)
+    neighbours = neighbours_of(cells)
     times: dict[str, list[tuple[float, float]]] = {}
     counts, number, until = [], 0, time.perf_counter() + seconds
 
@@ -121,7 +123,7 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
         number += 1
         given = timed(times, "rays", drawn)
         loss, records = timed(times, "forward and backward", gradients.forward_backward, cells, *given)
-        timed(times, "sums and step", step, records, values, moments, rule)
+        timed(times, "sums and step", step, records, values, moments, rule, neighbours)
         written = [records.numbers[a:b, 0] for a, b in zip(records.begin[:, 0], records.begin[:, -1], strict=True)]
         counts.append((len(loss), sum(map(len, written)), len(np.unique(np.concatenate(written)))))
     count, recorded, met = (float(np.mean([row[n] for row in counts[1:]])) for n in range(3))

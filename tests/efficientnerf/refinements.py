@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from efficientnerf.asset.cascades import cascade_sides, voxel_cascades, voxel_sides
+from efficientnerf.asset.cascades import voxel_sides
 from efficientnerf.asset.refinement.host import in_voxels, packet_bases
 from efficientnerf.asset.refinement.state import RefinementState
 from efficientnerf.asset.rendering import render_reference
@@ -18,8 +18,9 @@ from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, Records, packets_of
+from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import Moments, sum_gradients, values_of
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree
 
@@ -115,8 +116,8 @@ def empty_moments(state: RefinementState, *, adam: bool) -> Moments:
     return Moments(np.zeros(count, np.float32), np.zeros((count, width), np.float32), state.square_density, state.square_sh, state.visits)
 
 
-def rule_of(tree: NerfTree, state: RefinementState, **more: Any) -> Hyperparameters:
-    return Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, np.full(state.sh.shape[1], 0.01, np.float32), 0.9, 1e-12, **more)
+def rule_of(**more: Any) -> Hyperparameters:
+    return Hyperparameters(0.1, 0.01, 0.5, 0.9, 1e-12, **more)
 
 
 GRIDS: list[Callable[[], NerfTree]] = [lambda: random_tree(4, brick=2, degree=1), lambda: random_cascades(4, brick=2)]

@@ -14,19 +14,20 @@ import torch
 from torch import Tensor
 
 from efficientnerf.asset.refinement.error_map import INTERVAL, Drawn, ErrorMap
-from efficientnerf.asset.refinement.host import DECAY, EPSILON, MAX_PACKET_ANGLE
+from efficientnerf.asset.refinement.host import MAX_PACKET_ANGLE
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import MOMENTS, STATE, RefinementState
 from efficientnerf.asset.refinement.targets import Bundle, Targets, step_rng
 from efficientnerf.asset.refinement.tiles import tiles_met
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.walk import tree_grid
+from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of
 from efficientnerf.backends.transfer import constant, to_host_async
 from efficientnerf.backends.triton import tree_gradients, tree_packets
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, Rays, device_grid
-from efficientnerf.backends.triton.tree_steps import Hyperparameters, Moments, Neighbours, step
+from efficientnerf.backends.triton.tree_steps import Moments, Neighbours, step
 from efficientnerf.training.device_pixels import DevicePixels
 from efficientnerf.training.patches import PatchGrid
 from efficientnerf.training.readback import LAG
@@ -133,10 +134,8 @@ def optimise(
         origins, directions, wanted = targets.of(drawn.patches.pixels)
         first = targets.pixels.to_device(packets_within(drawn.patches.first, tree_packets.RAYS)) if patches.angle <= MAX_PACKET_ANGLE else None
         factor = fall(number)
-        hyperparameters = Hyperparameters(
-            density_lr * factor, sh_lr * factor, view_dependent_lr_ratio, DECAY, EPSILON, total_variation=rule.total_variation, sparsity=rule.sparsity,
-            entropy=rule.entropy, terms=rule.terms(number, state.tree.harmonics_count),
-        )  # fmt: skip
+        rates = {"density_lr": density_lr * factor, "sh_lr": sh_lr * factor, "view_share": view_dependent_lr_ratio}
+        hyperparameters = rule.hyperparameters(number, state.tree.harmonics_count, **rates)
         loss = arrays.step(number, rays_in_voxels(state.tree, origins, directions), wanted, hyperparameters, rule.min_weight, first)
         arrays.pending.append((drawn, *to_host_async(loss)))
         state.step = number

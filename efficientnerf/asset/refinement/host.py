@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from efficientnerf.asset.cascades import cascade_sides, voxel_cascades
 from efficientnerf.asset.refinement.error_map import INTERVAL, ErrorMap
 from efficientnerf.asset.refinement.rule import PLAIN, Rule
 from efficientnerf.asset.refinement.state import RefinementState
@@ -22,11 +21,10 @@ from efficientnerf.backends.numba.tree_training import gradients
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
-from efficientnerf.backends.numba.tree_training.steps import Hyperparameters, Moments, step, values_of
+from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.patches import PatchGrid
 
-DECAY, EPSILON = 0.99, 1e-10  # of RMSprop
 MAX_PACKET_ANGLE = 0.02  # radians across patches whose rays share harmonics; docs/experiments/tree-training-kernels.md
 
 
@@ -57,9 +55,6 @@ def optimise(
     none = np.zeros(0, np.float32), np.zeros((0, state.sh.shape[1]), np.float32)
     moments = Moments(*none, state.square_density, state.square_sh, state.visits)
     neighbours = neighbours_of(cells) if rule.total_variation > 0 else NO_NEIGHBOURS
-    sides, cascades = cascade_sides(state.tree), voxel_cascades(state.tree)
-    rates = np.full(state.sh.shape[1], sh_lr, np.float32)
-    rates[3:] *= view_dependent_lr_ratio
     while state.step < until:
         number = state.step + 1
         if state.step % INTERVAL == 0:
@@ -72,11 +67,8 @@ def optimise(
             cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, wanted, buffer, min_weight=rule.min_weight
         )
         factor = fall(number)
-        hyperparameters = Hyperparameters(
-            sides, cascades, density_lr * factor, rates * np.float32(factor), DECAY, EPSILON, total_variation=rule.total_variation, sparsity=rule.sparsity,
-            entropy=rule.entropy, terms=rule.terms(number, len(rates) // 3),
-        )  # fmt: skip
-        step(records, values, moments, hyperparameters, neighbours)
+        rates = {"density_lr": density_lr * factor, "sh_lr": sh_lr * factor, "view_share": view_dependent_lr_ratio}
+        step(records, values, moments, rule.hyperparameters(number, state.tree.harmonics_count, **rates), neighbours)
         state.step = number
         yield error_map.record(drawn, loss) / 3
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
+
+DECAY, EPSILON = 0.99, 1e-10  # of RMSprop
+
 
 @dataclass(frozen=True)
 class Rule:
@@ -28,6 +32,13 @@ class Rule:
     def terms(self, step: int, most: int) -> int:
         """Coefficients of a channel that a step moves, of so many."""
         return most if self.degree is None else min(most, (self.degree(step) + 1) ** 2)
+
+    def hyperparameters(self, step: int, most: int, *, density_lr: float, sh_lr: float, view_share: float) -> Hyperparameters:
+        """Of a step, of a tree of so many coefficients of a channel, at its own learning rates."""
+        return Hyperparameters(
+            density_lr, sh_lr, view_share, DECAY, EPSILON, total_variation=self.total_variation, sparsity=self.sparsity, entropy=self.entropy,
+            terms=self.terms(step, most),
+        )  # fmt: skip
 
 
 PLAIN = Rule()

@@ -12,30 +12,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.steps import MAX_THICKNESS, MAX_VISITS, MIN_THICKNESS, MOST_VARIATION
 from efficientnerf.backends.triton.launch import INTERPRETED, blocks
 from efficientnerf.backends.triton.tree_gradients import DeviceGrid, fixed_point_scale
 
 VOXELS_PER_PROGRAM = 256 if INTERPRETED else 32
-
-
-class Hyperparameters(NamedTuple):
-    """Those of the CPU's step of the same names, and
-
-    sh_rate     learning rate of the harmonics
-    view_share  of that for harmonics of degree 1 and above
-    """
-
-    density_rate: float
-    sh_rate: float
-    view_share: float
-    decay: float
-    epsilon: float
-    momentum: float = 0.0
-    total_variation: float = 0.0
-    sparsity: float = 0.0
-    entropy: float = 0.0
-    terms: int = 25
 
 
 class Moments(NamedTuple):

@@ -24,7 +24,7 @@ device = pytest.importorskip("efficientnerf.backends.triton.tree_steps")
 refinement = pytest.importorskip("efficientnerf.asset.refinement.device")
 kernels = pytest.importorskip("efficientnerf.backends.triton.tree_gradients")
 
-DECAY, EPSILON, RAYS = 0.9, 1e-12, 100
+RAYS = 100
 
 
 def sent(values: np.ndarray) -> torch.Tensor:
@@ -46,7 +46,7 @@ class OnDevice:
         scale = kernels.fixed_point_scale(RAYS)
         sums = tuple(sent(np.rint(by.astype(np.float64) * scale).astype(np.int64)) for by in (by_thickness, by_sh))
         stamp = sent(np.where(met, number, number - 1).astype(np.int32))
-        rule = device.Hyperparameters(0.1, 0.01, 0.5, DECAY, EPSILON, **more)
+        rule = rule_of(**more)
         device.step(self.grid, self.values, sums, self.moments, stamp, rule, self.neighbours, number=number, rays=RAYS)
         for part in sums:
             assert not part.cpu().numpy()[met].any()  # ready for the next step
@@ -66,8 +66,7 @@ def test_steps_are_those_of_the_cpu(made: Callable[[], NerfTree], more: dict[str
     there = OnDevice(tree, o, adam=adam, smooth=smooth)
     cells = cells_of(tree_grid(tree))
     moments, neighbours = empty_moments(o, adam=adam), neighbours_of(cells) if smooth else NO_NEIGHBOURS
-    rule = rule_of(tree, o, **more)
-    rule.sh_rates[3:] *= 0.5
+    rule = rule_of(**more)
     width = 3 * more.get("terms", 25)
     for number in (1, 2, 3):
         records = records_of(tree, o, number)
@@ -116,7 +115,7 @@ def test_regularisers_are_slopes_of_their_terms(made: Callable[[], NerfTree], ki
     there.step(np.zeros_like(o.density), np.zeros_like(o.sh), np.ones(len(sides), bool), 1, **{kind: 0.7})
     logarithm = torch.from_numpy(np.log(o.density.astype(np.float64) * sides)).requires_grad_()
     (slope,) = torch.autograd.grad(0.7 * penalty(tree, logarithm, kind), logarithm)
-    size, moved = np.sqrt(there.moments.square_density.cpu().double().numpy() / (1 - DECAY)), there.values[0].cpu().numpy() - o.density
+    size, moved = np.sqrt(there.moments.square_density.cpu().double().numpy() / (1 - rule_of().decay)), there.values[0].cpu().numpy() - o.density
     np.testing.assert_allclose(size, slope.abs().numpy(), rtol=1e-3, atol=1e-6 * np.abs(size).max())
     clear = size > 1e-4 * size.max()
     assert (np.sign(moved) == -np.sign(slope.numpy()))[clear].all()

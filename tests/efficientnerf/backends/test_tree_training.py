@@ -20,7 +20,7 @@ from efficientnerf.backends.numba.tree_training import gradients as kernels
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import Neighbours, differences, neighbours_of
 from efficientnerf.backends.numba.tree_training.packets import cells_of
-from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Hyperparameters, Values, step, sum_gradients, values_of
+from efficientnerf.backends.numba.tree_training.steps import MIN_THICKNESS, MOST_VARIATION, Values, step, sum_gradients, values_of
 from tests.efficientnerf.refinements import GRIDS, empty_moments, gradients, gradients_by_autograd, records_of, rule_of, seen_at_random
 from tests.efficientnerf.trees import nested_rays, random_cascades, random_tree, rays_at
 
@@ -79,7 +79,7 @@ def test_light_samples_absorb_and_have_no_gradient() -> None:
 def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: float, terms: int) -> None:
     tree = made()
     sides, o = voxel_sides(tree), initial_state(tree)
-    rates = np.linspace(0.01, 0.02, o.sh.shape[1]).astype(np.float32)
+    rates = np.where(np.arange(o.sh.shape[1]) < 3, 0.01, 0.005)
     moments, count, width = empty_moments(o, adam=momentum > 0), len(o.density), 3 * terms
     density, sh = o.density.astype(np.float64), o.sh.astype(np.float64)
     square_density, square_sh, visits, m_density, m_sh = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count), np.zeros((count, width))
@@ -87,7 +87,7 @@ def test_steps_are_those_of_the_formula(made: Callable[[], NerfTree], momentum: 
         records = records_of(tree, o, number)
         by_density, by_sh = np.zeros_like(o.density), np.zeros_like(o.sh)
         sum_gradients(records, by_density, by_sh)
-        rule = Hyperparameters(cascade_sides(tree), voxel_cascades(tree), 0.1, rates, 0.9, 1e-12, momentum, terms=terms)
+        rule = rule_of(momentum=momentum, terms=terms)
         step(records, values_of(cells_of(tree_grid(tree)), o.density, o.sh), moments, rule)
         met = np.zeros(count, bool)
         for begin, end in zip(records.begin[:, 0], records.begin[:, -1], strict=True):
@@ -123,7 +123,7 @@ def test_the_same_bytes_on_any_number_of_threads() -> None:
             values = values_of(cells, o.density, o.sh)
             for _ in range(2):
                 loss, records = kernels.forward_backward(cells, first, start, along, packet_bases(bases, first), values.dense, values.sh, seen, RecordBuffer())
-                step(records, values, moments, rule_of(tree, o, momentum=0.9))
+                step(records, values, moments, rule_of(momentum=0.9))
             found.append((loss, o.density, o.sh, *moments))
     finally:
         numba.set_num_threads(threads)
@@ -174,7 +174,7 @@ def test_regularisers_are_slopes_of_their_terms(made: Callable[[], NerfTree], ki
     old = np.log(o.density.astype(np.float64) * voxel_sides(tree))
     slope = by_density.astype(np.float64) * o.density
     values = values_of(cells_of(tree_grid(tree)), o.density, o.sh)
-    step(records, values, empty_moments(o, adam=False), rule_of(tree, o, **{kind: 0.7}))
+    step(records, values, empty_moments(o, adam=False), rule_of(**{kind: 0.7}))
     np.testing.assert_array_equal(values.dense[values.places], o.density)
     met = o.visits > 0
     assert 10 < met.sum() < len(met)
@@ -197,11 +197,11 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
     cells = cells_of(tree_grid(tree))
     old = np.log(plain.density.astype(np.float64) * voxel_sides(tree))
     for o, more in ((plain, {}), (smooth, {"total_variation": weight})):
-        step(records_of(tree, o, 1), values_of(cells, o.density, o.sh), empty_moments(o, adam=False), rule_of(tree, o, **more), neighbours_of(cells))
+        step(records_of(tree, o, 1), values_of(cells, o.density, o.sh), empty_moments(o, adam=False), rule_of(**more), neighbours_of(cells))
     np.testing.assert_array_equal(plain.square_density, smooth.square_density)
     moved = np.log(plain.density / smooth.density)
     np.testing.assert_array_equal(moved[plain.visits == 0], 0)
-    share = min(rule_of(tree, plain).density_rate * weight, MOST_VARIATION)
+    share = min(rule_of().density_rate * weight, MOST_VARIATION)
     for v in np.random.default_rng(1).choice(np.flatnonzero(plain.visits > 0), 12, replace=False):
         ends = []
         for side in (1e-5, -1e-5):
@@ -209,6 +209,16 @@ def test_total_variation_takes_its_slope_apart_from_the_moments(made: Callable[[
             by[v] += side
             ends.append(penalty(tree, by, old, np.arange(len(old)) == v, "total_variation"))
         assert moved[v] == pytest.approx(share * (ends[0] - ends[1]) / 2e-5, rel=2e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("made", GRIDS, ids=["one grid", "cascades"])
+def test_values_know_their_voxels(made: Callable[[], NerfTree]) -> None:
+    tree = made()
+    values = values_of(cells_of(tree_grid(tree)), tree.density_values, tree.sh.reshape(len(tree.sh), -1))
+    np.testing.assert_array_equal(values.cascades, voxel_cascades(tree))
+    np.testing.assert_allclose(values.sides, cascade_sides(tree), rtol=1e-15)
+    np.testing.assert_array_equal(values.dense[values.places], tree.density_values)
+    assert np.signbit(values.dense).sum() == len(values.dense) - len(values.density)
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -219,13 +229,12 @@ def test_rows_of_any_length_take_their_own_gradient_and_no_other(degree: int) ->
     records, before = records_of(tree, o, 1), o.sh.copy()
     by_density, by_sh = np.zeros(o.density.shape), np.zeros(o.sh.shape)
     sum_gradients(records, by_density, by_sh)
-    rule = rule_of(tree, o)
-    step(records, values_of(cells_of(tree_grid(tree)), o.density, o.sh), empty_moments(o, adam=False), rule)
+    step(records, values_of(cells_of(tree_grid(tree)), o.density, o.sh), empty_moments(o, adam=False), rule_of())
     met = o.visits > 0
     assert 0 < met.sum() < len(met)
     np.testing.assert_array_equal(o.sh[~met], before[~met])
     size = np.sqrt((by_sh**2).mean(axis=1, keepdims=True))
-    np.testing.assert_allclose((before - o.sh)[met], (rule.sh_rates * by_sh / (size + 1e-12))[met], rtol=1e-3, atol=2e-6)
+    np.testing.assert_allclose((before - o.sh)[met], (np.where(np.arange(by_sh.shape[1]) < 3, 0.01, 0.005) * by_sh / (size + 1e-12))[met], rtol=1e-3, atol=2e-6)
     np.testing.assert_allclose(np.sqrt(o.square_sh / 0.1)[met], size[met, 0], rtol=1e-4)
 
 
@@ -256,7 +265,7 @@ def test_total_variation_smooths_what_was_met_alone(made: Callable[[], NerfTree]
     o = initial_state(tree)
     before = o.density.copy()
     values = values_of(cells_of(tree_grid(tree)), o.density, o.sh)
-    step(records_of(tree, o, 2), values, empty_moments(o, adam=False), rule_of(tree, o, total_variation=1e6),
+    step(records_of(tree, o, 2), values, empty_moments(o, adam=False), rule_of(total_variation=1e6),
          neighbours_of(cells_of(tree_grid(tree))))  # fmt: skip
     np.testing.assert_array_equal(o.density[o.visits == 0], before[o.visits == 0])
     assert (o.density != before)[o.visits > 0].mean() > 0.8

@@ -22,6 +22,7 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, lowest_bit, store16
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
+from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
 from efficientnerf.backends.numba.tree_training.packets import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.rows import LANES, channels_from, load_first16, multiply_add16, padded, rows_of, store_first16, sum16
@@ -31,35 +32,6 @@ MIN_THICKNESS, MAX_THICKNESS = 1e-7, 150.0  # optical thickness of a voxel: invi
 MAX_VISITS = 60000
 MOST_VARIATION = 1 / 8  # share of the differences to six neighbours that a step takes away, at most: with more than a sixth they would grow
 AHEAD = 8  # voxels whose values are fetched before their turn
-
-
-class Hyperparameters(NamedTuple):
-    """Of a step.
-
-    sides            (L,) float64: sides of the voxels of each cascade, units of the frame
-    cascades         (N,) uint8: the cascade of each voxel
-    density_rate     learning rate of the logarithm of the optical thickness
-    sh_rates         (3 K,) float32 learning rates of the coefficients
-    decay            of the running mean of the squared gradient
-    epsilon          added to its root
-    momentum         of the running mean of the gradient; 0: RMSprop
-    total_variation  weights of the module's terms
-    sparsity
-    entropy
-    terms            coefficients that have gradients, of each channel: the first ones; those beyond stay as they are
-    """
-
-    sides: np.ndarray
-    cascades: np.ndarray
-    density_rate: float
-    sh_rates: np.ndarray
-    decay: float
-    epsilon: float
-    momentum: float = 0.0
-    total_variation: float = 0.0
-    sparsity: float = 0.0
-    entropy: float = 0.0
-    terms: int = 25
 
 
 @functools.lru_cache(maxsize=8)
@@ -85,22 +57,30 @@ class Moments(NamedTuple):
 class Values(NamedTuple):
     """What is fitted.
 
-    density  (N,)
-    sh       (N, 3 K)
-    places   (N,) int64 of `voxel_places`
-    dense    the same densities, of `dense_densities`
+    density   (N,)
+    sh        (N, 3 K)
+    places    (N,) int64 of `voxel_places`
+    dense     the same densities, of `dense_densities`
+    cascades  (N,) uint8: the cascade of each voxel
+    sides     (L,) float64: sides of the voxels of each cascade, units of the frame
     """
 
     density: np.ndarray
     sh: np.ndarray
     places: np.ndarray
     dense: np.ndarray
+    cascades: np.ndarray
+    sides: np.ndarray
 
 
 def values_of(cells: Cells, density: np.ndarray, sh: np.ndarray) -> Values:
     """The values of a tree, which steps change in place."""
-    places = voxel_places(cells, len(density))
-    return Values(density, sh, places, dense_densities(cells, places, density))
+    places, owners = voxel_places(cells, len(density)), np.zeros(len(cells.voxel_index), np.uint8)
+    for number, (shape, first) in enumerate(zip(cells.shape.tolist(), cells.first.tolist(), strict=True)):
+        index = cells.brick_index[first : first + int(np.prod(shape))]
+        owners[index[index >= 0]] = number
+    cascades = owners[places // cells.brick**3] if len(cells.first) > 1 else np.zeros(len(density), np.uint8)
+    return Values(density, sh, places, dense_densities(cells, places, density), cascades, cells.scale * (cells.step_length / cells.step))
 
 
 class StepPointers(NamedTuple):
@@ -263,12 +243,12 @@ def _fetch(v, number, p):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _step_pointers(records, rows, following, row, values, moments, neighbours, h, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
+def _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean, width):  # type: ignore[no-untyped-def]
     """See `StepPointers`."""
     return StepPointers(
         pointer(records.numbers), pointer(records.gradient), pointer(rows), pointer(following), pointer(row), values.sh.shape[1], width, rows.shape[1],
         pointer(values.density), pointer(values.sh), pointer(values.places), pointer(values.dense), pointer(moments.density), pointer(moments.sh),
-        pointer(moments.square_density), pointer(moments.square_sh), pointer(moments.visits), pointer(h.sides), pointer(h.cascades), pointer(rates),
+        pointer(moments.square_density), pointer(moments.square_sh), pointer(moments.visits), pointer(values.sides), pointer(values.cascades), pointer(rates),
         pointer(of_square), len(of_square) - 1, pointer(of_mean), len(of_mean) - 1, pointer(neighbours.around), neighbours.brick,
     )  # fmt: skip
 
@@ -283,7 +263,7 @@ def _step_bins(task, records, rows, values, moments, neighbours, h, rates, of_sq
     while slab < bins:
         low = slab << BIN_BITS
         following = _link_all(low, slab, records, head, following, some)
-        p = _step_pointers(records, rows, following, row, values, moments, neighbours, h, rates, of_square, of_mean, width)
+        p = _step_pointers(records, rows, following, row, values, moments, neighbours, rates, of_square, of_mean, width)
         count = _take_voxels(some, met)
         for n in range(count):
             v = low + met[n]
@@ -343,10 +323,10 @@ def step(
         s <- decay s + (1 - decay) g^2        m <- momentum m + (1 - momentum) g
         p <- p - rate m / (1 - momentum^visits) / (sqrt(s / (1 - decay^visits)) + epsilon)
     """
-    h, count = hyperparameters, records.begin.shape[1] - 1
-    terms = min(h.terms, values.sh.shape[1] // 3)
-    rows, rates, workers = rows_of(records.basis, terms), np.zeros(padded(3 * terms), np.float32), min(numba.get_num_threads(), count)
-    rates[: 3 * terms] = h.sh_rates[: 3 * terms]
+    h, count = Hyperparameters._make([*map(float, hyperparameters[:-1]), hyperparameters.terms]), records.begin.shape[1] - 1
+    terms, workers = min(h.terms, values.sh.shape[1] // 3), min(numba.get_num_threads(), count)
+    rows, rates = rows_of(records.basis, terms), np.full(padded(3 * terms), h.sh_rate * h.view_share, np.float32)
+    rates[:3] = h.sh_rate
     _step(
         workers, np.zeros(1, np.int64), records, rows, values, moments, neighbours, h, rates, corrections(h.decay), corrections(h.momentum), 3 * terms
     )
