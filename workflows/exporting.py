@@ -32,7 +32,7 @@ class Export:
     files      to write, by extension; those that are there only if `force`
     as_points  points instead of a mesh
     region, crop  of the asset; None: as the settings say
-    texture    of the mesh; None: what the settings say where a file keeps one, else none
+    texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
     picture    how textures are stored
     limit      of memory
     """
@@ -59,6 +59,17 @@ class Export:
     def keeps_textures(self) -> bool:
         return any(self.format(path).textures for path in self.surfaces)
 
+    @property
+    def is_coloured(self) -> bool:
+        return any(self.format(path).coloured for path in self.surfaces)
+
+    @property
+    def has_photographs(self) -> bool:
+        from stages.artifacts import PosesOutputs
+        from workflows.cli.target import is_run
+
+        return is_run(self.what) and PosesOutputs.of_run(self.what).scene.is_file()
+
 
 def faces_from_text(text: str) -> int:
     """20k, 0.1m or a plain number. UsageError for anything else."""
@@ -84,8 +95,7 @@ def check(export: Export) -> None:
         if path.suffix.lower() not in known:
             kind = "points" if export.as_points else "a mesh"
             raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
-    asked = export.texture not in (None, "off") or export.picture != "png"
-    if asked and not export.keeps_textures:
+    if (export.picture != "png" and not export.keeps_textures) or (export.texture not in (None, "off") and not (export.is_coloured and not export.as_points)):
         raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
     for path in export.surfaces:
         if export.format(path).extra == "usd":
@@ -128,7 +138,8 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
     region = export.region or (wanted.region if export.crop is None else "all")
     wanted = replace(wanted, region=region)
     if not export.as_points:
-        wanted = replace(wanted, texture=(export.texture or wanted.texture) if export.keeps_textures else "off")
+        shown = export.keeps_textures or (export.is_coloured and (export.texture is not None or export.has_photographs))
+        wanted = replace(wanted, texture=(export.texture or wanted.texture) if shown else "off")
         made = None if export.crop is not None else _made_by_the_stage(export.what, wanted, export.keeps_textures)
         if made is not None:
             return _write_mesh(export, *made)
@@ -184,12 +195,10 @@ def _meshed(export: Export, tree: NerfTree, frame: SourceFrame, wanted: MeshSett
     from stages.artifacts import BakeOutputs, MeshInputs, PosesOutputs, TrainOutputs
     from stages.mesh import SURFACE_SHARE, in_capture, mesh_of
     from stages.meshing.texture import largest_photograph, textured
-    from workflows.cli.target import is_run
 
-    has_photographs = is_run(export.what) and PosesOutputs.of_run(export.what).scene.is_file()
-    if wanted.texture == "photographs" and not has_photographs:
+    if wanted.texture == "photographs" and not export.has_photographs:
         raise UsageError(f"{export.what}: holds no photographs. Give a run with its cameras, or --texture asset.")
-    choice = "asset" if wanted.texture == "auto" and not has_photographs else wanted.texture
+    choice = "asset" if wanted.texture == "auto" and not export.has_photographs else wanted.texture
     inputs = MeshInputs(*(kind.of_run(export.what) for kind in (BakeOutputs, TrainOutputs, PosesOutputs)))  # type: ignore[arg-type]
     side = 0 if choice == "off" else wanted.texture_size
     remedy = "Take an asset of fewer voxels (enerf convert --resolution)" + (", or a smaller texture (--texture-size)." if side else ".")

@@ -14,9 +14,10 @@ import pytest
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.surface.mesh import Texture
+from pipeline.errors import UsageError
 from pipeline.run import Run
 from pipeline.stage import settings_dict
-from stages.artifacts import BakeOutputs, MeshOutputs
+from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.io.exporters import MESH_EXPORTERS
 from stages.io.exporters.writing import source_frame
 from stages.mesh import MeshSettings
@@ -75,8 +76,8 @@ def test_a_texture_may_be_left_out_of_it(run: Path) -> None:
     (entry,) = export(run, "mesh.glb", texture="off")
     assert "texels a side" not in entry
     assert b"COLOR_0" in (run.parent / "mesh.glb").read_bytes()
-    export(run, "mesh.ply", chosen=settings(texture="asset", texture_size=512))
-    assert (run.parent / "mesh.ply").read_bytes() == MeshOutputs.of_run(run).ply.read_bytes(), "a texture that no file keeps is not asked for"
+    (shape,) = export(run, "mesh.stl", chosen=settings(texture="asset", texture_size=512))
+    assert shape["faces"] == 12, "a texture that no file shows is not asked for"
 
 
 @pytest.mark.parametrize(
@@ -93,6 +94,28 @@ def test_a_stale_mesh_is_not_taken(run: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: SimpleNamespace(fresh=False, manifest=None))
     with pytest.raises(pytest.fail.Exception, match="made again"):
         export(run, "mesh.glb")
+
+
+def test_colours_of_vertices_are_asked_of_photographs_where_there_are_any(run: Path) -> None:
+    """A texture is made for a PLY, too: of a run that has photographs."""
+    other = settings(texture="photographs")
+    (without,) = export(run, "a.ply", chosen=other)
+    assert without["faces"] == 12
+    PosesOutputs.of_run(run).folder.mkdir()
+    PosesOutputs.of_run(run).scene.write_text("{}", encoding="utf-8")
+    with pytest.raises(pytest.fail.Exception, match=r"made again, with .*texture='photographs'"):
+        export(run, "b.ply", chosen=other)
+    with pytest.raises(UsageError, match="keeps a texture"):
+        export(run, "b.stl", texture="photographs")
+    with pytest.raises(UsageError, match="keeps a texture"):
+        export(run, "b.ply", picture="jpeg")
+
+
+def test_usd_is_refused_before_anything_is_made_where_its_package_is_missing(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stages.io.exporters.usd.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[usd\]'"):
+        export(run, "b.glb", "b.usdz")
+    assert not (run.parent / "b.glb").exists()
 
 
 @pytest.mark.parametrize("failing", [0, 1, 2])

@@ -22,6 +22,7 @@ class Format:
     opened_by  programs
     module     of this package, and its function: write
     textures   whether it keeps textures, and takes `picture`
+    coloured   whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
     extra      of the package efficientnerf, that has to be installed for it
     beside     whether a texture lies in files beside it: `companions` of its module
     """
@@ -33,6 +34,7 @@ class Format:
     module: str
     function: str
     textures: bool = False
+    coloured: bool = True
     extra: str | None = None
     beside: bool = False
 
@@ -59,7 +61,8 @@ _MESHES = (
            "iOS and macOS, Blender, Houdini, Omniverse", "usd", "write_usdz", textures=True, extra="usd"),
     Format(".usdc", "the same, its picture beside it", "the capture's axes (kept as a matrix)", "Blender, Houdini, Omniverse, Maya", "usd", "write_usdc",
            textures=True, extra="usd", beside=True),
-    Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices, the unit", "slicers for 3D printing, CAD", "stl", "write_mesh"),
+    Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices, the unit", "slicers for 3D printing, CAD", "stl", "write_mesh",
+           coloured=False),
 )  # fmt: skip
 _POINTS = (
     Format(".ply", "places, normals, colours; the capture's frame", "nothing", "MeshLab, CloudCompare, Blender", "ply", "write_points"),
