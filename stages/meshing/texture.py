@@ -41,7 +41,6 @@ def textured(mesh: Mesh, tree: NerfTree, inputs: MeshInputs, choice: str, larges
 def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Progress) -> Mesh | None:
     """Textured by the training photographs; None where there are none."""
     from efficientnerf.surface.mesh import Texture
-    from efficientnerf.surface.texturing.asset import interpolated
     from efficientnerf.surface.texturing.atlas import atlas_of
     from efficientnerf.surface.texturing.filling import texture_from
     from efficientnerf.surface.texturing.photographs import PhotographTexture, survey, texels_wanted
@@ -62,7 +61,7 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
     for number, photo in enumerate(photographs(inputs.poses.folder, views)):
         progress(len(views) + number, steps, "texture")
         texels.look(photo, surveys[number])
-    colours, known = texels.colours(interpolated(mesh, atlas))
+    colours, known = texels.finished(mesh)
     progress(steps, steps, "texture")
     facts = {
         "texture": "photographs",

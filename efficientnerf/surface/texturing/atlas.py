@@ -132,6 +132,7 @@ def _texels(atlas: Atlas) -> Texels:
     corners = np.ascontiguousarray(atlas.corners)
     for part in pieces(len(corners), first=4096):
         lay_faces(corners, part.start, part.stop, owner)
+    _give_each_a_texel(corners, owner)
     place = np.flatnonzero(owner.ravel() >= 0)
     face = owner.ravel()[place]
     order = np.argsort(face, kind="stable")
@@ -140,5 +141,18 @@ def _texels(atlas: Atlas) -> Texels:
     x, y = atlas.corners[face, :, 0] - (place % atlas.size + 0.5)[:, None], atlas.corners[face, :, 1] - (place // atlas.size + 0.5)[:, None]
     a, b = x[:, 1] * y[:, 2] - x[:, 2] * y[:, 1], x[:, 2] * y[:, 0] - x[:, 0] * y[:, 2]
     c = x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]
-    share = np.stack([a, b, c], 1)
+    share, total = np.stack([a, b, c], 1), (a + b + c)[:, None]
+    share = np.clip(np.divide(share, total, out=np.full_like(share, 1 / 3), where=total != 0), 0, 1)  # a texel that was given may lie beside its face
     return Texels(place, begin, np.asarray(share / share.sum(1, keepdims=True), np.float32))
+
+
+def _give_each_a_texel(corners: np.ndarray, owner: np.ndarray) -> None:
+    """Faces in which no texel's centre lies have that round their middle, where no other one does: else a small chart had the colours of those beside it."""
+    size = len(owner)
+    without = np.ones(len(corners), bool)
+    without[owner[owner >= 0]] = False
+    faces = np.flatnonzero(without)
+    column, row = np.clip(np.floor(corners[faces].mean(1)), 0, size - 1).astype(np.int64).T
+    place, first = np.unique(row * size + column, return_index=True)
+    empty = owner.reshape(-1)[place] < 0
+    owner.reshape(-1)[place[empty]] = faces[first[empty]]

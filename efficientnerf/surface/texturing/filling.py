@@ -8,6 +8,8 @@ import numpy as np
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.surface.texturing.atlas import Atlas
 
+RINGS = 6  # of vertices, over which the colours that photographs show are carried on to where none shows anything. docs/experiments/textures.md
+SEEN = 0.5  # texels' worth of photographs, from which the colour of a vertex is known
 EMPTY = 128  # what a texture holds that has no texel at all
 
 
@@ -25,3 +27,33 @@ def texture_from(atlas: Atlas, colours: np.ndarray) -> np.ndarray:
         for part in pieces(atlas.size, first=64):
             spread(part.start, part.stop, step, source, distance)
     return np.asarray(colours[source])
+
+
+def carried_on(faces: np.ndarray, vertex_colours: np.ndarray, atlas: Atlas, colours: np.ndarray, known: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """(V, 3) float32 colours of vertices, 0-1: what photographs show round each; where they show nothing, the mean of the vertices beside it that are known,
+    ring by ring; further away those that they have, `vertex_colours` (V, 3). An asset has no colours of its own where no photograph looks.
+
+    colours  (T, 3) uint8 of the texels
+    known    (T,) share of each that is from photographs; the rest is from
+    expected (T, 3) uint8
+    """
+    from scipy.sparse import csr_matrix
+
+    count, texels = len(vertex_colours), atlas.texels
+    sums, total = np.zeros((count, 3)), np.zeros(count)
+    for corner in range(3):
+        at, share = faces[texels.face, corner], texels.share[:, corner]
+        total += np.bincount(at, share * known, minlength=count)
+        for channel in range(3):
+            shown = np.where(known > 0, colours[:, channel] - (1 - known) * expected[:, channel], 0)
+            sums[:, channel] += np.bincount(at, share * shown, minlength=count)
+    reached = total >= SEEN
+    out = np.where(reached[:, None], np.clip(sums / np.maximum(total, SEEN)[:, None] / 255, 0, 1), 0.0)
+    tail, head = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    beside = csr_matrix((np.ones(2 * len(tail)), (np.concatenate([tail, head]), np.concatenate([head, tail]))), shape=(count, count))
+    for _ in range(RINGS):
+        weight, mean = beside @ reached.astype(np.float64), beside @ out
+        new = ~reached & (weight > 0)
+        out[new] = mean[new] / weight[new, None]
+        reached |= new
+    return np.where(reached[:, None], out, vertex_colours).astype(np.float32)

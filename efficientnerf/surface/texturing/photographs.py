@@ -13,15 +13,17 @@ import numpy as np
 
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, project, resized
-from efficientnerf.surface.mesh import face_areas
+from efficientnerf.surface.mesh import Mesh, face_areas
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
+from efficientnerf.surface.texturing.asset import interpolated
 from efficientnerf.surface.texturing.atlas import Atlas, Texels
+from efficientnerf.surface.texturing.filling import carried_on
 
 KEPT = 12  # photographs that a texel remembers
 POWER = 0.5  # of grades, that colours are weighted by. docs/experiments/textures.md
 SCALE = 60.0  # of 255, by which colours differ of which one is an outlier. docs/experiments/textures.md
 VOTE = 1.5  # of the colour that the asset has, on which of the photographs is right, against the best of them
-TRUST = 0.002  # grade of the colour that the asset has
+TRUST = 0.01  # grade of the colour that is expected. docs/experiments/textures.md
 REACH = 6.0  # pixels from an edge at which a photograph counts in full
 BORDER = 0.03  # of the longer side of a photograph, over which it fades out
 JUMP = 0.01  # of the inverse depth, at a depth edge
@@ -225,6 +227,13 @@ class PhotographTexture:
                 part.start, part.stop, self.texels.begin, self.texels.share, self.faces, seen.pixels, seen.depth, seen.facing, seen.near, seen.clear,
                 photo.colours, gains, np.float32(REACH), np.float32(SLACK), density, weight, self.seen, self.grades,
             )  # fmt: skip
+
+    def finished(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+        """Colours (T, 3) uint8 of the texels, and what share of each is from photographs (T,). `mesh`: this one, with the colours that the asset has at its
+        vertices, which tell outliers at first."""
+        expected = interpolated(mesh, self.atlas)
+        around = carried_on(self.faces, mesh.colours, self.atlas, *self.colours(expected), expected)
+        return self.colours(interpolated(replace(mesh, colours=around), self.atlas))
 
     def colours(self, expected: np.ndarray, views: int = KEPT, power: float = POWER, scale: float = SCALE) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the texels (T, 3) uint8, and what share of each is from photographs (T,); `expected` (T, 3) uint8 where they show nothing."""

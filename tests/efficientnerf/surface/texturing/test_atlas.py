@@ -101,8 +101,20 @@ def test_texels_know_their_place_on_the_surface() -> None:
     np.testing.assert_allclose(texels.share.sum(1), 1, atol=1e-5)
     assert texels.share.min() > -1e-4
     points = np.einsum("tc,tci->ti", texels.share, atlas.corners[texels.face])
-    np.testing.assert_allclose(points, np.stack([texels.place % atlas.size, texels.place // atlas.size], 1) + 0.5, atol=1e-3)
+    np.testing.assert_allclose(points, np.stack([texels.place % atlas.size, texels.place // atlas.size], 1) + 0.5, atol=2e-3)
     assert np.linalg.norm(texels.values(vertices, faces), axis=1).min() > 0.9
+
+
+def test_charts_smaller_than_a_texel_have_one() -> None:
+    """Loose faces of a tenth of a texel beside a large one: each is looked up in a colour of its own."""
+    rng = np.random.default_rng(0)
+    places = rng.normal(size=(40, 3))
+    vertices = np.concatenate([[[-9.0, -9, 0], [9, -9, 0], [0, 9, 0]], (places[:, None] + 0.01 * rng.normal(size=(40, 3, 3))).reshape(-1, 3)])
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    atlas = atlas_of(vertices, faces, np.inf, 128)
+    middle = np.floor(atlas.corners.mean(1)).astype(int)
+    texture = texture_from(atlas, np.repeat(atlas.texels.face[:, None], 3, axis=1).astype(np.uint8))
+    np.testing.assert_array_equal(texture[middle[:, 1], middle[:, 0], 0], np.arange(len(faces)))
 
 
 def test_the_size_follows_from_the_texels_that_are_wanted() -> None:

@@ -9,7 +9,8 @@ import pytest
 from numba import get_num_threads, set_num_threads
 
 from efficientnerf.geometry.cameras import Camera, project
-from efficientnerf.surface.mesh import vertex_normals
+from efficientnerf.surface.mesh import Mesh, vertex_normals
+from efficientnerf.surface.texturing.atlas import atlas_of
 from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, halved, photograph, survey, texels_wanted
 
 from .shapes import ball, box, cameras, pattern, photographed, textured
@@ -77,6 +78,29 @@ def test_a_face_that_is_hidden_gets_nothing() -> None:
     assert (colours[own & (known > 0.9)][:, 0] < 0.1).all()
     assert (known[own] > 0.9).any()
     assert (known[~own] > 0.9).any()
+
+
+def test_where_nothing_is_seen_the_colours_beside_it_are_carried_on() -> None:
+    """The asset is black where no photograph looks: just beyond what is seen it is not believed, on the far side it is."""
+    vertices, faces = ball(4)
+    photos = [photographed(vertices, faces, camera, lambda points: np.full((len(points), 3), [0.8, 0.4, 0.2])) for camera in cameras(4) if camera.centre[2] > 0]
+    normals = vertex_normals(vertices, faces)
+    surveys = [survey(vertices, faces, normals, pattern(vertices), photo) for photo in photos]
+    atlas = atlas_of(vertices, faces, np.inf, 128)
+    texels = PhotographTexture(vertices, faces, normals, atlas, np.max([each.density for each in surveys], axis=0), 0.0)
+    for photo, each in zip(photos, surveys, strict=True):
+        texels.look(photo, replace(each, gains=np.ones(3)))
+    mesh = Mesh(vertices, faces, normals, np.where(vertices[:, 2:] > 0, np.float32(0.5), np.float32(0)).repeat(3, axis=1))
+    colours, known = texels.finished(mesh)
+    points = atlas.texels.values(vertices, faces)
+    apart = np.linalg.norm(points[:, None] - points[known > 0.9][::7], axis=2).min(1)
+    unseen = known == 0
+    off = np.abs(colours[unseen & (apart < 0.35)] / 255 - [0.8, 0.4, 0.2])
+    assert off.max() < 0.1
+    assert off.mean() < 0.01
+    far = unseen & (apart > 0.9)
+    assert far.any()
+    assert (colours[far] == 0).all()
 
 
 def test_masks_and_alpha_are_kept_to() -> None:
