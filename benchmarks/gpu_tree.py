@@ -15,8 +15,8 @@ from efficientnerf.asset.refinement.rule import DECAY, EPSILON
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients
+from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets
-from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.triton import tree_gradients, tree_packets, tree_steps
 from efficientnerf.geometry.cameras import rays
 

@@ -97,8 +97,8 @@ def measured(run: Path, seconds: float, rays: int, side: int) -> dict[str, Any]:
     from efficientnerf.asset.refinement.tiles import tiles_met
     from efficientnerf.backends.numba.tree.walk import tree_grid
     from efficientnerf.backends.numba.tree_training import gradients
+    from efficientnerf.backends.numba.tree_training.cells import cells_of
     from efficientnerf.backends.numba.tree_training.neighbours import neighbours_of
-    from efficientnerf.backends.numba.tree_training.packets import cells_of
     from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
     from efficientnerf.training.patches import PatchGrid
 

@@ -17,9 +17,9 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, Records, packets_of
 from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
-from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.steps import Moments, sum_gradients, values_of
 from tests.efficientnerf.balls import BOUNDS
 from tests.efficientnerf.trees import random_cascades, random_tree, rays_at, uniform_tree

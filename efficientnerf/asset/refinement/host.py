@@ -18,9 +18,9 @@ from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree import contributions
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients
+from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import RecordBuffer, packets_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
-from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.steps import Moments, step, values_of
 from efficientnerf.rendering.harmonics import basis_numpy
 from efficientnerf.training.patches import PatchGrid

@@ -24,8 +24,8 @@ from efficientnerf.backends.numba.tree.contributions import max_contributions
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import gradients as kernels
+from efficientnerf.backends.numba.tree_training.cells import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import RayTargets, RecordBuffer, packets_of
-from efficientnerf.backends.numba.tree_training.packets import cells_of, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.steps import sum_gradients
 from tests.efficientnerf.balls import BOUNDS, pixels
 from tests.efficientnerf.refinements import ball_tree, gradients, gradients_by_autograd, seen_at_random

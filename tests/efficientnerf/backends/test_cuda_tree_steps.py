@@ -15,8 +15,8 @@ from efficientnerf.asset.refinement.state import RefinementState, initial_state
 from efficientnerf.asset.tree import NerfTree, voxel_coordinates
 from efficientnerf.backends.numba.tree.walk import tree_grid
 from efficientnerf.backends.numba.tree_training import steps as host
+from efficientnerf.backends.numba.tree_training.cells import cells_of
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, neighbours_of
-from efficientnerf.backends.numba.tree_training.packets import cells_of
 from tests.efficientnerf.device import DEVICE
 from tests.efficientnerf.refinements import GRIDS, empty_moments, records_of, rule_of
 

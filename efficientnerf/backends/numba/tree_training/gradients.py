@@ -22,6 +22,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import fmuladd, pointer
 from efficientnerf.backends.numba.tree.march import EARLY_STOP
+from efficientnerf.backends.numba.tree_training.cells import Cells, tree_pointers
 from efficientnerf.backends.numba.tree_training.corners import add_spread, mixed
 from efficientnerf.backends.numba.tree_training.packets import (
     BLOCKS,
@@ -29,12 +30,10 @@ from efficientnerf.backends.numba.tree_training.packets import (
     FIRST_SAMPLES,
     SAMPLES,
     WORDS,
-    Cells,
     clear,
     clear_distance,
     packet_arrays,
     packet_pointers,
-    tree_pointers,
     walk_ray,
 )
 from efficientnerf.backends.numba.tree_training.scalars import cast_like, sigmoid

@@ -21,10 +21,10 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, lowest_bit, store16
+from efficientnerf.backends.numba.tree_training.cells import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
 from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
 from efficientnerf.backends.numba.tree_training.neighbours import NO_NEIGHBOURS, Neighbours, differences
-from efficientnerf.backends.numba.tree_training.packets import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.rows import LANES, channels_from, load_first16, multiply_add16, padded, rows_of, store_first16, sum16
 from efficientnerf.backends.numba.tree_training.tasks import prefetch, take_next
 
