@@ -98,7 +98,7 @@ def test_where_nothing_is_seen_the_colours_beside_it_are_carried_on() -> None:
     off = np.abs(colours[unseen & (apart < 0.35)] / 255 - [0.8, 0.4, 0.2])
     assert off.max() < 0.1
     assert off.mean() < 0.01
-    far = unseen & (apart > 0.9)
+    far = unseen & (apart > 0.9) & (points[:, 2] < -0.1)
     assert far.any()
     assert (colours[far] == 0).all()
 
