@@ -34,7 +34,7 @@ FINEST = 2.0  # pixels of a photograph on the side of a texel from which it is r
 SMALLEST_PHOTOGRAPH = 16  # pixels along a side, to which it is reduced
 SHARP = 2.0  # times its sharpness over the median of all, at most 1, is what a photograph counts
 MIN_SAMPLES = 200  # vertices that a photograph has to show for its gains to be known
-GAIN = 0.02  # logarithm up to which a gain is left out: differences with the direction of view look the same
+GAIN = 0.12  # logarithm up to which gains are left out: differences with the direction of view look the same. docs/experiments/textures.md
 MOST_GAIN = 0.7
 
 
@@ -116,12 +116,12 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _gains(values: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """(3,) factors from values (N, 3) to what is expected (N, 3): medians of ratios, without what is nearly black or white; what is small left out."""
+    """(3,) factors from values (N, 3) to what is expected (N, 3): medians of ratios, without what is nearly black or white; ones where all are small."""
     good = ((values > 0.08) & (values < 0.92) & (expected > 0.08) & (expected < 0.92)).all(1)
     if good.sum() < MIN_SAMPLES:
         return np.ones(3)
     found = np.median(np.log(expected[good] / values[good]), axis=0)
-    return np.asarray(np.exp(np.clip(np.sign(found) * np.maximum(np.abs(found) - GAIN, 0), -MOST_GAIN, MOST_GAIN)))
+    return np.asarray(np.exp(np.clip(found, -MOST_GAIN, MOST_GAIN))) if np.abs(found).max() > GAIN else np.ones(3)
 
 
 def _sharpness(photo: Photograph, clear: np.ndarray) -> float:
