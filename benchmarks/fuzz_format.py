@@ -126,7 +126,8 @@ def use(tree: Any, rng: Rng, took: dict[str, float]) -> None:
     from efficientnerf.asset.format import WRITERS, FormatError, serialize
     from efficientnerf.asset.region import cropped, foreground
     from efficientnerf.geometry.cameras import Similarity
-    from efficientnerf.surface.isosurface import NoSurface, points, surface
+    from efficientnerf.surface.extraction import points, surface
+    from efficientnerf.surface.isosurface import NoSurface
     from efficientnerf.surface.volume import volume_of
     from pipeline.errors import BadInput
     from stages.framing.camera_paths import turntable_cameras

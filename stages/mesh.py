@@ -19,6 +19,7 @@ from stages.meshing.check import asset_views, checked, level_of, shown_by, warni
 from stages.meshing.texture import facts_of, largest_photograph, textured
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.region import Region
     from efficientnerf.surface.agreement import AssetView
     from efficientnerf.surface.mesh import Mesh
     from stages.io.exporters.writing import SourceFrame
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 PARTS = ("marching cubes", "colours")  # of finding a surface, as efficientnerf.surface.isosurface reports them
 STEPS = 500  # of the progress of each
 SURFACE_SHARE = 0.7  # of the stage's time; the texture takes the rest
+FACES = {"20k": 20_000, "100k": 100_000, "500k": 500_000}  # of mesh.max_faces
 
 
 @dataclass(frozen=True)
@@ -38,15 +40,17 @@ class MeshSettings:
         "What is meshed: the subject with what supports it, its edge clipped (foreground), or the whole scene (all), with cracks where its grids meet.",
         advanced=True,
     )
-    max_faces: Annotated[int, Meta(ge=100)] = setting(200_000, "Most faces of the mesh, which is decimated to this many.")
+    max_faces: Annotated[int, Meta(ge=100)] | Literal["20k", "100k", "500k"] = setting(
+        200_000, "Most faces of the mesh, which is decimated to this many: 20k for the web, 100k for games, 500k for prints and renders, or a number."
+    )
     density_threshold: float | Auto = setting(
-        "auto", "Density at which the surface lies, per unit of the training frame; auto: where the surface has the silhouettes of the asset."
+        "auto", "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes."
     )
     min_component: Fraction = setting(
         0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
     )
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
-        10, "Iterations of Taubin smoothing, which keeps the volume; as many, up to six, of smoothing normals follow, which keeps edges.", advanced=True
+        10, "Iterations of Taubin smoothing, which keeps the volume; as many, up to ten, of smoothing normals follow, which keeps edges.", advanced=True
     )
     texture: Literal["auto", "photographs", "asset", "off"] = setting(
         "auto",
@@ -58,16 +62,19 @@ class MeshSettings:
     )
 
 
-def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None) -> Mesh:
+def mesh_of(
+    tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None
+) -> Mesh:
     """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text).
 
-    views  is given those of the asset that say which components it shows
+    views   is given those of the asset that say which components it shows
+    region  that the surface is clipped to
     """
     from efficientnerf.surface.isosurface import NoSurface
     from efficientnerf.surface.nested import scene_surface
 
     progress = whole_progress(progress, 1 + len(tree.outer))
-    seen = asset_views(tree, progress)
+    seen, fused = asset_views(tree, progress)
     if views is not None:
         views += seen
     threshold = given(settings.density_threshold)
@@ -79,11 +86,13 @@ def mesh_of(tree: Any, settings: MeshSettings, progress: Callable[[int, int, str
         mesh = scene_surface(
             tree,
             level_of(tree, threshold, seen, tick),
-            faces=settings.max_faces,
+            faces=FACES[settings.max_faces] if isinstance(settings.max_faces, str) else settings.max_faces,
             min_component=settings.min_component,
             rounds=settings.smoothing_iterations,
             viewpoints=orbit_points(tree.metadata),
             shown=shown_by(seen, float(tree.voxel), tick),
+            views=fused if threshold is None else (),
+            region=region,
             progress=progress,
         )
     except NoSurface as error:
@@ -162,13 +171,15 @@ def run(job: Job) -> None:
     from stages.memory.surface import surface_needed
 
     outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
-    tree = restricted(load(inputs.bake.asset), settings.region)
+    whole = load(inputs.bake.asset)
+    tree = restricted(whole, settings.region)
     frame = source_frame(tree.metadata)
     need = surface_needed(tree, texture=0 if settings.texture == "off" else settings.texture_size, pixels=largest_photograph(inputs, settings.texture))
     refuse_what_does_not_fit(job, need, "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
     seen: list[AssetView] = []
     share = 1.0 if settings.texture == "off" else SURFACE_SHARE
-    surface = mesh_of(tree, settings, lambda done, total, text: job.reached(share * done, total, text), seen)
+    border = whole.region if settings.region == "foreground" else None
+    surface = mesh_of(tree, settings, lambda done, total, text: job.reached(share * done, total, text), seen, border)
     found = textured(
         surface, tree, inputs, settings.texture, settings.texture_size,
         lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text),

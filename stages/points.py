@@ -17,6 +17,7 @@ from stages.mesh import PARTS, orbit_points, remedy, whole_progress
 from stages.meshing.check import asset_views, level_of, shown_by
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.region import Region
     from efficientnerf.surface.mesh import PointCloud
     from stages.io.exporters.writing import SourceFrame
 
@@ -30,7 +31,9 @@ class PointsSettings:
     )
     num_points: PositiveInt = setting(200_000, "Number of points.")
     density_threshold: float | Auto = setting(
-        "auto", "Density at which the surface lies, per unit of the training frame; auto: where the surface has the silhouettes of the asset.", advanced=True
+        "auto",
+        "Density at which the surface lies, per unit of the training frame; auto: where views agree on its depth, else where it has their silhouettes.",
+        advanced=True,
     )
     min_component: Fraction = setting(
         0.0, "Area below which connected components get no points, as a fraction of the largest one's; nor do those that no view shows.", advanced=True
@@ -39,14 +42,17 @@ class PointsSettings:
     seed: Seed = setting(0, "Seed of the places of the points on the surface.", advanced=True)
 
 
-def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None]) -> PointCloud:
-    """Points on the tree's surface in the capture's frame. Raises StageFailed where there is none; `progress` takes (done, total, text)."""
+def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress: Callable[[int, int, str], None], region: Region | None = None) -> PointCloud:
+    """Points on the tree's surface, clipped to a region, in the capture's frame.
+
+    Raises StageFailed where there is none; `progress` takes (done, total, text).
+    """
     from efficientnerf.surface.isosurface import NoSurface
     from efficientnerf.surface.mesh import PointCloud
     from efficientnerf.surface.nested import scene_points
 
     progress = whole_progress(progress, 1 + len(tree.outer))
-    views = asset_views(tree, progress)
+    views, fused = asset_views(tree, progress)
 
     def tick() -> None:
         progress(1, 1, PARTS[0])
@@ -61,6 +67,8 @@ def points_of(tree: Any, settings: PointsSettings, frame: SourceFrame, progress:
             seed=settings.seed,
             viewpoints=orbit_points(tree.metadata),
             shown=shown_by(views, float(tree.voxel), tick),
+            views=fused if given(settings.density_threshold) is None else (),
+            region=region,
             progress=progress,
         )
     except NoSurface as error:
@@ -78,15 +86,16 @@ def run(job: Job) -> None:
     from stages.memory.need import refuse_what_does_not_fit
     from stages.memory.surface import surface_needed
 
-    tree = restricted(load(inputs_of(PointsInputs, job.inputs).bake.asset), job.settings.region)
+    whole = load(inputs_of(PointsInputs, job.inputs).bake.asset)
+    tree = restricted(whole, job.settings.region)
     frame = source_frame(tree.metadata)
     remedy = f"Lower points.num_points ({job.settings.num_points}), bake.max_mib or bake.resolution."
     refuse_what_does_not_fit(job, surface_needed(tree, job.settings.num_points), remedy)
-    cloud = points_of(tree, job.settings, frame, job.reached)
+    cloud = points_of(tree, job.settings, frame, job.reached, whole.region if job.settings.region == "foreground" else None)
     job.safe_point()
     path = PointsOutputs(job.out).ply
     POINT_EXPORTERS[path.suffix](cloud, path, frame)
     job.say(f"{len(cloud.positions)} points", points=len(cloud.positions))
 
 
-STAGE = Stage(name="points", version=4, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)
+STAGE = Stage(name="points", version=5, settings=PointsSettings, needs=needs_of(PointsInputs), run=run)

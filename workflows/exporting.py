@@ -11,6 +11,7 @@ from pipeline.errors import BadInput, UsageError
 from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, Format
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.region import Region
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.surface.mesh import Mesh
     from pipeline.executors.memory import Limit
@@ -143,14 +144,15 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
         made = None if export.crop is not None else _made_by_the_stage(export.what, wanted, export.keeps_textures)
         if made is not None:
             return _write_mesh(export, *made)
-    tree = restricted(load_asset(export.what), region, export.crop)
+    whole = load_asset(export.what)
+    tree, border = restricted(whole, region, export.crop), whole.region if region == "foreground" else None
     frame = source_frame(tree.metadata)
     if not export.as_points:
-        return _write_mesh(export, _meshed(export, tree, frame, wanted, progress), frame)
+        return _write_mesh(export, _meshed(export, tree, border, frame, wanted, progress), frame)
     from stages.points import points_of
 
     _refuse_what_does_not_fit(export, tree, f"Lower points.num_points ({wanted.num_points}).", points=wanted.num_points)
-    cloud = points_of(tree, wanted, frame, progress)
+    cloud = points_of(tree, wanted, frame, progress, border)
     for path in export.surfaces:
         with writing(path, force=export.force):
             export.format(path)(cloud, path, frame)
@@ -190,8 +192,8 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
     return mesh if wanted.texture != "off" or not keeps_textures else replace(mesh, texture=None), frame
 
 
-def _meshed(export: Export, tree: NerfTree, frame: SourceFrame, wanted: MeshSettings, progress: Progress) -> Mesh:
-    """The mesh of a tree in the capture's frame, textured as its settings say."""
+def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: SourceFrame, wanted: MeshSettings, progress: Progress) -> Mesh:
+    """The mesh of a tree, clipped to a region, in the capture's frame, textured as its settings say."""
     from stages.artifacts import BakeOutputs, MeshInputs, PosesOutputs, TrainOutputs
     from stages.mesh import SURFACE_SHARE, in_capture, mesh_of
     from stages.meshing.texture import largest_photograph, textured
@@ -211,7 +213,7 @@ def _meshed(export: Export, tree: NerfTree, frame: SourceFrame, wanted: MeshSett
     def texture(done: int, total: int, text: str) -> None:
         progress(round(1000 * (share + (1 - share) * done / max(total, 1))), 1000, text)
 
-    return in_capture(textured(mesh_of(tree, wanted, surface), tree, inputs, choice, wanted.texture_size, texture), frame)
+    return in_capture(textured(mesh_of(tree, wanted, surface, region=border), tree, inputs, choice, wanted.texture_size, texture), frame)
 
 
 def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:

@@ -8,15 +8,23 @@ F faces.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from efficientnerf.asset.cascades import Cascade, cascade_tree, cascades_of, voxel_cascades
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.surface.isosurface import NoSurface, Progress, Shown, cleaned_surface, points, spread, surface
+from efficientnerf.surface.extraction import cleaned_surface, points, spread, surface
+from efficientnerf.surface.fusion import Fusion, fusion_of
+from efficientnerf.surface.isosurface import NoSurface, Progress
 from efficientnerf.surface.mesh import Mesh, PointCloud, compact, face_areas
+from efficientnerf.surface.visible_parts import Shown
 from efficientnerf.surface.volume import volume_of
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.region import Region
+    from efficientnerf.surface.agreement import AssetView
 
 MIN_FACES = 20
 BORDER = 0.6  # voxels of a cascade from the borders of its box, and of the one before, in which its surface has lids
@@ -25,18 +33,22 @@ ALONG = 0.7  # cosine of a lid's normal to that of the border
 
 def scene_surface(
     tree: NerfTree, threshold: float | None, *, faces: int, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress,
-    shown: Shown | None = None,
+    shown: Shown | None = None, views: Sequence[AssetView] = (), region: Region | None = None,
 ) -> Mesh:  # fmt: skip
     """The surface of all cascades as one mesh; of a tree with one grid the same as `surface`. Arguments as there.
 
     threshold  density per world unit of the inmost cascade; each one after it has half of that, for its voxels are twice as large
+    views      of the tree by cameras with images of one size, whose depths are fused; none, of a forward-facing tree and of outer cascades: the densities
+               alone decide
+    region     that the surface is clipped to
     faces      budget of all together, shared by the numbers of voxels; a cascade whose share is under MIN_FACES is left out, but for the greatest
 
     Raises NoSurface where no cascade has any.
     """
     if not tree.outer:
         return surface(
-            volume_of(tree), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown, progress=progress
+            volume_of(tree, region), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
+            fusion=_fusion(0, tree, views, progress), progress=progress,
         )  # fmt: skip
     found = []
     sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
@@ -46,8 +58,8 @@ def scene_surface(
             continue
         try:
             mesh = surface(
-                volume_of(part), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-                progress=progress,
+                volume_of(part, region), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints,
+                shown=shown, fusion=_fusion(number, part, views, progress), progress=progress,
             )  # fmt: skip
         except NoSurface:
             continue
@@ -59,7 +71,7 @@ def scene_surface(
 
 def scene_points(
     tree: NerfTree, count: int, threshold: float | None, *, min_component: float, rounds: int, viewpoints: np.ndarray, seed: int, progress: Progress,
-    shown: Shown | None = None,
+    shown: Shown | None = None, views: Sequence[AssetView] = (), region: Region | None = None,
 ) -> PointCloud:  # fmt: skip
     """Points on the surfaces of all cascades; of a tree with one grid the same as `points`. Arguments as there and for `scene_surface`.
 
@@ -67,13 +79,14 @@ def scene_points(
     """
     if not tree.outer:
         return points(
-            volume_of(tree), count, threshold, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown, seed=seed,
-            progress=progress,
+            volume_of(tree, region), count, threshold, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
+            fusion=_fusion(0, tree, views, progress), seed=seed, progress=progress,
         )  # fmt: skip
     found = []
     for number, part in _parts(tree):
         try:
-            vertices, triangles, _ = cleaned_surface(volume_of(part), _level(threshold, number), min_component, rounds, viewpoints, progress, shown)
+            fusion, volume = _fusion(number, part, views, progress), volume_of(part, region)
+            vertices, triangles, _ = cleaned_surface(volume, _level(threshold, number), min_component, rounds, viewpoints, progress, shown, fusion)
         except NoSurface:
             continue
         kept = triangles[_visible(tree, number, vertices, triangles)]
@@ -93,6 +106,11 @@ def _parts(tree: NerfTree) -> Iterator[tuple[int, NerfTree]]:
         part = cascade_tree(tree, number)
         if len(part.density_values):
             yield number, part
+
+
+def _fusion(number: int, tree: NerfTree, views: Sequence[AssetView], progress: Progress) -> Fusion | None:
+    """Of a cascade. What the outer ones hold may be a few voxels large, and fused distances are smoothed over more than one."""
+    return fusion_of(tree, views, lambda: progress(0, 1, "marching cubes")) if views and tree.ndc is None and number == 0 else None
 
 
 def _level(threshold: float | None, number: int) -> float | None:

@@ -36,14 +36,16 @@ class MeshImage:
 def mesh_image(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> MeshImage:
     """What of a mesh each pixel's centre meets first, from either side. Edges are straight between the distorted places of their ends; faces that reach behind
     the camera, or beyond what its lens shows, are left out."""
-    from efficientnerf.backends.numba.mesh.rasterise import rasterise
+    from efficientnerf.backends.numba.mesh.rasterise import rasterise, row_spans
 
     pixels, depth = project(camera, vertices)
     near = np.zeros((camera.height, camera.width), np.float32)
     shown = np.full((camera.height, camera.width), -1, np.int32)
     faces = np.ascontiguousarray(faces, np.int64)
+    rows = np.empty((len(faces), 2), np.int32)
     for part in pieces(len(faces), first=FIRST):
-        rasterise(pixels, depth, faces, part.start, part.stop, min(BANDS, camera.height), near, shown)
+        row_spans(pixels, depth, faces, part.start, part.stop, camera.height, camera.width, rows)
+        rasterise(pixels, depth, faces, rows, part.start, part.stop, min(BANDS, camera.height), near, shown)
     with np.errstate(divide="ignore"):
         return MeshImage(shown, np.where(shown >= 0, np.float32(1) / near, np.float32(np.inf)).astype(np.float32))
 

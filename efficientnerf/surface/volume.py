@@ -8,7 +8,7 @@ beyond the far limit is left out, for it reaches to infinity.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -20,6 +20,7 @@ from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.surface.mesh import Mesh, PointCloud, vertex_normals
 
 if TYPE_CHECKING:
+    from efficientnerf.asset.region import Region
     from efficientnerf.asset.tree import NerfTree
 
 VOXELS_AT_ONCE = 2**20  # of bricks, while dense voxels are found
@@ -51,9 +52,13 @@ class Volume(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class WorldVolume:
-    """A tree, its points in its own frame; see `Volume`."""
+    """A tree, its points in its own frame; see `Volume`.
+
+    region  that surfaces are clipped to, half way into the band in which opacity fades; None: not at all
+    """
 
     tree: NerfTree
+    region: Region | None = field(default=None, kw_only=True)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -138,7 +143,8 @@ class NdcVolume(WorldVolume):
         return replace(cloud, positions=self.ndc.world(cloud.positions), normals=self.ndc.world_normals(cloud.positions, cloud.normals))
 
 
-def volume_of(tree: NerfTree) -> WorldVolume:
-    """The tree as a volume, interpolated: a surface lies between voxels, where those that hold its points may not be stored and have no colour."""
+def volume_of(tree: NerfTree, region: Region | None = None) -> WorldVolume:
+    """The tree as a volume that is clipped to a region. It is interpolated: a surface lies between voxels, where those that hold its points may not be stored
+    and have no colour."""
     tree = replace(tree, lookup="trilinear") if tree.lookup != "trilinear" else tree
-    return WorldVolume(tree) if tree.ndc is None else NdcVolume(tree, tree.ndc)
+    return WorldVolume(tree, region=region) if tree.ndc is None else NdcVolume(tree, tree.ndc)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from efficientnerf.surface.mesh import Mesh
 
 CAPTURED, ORBIT = 12, 12  # cameras
+FUSED = 24  # cameras beside these, whose depths are fused too
 LONGER_SIDE, PIXELS_PER_VOXEL = 400, 2  # of the images, pixels, at most; and for each voxel along the longest side
 WARNED = 0.03  # share of pixels missed or added, from which the stage says so
 PICTURED = 3  # views in the picture: those that agree least
@@ -39,15 +40,30 @@ def check_cameras(tree: NerfTree) -> list[Camera]:
     return out
 
 
-def asset_views(tree: NerfTree, progress: Callable[[int, int, str], None]) -> list[AssetView]:
-    """What the cameras of the check see of the asset."""
+def other_cameras(tree: NerfTree, known: list[Camera]) -> list[Camera]:
+    """Captured cameras that are not among those of the check, with images of the same size; of an asset that keeps none a turntable's between them."""
+    from stages.framing.camera_paths import turntable_cameras
+    from stages.framing.captured import captured_of
+
+    captured, size = captured_of(tree.metadata), (known[0].width, known[0].height)
+    if captured is None:
+        return turntable_cameras(tree, frames=2 * ORBIT, width=size[0], height=size[1])[1::2]
+    count = len(captured.poses)
+    left = np.setdiff1d(np.arange(count), np.linspace(0, count - 1, CAPTURED).round().astype(int))
+    chosen = left[np.unique(np.linspace(0, len(left) - 1, min(FUSED, len(left))).round().astype(int))]
+    return [replace(known[0], name=f"captured_{n:04d}", world_from_camera=captured.poses[n]) for n in chosen]
+
+
+def asset_views(tree: NerfTree, progress: Callable[[int, int, str], None]) -> tuple[list[AssetView], list[AssetView]]:
+    """What the cameras of the check see of the asset; and these with others, whose depths are fused: none of a forward-facing asset."""
     from efficientnerf.surface.agreement import asset_view
 
-    cameras, out = check_cameras(tree), []
+    checking = check_cameras(tree)
+    cameras, out = [*checking, *(other_cameras(tree, checking) if tree.ndc is None else [])], []
     for number, camera in enumerate(cameras):
         out.append(asset_view(tree, camera))
         progress(number + 1, len(cameras), "views of the asset")
-    return out
+    return out[: len(checking)], out if tree.ndc is None else []
 
 
 def checked(mesh: Mesh, views: list[AssetView], tick: Callable[[], None]) -> tuple[dict[str, Any], np.ndarray]:

@@ -11,7 +11,7 @@ from benchmarks.scenes.shapes import Box, Capsule, Disc, Ground, Material, Shape
 from benchmarks.scenes.triangles import mesh_of, triangles
 from benchmarks.surface import Surface, aligned, distances, image_scores, scores
 from efficientnerf.asset.tree import tree_from_voxels
-from efficientnerf.surface.isosurface import surface
+from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
 
 GREY = Material(((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))

@@ -48,7 +48,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         MESH_EXPORTERS[file.suffix](mesh, file, source_frame(METADATA))
     fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(MADE))))
     monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: fresh)
-    monkeypatch.setattr(exporting, "_meshed", lambda export, tree, frame, wanted, progress: pytest.fail(f"made again, with {wanted}"))
+    monkeypatch.setattr(exporting, "_meshed", lambda export, tree, border, frame, wanted, progress: pytest.fail(f"made again, with {wanted}"))
     return path
 
 

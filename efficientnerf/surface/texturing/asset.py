@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.surface.isosurface import CHUNK, surface_colours
+from efficientnerf.surface.colours import CHUNK, surface_colours
 from efficientnerf.surface.mesh import Mesh, Texture, vertex_normals
 from efficientnerf.surface.texturing.atlas import Atlas, atlas_of
 from efficientnerf.surface.texturing.filling import texture_from

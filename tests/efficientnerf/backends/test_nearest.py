@@ -17,7 +17,7 @@ from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.rendering.harmonics import basis_numpy
-from efficientnerf.surface.isosurface import surface
+from efficientnerf.surface.extraction import surface
 from efficientnerf.surface.volume import volume_of
 from tests import reference
 from tests.efficientnerf.nerftree_reader import Tree

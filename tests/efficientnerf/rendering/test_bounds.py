@@ -18,7 +18,8 @@ from efficientnerf.asset.format import FormatError, describe, load
 from efficientnerf.asset.rendering import MOST_PIXELS, render, render_rays, render_reference
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
-from efficientnerf.surface.isosurface import NoSurface, surface
+from efficientnerf.surface.extraction import surface
+from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.hostile import HOSTILE, filled
 from tests.efficientnerf.trees import looking, random_tree, uniform_tree

@@ -9,7 +9,8 @@ import pytest
 
 from efficientnerf.asset.rendering import render_rays
 from efficientnerf.asset.tree import NerfTree
-from efficientnerf.surface.isosurface import NoSurface, points, surface
+from efficientnerf.surface.extraction import points, surface
+from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import topology
 from efficientnerf.surface.volume import volume_of
 from tests.efficientnerf.walls import DEPTH, NEAR, wall

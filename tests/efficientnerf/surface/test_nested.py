@@ -9,7 +9,8 @@ import pytest
 
 from efficientnerf.asset.cascades import cascade_grids, cascades_of, nested
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
-from efficientnerf.surface.isosurface import NoSurface, points, surface
+from efficientnerf.surface.extraction import points, surface
+from efficientnerf.surface.isosurface import NoSurface
 from efficientnerf.surface.mesh import Mesh, PointCloud
 from efficientnerf.surface.nested import scene_points, scene_surface
 from efficientnerf.surface.volume import volume_of

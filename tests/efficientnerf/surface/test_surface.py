@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface, points, surface, surface_colours
+from efficientnerf.surface.colours import surface_colours
+from efficientnerf.surface.extraction import points, surface
+from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface
 from efficientnerf.surface.mesh import Mesh, decimate, face_areas, face_vectors, face_volumes, moved, sample, separate, smooth, smooth_normals, tidy, topology
 
 LEVEL = 40.0

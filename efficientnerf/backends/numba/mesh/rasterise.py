@@ -6,6 +6,8 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 
+CHUNK = 1024  # triangles that a thread takes at a time
+
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _pixels_between(low, high, size):  # type: ignore[no-untyped-def]
@@ -38,12 +40,30 @@ def _triangle(x, y, inverse, number, top, bottom, width, near, shown):  # type: 
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def rasterise(pixels, depth, faces, begin, end, bands, near, shown):  # type: ignore[no-untyped-def]
+def row_spans(pixels, depth, faces, begin, end, height, width, rows):  # type: ignore[no-untyped-def]
+    """First and last + 1 of the rows of an image in which triangles `begin` to `end` may hold a pixel's centre, to `rows` (F, 2) int32; both zero for those
+    that cannot, most of those smaller than a pixel. The other arguments are those of `rasterise`."""
+    for chunk in numba.prange((end - begin + CHUNK - 1) // CHUNK):
+        for face in range(begin + chunk * CHUNK, min(end, begin + (chunk + 1) * CHUNK)):
+            rows[face, 0] = rows[face, 1] = 0
+            one, two, three = faces[face, 0], faces[face, 1], faces[face, 2]
+            x, y = (pixels[one, 0], pixels[two, 0], pixels[three, 0]), (pixels[one, 1], pixels[two, 1], pixels[three, 1])
+            if not (depth[one] > 0.0 and depth[two] > 0.0 and depth[three] > 0.0 and np.isfinite(x[0] + x[1] + x[2]) and np.isfinite(y[0] + y[1] + y[2])):
+                continue
+            left, right = _pixels_between(min(x[0], x[1], x[2]), max(x[0], x[1], x[2]), width)
+            top, bottom = _pixels_between(min(y[0], y[1], y[2]), max(y[0], y[1], y[2]), height)
+            if left < right and top < bottom:
+                rows[face, 0], rows[face, 1] = top, bottom
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def rasterise(pixels, depth, faces, rows, begin, end, bands, near, shown):  # type: ignore[no-untyped-def]
     """Lays triangles `begin` to `end` over an image; of those that a pixel's centre meets the nearest stays, of equally near ones the first.
 
     pixels  (V, 2) float64 of the vertices; nan: not in view
     depth   (V,) float64 along the view axis; faces with a vertex at zero or behind are left out
     faces   (F, 3) int64
+    rows    (F, 2) int32 of `row_spans`
     bands   of rows, one to a thread at a time
     near    (H, W) float32 inverse depth of what is shown, zero at first
     shown   (H, W) int32 its face, -1 at first
@@ -53,12 +73,9 @@ def rasterise(pixels, depth, faces, begin, end, bands, near, shown):  # type: ig
         top, bottom = height * band // bands, height * (band + 1) // bands
         x, y, inverse = np.empty(3), np.empty(3), np.empty(3)
         for face in range(begin, end):
-            whole, low, high = True, np.inf, -np.inf
+            if rows[face, 0] >= bottom or rows[face, 1] <= top:
+                continue
             for corner in range(3):
                 vertex = faces[face, corner]
-                x[corner], y[corner] = pixels[vertex, 0], pixels[vertex, 1]
-                whole &= depth[vertex] > 0.0 and np.isfinite(x[corner]) and np.isfinite(y[corner])
-                inverse[corner] = 1.0 / depth[vertex]
-                low, high = min(low, y[corner]), max(high, y[corner])
-            if whole and high >= top and low <= bottom:
-                _triangle(x, y, inverse, face, top, bottom, width, near, shown)
+                x[corner], y[corner], inverse[corner] = pixels[vertex, 0], pixels[vertex, 1], 1.0 / depth[vertex]
+            _triangle(x, y, inverse, face, top, bottom, width, near, shown)

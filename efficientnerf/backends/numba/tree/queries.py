@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
 BLOCK = 1024  # points per task
+STEP_BACK = 0.5  # voxels
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -101,6 +103,25 @@ def _densities(points, grid, density, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
+def _distances_back(points, directions, optical, step, most, grid, density, out):  # type: ignore[no-untyped-def]
+    for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
+        index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
+        tree = walk_pointers(grid, density)
+        for n in range(block * BLOCK, min(points.shape[0], block * BLOCK + BLOCK)):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            after = np.float64(_density(x, y, z, tree, index, weight))
+            passed, out[n] = 0.0, most * step
+            for number in range(1, most + 1):
+                back = np.float32(number * step)
+                before = np.float64(_density(x - back * directions[n, 0], y - back * directions[n, 1], z - back * directions[n, 2], tree, index, weight))
+                more = 0.5 * (before + after) * step
+                if passed + more >= optical:
+                    out[n] = (number - 1 + (optical - passed) / more) * step
+                    break
+                passed, after = passed + more, before
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def _normals(points, grid, density, out):  # type: ignore[no-untyped-def]
     for block in numba.prange((points.shape[0] + BLOCK - 1) // BLOCK):
         index, weight = np.empty(8, np.int32), np.empty(8, np.float32)
@@ -148,6 +169,17 @@ def density_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:
         _densities(at, grid, tree.density_values, part)
         out[chosen] = part
     return out
+
+
+def distance_back(tree: NerfTree, points: np.ndarray, directions: np.ndarray, optical_depth: float, longest: float) -> np.ndarray:
+    """(N,) float32 how far back along unit directions (N, 3) from points (N, 3) of the tree's frame, of its inmost cascade, so much optical depth lies; at most
+    `longest`, units of the frame, where there is less in this."""
+    voxel = float(tree.voxel)
+    _, at, grid = next(_grids(replace(tree, outer=()) if tree.outer else tree, points))
+    out = np.empty(len(at), np.float32)
+    towards, most = np.ascontiguousarray(directions, np.float32), round(longest / voxel / STEP_BACK)
+    _distances_back(at, towards, optical_depth / voxel, STEP_BACK, most, grid, tree.density_values, out)
+    return out * np.float32(voxel)
 
 
 def normal_at(tree: NerfTree, points: np.ndarray) -> np.ndarray:

@@ -1,0 +1,126 @@
+"""The surface of a volume: extracted, cleaned, decimated and coloured; and points on it.
+
+V vertices, F faces. Everything is in the frame of the volume (`efficientnerf.surface.volume`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from efficientnerf.surface.colours import surface_colours
+from efficientnerf.surface.fusion import Fusion
+from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_threshold, enclosed_cells, isosurface, silent
+from efficientnerf.surface.mesh import Mesh, PointCloud, decimate, sample, separate, smooth, smooth_normals, tidy, vertex_normals
+from efficientnerf.surface.visible_parts import Shown, visible_parts
+from efficientnerf.surface.volume import NdcVolume, Volume
+
+NORMAL_ROUNDS, FUSED_ROUNDS = 6, 10  # of smoothing normals, from densities alone and fused; at most as many as of smoothing. docs/experiments/surface.md
+
+
+def cleaned_surface(
+    volume: Volume, threshold: float | None, min_component: float, rounds: int, viewpoints: np.ndarray, progress: Progress, shown: Shown | None = None,
+    fusion: Fusion | None = None,
+) -> tuple[np.ndarray, np.ndarray, dict[str, object]]:  # fmt: skip
+    """Vertices, faces and facts of the surface before it is decimated; see `surface`."""
+    level = automatic_threshold(volume) if threshold is None else float(threshold)
+    if not (np.isfinite(level) and level > 0):
+        raise NoSurface(f"threshold {level:g}: expected a density above zero")
+    enclosed = enclosed_cells(volume, level, viewpoints)
+    vertices, faces = isosurface(volume, level, progress, enclosed=enclosed if enclosed.any() else None, fusion=fusion)
+    if not len(faces):
+        raise NoSurface(f"the density nowhere reaches {level:.4g} per unit")
+    vertices, faces, facts = visible_parts(vertices, faces, min_component, viewpoints, _in_world(volume, shown))
+    if not len(faces):
+        raise NoSurface(f"no view shows anything of the surface at {level:.4g} per unit")
+    vertices = np.clip(smooth(vertices, faces, rounds), vertices.min(0), vertices.max(0))  # flat sides must not bulge out of the box
+    return vertices, faces, {"threshold": level, "threshold_chosen": "automatic" if threshold is None else "given", **facts}
+
+
+def _in_world(volume: Volume, shown: Shown | None) -> Shown | None:
+    """What is shown of components of the volume's frame."""
+    if shown is None or not isinstance(volume, NdcVolume):
+        return shown
+    ndc = volume.ndc
+    return lambda vertices, faces, component: shown(ndc.world(vertices), faces, component)
+
+
+_NO_VIEWPOINTS = np.zeros((0, 3))
+
+
+def surface(
+    volume: Volume,
+    threshold: float | None = None,
+    *,
+    faces: int = 200_000,
+    min_component: float = 0.01,
+    rounds: int = 10,
+    viewpoints: np.ndarray = _NO_VIEWPOINTS,
+    shown: Shown | None = None,
+    fusion: Fusion | None = None,
+    progress: Progress = silent,
+) -> Mesh:
+    """The volume's surface as a closed, coloured mesh in the training frame.
+
+    threshold      density per world unit of the surface; None: `automatic_threshold`
+    faces          budget that it is decimated to
+    min_component  components with less than this share of the largest one's area are removed
+    rounds         of smoothing, which keeps the volume; as many, up to NORMAL_ROUNDS or FUSED_ROUNDS, of smoothing normals, which keeps edges
+    viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
+    shown          how much views of the world show of components: those that they do not show are removed; None: hollows and what is in them are
+    fusion         depths of views, which decide where the surface is wherever they agree; None: the densities alone do
+    progress       called with (done, total, text); what it raises stops the work
+
+    Of an `NdcVolume` it is the surface in normalised device coordinates (budget, rounds and sizes of components count there), in the world.
+
+    Raises NoSurface.
+    """
+    ndc = volume if isinstance(volume, NdcVolume) else None
+    viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS  # the cameras are before the near plane, outside of the volume
+    vertices, triangles, facts = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress, shown, fusion)
+    facts["faces_before_decimation"] = len(triangles)
+    vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
+    vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # what decimation cut off
+    if len(triangles):
+        most = NORMAL_ROUNDS if fusion is None else FUSED_ROUNDS
+        vertices = np.clip(smooth_normals(vertices, triangles, min(rounds, most)), vertices.min(0), vertices.max(0))
+    normals = vertex_normals(vertices, triangles)
+    colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
+    mesh = Mesh(vertices, triangles, normals, colours, facts)
+    return mesh if ndc is None else ndc.mesh(mesh)
+
+
+def points(
+    volume: Volume,
+    count: int = 200_000,
+    threshold: float | None = None,
+    *,
+    min_component: float = 0.01,
+    rounds: int = 10,
+    viewpoints: np.ndarray = _NO_VIEWPOINTS,
+    shown: Shown | None = None,
+    fusion: Fusion | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> PointCloud:
+    """`count` points spread evenly over the surface (before decimation), with normals and colours. Raises NoSurface.
+
+    The same for the same seed; the other arguments as for `surface`. Of an `NdcVolume` they are spread evenly in normalised device
+    coordinates, as images show them: sparser in the world the further they are.
+    """
+    ndc = volume if isinstance(volume, NdcVolume) else None
+    viewpoints = viewpoints if ndc is None else _NO_VIEWPOINTS
+    vertices, triangles, _ = cleaned_surface(volume, threshold, min_component, rounds, viewpoints, progress, shown, fusion)
+    cloud = spread(volume, vertices, triangles, count, seed, progress)
+    return cloud if ndc is None else ndc.points(cloud)
+
+
+def spread(volume: Volume, vertices: np.ndarray, triangles: np.ndarray, count: int, seed: int, progress: Progress = silent) -> PointCloud:
+    """`count` points spread evenly over a surface of the volume, in its frame."""
+    face, weight = sample(vertices, triangles, count, seed)
+    corners = triangles[face]  # (N, 3)
+    normals = (vertex_normals(vertices, triangles)[corners] * weight[..., None]).sum(1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), vertex_normals(vertices, triangles)[corners[:, 0]])
+    positions = (vertices[corners] * weight[..., None]).sum(1)
+    directions = volume.view_directions if isinstance(volume, NdcVolume) else None
+    return PointCloud(positions, normals, surface_colours(volume, positions, normals, progress, directions))

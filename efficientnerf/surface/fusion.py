@@ -1,0 +1,110 @@
+"""A signed distance from the depths that views of an asset show, joined with the asset's densities. docs/experiments/surface.md
+
+Median depths (half of the light absorbed) of many views are planes of pixels; a voxel's distance from them is averaged over the views, each by its confidence:
+opacity, how well a plane fits the depths around the pixel, how steeply it is seen. Views that see through a voxel carve it. Curless and Levoy, "A volumetric
+method for building complex models from range images", SIGGRAPH 1996; Newcombe et al., "KinectFusion", ISMAR 2011.
+
+C cameras, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.backends.pieces import pieces
+from efficientnerf.geometry.cameras import rays
+from efficientnerf.surface.agreement import AssetView
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+# docs/experiments/surface.md
+ABSORBED = 0.15  # share of the light that is gone at the depths that are fused: half is gone well inside of what is soft
+LONGEST = 8.0  # voxels that this may lie before the median depth
+RADIUS = 4  # pixels around, that a plane is fitted to
+BAND = 3.0  # voxels off its plane that a pixel may be
+TRUNCATION = 3.0  # voxels
+EMPTY, HAZE = 0.01, 0.1  # opacities: nothing is fused a voxel beyond the first; from the second on, what views say is behind a surface is solid
+DENSITY_WEIGHT = 0.5  # of the densities, in views
+BLUR = 1.2  # voxels, standard deviation
+THIN = (-1.2, -0.5)  # least distance around a voxel: up to the first it is a part of something thick, from the second on of something thin
+CARVED = (0.5, 0.8)  # mean distance over the truncation: from the second on views see through a voxel, and it is no part of anything thin
+AROUND = 2  # voxels on either side that this is looked for in
+MARGIN = 4  # voxels that a block's values depend on beyond it
+
+
+@dataclass(frozen=True, eq=False)
+class Fusion:
+    """Views as `efficientnerf.backends.numba.mesh.fusion` reads them.
+
+    planes   (C, H, W, CHANNELS) float32
+    cameras  (C, 3, 4) float64 camera_from_world
+    lenses   (C, 4) float64 fx, fy, cx, cy
+    """
+
+    planes: np.ndarray
+    cameras: np.ndarray
+    lenses: np.ndarray
+
+
+def front_depth(tree: NerfTree, view: AssetView) -> np.ndarray:
+    """(H, W) float32 depth at which ABSORBED of the light is gone, along the view axis, of the pixels that have a median depth."""
+    from efficientnerf.backends.numba.tree.queries import distance_back
+
+    hit = np.isfinite(view.depth)
+    y, x = np.nonzero(hit)
+    origins, directions = rays(view.camera, np.stack([x, y], -1) + 0.5)
+    cosine = directions @ view.camera.forward
+    points = origins + (view.depth[hit] / cosine)[:, None] * directions
+    out = view.depth.copy()
+    for part in pieces(len(points), first=2**14):
+        back = distance_back(tree, points[part], directions[part], np.log(2) + np.log1p(-ABSORBED), LONGEST * float(tree.voxel))
+        out[y[part], x[part]] -= back * cosine[part]
+    return out
+
+
+def fusion_of(tree: NerfTree, views: Sequence[AssetView], tick: Callable[[], None]) -> Fusion:
+    """What pinhole cameras with images of one size see of a tree, for its inmost cascade. `tick` is called before each; what it raises stops the work."""
+    from efficientnerf.backends.numba.mesh.fusion import CHANNELS, fit_planes
+
+    height, width = views[0].depth.shape
+    voxel = float(tree.voxel)
+    planes = np.empty((len(views), height, width, CHANNELS), np.float32)
+    lenses = np.array([[view.camera.intrinsics[name] for name in ("fx", "fy", "cx", "cy")] for view in views])
+    for view, lens, out in zip(views, lenses, planes, strict=True):
+        tick()
+        depth = front_depth(tree, view)
+        for part in pieces(height, first=16):
+            fit_planes(depth, view.opacity, lens, part.start, part.stop, RADIUS, BAND * voxel, out)
+    cameras = np.array([np.linalg.inv(view.camera.world_from_camera)[:3] for view in views])
+    return Fusion(planes, np.ascontiguousarray(cameras), lenses)
+
+
+def fused_opacity(fusion: Fusion, opacity: np.ndarray, low: np.ndarray, bounds_min: np.ndarray, voxel: float) -> np.ndarray:
+    """(X, Y, Z) float32 values whose level 1/2 is the surface, from those of the densities, for voxels from `low` on. The outermost MARGIN are of no use."""
+    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+    from efficientnerf.backends.numba.mesh.fusion import FILLED, fuse
+
+    wanted = maximum_filter(opacity > EMPTY, size=3).astype(np.uint8)
+    wanted[opacity >= HAZE] = FILLED
+    distance, weight, spread = (np.zeros(opacity.shape, np.float32) for _ in range(3))
+    for part in pieces(len(opacity), first=8):
+        at = np.array([low[0] + part.start, low[1], low[2]], np.int64)
+        fuse(
+            np.asarray(bounds_min, np.float64), at, float(voxel), wanted[part], fusion.planes, fusion.cameras, fusion.lenses, TRUNCATION, distance[part],
+            weight[part], spread[part],
+        )  # fmt: skip
+    density = (TRUNCATION * (1 - 2 * opacity)).astype(np.float32)
+    mixed = np.where(wanted > 0, (distance * weight + DENSITY_WEIGHT * density) / (weight + DENSITY_WEIGHT), density).astype(np.float32)
+    smooth = gaussian_filter(mixed, BLUR, truncate=2.0)
+    least = minimum_filter(mixed, size=2 * AROUND + 1)
+    thin = np.clip((least - THIN[0]) / (THIN[1] - THIN[0]), 0, 1)
+    through = np.where(weight >= 1, distance / TRUNCATION, 0)
+    thin *= np.clip((CARVED[1] - through) / (CARVED[1] - CARVED[0]), 0, 1)
+    smooth += thin * (np.minimum(mixed, density) - smooth)
+    return np.asarray(np.clip(0.5 - smooth / (2 * TRUNCATION), 0, 1), np.float32)
