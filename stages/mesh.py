@@ -206,4 +206,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
 
 
-STAGE = Stage(name="mesh", version=8, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)
+STAGE = Stage(name="mesh", version=9, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)

@@ -27,7 +27,8 @@ TRUST = 0.01  # grade of the colour that is expected. docs/experiments/textures.
 REACH = 6.0  # pixels from an edge at which a photograph counts in full
 BORDER = 0.03  # of the longer side of a photograph, over which it fades out
 JUMP = 0.01  # of the inverse depth, at a depth edge
-SLACK = 0.01  # of its depth that a texel may lie behind what the mesh shows there
+SLACK = 0.001  # of its depth that a texel may lie behind what the mesh shows there
+BESIDE = 1.0  # pixels that it may be from where that depth was taken: it lies deeper by as much as the surface slopes
 FAINT = 250  # alpha under which a pixel shows something else, too
 FINER = 1.25  # texels on the side of a pixel
 FINEST = 2.0  # pixels of a photograph on the side of a texel from which it is reduced to half
@@ -89,11 +90,18 @@ def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours
     column, row = np.floor(np.clip(seen.pixels[at], -1, 1e9)).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < photo.camera.width) & (row < photo.camera.height)
     at, column, row = at[inside], column[inside], row[inside]
-    shown = (seen.depth[at] * seen.near[row, column] <= 1 + 2 * SLACK) & (seen.clear[row, column] >= 3.0)
+    slack = SLACK + _beside(photo) * np.sqrt(np.maximum(1 - seen.facing[at] ** 2, 0)) / seen.facing[at]
+    shown = (seen.depth[at] * seen.near[row, column] <= 1 + slack) & (seen.clear[row, column] >= 3.0)
     visible[at[shown]] = True
     density = np.where(visible[faces].any(1), np.sqrt(area), 0.0)
     values = photo.colours[row[shown], column[shown]].astype(np.float64) / 255
     return Survey(np.nan_to_num(density).astype(np.float32), _sharpness(photo, seen.clear), _gains(values, colours[at[shown]].astype(np.float64)))
+
+
+def _beside(photo: Photograph) -> float:
+    """BESIDE pixels of a photograph, as a share of the depth."""
+    intrinsics = photo.camera.intrinsics
+    return BESIDE / min(float(intrinsics["fx"]), float(intrinsics["fy"]))
 
 
 def texels_wanted(vertices: np.ndarray, faces: np.ndarray, density: np.ndarray) -> float:
@@ -225,7 +233,7 @@ class PhotographTexture:
         for part in pieces(len(self.faces), first=4096):
             observe(
                 part.start, part.stop, self.texels.begin, self.texels.share, self.faces, seen.pixels, seen.depth, seen.facing, seen.near, seen.clear,
-                photo.colours, gains, np.float32(REACH), np.float32(SLACK), density, weight, self.seen, self.grades,
+                photo.colours, gains, np.float32(REACH), np.float32(SLACK), np.float32(_beside(photo)), density, weight, self.seen, self.grades,
             )  # fmt: skip
 
     def finished(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

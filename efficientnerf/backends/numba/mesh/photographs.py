@@ -75,7 +75,9 @@ def _jumps(left, here, other, right, jump):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def observe(begin_face, end_face, texel_begin, share, faces, pixels, depth, facing, near, clear, photo, gain, reach, slack, density, weight, seen, grades):  # type: ignore[no-untyped-def]
+def observe(  # type: ignore[no-untyped-def]
+    begin_face, end_face, texel_begin, share, faces, pixels, depth, facing, near, clear, photo, gain, reach, slack, beside, density, weight, seen, grades,
+):  # fmt: skip
     """Lets texels of faces `begin_face` to `end_face` see a photograph; of what a texel has seen the K best graded are kept.
 
     texel_begin  (F + 1,) int64 first texel of each face
@@ -90,6 +92,7 @@ def observe(begin_face, end_face, texel_begin, share, faces, pixels, depth, faci
     gain         (3,) float32 factors of its colours
     reach        pixels from an edge at which it counts no more
     slack        share of its depth that a texel may lie behind what is seen
+    beside       the same for each unit of the slope of its surface
     density      (F,) float32 pixels for each texel, of the photograph that has most: its square root
     weight       of the photograph
     seen         (T, K, 3) uint8 colours
@@ -120,8 +123,9 @@ def observe(begin_face, end_face, texel_begin, share, faces, pixels, depth, faci
             free = clear[row, column]
             if not (cosine > 0.05 and free > 0.5):
                 continue
-            # A pixel's depth is that of its centre: a texel beside it may lie deeper by as much as the surface slopes.
-            if deep * near[row, column] > 1.0 + slack / max(cosine, np.float32(0.2)):
+            # A pixel's depth is that of its centre: a texel beside it may lie deeper by as much as the surface slopes. More would see through thin parts.
+            slope = np.sqrt(max(np.float32(1.0) - cosine * cosine, np.float32(0.0))) / max(cosine, np.float32(0.2))
+            if deep * near[row, column] > 1.0 + slack + beside * slope:
                 continue
             edge = min(free / reach, np.float32(1.0))
             grade = np.float32(weight * edge * edge * cosine * size * size)

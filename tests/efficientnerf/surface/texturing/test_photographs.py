@@ -208,3 +208,27 @@ def test_many_photographs_keep_the_best() -> None:
         assert (np.diff(texels.grades, axis=1) <= 0).all()
         found.append(texels.grades)
     np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize(("tilt", "gap"), [(0.0, 0.005), (0.9, 0.03)])
+def test_no_photograph_shows_what_lies_close_behind_a_thin_sheet(tilt: float, gap: float) -> None:
+    """Two sheets that face the camera, one a small share of the distance behind the other: thin parts do not show through, as far as pixels tell."""
+    camera = cameras(1)[0]
+    distance = float(np.linalg.norm(camera.centre))
+    towards = camera.centre / distance
+    along = np.cross(towards, [0.0, 0.0, 1.0])
+    along /= np.linalg.norm(along)
+    up = np.cross(along, towards)
+    along, normal = np.cos(tilt) * along + np.sin(tilt) * towards, np.cos(tilt) * towards - np.sin(tilt) * along
+    grid = np.stack(np.meshgrid([-0.4, 0.0, 0.4], [-0.4, 0.0, 0.4], indexing="ij"), -1).reshape(-1, 2)
+    front = grid[:, :1] * along + grid[:, 1:] * up
+    back = 0.6 * front - gap * distance * normal
+    corners = np.array([[0, 3, 4], [0, 4, 1], [1, 4, 5], [1, 5, 2], [3, 6, 7], [3, 7, 4], [4, 7, 8], [4, 8, 5]])
+    if np.cross(front[3] - front[0], front[4] - front[0]) @ towards < 0:
+        corners = corners[:, ::-1]
+    vertices, faces = np.concatenate([front, back]), np.concatenate([corners, corners + len(front)])
+    photo = photographed(vertices, faces, camera, lambda points: np.full((len(points), 3), [1.0, 0.0, 0.0]))
+    atlas, _, known = textured(vertices, faces, [photo])
+    behind = atlas.texels.face >= len(corners)
+    assert (known[behind] < 0.01).all()
+    assert (known[~behind] > 0.9).mean() > 0.3  # the rest is near the edges
