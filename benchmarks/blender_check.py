@@ -32,6 +32,7 @@ from stages.framing.camera_paths import pose_on_sphere
 from stages.io.exporters import MESH_EXPORTERS
 from stages.io.exporters.glb import gltf_from_capture
 from stages.io.exporters.writing import SourceFrame, source_frame
+from stages.io.pictures import opened, rgb_and_alpha
 from stages.io.refined_cameras import load_scene
 from stages.meshing.files import read_mesh
 
@@ -63,7 +64,14 @@ def in_blender(python: Path, path: Path, cameras: list[Camera], turn: np.ndarray
     done = subprocess.run([str(python), str(CHILD), str(wanted)], capture_output=True, text=True, check=False)
     if done.returncode != 0 or not report.is_file():
         raise SystemExit(f"Blender failed on {path.name}:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
-    return json.loads(report.read_text()), [np.asarray(Image.open(view["out"]).convert("RGBA")) for view in views]
+    return json.loads(report.read_text()), [_rgba(Path(view["out"])) for view in views]
+
+
+def _rgba(path: Path) -> np.ndarray:
+    """(H, W, 4) uint8 with straight alpha."""
+    with opened(path, ("PNG",)) as image:
+        rgb, alpha = rgb_and_alpha(image)
+    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8) if alpha is None else alpha])
 
 
 def compared(own: tuple[np.ndarray, np.ndarray], other: np.ndarray) -> tuple[float, float]:

@@ -72,12 +72,12 @@ def load_mesh(outputs: MeshOutputs, tree: NerfTree, region: str) -> EvaluatedMes
 
 def mesh_bytes(outputs: MeshOutputs) -> int:
     """Of memory, that measuring a mesh takes beside the view itself: its arrays, and those of its texture."""
-    from PIL import Image
+    from stages.io.pictures import read_header
 
     texels = 0
     if outputs.texture.is_file():
-        with Image.open(outputs.texture, formats=("PNG",)) as picture:
-            texels = picture.width * picture.height
+        width, height = read_header(outputs.texture).size
+        texels = width * height
     return 16 * (_size(outputs.ply) + _size(outputs.glb) // 4) + 12 * texels
 
 

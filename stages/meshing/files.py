@@ -1,8 +1,7 @@
-"""The mesh that the stage `mesh` has written, read again: the file of shared vertices, and the texture of the GLB."""
+"""The mesh that the stage `mesh` has written, read again: the file of shared vertices, where the GLB has them in the texture, and that."""
 
 from __future__ import annotations
 
-import io
 import json
 import struct
 from pathlib import Path
@@ -26,7 +25,7 @@ def read_mesh(outputs: MeshOutputs) -> Mesh:
     positions = np.stack([vertices[name] for name in ("x", "y", "z")], 1).astype(np.float64)
     normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
     colours = np.stack([vertices[name] for name in ("red", "green", "blue")], 1) / np.float32(255)
-    return Mesh(positions, faces, normals, colours, texture=_read_texture(outputs.glb, faces, positions))
+    return Mesh(positions, faces, normals, colours, texture=_read_texture(outputs, faces, positions))
 
 
 def _refuse(path: Path, why: str) -> NoReturn:
@@ -59,9 +58,12 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces
 
 
-def _read_texture(path: Path, faces: np.ndarray, positions: np.ndarray) -> Texture | None:
-    """The texture of a GLB of these faces, in their order; None where it has none."""
+def _read_texture(outputs: MeshOutputs, faces: np.ndarray, positions: np.ndarray) -> Texture | None:
+    """The texture of a mesh of these faces, in the order of the GLB; None where it has none."""
+    path = outputs.glb
     data = _data(path)
+    if len(data) < 20 or struct.unpack_from("<I", data, 8)[0] != len(data):
+        _refuse(path, "cut off")
     try:
         size = struct.unpack_from("<I", data, 12)[0]
         document, blob = json.loads(data[20 : 20 + size]), data[28 + size :]
@@ -72,14 +74,13 @@ def _read_texture(path: Path, faces: np.ndarray, positions: np.ndarray) -> Textu
         coordinates = _accessor(document, blob, primitive["attributes"]["TEXCOORD_0"], "<f4", 2).astype(np.float64) * [1, -1] + [0, 1]
         places = _accessor(document, blob, primitive["attributes"]["POSITION"], "<f4", 3)
         turn = np.array(document["nodes"][0]["extras"]["source_frame"]["gltf_from_capture"], np.float64)[:3, :3]
-        pictures = [_picture(document, blob, image) for image in document["images"]]
         same = corners.shape == faces.shape and np.allclose(places[corners] @ turn, positions[faces], rtol=1e-5, atol=1e-5 * float(np.abs(positions).max()))
-        texture = Texture(np.clip(coordinates[corners], 0, 1), *pictures[:2])
+        at = np.clip(coordinates[corners], 0, 1)
     except (ValueError, KeyError, IndexError, TypeError, struct.error, OSError) as error:
         _refuse(path, f"not as it was written ({type(error).__name__})")
     if not same:
         _refuse(path, "its faces are not those of the PLY beside it")
-    return texture
+    return Texture(at, _picture(outputs.texture))
 
 
 def _accessor(document: Any, blob: bytes, index: int, kind: str, width: int) -> np.ndarray:
@@ -88,11 +89,17 @@ def _accessor(document: Any, blob: bytes, index: int, kind: str, width: int) -> 
     return np.frombuffer(blob, kind, entry["count"] * width, view["byteOffset"]).reshape(-1, width)
 
 
-def _picture(document: Any, blob: bytes, image: Any) -> np.ndarray:
-    from PIL import Image
 
-    view = document["bufferViews"][image["bufferView"]]
-    with Image.open(io.BytesIO(blob[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]), formats=("PNG", "JPEG")) as opened:
-        if max(opened.size) > MOST_TEXELS or opened.mode != "RGB":
-            raise ValueError("no texture of ours")
-        return np.asarray(opened)
+def _picture(path: Path) -> np.ndarray:
+    from stages.io.pictures import UnreadableImage, read_header
+    from stages.io.png import read_png
+
+    try:
+        if max(read_header(path).size) > MOST_TEXELS:
+            _refuse(path, f"more than {MOST_TEXELS} texels along a side")
+        picture = read_png(path)
+    except UnreadableImage as error:
+        _refuse(path, str(error))
+    if picture.ndim != 3 or picture.shape[2] != 3:
+        _refuse(path, "not as it was written")
+    return picture

@@ -11,6 +11,7 @@ import torch
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
 from stages.evaluation.comparison import GAP, lpips_metrics
+from stages.evaluation.mesh import FIGURES
 from stages.evaluation.summary import summary
 from stages.evaluation.views import GroundTruth
 from stages.lpips_weights import BACKBONES, load_lpips
@@ -115,8 +116,8 @@ def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
     some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, "psnr_colour_fitted": 21.0, **figures}
     network = {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0, "floaters": None}
     against = {"asset_with_network_background": None, "gap": dict.fromkeys(GAP), "holes": 0.0, "floaters": None}
-    views = [{"name": "a", "network": network, "asset": {**some, "lpips_alex": None}, **against}]
-    found = summary(views, split="test", stride=1, background=None, perceptual=("lpips_alex",))
+    views = [{"name": "a", "network": network, "asset": {**some, "lpips_alex": None}, "mesh": dict.fromkeys(FIGURES), **against}]
+    found = summary(views, split="test", stride=1, background=None, mesh={"faces": 2}, perceptual=("lpips_alex",))
     assert found["network"]["lpips_alex"] == figures["lpips_alex"]
     assert found["asset"]["lpips_alex"] is None
     assert Lpips.__doc__

@@ -15,6 +15,8 @@ from efficientnerf.surface.mesh import Mesh, Texture
 from pipeline.errors import CorruptArtifact
 from stages.artifacts import MeshOutputs
 from stages.io.exporters import MESH_EXPORTERS
+from stages.io.exporters.writing import MOST_TEXELS
+from stages.io.png import write_png
 from stages.meshing.files import read_mesh
 from tests.stages.io.meshes import Y_DOWN, block
 
@@ -28,7 +30,7 @@ def textured() -> Mesh:
 def written(folder: Path, mesh: Mesh) -> MeshOutputs:
     folder.mkdir(exist_ok=True)
     outputs = MeshOutputs(folder)
-    for path in (outputs.ply, outputs.glb):
+    for path in (outputs.ply, outputs.glb, outputs.obj):
         MESH_EXPORTERS[path.suffix](mesh, path, Y_DOWN)
     return outputs
 
@@ -64,7 +66,8 @@ def rewritten(path: Path, change: Callable[[dict], None]) -> None:
     change(document)
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    path.write_bytes(data[:12] + struct.pack("<I", len(text)) + data[16:20] + text + data[20 + size :])
+    whole = 20 + len(text) + len(data) - 20 - size
+    path.write_bytes(data[:8] + struct.pack("<I", whole) + struct.pack("<I", len(text)) + data[16:20] + text + data[20 + size :])
 
 
 SPOILT: dict[str, Callable[[MeshOutputs], object]] = {
@@ -79,8 +82,10 @@ SPOILT: dict[str, Callable[[MeshOutputs], object]] = {
     "a glb of another mesh": lambda outputs: MESH_EXPORTERS[".glb"](replace(textured(), vertices=block().vertices * 2), outputs.glb, Y_DOWN),
     "no meshes": lambda outputs: rewritten(outputs.glb, lambda document: document.pop("meshes")),
     "an accessor out of range": lambda outputs: rewritten(outputs.glb, lambda document: document["accessors"][2].update(count=10**9)),
-    "no picture": lambda outputs: rewritten(outputs.glb, lambda document: document["images"].clear()),
-    "a picture elsewhere": lambda outputs: rewritten(outputs.glb, lambda document: document["images"][0].update(bufferView=0)),
+    "no picture": lambda outputs: outputs.texture.unlink(),
+    "a picture cut off": lambda outputs: outputs.texture.write_bytes(outputs.texture.read_bytes()[:-40]),
+    "a picture without colours": lambda outputs: write_png(np.zeros((8, 8), np.uint8), outputs.texture),
+    "a picture of too many texels": lambda outputs: write_png(np.zeros((1, MOST_TEXELS + 1, 3), np.uint8), outputs.texture),
 }
 
 
