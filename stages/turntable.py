@@ -58,7 +58,7 @@ class TurntableSettings:
     supersample: Annotated[int, Meta(ge=1, le=8)] = setting(1, "Rays along each side of a pixel.", advanced=True)
     crf: Annotated[int, Meta(ge=0, le=51)] = setting(18, "Constant rate factor of the video: 0 is lossless, 51 the worst.", advanced=True)
     exr: Literal["off", "first", "all"] = setting(
-        "first", "Frames that are written as EXR too, with linear colour, alpha, depth and normals: none (off), the first, or all."
+        "first", "Frames that are written as EXR too, with linear colour, alpha, depth, normals and positions: none (off), the first, or all."
     )
 
 
@@ -107,4 +107,4 @@ def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None
         shutil.copyfile(path, job.out / path.name)
 
 
-STAGE = Stage(name="turntable", version=3, settings=TurntableSettings, needs=needs_of(TurntableInputs), run=run)
+STAGE = Stage(name="turntable", version=4, settings=TurntableSettings, needs=needs_of(TurntableInputs), run=run)

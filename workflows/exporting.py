@@ -1,4 +1,4 @@
-"""What `enerf export` does: the surface of a run or of an asset as files, taken from the run's stage `mesh` where that has made the same."""
+"""What `enerf export` does: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import BadInput, UsageError
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, Format
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, VOLUME_EXPORTERS, Format
 
 if TYPE_CHECKING:
     from efficientnerf.asset.region import Region
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from workflows.cli.resolve import Settings
 
 CAMERAS = ".json"
+VOLUME_VOXEL = 250  # bytes of a voxel while its grids are sorted into nodes
 Box = tuple[float, float, float, float, float, float]
 Progress = Callable[[int, int, str], None]
 Written = dict[str, Any]
@@ -48,13 +49,26 @@ class Export:
     picture: str = "png"
     limit: Limit | None = None
 
+    @property
+    def formats(self) -> dict[str, Format]:
+        return {**(POINT_EXPORTERS if self.as_points else MESH_EXPORTERS), **VOLUME_EXPORTERS}
+
     def format(self, path: Path) -> Format:
-        return (POINT_EXPORTERS if self.as_points else MESH_EXPORTERS)[path.suffix.lower()]
+        return self.formats[path.suffix.lower()]
+
+    @property
+    def cameras(self) -> list[Path]:
+        return [path for path in self.files if path.suffix.lower() == CAMERAS]
+
+    @property
+    def volumes(self) -> list[Path]:
+        return [path for path in self.files if path.suffix.lower() in VOLUME_EXPORTERS]
 
     @property
     def surfaces(self) -> list[Path]:
-        """The files that hold the surface; the others hold cameras."""
-        return [path for path in self.files if path.suffix.lower() != CAMERAS]
+        """The files that hold the surface."""
+        others = {*self.cameras, *self.volumes}
+        return [path for path in self.files if path not in others]
 
     @property
     def keeps_textures(self) -> bool:
@@ -88,19 +102,17 @@ def faces_from_text(text: str) -> int:
 
 def check(export: Export) -> None:
     """Raise UsageError for what cannot be written, before anything is done."""
-    from stages.io.exporters.usd import refuse_without_usd
     from workflows.destination import check_files
 
-    known = [*(POINT_EXPORTERS if export.as_points else MESH_EXPORTERS), CAMERAS]
+    known = [*export.formats, CAMERAS]
     for path in export.files:
         if path.suffix.lower() not in known:
-            kind = "points" if export.as_points else "a mesh"
+            kind = "points" if export.as_points else "a mesh or a volume"
             raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
     if (export.picture != "png" and not export.keeps_textures) or (export.texture not in (None, "off") and not (export.is_coloured and not export.as_points)):
         raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
-    for path in export.surfaces:
-        if export.format(path).extra == "usd":
-            refuse_without_usd(path)
+    for path in (*export.surfaces, *export.volumes):
+        export.format(path).refuse_without_package(path)
     beside = [] if export.texture == "off" else [each for path in export.surfaces for each in export.format(path).companions(path, export.picture)]
     check_files([*export.files, *dict.fromkeys(beside)], force=export.force, inputs=[export.what])
 
@@ -114,7 +126,7 @@ def export_cameras(export: Export) -> list[Written]:
     from workflows.destination import writing
 
     written, what = [], export.what
-    for path in (path for path in export.files if path not in export.surfaces):
+    for path in export.cameras:
         poses = PosesOutputs(open_run(what).folder("poses")) if is_run(what) else PosesOutputs(what)
         if not poses.scene.is_file():
             raise BadInput(f"{what}: has no cameras; they are in a run whose stage poses is done. Give such a run for {path}.")
@@ -157,6 +169,29 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
         with writing(path, force=export.force):
             export.format(path)(cloud, path, frame)
     return [{"path": str(path.absolute()), "points": len(cloud.positions)} for path in export.surfaces]
+
+
+def export_volumes(export: Export, settings: Settings) -> list[Written]:
+    """The asset's voxels as volumes; what of it, the settings of the stage mesh say where --region does not."""
+    from stages.framing.restriction import restricted
+    from stages.io.exporters.writing import source_frame
+    from stages.memory.need import Need, libraries, refuse_more_than
+    from stages.memory.rendering import tree_bytes
+    from workflows.cli.target import load_asset
+    from workflows.destination import writing
+
+    if not export.volumes:
+        return []
+    region = export.region or (settings.resolved()["mesh"].region if export.crop is None else "all")
+    tree = restricted(load_asset(export.what), region, export.crop)
+    voxels = len(tree.density_values)
+    need = Need({"grids": VOLUME_VOXEL * voxels, "the asset": tree_bytes(tree), "libraries": libraries()})
+    refuse_more_than(export.limit, str(export.what), need, "Take an asset of fewer voxels (enerf convert --resolution).")
+    frame = source_frame(tree.metadata)
+    for path in export.volumes:
+        with writing(path, force=export.force):
+            export.format(path)(tree, path, frame)
+    return [{"path": str(path.absolute()), "voxels": voxels} for path in export.volumes]
 
 
 def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: int) -> None:
@@ -238,20 +273,35 @@ def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]
     return written
 
 
+# What has no table: extension, of what, command, what it keeps and loses, who opens it.
+_OTHERS = (
+    (CAMERAS, "cameras", "enerf export", "cameras and their lenses, of a run", "the surface", "nerfstudio, instant-ngp, gsplat"),
+    (".png", "pictures", "enerf render", "colour, 8 bits sRGB, and opacity over a transparent background", "depth", "everything"),
+    (".exr", "pictures", "enerf render --exr all", "linear colour, opacity, depth, normals and positions, 32 bits; the capture's frame", "nothing",
+     "Nuke, Blender, Fusion, Natron, DJV"),
+    (".mp4", "pictures", "enerf render --video", "colour, as video (H.264)", "opacity, depth", "everything"),
+    (".nerftree", "asset", "enerf convert", "all: voxels, view-dependent colours, surroundings", "nothing, or what --resolution and --sh-degree say", "enerf"),
+)  # fmt: skip
+
+
 def formats() -> list[dict[str, Any]]:
-    """All formats with what they keep and lose, the extra that they need, and who opens them."""
+    """All formats with what they keep and lose, the command that writes them, the extra that they need, and who opens them."""
     rows: list[dict[str, Any]] = []
-    for kind, table in (("mesh", MESH_EXPORTERS), ("points", POINT_EXPORTERS)):
+    for kind, table in (("mesh", MESH_EXPORTERS), ("points", POINT_EXPORTERS), ("volume", VOLUME_EXPORTERS)):
+        command = "enerf export --points" if kind == "points" else "enerf export"
         for each in table.values():
-            rows.append({"extension": each.extension, "of": kind, "keeps": each.keeps, "loses": each.loses, "extra": each.extra, "opened_by": each.opened_by})
-    cameras = {"keeps": "cameras and their lenses, of a run", "loses": "the surface", "extra": None, "opened_by": "nerfstudio, instant-ngp, gsplat"}
-    return [*rows, {"extension": CAMERAS, "of": "cameras", **cameras}]
+            facts = {"keeps": each.keeps, "loses": each.loses, "extra": each.extra, "opened_by": each.opened_by}
+            rows.append({"extension": each.extension, "of": kind, "command": command, **facts})
+    for extension, kind, command, keeps, loses, programs in _OTHERS:
+        rows.append({"extension": extension, "of": kind, "command": command, "keeps": keeps, "loses": loses, "extra": None, "opened_by": programs})
+    return rows
 
 
 def formats_in_words(rows: Sequence[dict[str, Any]]) -> list[str]:
     """As lines of a listing."""
     lines = []
     for row in rows:
-        lines.append(f"{row['extension']:<6} {row['of']}" + ("" if row["extra"] is None else f"; needs: pip install 'efficientnerf[{row['extra']}]'"))
-        lines += [f"       {name:<7} {row[key]}" for name, key in (("keeps", "keeps"), ("loses", "loses"), ("opens", "opened_by"))]
+        needed = "" if row["extra"] is None else f"; needs: pip install 'efficientnerf[{row['extra']}]'"
+        lines.append(f"{row['extension']:<9} {row['of']}; {row['command']}{needed}")
+        lines += [f"          {name:<7} {row[key]}" for name, key in (("keeps", "keeps"), ("loses", "loses"), ("opens", "opened_by"))]
     return lines

@@ -81,7 +81,8 @@ def render_frames(
             output = draw(tree, camera, supersample=options.supersample)
             opacity = np.ones_like(output.opacity) if surrounded else output.opacity  # nothing shows through the environment
             if with_exr:
-                write_exr(exr, colour=output.colour, opacity=opacity, depth=output.depth, normal=output.normal, world_from_capture=similarity)
+                passes = {"colour": output.colour, "opacity": opacity, "depth": output.depth, "normal": output.normal}
+                write_exr(exr, **passes, camera=camera, world_from_capture=similarity)
             write_png(frame_from_rendering(output.colour, opacity, background), png, durable=not reuse)
             if reuse:
                 note(folder / f"frame_{k:04d}.json", [path.name for path in outputs], outputs)

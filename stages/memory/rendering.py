@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of a
 # test view with its photograph, renders, errors and windows of SSIM.
-TREE, FRAME, COMPARED = 3, 100, 160
+TREE, FRAME, COMPARED = 3, 116, 160
 DRAWN = 120  # bytes of a pixel of a view in which the mesh is drawn, four samples each
 BAND = 160 * MIB  # rays at a time where each is rendered on its own
 FIELD = 150  # bytes of a ray through the field, with what lies before and behind the box

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
 TEXTURES = ("auto", "photographs", "asset", "off")  # of mesh.texture, which a test compares
 REGIONS = ("foreground", "all")  # efficientnerf.asset.region.REGIONS, which a test compares; that import is heavy
+EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
 Crop = tuple[float, float, float, float, float, float] | None
 
 
-@click.command(short_help="Write meshes, points or cameras in other formats.")
+@click.command(short_help="Write meshes, points, volumes or cameras in other formats.")
 @click.argument("what", metavar="RUN|ASSET", required=False, type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
@@ -47,8 +48,8 @@ def export(
     what: Path | None, first: Path | None, more: tuple[Path, ...], as_list: bool, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool,
     **given: Any,
 ) -> None:
-    """Write the surface of RUN or ASSET as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl, with --points as .ply or .xyz; or the cameras of RUN
-    as .json (nerfstudio).
+    """Write the surface of RUN or ASSET as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl, with --points as .ply, .xyz, .las or .laz; its voxels
+    as a volume (.vdb); or the cameras of RUN as .json (nerfstudio).
 
     Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. What the run's stage mesh has made with
     the same settings is taken from there. Settings of the stages mesh and points apply: '--set mesh.max_faces=...'.
@@ -73,7 +74,9 @@ def export(
     options += [] if size is None else [f"mesh.texture_size={size}"]
     with _shown(as_json, quiet) as show:
         written = exporting.export_cameras(asked)
-        written += exporting.export_surface(asked, _settings_for(what, (*sets, *options), _surface_stages()), _progress("export", show))
+        settings = _settings_for(what, (*sets, *options), _surface_stages())
+        written += exporting.export_volumes(asked, settings)
+        written += exporting.export_surface(asked, settings, _progress("export", show))
     if as_json:
         write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
     elif not quiet:
@@ -119,6 +122,7 @@ def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> 
 @click.option("--width", type=click.IntRange(16, 8192), help="Pixels; with --path in place of the file's.")
 @click.option("--height", type=click.IntRange(16, 8192), help="Pixels.")
 @click.option("--background", metavar="COLOUR", help="white, black, transparent or #rrggbb; by default the scene's environment, or white.")
+@click.option("--exr", type=click.Choice(EXR), help="Frames written as EXR too, with depth, normals and positions; in place of turntable.exr.")
 @click.option("--video", metavar="FILE", type=folder_type, help="Also write the frames as an MP4 (H.264).")
 @force_option
 @memory_option

@@ -1,7 +1,8 @@
-"""Meshes and points as files, one module per format. The tables say which formats there are, by extension.
+"""Meshes, points and volumes as files, one module per format. The tables say which formats there are, by extension.
 
 Every exporter is called as `write(what, path, frame)`: a mesh or points in the capture's frame, the file, and what is known of that frame; those of meshes
-whose format keeps textures take `picture`, "png" or "jpeg", too. It raises BadInput, before anything is written, for what would make a broken file.
+whose format keeps textures take `picture`, "png" or "jpeg", too; those of volumes take the asset. It raises BadInput, before anything is written, for what
+would make a broken file.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Format:
-    """What a format of meshes or points is.
+    """What a format of meshes, of points or of volumes is.
 
     extension  with its dot
-    keeps      of a mesh or of points
+    keeps      of a mesh, of points or of an asset
     loses      what it has no place for
     opened_by  programs
     module     of this package, and its function: write
     textures   whether it keeps textures, and takes `picture`
     coloured   whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
-    extra      of the package efficientnerf, that has to be installed for it
+    extra      of the package efficientnerf, that has to be installed for it: `refuse_without_package` of its module
     beside     whether a texture lies in files beside it: `companions` of its module
     """
 
@@ -50,6 +51,11 @@ class Format:
         found: list[Path] = import_module(f"{__name__}.{self.module}").companions(path, picture, normal_map) if self.beside else []
         return found
 
+    def refuse_without_package(self, path: Path) -> None:
+        """UsageError where a package is missing that writes it."""
+        if self.extra is not None:
+            import_module(f"{__name__}.{self.module}").refuse_without_package(path)
+
 
 _MESHES = (
     Format(".ply", "shape, normals, colours of vertices; the capture's frame", "the texture", "MeshLab, CloudCompare, Blender", "ply", "write_mesh"),
@@ -67,7 +73,15 @@ _MESHES = (
 _POINTS = (
     Format(".ply", "places, normals, colours; the capture's frame", "nothing", "MeshLab, CloudCompare, Blender", "ply", "write_points"),
     Format(".xyz", "places, colours, normals, as text; the capture's frame", "nothing", "CloudCompare, spreadsheets", "xyz", "write_points"),
-)
+    Format(".las", "places to a millionth of their reach, normals as extra dimensions, colours; the capture's frame", "nothing",
+           "CloudCompare, PDAL, QGIS, ArcGIS, Potree", "las", "write_points", extra="las"),
+    Format(".laz", "the same, compressed", "nothing", "CloudCompare, PDAL, QGIS, ArcGIS, Potree", "las", "write_points", extra="las"),
+)  # fmt: skip
+_VOLUMES = (
+    Format(".vdb", "density and colour of each voxel, linear, sparse; the capture's frame", "the colours' change with the view; forward-facing scenes",
+           "Blender, Houdini, Omniverse, Unreal", "vdb", "write_volume"),
+)  # fmt: skip
 
 MESH_EXPORTERS: dict[str, Format] = {each.extension: each for each in _MESHES}
 POINT_EXPORTERS: dict[str, Format] = {each.extension: each for each in _POINTS}
+VOLUME_EXPORTERS: dict[str, Format] = {each.extension: each for each in _VOLUMES}

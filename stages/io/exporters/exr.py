@@ -1,7 +1,8 @@
-"""OpenEXR: linear colour premultiplied by alpha, depth and normals, float32, as compositors read them.
+"""OpenEXR: linear colour premultiplied by alpha, depth, normals and positions, float32, as compositors read them.
 
 Channels: R G B A (linear light, Rec. 709 primaries), depth.Z (along the view axis, in the capture's units; infinity where nothing is hit),
-normal.X normal.Y normal.Z (unit, in the capture's frame; zero where nothing is hit).
+normal.X normal.Y normal.Z (unit, in the capture's frame; zero where nothing is hit), position.X position.Y position.Z (of what is hit, in the
+capture's frame; zero where nothing is).
 """
 
 from __future__ import annotations
@@ -13,20 +14,24 @@ from pathlib import Path
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import Similarity
+from efficientnerf.geometry.cameras import Camera, Similarity, rays
 from pipeline.files import atomic
+
+PIXELS_AT_ONCE = 2**20  # whose rays are made
 
 
 def write_exr(
-    path: Path, *, colour: np.ndarray, opacity: np.ndarray, depth: np.ndarray, normal: np.ndarray, world_from_capture: Similarity | None = None
-) -> None:
+    path: Path, *, colour: np.ndarray, opacity: np.ndarray, depth: np.ndarray, normal: np.ndarray, camera: Camera,
+    world_from_capture: Similarity | None = None,
+) -> None:  # fmt: skip
     """Write one rendering.
 
     colour   (H, W, 3)  sRGB, premultiplied by the opacity, over no background
     opacity  (H, W)
     depth    (H, W)     along the view axis, world units
     normal   (H, W, 3)  unit, world frame
-    world_from_capture  what takes depth and normals back to the capture's frame; None: they are in it
+    camera   that took it, in the world frame, H x W
+    world_from_capture  what takes depth, normals and positions back to the capture's frame; None: they are in it
 
     The file appears whole or not at all.
     """
@@ -34,12 +39,14 @@ def write_exr(
 
     from efficientnerf.rendering.colour import linear_premultiplied
 
-    scale, rotation = (1.0, np.eye(3)) if world_from_capture is None else (world_from_capture.scale, world_from_capture.rotation)
+    similarity = Similarity.identity() if world_from_capture is None else world_from_capture
+    scale, rotation = similarity.scale, similarity.rotation
     rgba = np.concatenate([linear_premultiplied(colour, opacity), opacity[..., None]], axis=-1)
     in_capture = normal @ rotation  # rows times R: the transpose of R applied to each
     # OpenEXR silently writes wrong data for arrays that are not contiguous, and refuses float64.
     channels = {"RGBA": _plane(rgba), "depth.Z": _plane(depth / scale)}
-    channels |= {f"normal.{axis}": _plane(in_capture[..., k]) for k, axis in enumerate("XYZ")}
+    place = positions(depth, camera, similarity)
+    channels |= {f"{name}.{axis}": _plane(values[..., k]) for name, values in (("normal", in_capture), ("position", place)) for k, axis in enumerate("XYZ")}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic(path) as temporary:
         try:
@@ -58,6 +65,21 @@ def write_exr(
                 if os.strerror(number) in str(error):
                     raise OSError(number, os.strerror(number), str(path)) from error
             raise
+
+
+def positions(depth: np.ndarray, camera: Camera, world_from_capture: Similarity) -> np.ndarray:
+    """(H, W, 3) float32 places of what a camera sees at depths (H, W) along its view axis, in the capture's frame; zero where nothing is hit."""
+    height, width = depth.shape
+    out = np.zeros((height, width, 3), np.float32)
+    back = world_from_capture.inverse()
+    for first in range(0, height, max(1, PIXELS_AT_ONCE // width)):
+        rows = slice(first, first + max(1, PIXELS_AT_ONCE // width))
+        hit = np.isfinite(depth[rows])
+        y, x = np.nonzero(hit)
+        origins, directions = rays(camera, np.stack([x, y + first], axis=1) + 0.5)
+        along = depth[rows][hit].astype(np.float64) / (directions @ camera.forward)
+        out[rows][hit] = back.points(origins + along[:, None] * directions)
+    return out
 
 
 def _plane(values: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ LAYER = "surface.usdc"  # in a package
 _PADDING = 0x1986  # the identifier of an extra field of a zip that holds nothing, as USD's own writer uses it
 
 
-def refuse_without_usd(path: Path) -> None:
+def refuse_without_package(path: Path) -> None:
     """UsageError where the package is missing that writes USD."""
     if find_spec("pxr") is None:
         raise UsageError(f"{path}: USD is written by the package usd-core, which is not installed. Install it: pip install 'efficientnerf[usd]'")
@@ -49,7 +49,7 @@ def companions(path: Path, picture: Picture = "png", normal_map: bool = False) -
 def write_usdc(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
     """Write a mesh given in the capture's frame, and its pictures beside it. Raises BadInput and UsageError."""
     check_mesh(mesh, path)
-    refuse_without_usd(path)
+    refuse_without_package(path)
     pictures = _pictures(mesh, picture)
     names = companions(path, picture, len(pictures) > 1)[: len(pictures)]
     layer = _layer(mesh, frame, [name.name for name in names])
@@ -59,7 +59,7 @@ def write_usdc(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
 def write_usdz(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, picture: Picture = "png") -> None:
     """Write a mesh given in the capture's frame as one package. Raises BadInput and UsageError."""
     check_mesh(mesh, path)
-    refuse_without_usd(path)
+    refuse_without_package(path)
     pictures = _pictures(mesh, picture)
     names = [name.name for name in companions(Path(LAYER), picture, len(pictures) > 1)][: len(pictures)]
     write_parts(path, [package({LAYER: _layer(mesh, frame, names), **dict(zip(names, pictures, strict=True))})])

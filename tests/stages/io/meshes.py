@@ -18,6 +18,8 @@ Z_UP = SourceFrame(Similarity.identity())
 Y_DOWN = SourceFrame(Similarity(0.5, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([1.0, 2, 3])), metric=True)
 NEEDS_USD = pytest.mark.skipif(importlib.util.find_spec("pxr") is None, reason="usd-core is not installed: pip install 'efficientnerf[usd]'")
 
+NEEDS_LAS = pytest.mark.skipif(importlib.util.find_spec("lazrs") is None, reason="laspy and lazrs are not installed: pip install 'efficientnerf[las]'")
+
 
 def block() -> Mesh:
     """A box of 1 x 2 x 3 with its corner at (1, 1, 1), its colours from black to white."""

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from efficientnerf.surface.mesh import Mesh, PointCloud
-from pipeline.errors import BadInput
+from pipeline.errors import BadInput, UsageError
 from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
 from stages.io.exporters.glb import gltf_from_capture
+from stages.io.exporters.las import step_of
 from stages.io.exporters.writing import SourceFrame, source_frame
-from tests.stages.io.meshes import NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
+from tests.stages.io.meshes import NEEDS_LAS, NEEDS_USD, Y_DOWN, Z_UP, accessor, block, glb_document
 
 
 def cloud() -> PointCloud:
@@ -68,8 +69,18 @@ def read_by_usd(path: Path) -> Read:
     return np.array(shape.GetPointsAttr().Get()) @ back, np.array(shape.GetNormalsAttr().Get()) @ back, srgb, faces
 
 
+def read_by_laspy(path: Path) -> Read:
+    import laspy
+
+    read = laspy.read(path)
+    assert (str(read.header.version), read.point_format.id) == ("1.4", 7)
+    assert read.header.are_points_compressed == (path.suffix == ".laz")
+    normals = np.stack([read[name] for name in ("NormalX", "NormalY", "NormalZ")], axis=1)
+    return np.asarray(read.xyz), normals, np.stack([read.red, read.green, read.blue], axis=1) / 65535, None
+
+
 READERS: dict[str, Callable[[Path], Read]] = {".ply": read_by_trimesh, ".obj": read_by_trimesh, ".glb": read_glb, ".xyz": read_by_numpy,
-                                              ".usdz": read_by_usd, ".usdc": read_by_usd}  # fmt: skip
+                                              ".usdz": read_by_usd, ".usdc": read_by_usd, ".las": read_by_laspy, ".laz": read_by_laspy}  # fmt: skip
 EXTENSIONS = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") else each for each in MESH_EXPORTERS]
 
 
@@ -78,7 +89,7 @@ EXTENSIONS = [pytest.param(each, marks=NEEDS_USD) if each.startswith(".usd") els
     ("table", "extension"),
     [
         *(pytest.param("mesh", each, marks=NEEDS_USD if each.startswith(".usd") else ()) for each in READERS if each in MESH_EXPORTERS),
-        *(("points", each) for each in POINT_EXPORTERS),
+        *(pytest.param("points", each, marks=NEEDS_LAS if POINT_EXPORTERS[each].extra else ()) for each in POINT_EXPORTERS),
     ],
 )
 def test_others_read_what_was_written(table: str, extension: str, frame: SourceFrame, tmp_path: Path) -> None:
@@ -92,7 +103,7 @@ def test_others_read_what_was_written(table: str, extension: str, frame: SourceF
         vertices, normals, colours, faces = READERS[extension](path)
     np.testing.assert_allclose(vertices, mesh.vertices, atol=1e-6)
     np.testing.assert_allclose(normals, mesh.normals, atol=2e-5)
-    np.testing.assert_allclose(colours, mesh.colours, atol=0.5 / 255 + 1e-6 if extension in (".ply", ".obj", ".xyz") else 2e-4)
+    np.testing.assert_allclose(colours, mesh.colours, atol=0.5 / 255 + 1e-6 if extension in (".ply", ".obj", ".xyz", ".las", ".laz") else 2e-4)
     if table == "mesh":
         np.testing.assert_array_equal(faces, mesh.faces)
     assert [each.name for each in tmp_path.iterdir()] == [path.name]
@@ -154,6 +165,33 @@ def test_broken_meshes_are_refused(extension: str, flaw: str, tmp_path: Path) ->
     with pytest.raises(BadInput, match=message):
         MESH_EXPORTERS[extension](mesh, path, Z_UP)
     assert path.read_bytes() == b"older"
+
+
+@NEEDS_LAS
+@pytest.mark.parametrize("extension", [".las", ".laz"])
+@pytest.mark.parametrize(("size", "at"), [(1.0, 0.0), (1e-4, 0.0), (3e5, 0.0), (20.0, 5e6)])
+def test_las_coordinates_are_fine_wherever_the_points_lie(extension: str, size: float, at: float, tmp_path: Path) -> None:
+    """To a millionth of their reach, as far as doubles go; and the same points are the same bytes."""
+    places = np.random.default_rng(0).random((50, 3)) * size + at
+    points = PointCloud(places, np.tile([0.0, 0, 1], (50, 1)), np.zeros((50, 3), np.float32))
+    for name in ("a", "b"):
+        POINT_EXPORTERS[extension](points, tmp_path / f"{name}{extension}", Z_UP)
+    np.testing.assert_allclose(read_by_laspy(tmp_path / f"a{extension}")[0], places, rtol=0, atol=0.5e-6 * size + 1e-15 * at)
+    assert (tmp_path / f"a{extension}").read_bytes() == (tmp_path / f"b{extension}").read_bytes()
+
+
+def test_las_steps_leave_room_in_32_bits() -> None:
+    for reach, largest in ((0.0, 0.0), (0.0, 7.0), (3.0, 3.0), (9.99, 1e6), (1e-7, 1.0), (1e30, 1e30)):
+        step = step_of(reach, largest)
+        assert reach / 2 / step < 2**31 - 1
+        assert step <= max(reach * 1e-6, largest * 1e-15, 1e-30) * (1 + 1e-9)
+
+
+def test_las_is_refused_where_its_package_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stages.io.exporters.las.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'efficientnerf\[las\]'"):
+        POINT_EXPORTERS[".laz"](cloud(), tmp_path / "a.laz", Z_UP)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("extension", POINT_EXPORTERS)

@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 
 from efficientnerf.evaluation.metrics import psnr
-from efficientnerf.geometry.cameras import Camera, Similarity
+from efficientnerf.geometry.cameras import Camera, Similarity, project
 from efficientnerf.rendering.colour import linear_from_srgb, linear_premultiplied, srgb_from_linear, straight_from_premultiplied
 from pipeline.errors import UsageError
 from stages.io.exporters.exr import write_exr
@@ -73,13 +73,13 @@ def test_exr_is_linear_premultiplied_and_in_the_capture_frame(tmp_path: Path) ->
     rotation = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     similarity = Similarity(0.25, rotation, np.array([0.3, 0.0, -0.1]))
     seen = BallTree(sigma=3.0).render(CAMERA)
-    arguments = {"colour": seen.colour, "opacity": seen.opacity, "depth": seen.depth, "normal": seen.normal, "world_from_capture": similarity}
+    arguments = {"colour": seen.colour, "opacity": seen.opacity, "depth": seen.depth, "normal": seen.normal, "camera": CAMERA, "world_from_capture": similarity}
     write_exr(tmp_path / "a.exr", **arguments)
     write_exr(tmp_path / "b.exr", **arguments)
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
-    assert set(channels) == {"R", "G", "B", "A", "depth.Z", "normal.X", "normal.Y", "normal.Z"}
+    assert set(channels) == {"R", "G", "B", "A", "depth.Z", *(f"{name}.{axis}" for name in ("normal", "position") for axis in "XYZ")}
     assert all(pixels.dtype == np.float32 and pixels.shape == (36, 48) for pixels in channels.values())
     np.testing.assert_array_equal(channels["A"], seen.opacity)
     rgb = np.stack([channels[k] for k in "RGB"], -1)
@@ -90,6 +90,17 @@ def test_exr_is_linear_premultiplied_and_in_the_capture_frame(tmp_path: Path) ->
     np.testing.assert_allclose(normal @ rotation.T, seen.normal, atol=1e-6)
     # the middle of the ball faces the camera, which in the capture's frame stands along R^T (0, -1, 0)
     np.testing.assert_allclose(normal[18, 24], rotation.T @ [0, -1, 0], atol=0.05)
+    # what is hit lies where the camera sees it at that depth, on the ball
+    position = np.stack([channels[f"position.{k}"] for k in "XYZ"], -1)
+    hit = np.isfinite(seen.depth)
+    assert (position[~hit] == 0).all()
+    world = similarity.points(position[hit])
+    pixels, depth = project(CAMERA, world)
+    y, x = np.nonzero(hit)
+    np.testing.assert_allclose(pixels, np.stack([x, y], 1) + 0.5, atol=1e-4)
+    np.testing.assert_allclose(depth, seen.depth[hit], rtol=1e-6)
+    assert len(world) > 100
+    assert np.linalg.norm(world, axis=1).max() < 0.6 + 1e-3, "inside of the ball"
 
 
 def test_exr_whose_writing_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,13 +110,14 @@ def test_exr_whose_writing_fails_leaves_nothing(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Path, "write_bytes", failing)
     seen = BallTree().render(CAMERA)
     with pytest.raises(OSError, match=r"Input/output error"):
-        write_exr(tmp_path / "a.exr", colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal)
+        write_exr(tmp_path / "a.exr", colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal, camera=CAMERA)
     assert not list(tmp_path.iterdir())
 
 
 def test_exr_of_a_view_that_is_not_contiguous(tmp_path: Path) -> None:
     seen = BallTree().render(CAMERA)
-    write_exr(tmp_path / "a.exr", colour=seen.colour[:, ::-1], opacity=seen.opacity[:, ::-1], depth=seen.depth[:, ::-1], normal=seen.normal[:, ::-1])
+    turned = {name: getattr(seen, name)[:, ::-1] for name in ("colour", "opacity", "depth", "normal")}
+    write_exr(tmp_path / "a.exr", **turned, camera=CAMERA)
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         np.testing.assert_array_equal(file.channels()["A"].pixels, seen.opacity[:, ::-1])
 
@@ -183,6 +195,6 @@ def test_a_full_disk_is_told_as_one_and_leaves_nothing(tmp_path: Path, monkeypat
     write = OpenEXR.File.write
     monkeypatch.setattr(OpenEXR.File, "write", lambda file, path: write(file, "/dev/full"))
     with pytest.raises(OSError, match="No space left") as caught:
-        write_exr(tmp_path / "a.exr", colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal)
+        write_exr(tmp_path / "a.exr", colour=seen.colour, opacity=seen.opacity, depth=seen.depth, normal=seen.normal, camera=CAMERA)
     assert caught.value.errno == errno.ENOSPC
     assert not list(tmp_path.iterdir())

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -21,10 +22,12 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, VOLUME_EXPORTERS
 from stages.mesh import MeshSettings
+from stages.turntable import TurntableSettings
 from tests.workflows.command import Result
-from workflows.cli.files import REGIONS, TEXTURES
+from workflows.cli.files import EXR, REGIONS, TEXTURES
+from workflows.cli.main import enerf as enerf_commands
 from workflows.exporting import faces_from_text
 
 Enerf = Callable[..., Result]
@@ -109,14 +112,17 @@ def test_an_obj_replaces_none_of_its_three_files_without_force(enerf: Enerf, bal
 def test_the_list_names_every_format(enerf: Enerf) -> None:
     lines = enerf("export", "--list").out.splitlines()
     rows = enerf("export", "--list", "--json").objects[-1]["formats"]
-    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, ".json"}
+    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *VOLUME_EXPORTERS, ".json", ".png", ".exr", ".mp4", ".nerftree"}
     assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
     assert sum("pip install 'efficientnerf[usd]'" in line for line in lines) == 2
+    assert sum("pip install 'efficientnerf[las]'" in line for line in lines) == 2
+    assert all(row["command"].split()[1] in enerf_commands.commands for row in rows)
     assert len(lines) == 4 * len(rows)
 
 
 def test_the_textures_that_can_be_asked_for_are_those_that_there_are() -> None:
     assert typing.get_args(typing.get_type_hints(MeshSettings)["texture"]) == TEXTURES
+    assert typing.get_args(typing.get_type_hints(TurntableSettings)["exr"]) == EXR
 
 
 @pytest.mark.parametrize(("text", "expected"), [("20k", 20_000), ("0.5K", 500), ("1m", 1_000_000), ("150000", 150_000)])
@@ -138,11 +144,35 @@ def test_points(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     assert enerf("inspect", tmp_path / "ball.ply", "--json").object["vertices"] == 300
 
 
+def test_a_volume_of_what_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    """The foreground is the red ball, with fewer voxels than all; a grid of its own for what lies around it."""
+    for name, more in (("subject", []), ("all", ["--region", "all"])):
+        result = enerf("export", scene, "--to", tmp_path / f"{name}.vdb", *more, "--json")
+        assert result.code == 0, result.err
+        assert result.objects[-1]["written"][0]["voxels"] > 1000
+    subject, everything = ((tmp_path / f"{name}.vdb").read_bytes() for name in ("subject", "all"))
+    assert b"density_1" in everything
+    assert b"density_1" not in subject
+    again = enerf("export", scene, "--to", tmp_path / "all.vdb")
+    assert (again.code, (tmp_path / "all.vdb").read_bytes()) == (2, everything)
+    assert enerf("export", scene, "--to", tmp_path / "few.vdb", "--memory", "100m").code == 2
+
+
+def test_every_frame_has_its_passes_where_asked_for(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
+    result = enerf("render", ball, "--out", tmp_path, "--frames", 2, "--width", 16, "--height", 16, "--exr", "all")
+    assert result.code == 0, result.err
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"frame_000{k}.{kind}" for k in range(2) for kind in ("exr", "png")]
+    for k in range(2):
+        with OpenEXR.File(str(tmp_path / f"frame_000{k}.exr"), separate_channels=True) as file:
+            place = np.stack([file.channels()[f"position.{axis}"].pixels for axis in "XYZ"], axis=-1)
+        assert np.linalg.norm(place[8, 8]) == pytest.approx(0.6 / SCALE, abs=0.1), "on the ball, in the capture's units"
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--to", "ball.fbx"], 2, ".ply, .glb, .obj, .usdz, .usdc, .stl"),
-        (["--to", "ball.obj", "--points"], 2, ".ply, .xyz"),
+        (["--to", "ball.fbx"], 2, ".ply, .glb, .obj, .usdz, .usdc, .stl, .vdb"),
+        (["--to", "ball.obj", "--points"], 2, ".ply, .xyz, .las, .laz, .vdb"),
         (["--to", "no/where/ball.ply"], 2, "does not exist"),
         (["--to", "cameras.json"], 2, "has no cameras"),
         (["--to", "ball.ply", "--set", "mesh.max_facs=3"], 2, "Nearest: mesh.max_faces."),
