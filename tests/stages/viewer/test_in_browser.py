@@ -1,0 +1,231 @@
+"""The page in a real browser, software rendering: pictures against the CPU renderer, hands on the page, files that it has to refuse."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.format import serialize
+from efficientnerf.asset.region import Region, foreground
+from efficientnerf.asset.rendering import render
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.ndc import Ndc
+from stages.viewer.page import viewer_page
+from tests.efficientnerf.hostile import HOSTILE
+from tests.efficientnerf.trees import looking, random_cascades, random_tree
+from tests.stages.viewer import browser
+
+pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
+SIDE = 64
+ORBIT = {"centre": [0.0, 1.0, -0.4], "radius": 3.0, "elevation": 20.0, "heading": 40.0, "forward_facing": False}
+REGION = Region(np.array([[-0.55, 0.35, -0.95], [0.1, 0.9, 0.2]]), 0.3, 0.15)
+
+
+def forward_facing() -> NerfTree:
+    ndc = Ndc(np.eye(4), 60.0, 64.0, 64.0, 1.0)
+    return replace(random_tree(7, shape=(6, 6, 6), brick=4, degree=2, sigma=20.0, ndc=ndc), bounds_min=np.full(3, -1.0), voxel=2 / 24)
+
+
+TREES = {
+    "bounded": lambda: random_tree(1, degree=2, step_size=1.0, background=(1.0, 1.0, 1.0)),
+    "nearest": lambda: random_tree(2, degree=0, lookup="nearest", background=(1.0, 1.0, 1.0)),
+    "degree 4": lambda: random_tree(5, degree=4, brick=2, background=(1.0, 1.0, 1.0)),
+    "whole": lambda: random_cascades(3, degree=1, region=REGION),
+    "forward facing": forward_facing,
+}
+
+
+RESTED = """async () => {
+  const { viewer } = await enerf.ready, frame = () => new Promise((done) => requestAnimationFrame(done));
+  for (let still = 0; still < 3; await frame()) still = viewer.state === "done" ? still + 1 : 0;
+}"""
+
+
+def cameras_at(tree: NerfTree) -> list[Camera]:
+    """Five, around the tree or before it."""
+    if tree.ndc is not None:
+        poses = [np.eye(4) for _ in range(5)]
+        for n, pose in enumerate(poses):
+            pose[:3, 3] = 0.1 * np.sin([n, 2 * n, 3 * n])
+        return [Camera(str(n), SIDE, SIDE, "SIMPLE_PINHOLE", (60.0, 32.0, 32.0), pose) for n, pose in enumerate(poses)]
+    first = looking(tree)
+    centre = (tree.bounds_min + tree.bounds_max) / 2
+    out = []
+    for n in range(5):
+        angle = 1.3 * n
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pose = first.world_from_camera.copy()
+        pose[:3, :3], pose[:3, 3] = turn @ pose[:3, :3], centre + turn @ (pose[:3, 3] - centre) * (1 - 0.15 * n)
+        out.append(Camera(str(n), SIDE, SIDE, "PINHOLE", (80.0, 84.0, 30.0, 33.0), pose))
+    return out
+
+
+def decibels(found: np.ndarray, expected: np.ndarray) -> float:
+    error = np.mean((found.astype(np.float64) / 255 - np.clip(expected, 0, 1)) ** 2)
+    return float(-10 * np.log10(max(error, 1e-12)))
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with browser.chromium() as found:
+        yield found
+
+
+def written(folder: Path, asset: bytes, **options: Any) -> Path:
+    path = folder / "viewer.html"
+    path.write_bytes(viewer_page(asset, **options))
+    return path
+
+
+@pytest.mark.parametrize("kind", TREES)
+def test_a_page_renders_what_the_cpu_renders(kind: str, chromium: Any, tmp_path: Path) -> None:
+    from efficientnerf.asset.quantisation import compacted
+
+    tree = compacted(TREES[kind]())
+    with browser.opened(chromium, written(tmp_path, serialize(tree, "compact"))) as page:
+        page.ready()
+        for camera in cameras_at(tree):
+            behind = None if tree.environment is not None else (0.2, 0.5, 0.9)
+            found = page.rendered(camera, background=behind or (0, 0, 0), surroundings=behind is None)
+            expected = render(tree, camera, background=behind).colour
+            assert expected.std() > 0.02  # there is something to see
+            assert decibels(found, expected) > 45
+        assert page.console == []
+        assert [each for each in page.requests if not each.startswith(("file:", "data:"))] == []
+
+
+def test_the_subject_alone_is_what_the_region_says(chromium: Any, tmp_path: Path) -> None:
+    from efficientnerf.asset.quantisation import compacted
+
+    tree = compacted(TREES["whole"]())
+    camera = cameras_at(tree)[0]
+    with browser.opened(chromium, written(tmp_path, serialize(tree, "compact"))) as page:
+        page.ready()
+        page.page.select_option("#subject", "subject")
+        page.page.wait_for_selector("#loading", state="hidden")
+        expected = render(foreground(tree), camera, background=(1, 1, 1)).colour
+        assert np.abs(expected - render(tree, camera).colour).max() > 0.1
+        assert decibels(page.rendered(camera, background=(1, 1, 1), surroundings=False), expected) > 45
+
+
+def picture(page: browser.Page) -> bytes:
+    """The canvas as it is shown once it rests."""
+    page.page.evaluate(RESTED)
+    return bytes(page.page.locator("#scene").screenshot())
+
+
+def test_hands_on_the_page_move_the_picture(chromium: Any, tmp_path: Path) -> None:
+    tree = TREES["bounded"]().with_metadata(orbit=ORBIT)
+    poses = cameras_at(tree)
+    path = written(tmp_path, serialize(tree, "compact"), cameras=poses, photographs={"0": base64.b64decode(JPEG)}, title="a scene")
+    with browser.opened(chromium, path, has_touch=True) as page:
+        page.ready()
+        mouse, keyboard = page.page.mouse, page.page.keyboard
+        seen = [picture(page)]
+
+        def changed(after: str) -> None:
+            seen.append(picture(page))
+            assert seen[-1] != seen[-2], after
+
+        mouse.move(150, 120)
+        mouse.down()
+        mouse.move(210, 140, steps=3)
+        mouse.up()
+        changed("a drag")
+        mouse.wheel(0, -300)
+        changed("the wheel")
+        page.page.locator("#scene").focus()
+        keyboard.press("ArrowLeft")
+        changed("a key")
+        page.page.select_option("#mode", "2")
+        changed("normals")
+        page.page.select_option("#mode", "0")
+        page.page.select_option("#background", "black")
+        changed("a background")
+        for kind, places in (("touchStart", [(100, 100), (200, 100)]), ("touchMove", [(80, 100), (220, 100)]), ("touchEnd", [])):
+            points = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(places)]
+            if kind == "touchStart":
+                session = page.page.context.new_cdp_session(page.page)
+            session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        changed("a pinch")
+        page.page.click("#next")
+        assert page.page.inner_text("#camera") == "0"
+        assert page.page.is_visible("#photograph")
+        page.page.fill("#blend", "50")
+        assert page.page.eval_on_selector("#photograph", "each => each.style.clipPath") == "inset(0px 50% 0px 0px)"
+        page.page.click("#home")
+        page.page.select_option("#background", "scene")
+        assert picture(page) == seen[0]
+        with page.page.expect_download() as saved:
+            page.page.click("#save")
+        assert saved.value.suggested_filename == "a_scene.png"
+        assert page.console == []
+        assert [each for each in page.requests if not each.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_a_page_refuses_what_verify_refuses(chromium: Any, tmp_path: Path) -> None:
+    good = serialize(random_tree(1), "compact")
+    with browser.opened(chromium, written(tmp_path, good)) as page:
+        page.ready()
+        assert page.page.evaluate("x => enerf.check(x)", base64.b64encode(good).decode()) is None
+        files = {name: make() for name, (make, _) in HOSTILE.items()}
+        texts = {name: base64.b64encode(file).decode() for name, file in files.items() if len(file) < 10**6}
+        check = "async all => { const out = {}; for (const [n, x] of Object.entries(all)) out[n] = await enerf.check(x); return out; }"
+        said = page.page.evaluate(check, texts)
+        assert len(said) > 250
+        assert [name for name, text in said.items() if text is None] == []
+        other = [name for name, text in said.items() if "'enerf convert' makes it" in text]  # tensors of layouts that it does not read
+        assert [name for name in other if b'compact"' in files[name]] == []
+        start = 8 + int.from_bytes(good[:8], "little")
+        rng = np.random.default_rng(0)
+        for at in [*rng.integers(0, start, 20), *rng.integers(start, len(good), 20)]:  # every byte counts, but for spaces of the header
+            altered = bytearray(good)
+            altered[at] ^= 1
+            text = page.page.evaluate("x => enerf.check(x)", base64.b64encode(bytes(altered)).decode())
+            assert text is not None, int(at)
+        assert page.console == []
+
+
+def test_an_altered_page_says_so(chromium: Any, tmp_path: Path) -> None:
+    good = serialize(random_tree(1), "compact")
+    altered = bytearray(good)
+    altered[-1] ^= 1
+    with browser.opened(chromium, written(tmp_path, bytes(altered))) as page:
+        assert "refused" in page.refusal()
+        assert "SHA-256" in page.refusal()
+        assert page.console == []
+    text = viewer_page(good).decode().replace(f'"bytes":{len(good)}', f'"bytes":{len(good) - 1}')
+    (tmp_path / "viewer.html").write_text(text)
+    with browser.opened(chromium, tmp_path / "viewer.html") as page:
+        assert "longer than it states" in page.refusal()
+
+
+def test_a_browser_without_webgl2_is_told(chromium: Any, tmp_path: Path) -> None:
+    context = chromium.new_context()
+    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page = context.new_page()
+    page.goto(written(tmp_path, serialize(random_tree(1), "compact")).as_uri())
+    page.wait_for_selector(".failed")
+    assert "WebGL2" in page.inner_text("#status")
+    context.close()
+
+
+def test_its_own_digests_are_those_of_the_standard(chromium: Any, tmp_path: Path) -> None:
+    with browser.opened(chromium, written(tmp_path, serialize(random_tree(1), "compact"))) as page:
+        for length in (0, 3, 55, 56, 63, 64, 65, 119, 120, 1000):
+            content = bytes(n % 251 for n in range(length))
+            assert page.page.evaluate("x => enerf.sha256(Uint8Array.from(x))", list(content)) == hashlib.sha256(content).hexdigest()
+
+
+JPEG = (
+    "/9j/4AAQSkZJRgABAQAAAQABAAD/2wBDAAMCAgICAgMCAgIDAwMDBAYEBAQEBAgGBgUGCQgKCgkICQkKDA8MCgsOCwkJDRENDg8QEBEQCgwSExIQEw8QEBD/wAALCAABAAEBAREA/8QAFAABAAAAAAAAAAAAAAAAAAAACf/"
+    "EABQQAQAAAAAAAAAAAAAAAAAAAAD/2gAIAQEAAD8AVN//2Q=="
+)  # fmt: skip

@@ -1,0 +1,130 @@
+"""The viewer as a file: one page, without requests, which names cannot break out of."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.format import FormatError, load, save, serialize
+from efficientnerf.geometry.cameras import Camera
+from stages.viewer.page import MODULES, script_text, viewer_page, write_viewer
+from tests.efficientnerf.trees import random_tree
+
+NASTY = '</title></script><script>alert("x")</script><!--&amp;\u202e'
+
+
+def text_of(page: bytes) -> str:
+    return page.decode("utf-8")
+
+
+def carried(page: str) -> bytes:
+    """The bytes of the asset in a page."""
+    parts = re.findall(r'<script type="text/plain" data-part>([A-Za-z0-9+/=]*)</script>', page)
+    return zlib.decompress(b"".join(base64.b64decode(part) for part in parts), -15)
+
+
+def facts(page: str) -> dict[str, object]:
+    found = re.search(r'<script id="facts" type="application/json">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    out: dict[str, object] = json.loads(found[1])
+    return out
+
+
+@pytest.fixture(scope="module")
+def asset() -> bytes:
+    return serialize(random_tree(3, background=(1.0, 1.0, 1.0)), "compact")
+
+
+def test_a_page_carries_the_asset_byte_by_byte(asset: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.nerftree"
+    path.write_bytes(asset)
+    size = write_viewer(path, tmp_path / "viewer.html")
+    page = (tmp_path / "viewer.html").read_bytes()
+    assert len(page) == size
+    assert carried(text_of(page)) == asset
+    assert facts(text_of(page))["bytes"] == len(asset)
+    assert "<title>a</title>" in text_of(page)
+
+
+@pytest.mark.parametrize("layout", ["sparse", "full", "packed"])
+def test_other_layouts_become_compact(layout: str, tmp_path: Path) -> None:
+    tree = random_tree(4, shape=(2, 2, 2), share=0.6)  # of fewer voxels than a palette has entries: each keeps its values
+    save(tree, tmp_path / "a.nerftree", layout)
+    write_viewer(tmp_path / "a.nerftree", tmp_path / "viewer.html")
+    (tmp_path / "b.nerftree").write_bytes(carried(text_of((tmp_path / "viewer.html").read_bytes())))
+    again, before = load(tmp_path / "b.nerftree"), load(tmp_path / "a.nerftree")
+    assert np.array_equal(again.brick_index, before.brick_index)
+    assert np.abs(again.sh - before.sh).max() < 2e-3
+
+
+def test_no_page_is_made_of_a_damaged_asset(asset: bytes, tmp_path: Path) -> None:
+    damaged = bytearray(asset)
+    damaged[-3] ^= 1
+    (tmp_path / "a.nerftree").write_bytes(bytes(damaged))
+    with pytest.raises(FormatError, match="SHA-256"):
+        write_viewer(tmp_path / "a.nerftree", tmp_path / "viewer.html")
+    assert [each.name for each in tmp_path.iterdir()] == ["a.nerftree"]
+
+
+def test_the_same_asset_makes_the_same_page(asset: bytes) -> None:
+    assert viewer_page(asset, title="x") == viewer_page(asset, title="x")
+
+
+def test_names_stay_text(asset: bytes) -> None:
+    camera = Camera(NASTY, 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), np.eye(4))
+    page = text_of(viewer_page(asset, cameras=[camera], photographs={NASTY: b"\xff\xd8</script>"}, title=NASTY))
+    assert page.count("<script") == 3  # facts, one part of data, the script
+    assert "alert" not in re.sub(r'<script id="facts".*?</script>|<title>.*?</title>|<h1>.*?</h1>', "", page, flags=re.DOTALL)
+    assert "<script>alert" not in page
+    (entry,) = facts(page)["cameras"]  # type: ignore[misc]
+    assert entry["name"].startswith('</title></script><script>alert("x")')
+    assert entry["photograph"] == "data:image/jpeg;base64," + base64.b64encode(b"\xff\xd8</script>").decode()
+
+
+def test_the_policy_allows_the_pages_own_script_and_style_alone(asset: bytes) -> None:
+    page = text_of(viewer_page(asset))
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', page)
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    assert rules["default-src"] == "'none'"
+    assert rules["img-src"] == "data: blob:"
+
+    def digest(text: str) -> str:
+        return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+    (style,), (script,) = re.findall(r"<style>(.*?)</style>", page, re.DOTALL), re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    assert (rules["style-src"], rules["script-src"]) == (digest(style), digest(script))
+    assert not re.search(r"""\s(on\w+|style)=["']""", page.replace(script, ""))  # they would be refused
+
+
+def test_nothing_in_the_page_names_another_place(asset: bytes) -> None:
+    page = text_of(viewer_page(asset))
+    assert not re.search(r"(https?:)?//[a-z0-9-]+\.[a-z]", page, re.IGNORECASE)
+    assert not re.search(r"\b(fetch|XMLHttpRequest|WebSocket|EventSource|importScripts|sendBeacon|eval|innerHTML)\b", script_text())
+    assert not re.search(r"""\b(src|href|action)=["'](?!data:)""", page.replace(script_text(), ""))
+
+
+def test_modules_become_one_script_without_imports() -> None:
+    script = script_text()
+    assert not re.search(r"^(import|export)\b", script, re.MULTILINE)
+    assert [name for name in MODULES if f"// {name}.js" not in script] == []
+    names = re.findall(r"^(?:async function|function|class|const|let) (\w+)", script, re.MULTILINE)
+    assert len(names) == len(set(names))  # of all modules, which share one scope
+
+
+def test_cameras_come_from_the_assets_captured_path() -> None:
+    poses = [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, -float(n)] for n in range(3)]
+    path = {"poses": poses, "width": 40, "height": 30, "focal": 50.0}
+    found = facts(text_of(viewer_page(serialize(random_tree(3).with_metadata(captured_path=path), "compact"))))["cameras"]
+    assert [(each["eye"], each["fx"], each["cx"]) for each in found] == [([0, 0, -n], 50.0, 20.0) for n in range(3)]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("path", [3, {}, {"poses": [[1]], "width": 4, "height": 4, "focal": 4}, {"poses": [], "width": "x", "height": 4, "focal": 4}])
+def test_a_captured_path_that_is_none_is_left_out(path: object) -> None:
+    assert facts(text_of(viewer_page(serialize(random_tree(3).with_metadata(captured_path=path), "compact"))))["cameras"] == []
