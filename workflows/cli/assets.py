@@ -1,4 +1,4 @@
-"""`enerf diff` and `enerf convert`: commands on asset files."""
+"""`enerf diff`, `enerf convert` and `enerf view`: commands on assets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option
+from workflows.cli.options import common_options, folder_type, force_option, json_option, quiet_option, workflow
 
 DIFFERENT = 6  # exit code of `enerf diff`; 1 would be that of a defect
 # efficientnerf.asset.file.serialisation.WRITERS, which a test compares; that import is heavy
@@ -74,3 +74,45 @@ def convert(what: Path, out: Path, layout: str | None, degree: int | None, resol
         write_json({"event": "summary", "ok": True, "written": [{"path": str(out.absolute()), **facts}], "exit_code": 0})
     elif not quiet:
         closing(f"{out}: {about['layout']}, {about['voxels']} voxels, degree {about['sh_degree']}, {size(about['bytes'])}")
+
+
+@click.command(short_help="Show a run or an asset in a browser.")
+@click.argument("what", metavar="RUN|ASSET", type=folder_type)
+@click.option("--no-browser", is_flag=True, help="Only make the page, and say where it is.")
+@click.option("--serve", "port", metavar="PORT", type=click.IntRange(0, 65535), help="Serve the page on this port until Ctrl-C; 0: one that is free.")
+@click.option("--address", metavar="IP", help="With --serve: the interface to listen on, 127.0.0.1 by default; on others, whoever reaches it may look.")
+@click.option("--force", is_flag=True, help="Make the page again even if there is one of the present asset.")
+@json_option
+@quiet_option
+@common_options
+def view(what: Path, no_browser: bool, port: int | None, address: str | None, force: bool, as_json: bool, quiet: bool) -> None:
+    """Open the viewer page of RUN or ASSET, which needs no network: RUN/viewer.html, made if it is missing or older than the asset; for an asset file a new
+    one in a temporary folder.
+
+    With --serve, the stages, curves and previews of a RUN are shown while it trains, and the viewer once there is an asset. From another machine:
+    'ssh -L 8000:localhost:PORT HOST', then http://localhost:8000/. The server reads, and answers for these pages alone.
+    """
+    from workflows.cli.output import closing, write_json
+    from workflows.viewing.serving import check_address, open_in_browser, page_of, serve
+
+    loopback = check_address(address, port)
+    if port is None:
+        page, made = page_of(what, force=force)
+        opened = not no_browser and open_in_browser(page.absolute().as_uri())
+        if as_json:
+            write_json({"event": "summary", "ok": True, "page": str(page.absolute()), "made": made, "opened": opened, "exit_code": 0})
+        elif not quiet:
+            closing(str(page.absolute()) + ("" if opened or no_browser else "  (open it in a browser)"))
+        return
+
+    def ready(url: str) -> None:
+        if as_json:
+            write_json({"event": "serving", "url": url})
+        else:
+            closing(f"{url}  (Ctrl-C ends it)" + ("" if loopback else "; whoever reaches this machine may look"))
+        if not no_browser and loopback:
+            open_in_browser(url)
+
+    serve(what, workflow().stages, address, port, ready, force=force)
+    if as_json:
+        write_json({"event": "summary", "ok": True, "exit_code": 0})

@@ -46,6 +46,7 @@ for command in (
     files.inspect,
     assets.diff,
     assets.convert,
+    assets.view,
     presets.presets,
     paper.paper,
 ):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -23,40 +22,24 @@ def status(run_folder: Path, as_json: bool) -> None:
     from workflows.cli.output import listing, write_json
     from workflows.cli.progress import duration, size
     from workflows.cli.target import check_names, open_run
+    from workflows.inspection.status import run_status
 
     run = open_run(run_folder)
     check_names(run)
-    stages: list[dict[str, Any]] = []
-    for decision in survey(workflow().stages, run):
-        made = decision.manifest
-        stages.append(
-            {
-                "name": decision.stage,
-                "state": decision.state,
-                "reason": decision.reason,
-                "note": decision.note,
-                "seconds": None if made is None else made.seconds,
-                "bytes": None if made is None else made.size,
-                "peak_memory": None if made is None else made.peak_memory,
-                "digest": None if made is None else made.digest,
-                "extra": list(decision.extra),
-            }
-        )
-    holder = run.holder()
+    found = run_status(run, survey(workflow().stages, run))
     if as_json:
-        facts: dict[str, Any] = {"run": str(run.path), "source": run.source, "preset": run.preset, "seed": run.seed, "device": run.device}
-        write_json({**facts, "written_by": None if holder is None else holder.text(), "stages": stages}, indent=1)
+        write_json(found, indent=1)
         return
     listing(f"{run.path}  from {run.source}  preset {run.preset}" if run.preset else f"{run.path}  from {run.source}")
-    for entry in stages:
+    for entry in found["stages"]:
         seconds = "" if entry["seconds"] is None else duration(entry["seconds"])
         count = "" if entry["bytes"] is None else size(entry["bytes"])
         line = f"{entry['name']:<10} {entry['state']:<8} {seconds:>13} {count:>8}  {entry['reason'] or entry['note'] or ''}"
         listing(line.rstrip())
         if entry["extra"]:
             listing(f"{'':<10} not written by it: {', '.join(entry['extra'][:5])}{' ...' if len(entry['extra']) > 5 else ''}")
-    if holder is not None:
-        listing(f"It is being written by {holder.text()}.")
+    if found["written_by"] is not None:
+        listing(f"It is being written by {found['written_by']}.")
 
 
 @click.command(short_help="Check every file against its recorded hash.")

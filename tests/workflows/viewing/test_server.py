@@ -1,0 +1,207 @@
+"""The server of `enerf view --serve`: it answers for what its site lists, to whoever may ask, and for nothing else."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import UsageError
+from workflows.viewing import server as server_module
+from workflows.viewing.server import HEADERS, LOOPBACK, Answer, Server, open_inside
+
+Ask = Callable[..., tuple[int, dict[str, str], bytes]]
+
+
+def site(path: str) -> Answer | None:
+    if path == "/broken":
+        raise ValueError("a secret")
+    return Answer("text/plain", b"hello") if path == "/" else None
+
+
+def asked(server: Server, request: bytes) -> tuple[int, dict[str, str], bytes]:
+    """Status, headers and body of the answer to the bytes of a request."""
+    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        connection.sendall(request)
+        answer = b""
+        while part := connection.recv(2**16):
+            answer += part
+    head, _, body = answer.partition(b"\r\n\r\n")
+    lines = head.decode("ascii").split("\r\n")
+    assert lines[0].startswith("HTTP/1.0 "), answer
+    return int(lines[0].split()[1]), dict(line.split(": ", 1) for line in lines[1:]), body
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    with Server(site, LOOPBACK, 0) as made:
+        threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield made
+        made.shutdown()
+
+
+@pytest.fixture
+def ask(server: Server) -> Ask:
+    def call(path: str = "/", *, method: str = "GET", host: str | None = "localhost", more: str = "") -> tuple[int, dict[str, str], bytes]:
+        named = "" if host is None else f"Host: {host}\r\n"
+        return asked(server, f"{method} {path} HTTP/1.1\r\n{named}{more}\r\n".encode("latin-1"))
+
+    return call
+
+
+def test_get_and_head_say_the_same(ask: Ask) -> None:
+    status, headers, body = ask()
+    assert (status, body) == (200, b"hello")
+    assert headers.items() >= {**HEADERS, "Content-Type": "text/plain", "Content-Length": "5", "Connection": "close"}.items()
+    assert ask(method="HEAD") == (200, headers, b"")
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "PATCH", "CONNECT", "TRACE", "get", "error", "_send", "PROPFIND"])
+def test_other_methods_are_not_allowed(ask: Ask, method: str) -> None:
+    status, headers, body = ask(method=method, more="Content-Length: 0\r\n")
+    assert (status, headers["Allow"]) == (405, "GET, HEAD")
+    assert body == b"405 Method Not Allowed\n"
+
+
+@pytest.mark.parametrize("host", ["localhost", "LocalHost:9000", "127.0.0.1", "127.0.0.1:1", "127.1.2.3:80", "[::1]", "[::1]:8000"])
+def test_it_answers_to_the_names_of_this_machine_at_any_port(ask: Ask, host: str) -> None:
+    assert ask(host=host)[0] == 200
+
+
+HOSTS = ["evil.example", "localhost.evil.example", "127.0.0.1.nip.io", "0.0.0.0", "10.0.0.1", "", "localhost:x", "localhost:123456", "user@localhost", "::1",
+         "[::1", "[::1]x", "[localhost]:80", "localhost, evil.example", "127.0.0.1:80:80", "0x7f000001", "127.1", "localhost."]  # fmt: skip
+
+
+@pytest.mark.parametrize("host", [*HOSTS, None])
+def test_it_answers_to_no_other_name(ask: Ask, host: str | None) -> None:
+    """DNS rebinding: a name of somebody else's that was made to point to this machine."""
+    status, headers, body = ask(host=host)
+    assert (status, body) == (421, b"421 Misdirected Request\n")
+    assert headers.items() >= HEADERS.items()
+
+
+def test_two_names_are_none(ask: Ask) -> None:
+    assert ask(more="Host: localhost\r\n")[0] == 421
+
+
+def test_beyond_this_machine_numbers_name_it_and_names_do_not() -> None:
+    with Server(site, "0.0.0.0", 0) as wide:
+        assert wide.is_named("192.168.1.7:8000")
+        assert wide.is_named("[fe80::1]:8000")
+        assert not wide.is_named("evil.example")
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status"),
+    [(b"GET", 400), (b"GET / HTTP/9.9.9", 400), (b"GET / HTTP/3.0", 505), (b"GET  /  HTTP/1.1 more", 400), (b"\xff\xfe\x00", 400),
+     (b"GET /" + b"a" * 70_000 + b" HTTP/1.1", 414)],
+)  # fmt: skip
+def test_what_is_no_request_is_refused_and_not_repeated(server: Server, request_line: bytes, status: int) -> None:
+    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        connection.sendall(request_line + b"\r\nHost: localhost\r\n\r\n")
+        answer = b""
+        try:
+            while part := connection.recv(2**16):
+                answer += part
+        except ConnectionResetError:
+            pass  # it did not read all of what was too long
+    assert str(status).encode() in answer
+    assert b"aaaa" not in answer
+
+
+def test_too_many_headers_are_refused(ask: Ask) -> None:
+    assert ask(more="".join(f"X-{k}: 1\r\n" for k in range(200)))[0] == 431
+
+
+@pytest.mark.parametrize("path", ["/nothing", "/?", "/%2e%2e/", "http://localhost/", "*", "/\\..\\", "/etc/passwd", "/index.html"])
+def test_what_is_not_listed_is_not_there(ask: Ask, path: str) -> None:
+    status, headers, body = ask(path)
+    assert (status, body) == (404, b"404 Not Found\n")
+    assert headers["Content-Security-Policy"] == "default-src 'none'; frame-ancestors 'none'"
+
+
+def test_an_error_of_its_own_is_not_told(ask: Ask) -> None:
+    status, _, body = ask("/broken")
+    assert (status, body) == (500, b"500 Internal Server Error\n")
+    assert ask()[0] == 200
+
+
+def test_one_that_says_nothing_keeps_nobody_else_waiting(server: Server, ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module._Handler, "timeout", 0.2)
+    with socket.create_connection(server.server_address[:2], timeout=10) as silent:
+        silent.sendall(b"GET / HT")
+        assert ask()[0] == 200
+        assert silent.recv(10) == b"", "it is hung up on"
+
+
+def test_more_than_it_answers_at_once_are_turned_away_and_later_welcome(server: Server, ask: Ask) -> None:
+    held = [server.slots.acquire(blocking=False) for _ in range(server_module.MOST_AT_ONCE)]
+    assert all(held)
+    with socket.create_connection(server.server_address[:2], timeout=10) as late:
+        assert late.recv(10) == b""
+    for _ in held:
+        server.slots.release()
+    for _ in range(2 * server_module.MOST_AT_ONCE):
+        assert ask()[0] == 200, "a slot is given back after each"
+
+
+def test_a_port_that_is_taken_is_refused(server: Server) -> None:
+    with pytest.raises(UsageError, match=f"--serve {server.server_port}: cannot listen on 127.0.0.1"):
+        Server(site, LOOPBACK, server.server_port)
+    with pytest.raises(UsageError, match=r"cannot listen on 203\.0\.113\.9"):
+        Server(site, "203.0.113.9", 0)
+
+
+def test_the_url_is_that_of_the_port_that_was_free(server: Server) -> None:
+    assert server.url == f"http://127.0.0.1:{server.server_port}/"
+    assert server.server_port > 0
+
+
+def test_files_are_opened_through_no_link_and_nothing_but_files(tmp_path: Path) -> None:
+    run, outside = tmp_path / "run", tmp_path / "outside"
+    for folder in (run / "a", outside):
+        folder.mkdir(parents=True)
+        (folder / "file").write_bytes(b"12345")
+    (run / "link").symlink_to(outside / "file")
+    (run / "folder").symlink_to(outside)
+    os.mkfifo(run / "pipe")
+    before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else None
+    for name in ("link", "folder/file", "pipe", "a", "nothing", "../outside/file", "a/../file", "/etc/passwd", "", "a//file", "a/file/", "./a/file", "a\0"):
+        assert open_inside(run, name, 100) is None, name
+    assert open_inside(run, "a/file", 4) is None, "larger than may be"
+    if before is not None:
+        assert len(os.listdir("/proc/self/fd")) == before
+    found = open_inside(run, "a/file", 5)
+    assert found is not None
+    assert os.read(found, 10) == b"12345"
+    os.close(found)
+
+
+def test_an_open_file_is_sent_and_closed(tmp_path: Path) -> None:
+    (tmp_path / "large").write_bytes(os.urandom(10**6))
+    sent: list[int] = []
+
+    def files(path: str) -> Answer | None:
+        file = open_inside(tmp_path, "large", 10**7)
+        assert file is not None
+        sent.append(file)
+        return Answer("application/octet-stream", file=file)
+
+    with Server(files, LOOPBACK, 0) as made:
+        threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        status, headers, body = asked(made, b"GET /x HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert (status, headers["Content-Length"], body) == (200, "1000000", (tmp_path / "large").read_bytes())
+        assert asked(made, b"HEAD /x HTTP/1.1\r\nHost: localhost\r\n\r\n")[::2] == (200, b"")
+        with socket.create_connection(made.server_address[:2], timeout=10) as gone:
+            gone.sendall(b"GET /x HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        deadline = time.monotonic() + 10
+        while (len(sent) < 3 or made.slots._value < server_module.MOST_AT_ONCE) and time.monotonic() < deadline:  # type: ignore[attr-defined]
+            time.sleep(0.01)
+        made.shutdown()
+    assert len(sent) == 3
+    assert not any(os.path.samefile(f"/proc/self/fd/{number}", tmp_path / "large") for number in sent if os.path.exists(f"/proc/self/fd/{number}"))

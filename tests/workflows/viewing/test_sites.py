@@ -1,0 +1,257 @@
+"""What is served of a run while it is made, and what of a hostile one."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset import format
+from efficientnerf.asset.tree import tree_from_voxels
+from pipeline.artifact import workplace
+from pipeline.decide import decide
+from pipeline.run import Run
+from pipeline.stage import Stage
+from stages.artifacts import BakeOutputs
+from tests.workflows.toys import TrainSettings
+from workflows.cli.main import main
+from workflows.viewing import progress, sites
+from workflows.viewing.page import present_page
+from workflows.viewing.progress import MOST_POINTS, MOST_PREVIEWS, Progress
+from workflows.viewing.server import Answer
+from workflows.viewing.sites import LIVE_POLICY, AssetSite, RunSite
+
+TRAIN = Stage("train", 1, TrainSettings, (), lambda job: None)
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return Run.create(tmp_path / "run", Path("/photographs"), {})
+
+
+def scratch(run: Run) -> Path:
+    """The scratch folder of the stage that is being made."""
+    request = decide(TRAIN, run).request
+    assert request is not None
+    folder = workplace(run.path, "train", request).scratch
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def put(folder: Path, steps: int, previews: list[int]) -> None:
+    lines = [{"step": k, "seconds": k / 10, "psnr": 10 + k / 100, "preview_psnr": 9.5 if k in previews else None, "more": [1]} for k in range(steps)]
+    (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    for step in previews:
+        (folder / f"preview_{step:06d}.png").write_bytes(PNG + bytes([step % 256]))
+
+
+def site_of(run: Run, tmp_path: Path) -> RunSite:
+    return RunSite(run.path, (TRAIN,), tmp_path)
+
+
+def body(answer: Answer | None) -> bytes | None:
+    """What is sent; None where there is nothing."""
+    if answer is None or answer.file is None:
+        return None if answer is None else answer.data
+    with open(answer.file, "rb") as file:
+        return file.read()
+
+
+def test_what_is_being_made_is_shown_as_it_comes(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "PAUSE", 0.0)
+    monkeypatch.setattr(progress, "SHARE", 1e9)
+    site = site_of(run, tmp_path)
+    begun = json.loads(site.status())
+    assert [stage["state"] for stage in begun["stages"]] == ["missing"]
+    assert (begun["name"], begun["source"], begun["asset"], begun["error"]) == ("run", "/photographs", None, None)
+    assert begun["training"]["train"]["step"] is None
+    assert site("/previews/train/preview_000003.png") is None
+    put(scratch(run), 7, [3, 5])
+    now = json.loads(site.status())
+    assert [stage["state"] for stage in now["stages"]] == ["partial"]
+    shown = now["training"]["train"]
+    assert (shown["live"], shown["step"], shown["seconds"]) == (True, 6, 0.6)
+    assert shown["psnr"] == [[k, 10 + k / 100] for k in range(7)]
+    assert shown["preview_psnr"] == [[3, 9.5], [5, 9.5]]
+    assert shown["previews"] == ["preview_000003.png", "preview_000005.png"]
+    answer = site("/previews/train/preview_000005.png")
+    assert answer is not None
+    assert answer.kind == "image/png"
+    assert body(answer) == PNG + b"\x05"
+
+
+def test_it_tells_what_status_tells(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from workflows.asset import STAGES
+
+    assert main(["status", str(run.path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    served = json.loads(RunSite(run.path, STAGES, tmp_path).status())
+    assert {name: served[name] for name in told} == told
+
+
+def test_nothing_is_written_into_the_run(run: Run, tmp_path: Path) -> None:
+    put(scratch(run), 3, [1])
+    before = {path: path.lstat().st_mtime_ns for path in [run.path, *run.path.rglob("*")]}
+    site = site_of(run, tmp_path / "pages")
+    for path in ("/", "/status.json", "/viewer.html", "/previews/train/preview_000001.png"):
+        body(site(path))
+    assert {path: path.lstat().st_mtime_ns for path in [run.path, *run.path.rglob("*")]} == before
+
+
+def test_a_run_is_looked_at_no_more_often_than_it_takes_a_tenth_of_the_time(run: Run) -> None:
+    now, looks = [0.0], [0]
+    shown = Progress(run.path, (TRAIN,), clock=lambda: now[0])
+    look = shown._look
+
+    def slow() -> dict[str, Any]:
+        looks[0] += 1
+        now[0] += 0.5
+        return look()
+
+    shown._look = slow  # type: ignore[method-assign]
+    for _ in range(100):
+        shown.state()
+        now[0] += 0.1
+    assert looks[0] == 2  # in ten seconds and a half
+
+
+def test_a_run_that_cannot_be_looked_at_keeps_what_was_seen(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "PAUSE", 0.0)
+    monkeypatch.setattr(progress, "SHARE", 1e9)
+    shown = Progress(run.path, (TRAIN,))
+    assert shown.state()["error"] is None
+    (run.path / "train").symlink_to("/etc")
+    state = shown.state()
+    assert "train is a link" in state["error"]
+    assert state["stages"][0]["state"] == "missing"
+    (run.path / "train").unlink()
+    assert shown.state()["error"] is None
+
+
+BROKEN = ["{", "null", '{"step": -1}', '{"step": 1e400}', '{"step": 7, "psnr": 1e400}', '{"psnr": 3}', "[" * 5000, '{"step": "7"}', "\0"]
+
+
+@pytest.mark.parametrize("line", BROKEN, ids=range(len(BROKEN)))
+def test_a_log_ends_at_a_line_that_is_none(run: Run, tmp_path: Path, line: str) -> None:
+    put(scratch(run), 4, [])
+    with open(scratch(run) / "log.jsonl", "a", encoding="utf-8") as file:
+        file.write(line + '\n{"step": 9}\n')
+    assert json.loads(site_of(run, tmp_path).status())["training"]["train"]["step"] == 3
+
+
+def test_long_curves_are_thinned_and_keep_their_end(run: Run, tmp_path: Path) -> None:
+    put(scratch(run), 5000, [])
+    for step in range(3 * MOST_PREVIEWS):
+        (scratch(run) / f"preview_{step * 10:06d}.png").write_bytes(PNG)
+    shown = json.loads(site_of(run, tmp_path).status())["training"]["train"]
+    assert len(shown["psnr"]) == MOST_POINTS
+    assert (shown["psnr"][0][0], shown["psnr"][-1][0]) == (0, 4999)
+    assert len(shown["previews"]) == MOST_PREVIEWS
+    assert (shown["previews"][0], shown["previews"][-1]) == ("preview_000000.png", "preview_002990.png")
+
+
+HOSTILE = ["/previews/train/../../run.json", "/previews/train/%2e%2e/run.json", "/previews/train/..%2f..%2frun.json", "/previews//preview_000001.png",
+           "/previews/../preview_000001.png", "/previews/train/preview_000001.png/", "/previews/train/preview_000001.png?x", "/previews/train/preview_1.png",
+           "/previews/train/", "/previews/train/preview_000001.PNG", "/previews/train/preview_000001.png%00", "/previews/train/preview_000001.png\n",
+           "/previews/bake/preview_000001.png", "/previews/poses/preview_000001.png", "/run.json", "/.lock", "/train/log.jsonl", "/.work/", "//status.json",
+           "/live.html", "/../live.js", "/sites.py", "/status.json/", "/STATUS.JSON", "", "status.json", "/previews/train/preview_٠٠٠٠٠١.png"]  # fmt: skip
+
+
+def test_no_other_path_leads_anywhere(run: Run, tmp_path: Path) -> None:
+    put(scratch(run), 3, [1])
+    site = site_of(run, tmp_path)
+    site.status()
+    assert body(site("/previews/train/preview_000001.png")) == PNG + b"\x01"
+    for path in HOSTILE:
+        assert site(path) is None, path
+
+
+def test_a_preview_that_became_a_link_is_not_followed(run: Run, tmp_path: Path) -> None:
+    """Between two looks at the run, which refuse one that holds links."""
+    secret = tmp_path / "secret"
+    secret.mkdir()
+    for name in ("preview_000001.png", "preview_000002.png"):
+        (secret / name).write_text("secret", encoding="utf-8")
+    put(scratch(run), 3, [1, 2])
+    site = site_of(run, tmp_path)
+    site.status()
+    preview = scratch(run) / "preview_000001.png"
+    preview.unlink()
+    assert site("/previews/train/preview_000001.png") is None
+    preview.symlink_to(secret / preview.name)
+    assert site("/previews/train/preview_000001.png") is None
+    preview.unlink()
+    os.mkfifo(preview)
+    assert site("/previews/train/preview_000001.png") is None
+    shutil.rmtree(scratch(run))
+    scratch(run).rmdir()
+    (run.path / ".work" / "train").rename(tmp_path / "moved")
+    (run.path / ".work" / "train").symlink_to(tmp_path / "moved")
+    assert site("/previews/train/preview_000002.png") is None
+
+
+def test_the_live_page_asks_for_nothing_but_what_is_served(run: Run, tmp_path: Path) -> None:
+    site = site_of(run, tmp_path)
+    texts = {}
+    for path in ("/", "/live.js", "/live.css"):
+        answer = site(path)
+        assert answer is not None
+        assert answer.policy == LIVE_POLICY
+        texts[path] = answer.data.decode("utf-8")
+    assert set(re.findall(r'(?:src|href)="([^"]+)"', texts["/"])) == {"data:,", "/live.css", "/live.js", "/viewer.html"}
+    everything = "".join(texts.values())
+    assert re.findall(r"https?://[^\"' ]+", everything) == ["http://www.w3.org/2000/svg"]
+    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|style=|<style|\bon[a-z]+=\"", everything)
+    assert "unsafe" not in LIVE_POLICY
+
+
+def asset(path: Path) -> None:
+    index = np.argwhere(np.ones((4, 4, 4), bool))
+    format.save(tree_from_voxels((1, 1, 1), 0.5, np.full(3, -1.0), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), brick=4), path)
+
+
+def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    def make(asset: Path, target: Path, title: str) -> None:
+        made.append(title)
+        target.write_text(f"page {len(made)}", encoding="utf-8")
+
+    monkeypatch.setattr(sites, "make_page", make)
+    monkeypatch.setattr(progress, "PAUSE", 0.0)
+    monkeypatch.setattr(progress, "SHARE", 1e9)
+    site = site_of(run, tmp_path)
+    assert site("/viewer.html") is None
+    file = BakeOutputs.of_run(run.path).asset
+    file.parent.mkdir()
+    asset(file)
+    first = json.loads(site.status())["asset"]
+    assert [body(site("/viewer.html")) for _ in range(2)] == [b"page 1"] * 2
+    asset(file)
+    os.utime(file, ns=(1, file.stat().st_mtime_ns + 10**9))
+    assert json.loads(site.status())["asset"] != first
+    assert body(site("/viewer.html")) == b"page 2"
+    assert made == ["run", "run"]
+    assert not (run.path / "viewer.html").exists()
+    (run.path / "viewer.html").write_text("of the run", encoding="utf-8")
+    os.utime(run.path / "viewer.html", ns=(1, file.stat().st_mtime_ns))
+    assert body(site("/viewer.html")) == b"of the run"
+    os.utime(run.path / "viewer.html", ns=(1, file.stat().st_mtime_ns - 1))
+    assert body(site("/viewer.html")) == b"page 2", "one that is older than the asset is of another"
+    (run.path / "viewer.html").unlink()
+    (run.path / "viewer.html").symlink_to(run.path / "run.json")
+    assert present_page(run.path, file) is None
+
+
+def test_of_an_asset_there_is_its_page_alone(tmp_path: Path) -> None:
+    (tmp_path / "viewer.html").write_text("page", encoding="utf-8")
+    site = AssetSite(tmp_path / "viewer.html")
+    assert body(site("/")) == body(site("/viewer.html")) == b"page"
+    assert [site(path) for path in ("/status.json", "/live.js", "/..", "/viewer.html/")] == [None] * 4

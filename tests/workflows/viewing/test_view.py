@@ -1,0 +1,174 @@
+"""`enerf view`: the page is made where it is missing, opened, or served until Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import urllib.error
+import urllib.request
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset import format
+from efficientnerf.asset.tree import tree_from_voxels
+from pipeline.run import Run
+from stages.artifacts import BakeOutputs
+from tests.workflows.command import Enerf
+from workflows.viewing import serving, sites
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
+    """What a browser was asked to show. Pages are made by a stand-in, and temporary folders lie in this test's."""
+    shown: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda url: shown.append(url) or True)
+    monkeypatch.setenv("DISPLAY", ":0")
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+
+    def make(asset: Path, target: Path, title: str) -> None:
+        target.write_text(f"{title} of {asset.stat().st_size} bytes", encoding="utf-8")
+
+    for module in (serving, sites):
+        monkeypatch.setattr(module, "make_page", make)
+    return shown
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run with nothing but an asset."""
+    path = Run.create(tmp_path / "run", Path("/photographs"), {}).path
+    file = BakeOutputs.of_run(path).asset
+    file.parent.mkdir()
+    index = np.argwhere(np.ones((4, 4, 4), bool))
+    format.save(tree_from_voxels((1, 1, 1), 0.5, np.full(3, -1.0), index, np.full(64, 50.0), np.zeros((64, 1, 3), np.float32), brick=4), file)
+    return path
+
+
+def test_the_page_of_a_run_is_made_once_and_again_of_another_asset(enerf: Enerf, run: Path, opened: list[str]) -> None:
+    page, asset = run / "viewer.html", BakeOutputs.of_run(run).asset
+    for made in (True, False):
+        assert enerf("view", run, "--json").object == {"event": "summary", "ok": True, "page": str(page), "made": made, "opened": True, "exit_code": 0}
+    assert opened == [page.as_uri()] * 2
+    assert page.read_text(encoding="utf-8") == f"run of {asset.stat().st_size} bytes"
+    assert enerf("view", run, "--force", "--no-browser", "--json").object["made"]
+    os.utime(asset, ns=(1, page.stat().st_mtime_ns + 1))
+    assert enerf("view", run, "--no-browser", "--json").object["made"]
+    assert len(opened) == 2
+    assert enerf("view", run, "--no-browser").out == f"{page}\n"
+    assert enerf("view", run, "--no-browser", "--quiet").out == ""
+
+
+def test_of_an_asset_file_the_page_lies_elsewhere(enerf: Enerf, run: Path, opened: list[str], tmp_path: Path) -> None:
+    asset = BakeOutputs.of_run(run).asset
+    pages = [Path(enerf("view", asset, "--no-browser", "--json").object["page"]) for _ in range(2)]
+    assert pages[0] != pages[1]
+    assert all(page.is_file() and page.parent.parent == tmp_path / "temporary" for page in pages)
+    assert pages[0].parent.stat().st_mode & 0o77 == 0, "nobody else can put another page there"
+    assert [each.name for each in asset.parent.iterdir()] == [asset.name]
+
+
+def test_without_a_screen_no_browser_takes_the_terminal(enerf: Enerf, run: Path, opened: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    result = enerf("view", run)
+    assert result.out == f"{run / 'viewer.html'}  (open it in a browser)\n"
+    assert opened == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["run", "--serve", "66000"], 2, "--serve"),
+        (["run", "--address", "::1"], 2, "give --serve PORT"),
+        (["run", "--serve", "0", "--address", "here"], 2, "127.0.0.1"),
+        (["run", "--serve", "0", "--address", "203.0.113.9"], 2, "listen"),
+        (["nothing"], 2, "no such file"),
+        (["empty"], 2, "neither a run"),
+        (["bare"], 2, "has no asset yet"),
+    ],
+)
+def test_what_is_refused(
+    enerf: Enerf, run: Path, opened: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    Run.create(tmp_path / "bare", Path("/photographs"), {})
+    result = enerf("view", *arguments, "--json")
+    assert result.code == code
+    assert words in result.err
+    assert result.objects[-1]["exit_code"] == code
+    assert not list((tmp_path / "temporary").iterdir())
+
+
+def test_a_damaged_asset_makes_no_page(enerf: Enerf, run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("stages.viewer.page")
+    damaged = tmp_path / "damaged.nerftree"
+    damaged.write_bytes(BakeOutputs.of_run(run).asset.read_bytes()[:-9])
+    result = enerf("view", damaged, "--no-browser")
+    assert result.code == 4
+    assert str(damaged) in result.err
+
+
+def got(url: str) -> bytes:
+    with urllib.request.urlopen(url, timeout=20) as answer:
+        return bytes(answer.read())
+
+
+@pytest.mark.parametrize("more", [[], ["--no-browser"]])
+def test_a_run_is_served_until_a_signal(enerf: Enerf, run: Path, opened: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: list[str]) -> None:
+    """All in one process: what would wait for a signal asks for the pages instead."""
+    answers: dict[str, bytes | int] = {}
+    urls: list[str] = []
+
+    @contextmanager
+    def stopping() -> Iterator[Callable[[], int | None]]:
+        def asked() -> int | None:
+            for path in ("", "status.json", "viewer.html", "run.json"):
+                try:
+                    answers[path] = got(urls[0] + path)
+                except urllib.error.HTTPError as error:
+                    answers[path] = error.code
+            return signal.SIGINT
+
+        yield asked
+
+    monkeypatch.setattr(serving, "stopping", stopping)
+    monkeypatch.setattr("workflows.cli.output.write_json", lambda value, **_: urls.append(value["url"]) if "url" in value else None)
+    assert enerf("view", run, "--serve", 0, "--json", *more).code == 0
+    assert b"/live.js" in answers[""]  # type: ignore[operator]
+    assert json.loads(answers["status.json"])["name"] == "run"
+    assert answers["viewer.html"] == f"run of {BakeOutputs.of_run(run).asset.stat().st_size} bytes".encode()
+    assert answers["run.json"] == 404
+    assert urls[0].startswith("http://127.0.0.1:")
+    assert opened == ([] if more else urls)
+    assert not list((tmp_path / "temporary").iterdir()), "what was made for it goes with it"
+    assert not (run / "viewer.html").exists()
+    with pytest.raises(OSError, match=r"refused|Connection"):
+        got(urls[0])
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_cleanly(tmp_path: Path, number: signal.Signals) -> None:
+    run = Run.create(tmp_path / "run", Path("/photographs"), {}).path
+    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "workflows.cli.main", "view", str(run), "--serve", "0", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment, text=True) as process:
+        assert process.stdout is not None
+        url = json.loads(process.stdout.readline())["url"]
+        assert json.loads(got(url + "status.json"))["error"] is None
+        process.send_signal(number)
+        out, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, "")
+    assert json.loads(out) == {"event": "summary", "ok": True, "exit_code": 0}
+    assert [each.name for each in tmp_path.iterdir()] == ["run"]

@@ -1,0 +1,32 @@
+"""The states of a run's stages, as `enerf status --json` and the live page tell them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipeline.decide import Decision
+    from pipeline.run import Run
+
+
+def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
+    """A run, who is writing it, and its stages."""
+    holder = run.holder()
+    facts = {"run": str(run.path), "source": run.source, "preset": run.preset, "seed": run.seed, "device": run.device}
+    return {**facts, "written_by": None if holder is None else holder.text(), "stages": [_stage(each) for each in decisions]}
+
+
+def _stage(decision: Decision) -> dict[str, Any]:
+    made = decision.manifest
+    return {
+        "name": decision.stage,
+        "state": decision.state,
+        "reason": decision.reason,
+        "note": decision.note,
+        "seconds": None if made is None else made.seconds,
+        "bytes": None if made is None else made.size,
+        "peak_memory": None if made is None else made.peak_memory,
+        "digest": None if made is None else made.digest,
+        "extra": list(decision.extra),
+    }

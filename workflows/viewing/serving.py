@@ -1,0 +1,91 @@
+"""`enerf view`: a page is opened, or served until Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.errors import UsageError
+from pipeline.interrupt import stopping
+from stages.viewer.page import NAME
+from workflows.viewing.page import make_page, present_page, title_of
+
+if TYPE_CHECKING:
+    from pipeline.stage import Stage
+
+LOOK = 0.2  # seconds between two looks whether a signal came
+
+
+def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
+    """The viewer page of a run or an asset file, and whether it was made now: in the run, or in a new temporary folder that stays."""
+    from workflows.cli.target import asset_of, is_run
+
+    asset = asset_of(what)
+    there = None if force else present_page(what, asset)
+    if there is not None:
+        return there, False
+    target = (what if is_run(what) else Path(tempfile.mkdtemp(prefix="enerf-view-"))) / NAME
+    make_page(asset, target, title_of(what, asset))
+    return target, True
+
+
+def check_address(address: str | None, port: int | None) -> bool:
+    """Whether what is to be listened on is reached from this machine alone. Raises UsageError for what is no number of an interface."""
+    import ipaddress
+
+    if address is None:
+        return True
+    if port is None:
+        raise UsageError("--address: says where to listen; give --serve PORT, too.")
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        raise UsageError(f"--address {address}: expected the number of an interface, such as 127.0.0.1, ::1 or 0.0.0.0.") from None
+
+
+def open_in_browser(url: str) -> bool:
+    """Whether a browser was asked to show a page: not without a screen, where one would take the terminal."""
+    import webbrowser
+
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return False
+    try:
+        return webbrowser.open(url)
+    except (webbrowser.Error, OSError):
+        return False
+
+
+def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, ready: Callable[[str], None], *, force: bool = False) -> None:
+    """Serve a run, finished or not, or an asset file, until a signal comes. Raises as `asset_of` and `Server` do.
+
+    address  None: this machine alone
+    ready    is told the URL
+    force    make the page even if the run has one
+    """
+    from workflows.cli.target import asset_of, is_run, open_run
+    from workflows.viewing.server import LOOPBACK, Server
+    from workflows.viewing.sites import AssetSite, RunSite
+
+    with tempfile.TemporaryDirectory(prefix="enerf-view-") as name, stopping() as stop:
+        folder = Path(name)
+        if is_run(what):
+            open_run(what)
+            site: AssetSite | RunSite = RunSite(Path(os.path.abspath(what)), stages, folder, force=force)
+        else:
+            asset = asset_of(what)
+            make_page(asset, folder / NAME, title_of(what, asset))
+            site = AssetSite(folder / NAME)
+        with Server(site, address or LOOPBACK, port) as server:
+            threading.Thread(target=server.serve_forever, kwargs={"poll_interval": LOOK}, daemon=True).start()
+            try:
+                ready(server.url)
+                while stop() is None:
+                    time.sleep(LOOK)
+            finally:
+                server.shutdown()

@@ -1,0 +1,99 @@
+"""What there is to be served: of a run its live page, its progress, its previews and its viewer; of an asset file the viewer alone."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.errors import PipelineError
+from stages.viewer.page import NAME
+from workflows.viewing.page import make_page, present_page, title_of
+from workflows.viewing.progress import PREVIEW, Progress, asset_identity
+from workflows.viewing.server import Answer, open_inside
+
+if TYPE_CHECKING:
+    from pipeline.stage import Stage
+
+HTML, JSON, PNG = "text/html; charset=utf-8", "application/json", "image/png"
+LIVE = {"/": ("live.html", HTML), "/live.js": ("live.js", "text/javascript; charset=utf-8"), "/live.css": ("live.css", "text/css; charset=utf-8")}
+LIVE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; frame-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+VIEWER_POLICY = "frame-ancestors 'self'"  # the page has a policy of its own, of the hashes of its scripts
+LARGEST_PAGE, LARGEST_PREVIEW = 2**31, 2**24  # bytes
+_PREVIEW = re.compile(rf"/previews/([a-z]+)/({PREVIEW.pattern})")
+
+
+class AssetSite:
+    """An asset file: its viewer page, which is made."""
+
+    def __init__(self, page: Path) -> None:
+        self.page = page
+
+    def __call__(self, path: str) -> Answer | None:
+        return _page(self.page) if path in ("/", "/viewer.html") else None
+
+
+class RunSite:
+    """A run that may still be made. Nothing is written into it.
+
+    folder  takes the viewer page where the run has none of its present asset
+    force   take it even where the run has one
+    """
+
+    def __init__(self, run: Path, stages: Sequence[Stage], folder: Path, *, force: bool = False) -> None:
+        self.run, self.folder, self.force = run, folder, force
+        self.progress = Progress(run, stages)
+        self._making = threading.Lock()
+        self._made: str | None = None  # of which asset the page in the folder is
+
+    def __call__(self, path: str) -> Answer | None:
+        if path in LIVE:
+            name, kind = LIVE[path]
+            return Answer(kind, Path(__file__).with_name(name).read_bytes(), policy=LIVE_POLICY)
+        if path == "/status.json":
+            return Answer(JSON, self.status())
+        if path == "/viewer.html":
+            return self._viewer()
+        found = _PREVIEW.fullmatch(path)
+        return None if found is None else self._preview(found[1], found[2])
+
+    def status(self) -> bytes:
+        from workflows.cli.output import plain
+
+        return json.dumps(plain(self.progress.state()), ensure_ascii=True, allow_nan=False).encode("ascii")
+
+    def _preview(self, stage: str, name: str) -> Answer | None:
+        place = self.progress.previews.get((stage, name))
+        file = None if place is None else open_inside(self.run, place, LARGEST_PREVIEW)
+        return None if file is None else Answer(PNG, file=file)
+
+    def _viewer(self) -> Answer | None:
+        """Of the present asset, made on the first request for it."""
+        from workflows.cli.target import asset_of
+
+        with self._making:
+            try:
+                asset = asset_of(self.run)
+                there = None if self.force else present_page(self.run, asset)
+                if there is not None:
+                    return _page(there)
+                identity, page = asset_identity(self.run), self.folder / NAME
+                if identity is None:
+                    return None
+                if identity != self._made:
+                    make_page(asset, page, title_of(self.run, asset))
+                    self._made = identity
+            except PipelineError:  # no asset yet, or one that is just replaced: status.json says
+                return None
+            return _page(page)
+
+
+def _page(path: Path) -> Answer | None:
+    file = open_inside(path.parent, path.name, LARGEST_PAGE)
+    return None if file is None else Answer(HTML, file=file, policy=VIEWER_POLICY)
