@@ -265,7 +265,7 @@ def test_presets_are_listed(enerf: Enerf, toys: Path) -> None:
 
 def test_help_names_all_commands(enerf: Enerf) -> None:
     text = enerf("--help").out
-    for name in ("run", "stage", "status", "verify", "export", "render", "inspect", "diff", "convert", "presets"):
+    for name in ("run", "stage", "status", "verify", "export", "render", "inspect", "diff", "convert", "view", "presets"):
         assert f"\n  {name} " in text
         assert "--debug" in enerf(name, "--help").out
     assert enerf().code in (0, 2)
