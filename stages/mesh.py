@@ -16,7 +16,8 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.meshing.check import asset_views, checked, level_of, shown_by, warning_of
-from stages.meshing.texture import facts_of, largest_photograph, textured
+from stages.meshing.texture import facts_of, largest_photograph, refuse_normal_map_without_texture, textured, with_relief
+from stages.meshing.timing import Stopwatch
 
 if TYPE_CHECKING:
     from efficientnerf.asset.region import Region
@@ -60,15 +61,23 @@ class MeshSettings:
     texture_size: Annotated[int, Meta(ge=256, le=8192)] = setting(
         2048, "Most texels along a side of the texture; fewer, a power of two, where a texel is smaller than a pixel of the photographs.", advanced=True
     )
+    normal_map: bool = setting(
+        False,
+        "A normal map beside the texture, of the surface before it was decimated. Materials are lit then, not unlit: lamps show its relief, over the light of"
+        " the capture.",
+        advanced=True,
+    )
 
 
 def mesh_of(
-    tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None
-) -> Mesh:
+    tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
+    dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
+) -> Mesh:  # fmt: skip
     """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text).
 
     views   is given those of the asset that say which components it shows
     region  that the surface is clipped to
+    dense   is given vertices and faces as they were before decimation
     """
     from efficientnerf.surface.isosurface import NoSurface
     from efficientnerf.surface.nested import scene_surface
@@ -93,6 +102,7 @@ def mesh_of(
             shown=shown_by(seen, float(tree.voxel), tick),
             views=fused if threshold is None else (),
             region=region,
+            dense=dense,
             progress=progress,
         )
     except NoSurface as error:
@@ -171,31 +181,40 @@ def run(job: Job) -> None:
     from stages.memory.surface import surface_needed
 
     outputs, inputs, settings = MeshOutputs(job.out), inputs_of(MeshInputs, job.inputs), job.settings
+    refuse_normal_map_without_texture(settings)
+    watch = Stopwatch()
     whole = load(inputs.bake.asset)
     tree = restricted(whole, settings.region)
     frame = source_frame(tree.metadata)
-    need = surface_needed(tree, texture=0 if settings.texture == "off" else settings.texture_size, pixels=largest_photograph(inputs, settings.texture))
+    need = surface_needed(
+        tree, texture=0 if settings.texture == "off" else settings.texture_size, pixels=largest_photograph(inputs, settings.texture), dense=settings.normal_map
+    )
     refuse_what_does_not_fit(job, need, "Lower bake.max_mib, bake.resolution or mesh.texture_size.")
     seen: list[AssetView] = []
     share = 1.0 if settings.texture == "off" else SURFACE_SHARE
     border = whole.region if settings.region == "foreground" else None
-    surface = mesh_of(tree, settings, lambda done, total, text: job.reached(share * done, total, text), seen, border)
-    found = textured(
-        surface, tree, inputs, settings.texture, settings.texture_size,
-        lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text),
-    )  # fmt: skip
+    dense: list[tuple[np.ndarray, np.ndarray]] | None = [] if settings.normal_map else None
+    surface = mesh_of(tree, settings, watch.listening(lambda done, total, text: job.reached(share * done, total, text)), seen, border, dense)
+    texture_progress = watch.listening(lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text))
+    found = textured(surface, tree, inputs, settings.texture, settings.texture_size, texture_progress)
+    if dense is not None:
+        found = with_relief(found, dense, lambda: texture_progress(1, 1, "normal map"))
     job.safe_point()
     orbit = tree.metadata.get("orbit", {})
     elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
     forward = bool(orbit.get("forward_facing", False))
     sides: dict[str, Any] = {"turns": IN_FRONT, "shown": 0.8} if forward else {}
     write_png(render_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides), outputs.preview)
+    watch.lap("preview")
     job.safe_point()
     mesh = in_capture(found, frame)
     for path in (outputs.ply, outputs.glb, outputs.obj):
         MESH_EXPORTERS[path.suffix](mesh, path, frame)
+    watch.lap("files")
     agreed, picture = checked(found, seen, job.safe_point)
     write_png(picture, outputs.check)
+    watch.lap("check")
+    write_json(outputs.timings, watch.seconds)
     report = describe(mesh, frame) | {"region": job.settings.region} | agreed
     write_json(outputs.report, report)
     if (doubt := warning_of(report)) is not None:
@@ -206,4 +225,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
 
 
-STAGE = Stage(name="mesh", version=9, settings=MeshSettings, needs=needs_of(MeshInputs), run=run)
+STAGE = Stage(name="mesh", version=9, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))

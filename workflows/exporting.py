@@ -11,6 +11,8 @@ from pipeline.errors import BadInput, UsageError
 from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, VOLUME_EXPORTERS, Format
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from efficientnerf.asset.region import Region
     from efficientnerf.asset.tree import NerfTree
     from efficientnerf.surface.mesh import Mesh
@@ -35,6 +37,7 @@ class Export:
     as_points  points instead of a mesh
     region, crop  of the asset; None: as the settings say
     texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
+    normal_map  beside the texture; None: as the settings say, where a file keeps it
     picture    how textures are stored
     limit      of memory
     """
@@ -46,6 +49,7 @@ class Export:
     crop: Box | None = None
     force: bool = False
     texture: str | None = None
+    normal_map: bool | None = None
     picture: str = "png"
     limit: Limit | None = None
 
@@ -111,9 +115,13 @@ def check(export: Export) -> None:
             raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
     if (export.picture != "png" and not export.keeps_textures) or (export.texture not in (None, "off") and not (export.is_coloured and not export.as_points)):
         raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
+    if export.normal_map and (export.as_points or export.texture == "off" or not export.keeps_textures):
+        raise UsageError("None of the files keeps a normal map: it lies beside a texture. Give a .glb, .obj, .usdz or .usdc, and leave out --texture off.")
     for path in (*export.surfaces, *export.volumes):
         export.format(path).refuse_without_package(path)
-    beside = [] if export.texture == "off" else [each for path in export.surfaces for each in export.format(path).companions(path, export.picture)]
+    beside = [] if export.texture == "off" else [
+        each for path in export.surfaces for each in export.format(path).companions(path, export.picture, bool(export.normal_map))
+    ]
     check_files([*export.files, *dict.fromkeys(beside)], force=export.force, inputs=[export.what])
 
 
@@ -153,6 +161,8 @@ def export_surface(export: Export, settings: Settings, progress: Progress) -> li
     if not export.as_points:
         shown = export.keeps_textures or (export.is_coloured and (export.texture is not None or export.has_photographs))
         wanted = replace(wanted, texture=(export.texture or wanted.texture) if shown else "off")
+        relief = wanted.normal_map if export.normal_map is None else export.normal_map
+        wanted = replace(wanted, normal_map=relief and export.keeps_textures and wanted.texture != "off")
         made = None if export.crop is not None else _made_by_the_stage(export.what, wanted, export.keeps_textures)
         if made is not None:
             return _write_mesh(export, *made)
@@ -194,7 +204,7 @@ def export_volumes(export: Export, settings: Settings) -> list[Written]:
     return [{"path": str(path.absolute()), "voxels": voxels} for path in export.volumes]
 
 
-def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: int) -> None:
+def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: Any) -> None:
     from stages.memory.need import refuse_more_than
     from stages.memory.surface import surface_needed
 
@@ -219,10 +229,14 @@ def _made_by_the_stage(what: Path, wanted: MeshSettings, keeps_textures: bool) -
     if not decision.fresh or decision.manifest is None:
         return None
     made = settings_from(MeshSettings, decision.manifest.request.settings, where=STAGE.name)
-    same = settings_dict(replace(made, texture="off", texture_size=2048)) == settings_dict(replace(wanted, texture="off", texture_size=2048))
-    if not same or (wanted.texture != "off" and (made.texture, made.texture_size) != (wanted.texture, wanted.texture_size)):
+    plain = [settings_dict(replace(each, texture="off", texture_size=2048, normal_map=False)) for each in (made, wanted)]
+    if plain[0] != plain[1] or (wanted.normal_map and not made.normal_map):
+        return None
+    if wanted.texture != "off" and (made.texture, made.texture_size) != (wanted.texture, wanted.texture_size):
         return None
     mesh = read_mesh(MeshOutputs.of_run(what))
+    if mesh.texture is not None and not wanted.normal_map:
+        mesh = replace(mesh, texture=replace(mesh.texture, normals=None))
     frame = source_frame(describe(BakeOutputs.of_run(what).asset))
     return mesh if wanted.texture != "off" or not keeps_textures else replace(mesh, texture=None), frame
 
@@ -231,7 +245,7 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     """The mesh of a tree, clipped to a region, in the capture's frame, textured as its settings say."""
     from stages.artifacts import BakeOutputs, MeshInputs, PosesOutputs, TrainOutputs
     from stages.mesh import SURFACE_SHARE, in_capture, mesh_of
-    from stages.meshing.texture import largest_photograph, textured
+    from stages.meshing.texture import largest_photograph, textured, with_relief
 
     if wanted.texture == "photographs" and not export.has_photographs:
         raise UsageError(f"{export.what}: holds no photographs. Give a run with its cameras, or --texture asset.")
@@ -239,7 +253,7 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     inputs = MeshInputs(*(kind.of_run(export.what) for kind in (BakeOutputs, TrainOutputs, PosesOutputs)))  # type: ignore[arg-type]
     side = 0 if choice == "off" else wanted.texture_size
     remedy = "Take an asset of fewer voxels (enerf convert --resolution)" + (", or a smaller texture (--texture-size)." if side else ".")
-    _refuse_what_does_not_fit(export, tree, remedy, texture=side, pixels=largest_photograph(inputs, choice))
+    _refuse_what_does_not_fit(export, tree, remedy, texture=side, pixels=largest_photograph(inputs, choice), dense=wanted.normal_map)
     share = 1.0 if choice == "off" else SURFACE_SHARE
 
     def surface(done: int, total: int, text: str) -> None:
@@ -248,7 +262,9 @@ def _meshed(export: Export, tree: NerfTree, border: Region | None, frame: Source
     def texture(done: int, total: int, text: str) -> None:
         progress(round(1000 * (share + (1 - share) * done / max(total, 1))), 1000, text)
 
-    return in_capture(textured(mesh_of(tree, wanted, surface, region=border), tree, inputs, choice, wanted.texture_size, texture), frame)
+    dense: list[tuple[np.ndarray, np.ndarray]] | None = [] if wanted.normal_map else None
+    mesh = textured(mesh_of(tree, wanted, surface, region=border, dense=dense), tree, inputs, choice, wanted.texture_size, texture)
+    return in_capture(mesh if dense is None else with_relief(mesh, dense, lambda: texture(1, 1, "normal map")), frame)
 
 
 def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]:

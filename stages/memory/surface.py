@@ -19,10 +19,13 @@ VOXEL, CELL, BRICK_VOXEL, POINT = 150, 8, 64, 250
 PIXEL, BLOCK_VOXEL = 36, 120
 # Of a texel, with what it has seen of photographs; of a photograph's pixel with depth and edges.
 TEXEL, PHOTOGRAPH_PIXEL = 140, 60
+# Of a stored voxel, what a normal map is baked from: the surface before decimation with its normals, and cells in which its faces are found.
+DENSE_VOXEL, DENSE_CELLS = 250, 8 * 256**3
 
 
-def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0) -> Need:
-    """What it takes to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels."""
+def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: int = 0, dense: bool = False) -> Need:
+    """What it takes to mesh a tree, to spread so many points over the surface, and to texture it: so many texels a side, photographs of so many pixels,
+    and with a normal map where `dense`."""
     from efficientnerf.surface.fusion import MARGIN
     from efficientnerf.surface.isosurface import BLOCK, pool_of
     from efficientnerf.surface.volume import VOXELS_AT_ONCE, volume_of
@@ -37,5 +40,6 @@ def surface_needed(tree: NerfTree, points: int = 0, texture: int = 0, pixels: in
         "the asset": tree_bytes(tree),
         "libraries": libraries() + SURFACES,
     }
-    optional = {"points": POINT * points, "the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels}
+    optional = {"points": POINT * points, "the texture": TEXEL * texture**2, "a photograph": PHOTOGRAPH_PIXEL * pixels,
+                "the normal map": (DENSE_VOXEL * len(tree.density_values) + DENSE_CELLS) if dense else 0}  # fmt: skip
     return Need(terms | {what: count for what, count in optional.items() if count})

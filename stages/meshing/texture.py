@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from efficientnerf.surface.texturing.photographs import Photograph
     from stages.artifacts import MeshInputs
     from stages.io.scene import View
+    from stages.mesh import MeshSettings
 
 Progress = Callable[[int, int, str], None]
 
@@ -57,6 +58,7 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
     density = np.max([each.density for each in surveys], axis=0)
     atlas = atlas_of(mesh.vertices, mesh.faces, texels_wanted(mesh.vertices, mesh.faces, density), largest)
     sharpness = float(np.median([each.sharpness for each in surveys]))
+    progress(len(views), steps, "charts")
     texels = PhotographTexture(mesh.vertices, mesh.faces, mesh.normals, atlas, density, sharpness)
     for number, photo in enumerate(photographs(inputs.poses.folder, views)):
         progress(len(views) + number, steps, "texture")
@@ -71,6 +73,23 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
         "texels_per_pixel": texels.texels_per_pixel(),
     }
     return replace(mesh, texture=Texture(atlas.coordinates, texture_from(atlas, colours)), facts=mesh.facts | facts)
+
+
+def with_relief(mesh: Mesh, dense: list[tuple[np.ndarray, np.ndarray]], tick: Callable[[], None]) -> Mesh:
+    """The textured mesh with a normal map of what it was before decimation: vertices and faces of each cascade."""
+    from efficientnerf.surface.texturing.normal_map import Dense, with_normal_map
+
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in dense)])
+    faces = np.concatenate([part + start for (_, part), start in zip(dense, first)])
+    return with_normal_map(mesh, Dense(np.concatenate([vertices for vertices, _ in dense]), faces), tick)
+
+
+def refuse_normal_map_without_texture(settings: MeshSettings) -> None:
+    """Raise UsageError for a normal map on a mesh without texture coordinates."""
+    from pipeline.errors import UsageError
+
+    if settings.normal_map and settings.texture == "off":
+        raise UsageError("mesh.normal_map lies on the coordinates of a texture, and mesh.texture is off. Set one of them otherwise.")
 
 
 def largest_photograph(inputs: MeshInputs, choice: str) -> int:

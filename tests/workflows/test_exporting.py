@@ -21,6 +21,7 @@ from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
 from stages.io.exporters import MESH_EXPORTERS
 from stages.io.exporters.writing import source_frame
 from stages.mesh import MeshSettings
+from stages.meshing.files import read_mesh
 from stages.points import PointsSettings
 from tests.stages.io.meshes import block
 from workflows import exporting
@@ -83,11 +84,39 @@ def test_a_texture_may_be_left_out_of_it(run: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "more"),
     [({"max_faces": 400}, {}), ({"texture_size": 512}, {}), ({}, {"texture": "asset"}), ({}, {"region": "all"}), ({"smoothing_iterations": 3}, {}),
-     ({}, {"crop": (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)})],
+     ({"normal_map": True}, {}), ({}, {"normal_map": True}), ({}, {"crop": (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)})],
 )  # fmt: skip
 def test_anything_else_is_made_anew(run: Path, change: dict[str, Any], more: dict[str, Any]) -> None:
     with pytest.raises(pytest.fail.Exception, match="made again"):
         export(run, "mesh.glb", chosen=settings(**change), **more)
+
+
+def test_a_normal_map_is_left_out_where_it_is_not_asked_for(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = replace(MADE, normal_map=True)
+    fresh = SimpleNamespace(fresh=True, manifest=SimpleNamespace(request=SimpleNamespace(settings=settings_dict(made))))
+    monkeypatch.setattr("pipeline.decide.decide", lambda stage, run: fresh)
+    outputs = MeshOutputs.of_run(run)
+    mesh = read_mesh(outputs)
+    assert mesh.texture is not None
+    mesh = replace(mesh, texture=replace(mesh.texture, normals=255 - mesh.texture.colours))
+    for file in (outputs.glb, outputs.obj):
+        MESH_EXPORTERS[file.suffix](mesh, file, source_frame(METADATA))
+    for wanted in (True, None, False):
+        folder = run.parent / str(wanted)
+        folder.mkdir()
+        with_map = wanted is not False
+        entries = export(run, f"{wanted}/mesh.glb", f"{wanted}/mesh.obj", chosen=settings(normal_map=True), normal_map=wanted)
+        assert (b"normalTexture" in (folder / "mesh.glb").read_bytes()) == with_map
+        assert (folder / "mesh_normal.png").is_file() == with_map
+        assert (str(folder / "mesh_normal.png") in entries[1]["beside"]) == with_map
+
+
+def test_a_normal_map_wants_a_texture_to_lie_beside(run: Path) -> None:
+    for names, more in ((("a.ply",), {}), (("a.glb",), {"texture": "off"}), (("a.xyz",), {"as_points": True})):
+        with pytest.raises(UsageError, match="keeps a normal map"):
+            export(run, *names, normal_map=True, **more)
+    (entry,) = export(run, "a.ply", chosen=settings(normal_map=True))
+    assert entry["faces"] == 12, "a file without a place for it takes the mesh as it is"
 
 
 def test_a_stale_mesh_is_not_taken(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,6 +37,11 @@ Crop = tuple[float, float, float, float, float, float] | None
     "--texture", type=click.Choice(TEXTURES), help="From the training photographs or the asset, in place of mesh.texture; off: colours of vertices alone."
 )
 @click.option("--texture-size", metavar="N", help="Most texels along a side, in place of mesh.texture_size.")
+@click.option(
+    "--normal-map/--no-normal-map",
+    default=None,
+    help="The relief that decimation took away, beside the texture, in place of mesh.normal_map; materials are lit then.",
+)
 @click.option("--jpeg", is_flag=True, help="Textures as JPEG instead of PNG: smaller files.")
 @force_option
 @memory_option

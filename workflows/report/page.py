@@ -122,6 +122,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         views=_views(found),
         asset_report=_facts(folder, BAKE.report, damaged),
         mesh_report=_facts(folder, MESH.report, damaged),
+        mesh_seconds=_facts(folder, MESH.timings, damaged),
         previews=_previews(folder, TRAIN.previews),
         asset_previews=_previews(folder, BAKE.previews),
         cameras=_cameras(folder, damaged),

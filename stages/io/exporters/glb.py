@@ -5,7 +5,8 @@ Axes     glTF's y is up. The mesh is turned by the shortest rotation that takes 
 Texture  inside of the file, PNG or JPEG, sRGB as glTF has it. Vertices are split at the texture's seams alone. v counts from the upper edge in glTF.
 Colour   without a texture COLOR_0, which holds linear light by definition; 16 bits, because 8 linear bits band in the shadows.
 Light    the material is unlit: the colours already hold the light of the capture, and no viewer's lamps shall be added to it. With a normal map it is lit
-         instead (not metallic, rough): an unlit material ignores normal maps, and who asked for one means to light the mesh.
+         instead (not metallic, rough): an unlit material ignores normal maps, and who asked for one means to light the mesh. Its tangents are MikkTSpace's,
+         those that a viewer would make, and written so that none has to.
 Sides    a mesh with open edges is seen from both sides.
 
 Khronos, glTF 2.0 specification, sections 3.7.2.1 (attributes), 3.8 (textures) and 4.4 (binary); extension KHR_materials_unlit.
@@ -24,7 +25,9 @@ import numpy as np
 
 from efficientnerf.rendering.colour import linear_from_srgb
 from efficientnerf.surface.mesh import Mesh
-from stages.io.exporters.textures import MIME, Picture, encoded, open_faces, split_at_seams
+from efficientnerf.surface.texturing.corners import split_at_seams
+from efficientnerf.surface.texturing.tangents import tangents
+from stages.io.exporters.textures import MIME, Picture, encoded, open_faces
 from stages.io.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _KINDS = {"<f4": 5126, "<u2": 5123, "<u4": 5125}
@@ -97,6 +100,9 @@ def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: _Buffer) -> dict[str, An
     }
     if mesh.texture is not None:
         attributes["TEXCOORD_0"] = buffer.accessor(np.asarray(corners.coordinates * [1, -1] + [0, 1], "<f4"), _VERTICES)
+        if mesh.texture.normals is not None:
+            frame = tangents(positions.astype(np.float64), normals.astype(np.float64), corners.coordinates.astype(np.float64), corners.faces)
+            attributes["TANGENT"] = buffer.accessor(np.asarray(frame, "<f4"), _VERTICES)
     else:
         linear = np.concatenate([linear_from_srgb(np.clip(mesh.colours.astype(np.float64), 0, 1)), np.ones((len(mesh.colours), 1))], 1)
         attributes["COLOR_0"] = buffer.accessor(np.asarray(np.round(linear * 65535), "<u2"), _VERTICES, normalized=True)
