@@ -51,7 +51,7 @@ class MeshSettings:
         0.0, "Area below which connected components are dropped, as a fraction of the largest one's; those that no view shows are in any case.", advanced=True
     )
     smoothing_iterations: Annotated[int, Meta(ge=0, le=200)] = setting(
-        10, "Iterations of Taubin smoothing, which keeps the volume; as many, up to ten, of smoothing normals follow, which keeps edges.", advanced=True
+        10, "Iterations of Taubin smoothing, which keeps the volume; eight times as many, up to 80, of normals follow, which keep edges.", advanced=True
     )
     texture: Literal["auto", "photographs", "asset", "off"] = setting(
         "auto",
@@ -73,7 +73,8 @@ def mesh_of(
     tree: Any, settings: MeshSettings, progress: Callable[[int, int, str], None], views: list[AssetView] | None = None, region: Region | None = None,
     dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Mesh:  # fmt: skip
-    """The tree's surface in the training frame. Raises StageFailed where there is none; `progress` takes (done, total, text).
+    """The tree's surface in the training frame; `progress` takes (done, total, text). Raises StageFailed where there is none at a density that was asked for;
+    else it has no faces then, and "no_surface" among its facts says why.
 
     views   is given those of the asset that say which components it shows
     region  that the surface is clipped to
@@ -106,8 +107,17 @@ def mesh_of(
             progress=progress,
         )
     except NoSurface as error:
-        raise StageFailed(f"mesh: {error}. {remedy('mesh', threshold)}") from error
+        if threshold is not None:
+            raise StageFailed(f"mesh: {error}. {remedy('mesh', threshold)}") from error
+        mesh = nothing(str(error))
     return replace(mesh, facts=mesh.facts | {"threshold_chosen": "automatic" if threshold is None else "given"})
+
+
+def nothing(why: str) -> Mesh:
+    """A mesh without faces."""
+    from efficientnerf.surface.mesh import Mesh
+
+    return Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.float32), {"no_surface": why})
 
 
 def whole_progress(progress: Callable[[int, int, str], None], grids: int = 1) -> Callable[[int, int, str], None]:
@@ -161,12 +171,26 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         **asdict(found),
-        "bounds": [mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()],
+        "bounds": [mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()] if len(mesh.vertices) else None,
         "unit": "metre" if frame.metric else "unknown",
         "area": float(face_areas(mesh.vertices, mesh.faces).sum()),
         "volume": float(face_volumes(mesh.vertices, mesh.faces).sum()) if found.watertight else None,
         **mesh.facts,
     }
+
+
+def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: SourceFrame, job: Job) -> None:
+    """The files of a mesh without faces, and a warning: what else a run makes of its asset does not depend on there being one."""
+    from stages.io.png import write_png
+    from stages.meshing.files import write_empty_meshes
+
+    write_empty_meshes(outputs, frame)
+    agreed, picture = checked(mesh, seen, job.safe_point)
+    for path in (outputs.preview, outputs.check):
+        write_png(picture, path)
+    write_json(outputs.report, describe(mesh, frame) | {"region": job.settings.region} | agreed)
+    job.warn(f"the mesh is empty: {mesh.facts['no_surface']}. {remedy('mesh', None)}")
+    job.say("no faces", faces=0, components=0, watertight=False)
 
 
 @compiling_kernels
@@ -195,6 +219,10 @@ def run(job: Job) -> None:
     border = whole.region if settings.region == "foreground" else None
     dense: list[tuple[np.ndarray, np.ndarray]] | None = [] if settings.normal_map else None
     surface = mesh_of(tree, settings, watch.listening(lambda done, total, text: job.reached(share * done, total, text)), seen, border, dense)
+    if "no_surface" in surface.facts:
+        write_empty(outputs, surface, seen, frame, job)
+        write_json(outputs.timings, watch.seconds)
+        return
     texture_progress = watch.listening(lambda done, total, text: job.reached(share * total + (1 - share) * done, total, text))
     found = textured(surface, tree, inputs, settings.texture, settings.texture_size, texture_progress)
     if dense is not None:
@@ -225,4 +253,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
 
 
-STAGE = Stage(name="mesh", version=9, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))
+STAGE = Stage(name="mesh", version=10, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))

@@ -1,4 +1,5 @@
-"""The mesh that the stage `mesh` has written, read again: the file of shared vertices, where the GLB has them in the texture, and that."""
+"""The mesh that the stage `mesh` has written, read again: the file of shared vertices, where the GLB has them in the texture, and that. And files of a mesh
+without faces, which exporters refuse."""
 
 from __future__ import annotations
 
@@ -12,8 +13,10 @@ import numpy as np
 from efficientnerf.surface.mesh import Mesh, Texture
 from pipeline.errors import CorruptArtifact
 from stages.artifacts import MeshOutputs
+from stages.io.exporters.obj import head as obj_head
 from stages.io.exporters.ply import FACE, VERTEX
-from stages.io.exporters.writing import MOST_TEXELS
+from stages.io.exporters.ply import mesh_header as ply_header
+from stages.io.exporters.writing import MOST_TEXELS, SourceFrame, write_parts
 
 MOST_BYTES = 2**32  # of a file that is read
 
@@ -25,7 +28,17 @@ def read_mesh(outputs: MeshOutputs) -> Mesh:
     positions = np.stack([vertices[name] for name in ("x", "y", "z")], 1).astype(np.float64)
     normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], 1).astype(np.float64)
     colours = np.stack([vertices[name] for name in ("red", "green", "blue")], 1) / np.float32(255)
-    return Mesh(positions, faces, normals, colours, texture=_read_texture(outputs, faces, positions))
+    return Mesh(positions, faces, normals, colours, texture=_read_texture(outputs, faces, positions) if len(faces) else None)
+
+
+def write_empty_meshes(outputs: MeshOutputs, frame: SourceFrame) -> None:
+    """PLY, GLB and OBJ without vertices and faces; the GLB, in which no mesh may be empty, without a mesh."""
+    write_parts(outputs.ply, [ply_header(0, 0, frame).encode("ascii")])
+    document = {"asset": {"version": "2.0", "generator": "efficientnerf"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "surface"}]}
+    described = json.dumps(document, separators=(",", ":")).encode()
+    described += b" " * (-len(described) % 4)
+    write_parts(outputs.glb, [struct.pack("<4sII", b"glTF", 2, 20 + len(described)), struct.pack("<I4s", len(described), b"JSON"), described])
+    write_parts(outputs.obj, [obj_head(frame)])
 
 
 def _refuse(path: Path, why: str) -> NoReturn:
@@ -53,7 +66,7 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         _refuse(path, "not as it was written")
     vertices = np.frombuffer(body, VERTEX, counts["vertex"])
     faces = np.frombuffer(body, FACE, counts["face"], vertices.nbytes)["vertex_indices"].astype(np.int64)
-    if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+    if (len(vertices) and not len(faces)) or (len(faces) and (faces.min() < 0 or faces.max() >= len(vertices))):
         _refuse(path, "its faces name vertices that it does not have")
     return vertices, faces
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from efficientnerf.asset import format
 from efficientnerf.asset.region import Region
@@ -17,8 +19,9 @@ from pipeline.errors import CorruptArtifact, Interrupted, StageFailed, UsageErro
 from pipeline.stage import Job
 from stages import mesh as stage
 from stages.artifacts import MeshInputs, MeshOutputs, inputs_of
+from stages.evaluation.mesh import load_mesh
 from stages.io.png import write_png
-from stages.io.scene import Orbit, Scene, View, save
+from stages.io.scene import Orbit, Scene, View, load, save
 from stages.mesh import MeshSettings
 from stages.meshing.files import read_mesh
 from stages.meshing.texture import textured
@@ -152,10 +155,25 @@ def test_a_threshold_out_of_reach_names_the_remedy(ball: Path, photographed: Pat
         stage.run(Job(settings=MeshSettings(density_threshold=1e4), inputs=inputs(ball, photographed), out=tmp_path / "out", work=tmp_path / "work"))
 
 
-def test_an_empty_asset_names_the_remedy(photographed: Path, tmp_path: Path) -> None:
+def test_an_empty_asset_makes_an_empty_mesh_that_can_be_measured_and_names_the_remedy(photographed: Path, tmp_path: Path) -> None:
     bake = bake_ball(tmp_path / "bake", density=0.01)
-    with pytest.raises(StageFailed, match="train longer"):
-        stage.run(Job(settings=MeshSettings(), inputs=inputs(bake, photographed), out=tmp_path / "out", work=tmp_path / "work"))
+    events: list[dict[str, Any]] = []
+    stage.run(Job(settings=MeshSettings(), inputs=inputs(bake, photographed), out=tmp_path / "out", work=tmp_path / "work", report=events.append))
+    (warning,) = [event["text"] for event in events if event["event"] == "warning"]
+    assert "empty" in warning
+    assert "train longer" in warning
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (report["faces"], report["bounds"], report["watertight"]) == (0, None, False)
+    outputs = MeshOutputs(tmp_path / "out")
+    for path in (outputs.ply, outputs.glb, outputs.obj, outputs.preview, outputs.check):
+        assert path.stat().st_size
+    assert len(trimesh.load(outputs.glb, force="scene").geometry) == 0
+    tree = format.load(bake / "asset.nerftree")
+    measured = load_mesh(outputs, tree, "foreground")
+    assert measured.facts == {"faces": 0, "vertices": 0, "texture_size": None}
+    for image in measured.shader.images(load(photographed).views[0].camera):
+        assert not image.covered.any()
+        assert np.isinf(image.depth).all()
 
 
 def test_a_signal_stops_it(ball: Path, photographed: Path, tmp_path: Path) -> None:

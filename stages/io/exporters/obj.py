@@ -41,13 +41,14 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
     write_files({**files, path: _textured(mesh, frame, material.name)})
 
 
-def _head(frame: SourceFrame) -> bytes:
+def head(frame: SourceFrame) -> bytes:
+    """The first line."""
     up = " ".join(f"{value:.9g}" for value in frame.up + 0.0)
     return f"# frame of the capture; up {up}; unit {'metre' if frame.metric else 'unknown'}; colours sRGB\n".encode("ascii")
 
 
 def _coloured(mesh: Mesh, frame: SourceFrame) -> Iterator[bytes]:
-    yield _head(frame)
+    yield head(frame)
     yield from _lines("v %.9g %.9g %.9g %.4f %.4f %.4f\n", np.hstack([mesh.vertices, np.clip(mesh.colours, 0, 1)]))
     yield from _lines("vn %.5f %.5f %.5f\n", mesh.normals)
     yield from _lines("f %d//%d %d//%d %d//%d\n", np.repeat(mesh.faces + 1, 2, axis=1))
@@ -57,7 +58,7 @@ def _textured(mesh: Mesh, frame: SourceFrame, material: str) -> Iterator[bytes]:
     assert mesh.texture is not None
     places = np.ascontiguousarray(mesh.texture.coordinates.reshape(-1, 2), np.float32) + np.float32(0)
     _, first, number = np.unique(places.view(np.uint64).ravel(), return_index=True, return_inverse=True)
-    yield _head(frame)
+    yield head(frame)
     yield f"mtllib {material}\n".encode("ascii")
     yield from _lines("v %.9g %.9g %.9g\n", mesh.vertices)
     yield from _lines("vt %.7f %.7f\n", places[first])

@@ -19,7 +19,7 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP) -> 
     check_mesh(mesh, path)
     faces = np.empty(len(mesh.faces), FACE)
     faces["count"], faces["vertex_indices"] = 3, mesh.faces
-    header = _header(len(mesh.vertices), frame) + f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    header = mesh_header(len(mesh.vertices), len(faces), frame)
     write_parts(path, [header.encode("ascii"), _vertices(mesh.vertices, mesh.normals, mesh.colours), faces.tobytes()])
 
 
@@ -28,6 +28,11 @@ def write_points(points: PointCloud, path: Path, frame: SourceFrame = CAPTURE_IS
     check_points(points, path)
     header = _header(len(points.positions), frame) + "end_header\n"
     write_parts(path, [header.encode("ascii"), _vertices(points.positions, points.normals, points.colours)])
+
+
+def mesh_header(vertices: int, faces: int, frame: SourceFrame) -> str:
+    """What stands before the rows of a mesh of so many vertices and faces."""
+    return _header(vertices, frame) + f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
 
 
 def _header(count: int, frame: SourceFrame) -> str:
