@@ -14,7 +14,8 @@ from efficientnerf.surface.mesh import Mesh, PointCloud, decimate, sample, separ
 from efficientnerf.surface.visible_parts import Shown, visible_parts
 from efficientnerf.surface.volume import NdcVolume, Volume
 
-NORMAL_ROUNDS, FUSED_ROUNDS = 6, 10  # of smoothing normals, from densities alone and fused; at most as many as of smoothing. docs/experiments/surface.md
+# Rounds of smoothing normals for each of smoothing, at most, and how sharp the edges are that stay. docs/experiments/surface.md
+NORMALS, FUSED_NORMALS = (1, 6, 0.6), (8, 80, 0.2)  # of surfaces of densities alone, and of fused ones
 
 
 def cleaned_surface(
@@ -65,7 +66,7 @@ def surface(
     threshold      density per world unit of the surface; None: `automatic_threshold`
     faces          budget that it is decimated to
     min_component  components with less than this share of the largest one's area are removed
-    rounds         of smoothing, which keeps the volume; as many, up to NORMAL_ROUNDS or FUSED_ROUNDS, of smoothing normals, which keeps edges
+    rounds         of smoothing, which keeps the volume; those of smoothing normals, which keep edges, are NORMALS or FUSED_NORMALS
     viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
     shown          how much views of the world show of components: those that they do not show are removed; None: hollows and what is in them are
     fusion         depths of views, which decide where the surface is wherever they agree; None: the densities alone do
@@ -85,8 +86,8 @@ def surface(
     vertices, triangles = separate(*tidy(*decimate(vertices, triangles, faces)))
     vertices, triangles, _ = visible_parts(vertices, triangles, min_component, viewpoints, _in_world(volume, shown))  # what decimation cut off
     if len(triangles):
-        most = NORMAL_ROUNDS if fusion is None else FUSED_ROUNDS
-        vertices = np.clip(smooth_normals(vertices, triangles, min(rounds, most)), vertices.min(0), vertices.max(0))
+        times, most, sharpness = NORMALS if fusion is None else FUSED_NORMALS
+        vertices = np.clip(smooth_normals(vertices, triangles, min(times * rounds, most), sharpness), vertices.min(0), vertices.max(0))
     normals = vertex_normals(vertices, triangles)
     colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
     mesh = Mesh(vertices, triangles, normals, colours, facts)

@@ -6,6 +6,7 @@ V vertices, F faces (counter-clockwise seen from outside), C connected component
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -249,16 +250,10 @@ def smooth(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
     Waves as short as a few edges (the terraces of marching cubes) vanish; the volume stays. Taubin, "A signal processing approach to fair
     surface design", SIGGRAPH 1995, with lambda = 0.5 and a pass band of 0.1.
     """
-    from scipy.sparse import csr_matrix
-
     if rounds <= 0 or not len(faces):
         return vertices
     shrink, grow = 0.5, -1 / (1 / 0.5 - 0.1)
-    tail, head = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-    rows, columns = np.concatenate([tail, head]), np.concatenate([head, tail])
-    neighbours = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(vertices), len(vertices)))
-    neighbours.data[:] = 1.0  # an edge is met once per face and direction; every neighbour counts alike
-    degree = np.maximum(np.diff(neighbours.indptr), 1)[:, None]
+    neighbours, degree = _neighbours(faces, len(vertices))
     for _ in range(rounds):
         for step in (shrink, grow):
             vertices = vertices + step * (neighbours @ vertices / degree - vertices)
@@ -303,22 +298,45 @@ def sample(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> tu
     return face, np.stack([1 - root, root * (1 - v), root * v], 1)
 
 
+FITS, DRIFT_ROUNDS = 40, 24  # of vertices to normals at most, and of averaging what all vertices of a place have in common. docs/experiments/surface.md
+
+
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float = 0.6) -> np.ndarray:
-    """(V, 3) vertices after `rounds` of bilateral smoothing of the faces' normals, which keeps edges.
+    """(V, 3) vertices after `rounds` of bilateral smoothing of the faces' normals, which keeps edges and, over a few edges, the volume.
 
     sharpness  difference of two unit normals beyond which faces hardly count for each other. docs/experiments/surface.md
 
     Each normal becomes the mean of its own and those of the three faces beside it, weighted by area and by exp(-difference^2 / (2 sharpness^2)); then vertices
-    go as far along the normals around them as makes the faces fit these. Zheng et al., "Bilateral normal filtering for mesh denoising", TVCG 2011; Sun et al.,
-    "Fast and effective feature-preserving mesh denoising", TVCG 2007.
+    go as far along the normals around them as makes the faces fit these. What the vertices of a place have gone along their normals in common is taken back:
+    thin parts would shrink to nothing. Zheng et al., "Bilateral normal filtering for mesh denoising", TVCG 2011; Sun et al., "Fast and effective
+    feature-preserving mesh denoising", TVCG 2007.
     """
     from scipy.sparse import csr_matrix
 
     if rounds <= 0 or not len(faces):
         return vertices
-    first, second = _neighbouring_faces(faces, len(vertices))
+    normals = _bilateral_normals(vertices, faces, rounds, sharpness)
     around = csr_matrix((np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))), shape=(len(vertices), len(faces)))
     count = np.maximum(np.diff(around.indptr), 1)[:, None]
+    outer = np.stack([around @ (normals * normals[:, axis, None]) for axis in range(3)], 1)  # (V, 3, 3) sums of n n^T
+    fitted = vertices
+    for _ in range(min(rounds, FITS)):
+        middle = fitted[faces].mean(1)
+        target = around @ (normals * (normals * middle).sum(1, keepdims=True))
+        fitted = fitted + (target - np.einsum("vij,vj->vi", outer, fitted)) / count
+    outward = vertex_normals(vertices, faces)
+    drift = ((fitted - vertices) * outward).sum(1, keepdims=True)
+    neighbours, degree = _neighbours(faces, len(vertices))
+    for _ in range(DRIFT_ROUNDS):
+        drift = 0.5 * drift + 0.5 * (neighbours @ drift) / degree
+    return fitted - drift * outward
+
+
+def _bilateral_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float) -> np.ndarray:
+    """(F, 3) unit normals of faces after `rounds` of smoothing."""
+    from scipy.sparse import csr_matrix
+
+    first, second = _neighbouring_faces(faces, len(vertices))
     vectors = face_vectors(vertices, faces)
     area = np.linalg.norm(vectors, axis=1)
     normals = vectors / np.maximum(area, 1e-300)[:, None]
@@ -328,12 +346,18 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
         beside = csr_matrix((np.concatenate([weight * area[second], weight * area[first]]), pairs), shape=(len(faces),) * 2)
         sums = beside @ normals + area[:, None] * normals
         normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
-    outer = np.stack([around @ (normals * normals[:, axis, None]) for axis in range(3)], 1)  # (V, 3, 3) sums of n n^T
-    for _ in range(rounds):
-        middle = vertices[faces].mean(1)
-        target = around @ (normals * (normals * middle).sum(1, keepdims=True))
-        vertices = vertices + (target - np.einsum("vij,vj->vi", outer, vertices)) / count
-    return vertices
+    return np.asarray(normals)
+
+
+def _neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:
+    """Which vertices share an edge, a sparse matrix (V, V) of ones, and how many there are of each (V, 1), at least one."""
+    from scipy.sparse import csr_matrix
+
+    tail, head = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    rows, columns = np.concatenate([tail, head]), np.concatenate([head, tail])
+    neighbours = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    neighbours.data[:] = 1.0  # an edge is met once per face and direction; every neighbour counts alike
+    return neighbours, np.maximum(np.diff(neighbours.indptr), 1)[:, None]
 
 
 def _neighbouring_faces(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -223,13 +223,14 @@ def normal_errors(vertices: np.ndarray, faces: np.ndarray, truth: np.ndarray) ->
     return np.degrees(np.arccos(np.clip((vectors * truth).sum(1) / np.linalg.norm(vectors, axis=1), -1, 1)))
 
 
-def test_smoothed_normals_lose_noise_and_keep_edges() -> None:
+@pytest.mark.parametrize(("rounds", "sharpness"), [(6, 0.6), (80, 0.2)])
+def test_smoothed_normals_lose_noise_and_keep_edges(rounds: int, sharpness: float) -> None:
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     for _ in range(4):
         box = box.subdivide()
     vertices, faces, truth = np.asarray(box.vertices), np.asarray(box.faces), np.asarray(box.face_normals)
     noisy = vertices + np.random.default_rng(0).normal(scale=0.006, size=vertices.shape)
-    smoothed = smooth_normals(noisy, faces, 6)
+    smoothed = smooth_normals(noisy, faces, rounds, sharpness)
     before, after = normal_errors(noisy, faces, truth), normal_errors(smoothed, faces, truth)
     assert after.mean() < 0.4 * before.mean()
     at_edge = (np.abs(vertices[faces]).max(1) > 0.499).sum(1) > 1  # faces that reach an edge of the box
@@ -237,6 +238,16 @@ def test_smoothed_normals_lose_noise_and_keep_edges() -> None:
     assert np.abs(smoothed - vertices).max() < 0.03
     rounded = smooth(noisy, faces, 6)
     assert after[at_edge].mean() < 0.7 * normal_errors(rounded, faces, truth)[at_edge].mean()
+
+
+@pytest.mark.parametrize(("rounds", "sharpness"), [(6, 0.6), (80, 0.2)])
+def test_smoothing_normals_keeps_thin_parts_as_thick(rounds: int, sharpness: float) -> None:
+    wire = trimesh.creation.cylinder(0.02, 1.0, sections=5)
+    for _ in range(3):
+        wire = wire.subdivide()
+    vertices, faces = np.asarray(wire.vertices), np.asarray(wire.faces)
+    noisy = vertices + np.random.default_rng(0).normal(scale=0.005, size=vertices.shape)
+    assert face_volumes(smooth_normals(noisy, faces, rounds, sharpness), faces).sum() == pytest.approx(face_volumes(noisy, faces).sum(), rel=0.015)
 
 
 def test_smoothing_normals_leaves_a_plane_and_takes_no_rounds_for_nothing() -> None:
