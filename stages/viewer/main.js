@@ -76,7 +76,7 @@ class Viewer {
     const { eye } = this.eye.view(1, 1), corner = (n) => this.box.map((x) => x)[n];
     const middle = [0, 1, 2].map((axis) => (corner(0)[axis] + corner(1)[axis]) / 2), reach = Math.hypot(...middle.map((x, axis) => corner(1)[axis] - x));
     const distance = Math.hypot(...middle.map((x, axis) => x - eye[axis])), nearest = Math.max(distance - reach, 0.15 * distance, 1e-6);
-    return { ...this.options, rough, range: [nearest, distance + (this.options.surroundings || this.tree.ndc ? 4 : 1) * reach] };
+    return { ...this.options, rough: rough || this.options.rough, range: [nearest, distance + (this.options.surroundings || this.tree.ndc ? 4 : 1) * reach] };
   }
 
   tick(now) {

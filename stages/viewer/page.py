@@ -37,10 +37,10 @@ def write_viewer(
 
     Raises FormatError for a file that is no asset.
     """
-    from efficientnerf.asset.file.container import write_whole
+    from pipeline.files import write_atomically
 
     page = viewer_page(compact_bytes(asset), cameras=cameras, photographs=photographs, title=title or asset.stem)
-    write_whole(target, page)
+    write_atomically(target, page)
     return len(page)
 
 

@@ -5,6 +5,7 @@ import { volumeOf } from "./volume.js";
 
 export class Unsupported extends Error {}
 
+const LEAST_WEIGHT = 1e-3, ROUGH_WEIGHT = 0.02;
 const UNITS = ["coarse", "density", "base", "palette", "environment", "codes0", "codes1", "codes2"];
 
 export class Renderer {
@@ -100,7 +101,6 @@ export class Renderer {
     gl.uniform1fv(this.at("side"), tree.grids.map(({ voxel }) => voxel));
     gl.uniform3iv(this.at("shape"), tree.grids.flatMap(({ shape }) => shape));
     gl.uniform1iv(this.at("above"), depths.map((_, n) => depths.slice(0, n).reduce((a, b) => a + b, 0)));
-    gl.uniform2i(this.at("tiles"), tx, ty);
     gl.uniform3f(this.at("densityScale"), 1 / (tx * pad), 1 / (ty * pad), 1 / (tz * pad));
     if (tree.ndc) {
       const { rows, slopes, near } = tree.ndc;
@@ -127,6 +127,7 @@ export class Renderer {
     gl.uniform1i(this.at("mode"), options.mode);
     gl.uniform2f(this.at("range"), ...options.range);
     gl.uniform1i(this.at("rough"), options.rough ? 1 : 0);
+    gl.uniform1f(this.at("least"), options.rough ? ROUGH_WEIGHT : options.least ?? LEAST_WEIGHT);
     this.done = 0;
   }
 

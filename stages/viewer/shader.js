@@ -51,7 +51,6 @@ uniform vec3 low[${cascades}];
 uniform float side[${cascades}];        // of a voxel
 uniform ivec3 shape[${cascades}];
 uniform int above[${cascades}];         // where a cascade begins along z of the coarse volume
-uniform ivec2 tiles;
 uniform vec3 densityScale;              // one over the atlas' sides
 uniform vec4 lens;                      // fx, fy, cx, cy in pixels of the drawing
 uniform float rows;                     // of the drawing
@@ -64,6 +63,7 @@ uniform vec4 background;                // a: whether it takes the place of the 
 uniform int mode;                       // 0 colour, 1 depth, 2 normal, 3 harmonics of degree 0
 uniform vec2 range;                     // least and greatest depth shown
 uniform bool rough;                     // colours of one voxel in place of eight
+uniform float least;                    // weight below which no colour is looked up; it is added to that of the next sample
 out vec4 result;
 
 const float STEP = ${tree.step.toFixed(9)};
@@ -79,8 +79,7 @@ ${BASIS.slice(0, tree.harmonics).map(([factor, text], k) => `  Y[${k}] = ${facto
 }
 
 ivec3 tileOf(uint cell) {
-  int n = int(cell & 0x7fffffffu), plane = tiles.x * tiles.y, z = n / plane, rest = n - z * plane, y = rest / tiles.x;
-  return ivec3(rest - y * tiles.x, y, z);
+  return ivec3(cell & 1023u, (cell >> 10u) & 1023u, (cell >> 20u) & 1023u);
 }
 
 // What is before the sigmoid, times the weight, of one voxel; w: the weight if it is stored.
@@ -129,33 +128,40 @@ float depthAt(vec3 u, ivec3 cell, ivec3 tile) {
 void march(int n, vec3 p, vec3 d, float enter, float leave) {
   vec3 inverse = 1.0 / mix(d, vec3(1e-9), lessThan(abs(d), vec3(1e-9)));
   ivec3 last = shape[n] - 1, cell = ivec3(0), tile = ivec3(0);
-  float k = 0.0, most = 2.0 * float((last.x + last.y + last.z + 3) * B) / STEP + 4.0;
-  for (int i = 0; i < 16384; i++) {
+  vec3 at = vec3(0.0), along = d * densityScale;
+  float k = 0.0, end = min(ceil((leave - enter) / STEP), 2.0 * float((last.x + last.y + last.z + 3) * B) / STEP + 4.0), next = 0.0;
+  for (int i = 0; i < 16384; i++) { // one loop for cells and samples: rays that are drawn together stay together
     float t = enter + (k + 0.5) * STEP;
-    if (!(t < leave) || k > most || transmittance < 5e-4) break;
+    if (!(t < leave) || k >= end || transmittance < 5e-4) break;
     vec3 u = p + t * d;
-    cell = clamp(ivec3(floor(u / float(B))), ivec3(0), last);
-    uint found = texelFetch(coarse, cell + ivec3(0, 0, above[n]), 0).r;
-    if (found < 0x80000000u) {
-      int leap = int(found);
-      vec3 beyond = max((vec3((cell - leap + 1) * B) - u) * inverse, (vec3((cell + leap) * B) - u) * inverse);
-      k += max(1.0, ceil(min(beyond.x, min(beyond.y, beyond.z)) / STEP - 1e-3));
-      continue;
+    if (k >= next) {
+      cell = clamp(ivec3(floor(u / float(B))), ivec3(0), last);
+      uint found = texelFetch(coarse, cell + ivec3(0, 0, above[n]), 0).r;
+      bool occupied = found >= 0x80000000u;
+      int reach = occupied ? 1 : int(found);
+      vec3 beyond = max((vec3((cell - reach + 1) * B) - u) * inverse, (vec3((cell + reach) * B) - u) * inverse);
+      next = k + max(1.0, ceil(min(beyond.x, min(beyond.y, beyond.z)) / STEP - 1e-3));
+      if (!occupied) {
+        k = next;
+        continue;
+      }
+      tile = tileOf(found);
+      at = (vec3(tile * (B + 2) + 1 - cell * B) + p) * densityScale;
     }
     k += 1.0;
-    tile = tileOf(found);
-    float thickness = depthAt(u, cell, tile) * STEP, left = transmittance * exp(-thickness), weight = transmittance - left;
-    if (weight <= 0.0) continue;
+    float thickness = textureLod(density, at + t * along, 0.0).r * STEP;
+    if (thickness <= 0.0) continue;
+    float left = transmittance * exp(-thickness);
+    pending += transmittance - left;
     if (left < 0.5 && halfway < 0.0) {
       halfway = (t + (log(2.0 * transmittance) / thickness - 0.5) * STEP) * side[n];
-      place = low[n] + (p + t * d) * side[n];
+      place = low[n] + u * side[n];
       facing = -vec3(depthAt(u + vec3(0.5, 0, 0), cell, tile) - depthAt(u - vec3(0.5, 0, 0), cell, tile),
                      depthAt(u + vec3(0, 0.5, 0), cell, tile) - depthAt(u - vec3(0, 0.5, 0), cell, tile),
                      depthAt(u + vec3(0, 0, 0.5), cell, tile) - depthAt(u - vec3(0, 0, 0.5), cell, tile));
     }
     transmittance = left;
-    pending += weight;
-    if (pending > 1e-3 && (mode == 0 || mode == 3)) {
+    if (pending > least && (mode == 0 || mode == 3)) {
       colour += pending * colourAt(u, cell, tile, n);
       pending = 0.0;
     }

@@ -1,6 +1,6 @@
 // From a tree to the arrays of textures: a volume of coarse cells, and bricks in atlases.
 //
-// coarse   per cell: OCCUPIED + number of its brick, or the chessboard distance to the nearest occupied cell; the cascades lie one above the other along z
+// coarse   per cell: OCCUPIED and its brick's tile, ten bits an axis, or the chessboard distance to the nearest occupied cell; the cascades lie one above the other along z
 // density  optical depth of a voxel's side, halves; tiles of brick + 2 voxels a side, the outermost those of the bricks around, so that the texture unit
 //          interpolates it
 // base     codes of the base colour, and 255 where a voxel is stored; tiles of brick voxels a side
@@ -127,7 +127,8 @@ export function volumeOf(tree, subject, most) {
     leaps(cells, [X, Y, Z]);
     for (let x = 0; x < X; x++) for (let y = 0; y < Y; y++) for (let z = 0; z < Z; z++) {
       const c = (x * Y + y) * Z + z;
-      coarse[(offset + z) * size[0] * size[1] + y * size[0] + x] = cells[c] === 0 ? OCCUPIED + owner[c] : cells[c];
+      const id = owner[c], tile = (id % tx) + (Math.floor(id / tx) % ty) * 1024 + Math.floor(id / (tx * ty)) * 1048576;
+      coarse[(offset + z) * size[0] * size[1] + y * size[0] + x] = cells[c] === 0 ? OCCUPIED + tile : cells[c];
     }
     offset += Z;
   });

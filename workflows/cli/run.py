@@ -112,10 +112,12 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
 
 
 def _describe(run: Run, *, anew: bool) -> None:
-    """Write the page about the run: anew, or where an earlier call was cut short before it did."""
+    """Write the pages about the run: anew, or where an earlier call was cut short before it did."""
     if anew or not _is_described(run):
         from workflows.report.page import write_report
+        from workflows.report.viewer import write_run_viewer
 
+        write_run_viewer(run)
         write_report(run, workflow().stages)
 
 

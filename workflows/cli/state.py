@@ -102,15 +102,19 @@ def _verify_run(run_folder: Path, as_json: bool, quiet: bool) -> None:
 @json_option
 @common_options
 def report(run_folder: Path, as_json: bool) -> None:
-    """Write RUN/report.html: files, renders, metrics and settings of RUN. 'enerf run' writes it when it is done."""
+    """Write RUN/report.html: files, renders, metrics and settings of RUN; and RUN/viewer.html, which shows its asset in a browser. 'enerf run' writes
+    both when it is done."""
     from workflows.cli.output import closing, write_json
     from workflows.cli.target import check_names, open_run
     from workflows.report.page import write_report
+    from workflows.report.viewer import write_run_viewer
 
     run = open_run(run_folder)
     check_names(run)
+    viewer = write_run_viewer(run, anew=True)
     path = write_report(run, workflow().stages)
     if as_json:
-        write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), "exit_code": 0})
+        shown = {} if viewer is None else {"viewer": str(viewer)}
+        write_json({"event": "summary", "ok": True, "run": str(run.path), "report": str(path), **shown, "exit_code": 0})
     else:
-        closing(str(path))
+        closing(str(path), *([] if viewer is None else [str(viewer)]))

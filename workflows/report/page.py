@@ -34,8 +34,10 @@ NAME = "report.html"
 RUN = Path()  # names are relative to the page
 POSES, TRAIN, BAKE, EVALUATE = PosesOutputs.of_run(RUN), TrainOutputs.of_run(RUN), BakeOutputs.of_run(RUN), EvaluateOutputs.of_run(RUN)
 TURNTABLE, MESH, POINTS = TurntableOutputs.of_run(RUN), MeshOutputs.of_run(RUN), PointsOutputs.of_run(RUN)
+VIEWER = RUN / "viewer.html"
 DOWNLOADS = (
     (BAKE.asset, "the baked asset"),
+    (VIEWER, "the asset in a browser, to walk around; one file, offline"),
     (TURNTABLE.video, "turntable, H.264"),
     (MESH.glb, "mesh with its texture, y up"),
     (MESH.obj, "mesh, the capture's frame"),
@@ -118,6 +120,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         evaluate=EVALUATE,
         turntable=TURNTABLE,
         mesh=MESH,
+        viewer=VIEWER,
         files=[{"name": name, "what": what, "size": size(count)} for name, what in DOWNLOADS if (count := _size(folder / name)) is not None],
         views=_views(found),
         asset_report=_facts(folder, BAKE.report, damaged),

@@ -32,10 +32,11 @@ ARTIFACTS = {
     "mesh_ply": MeshOutputs.of_run(RUN).ply,
     "points": PointsOutputs.of_run(RUN).ply,
     "report": RUN / "report.html",
+    "viewer": RUN / "viewer.html",
 }
 TITLES = {
     "asset": "asset", "captured_path": "video", "strip_worst": "strip", "turntable": "turntable", "mesh_glb": "mesh", "mesh_obj": "mesh", "mesh_ply": "mesh",
-    "points": "points", "report": "report",
+    "points": "points", "report": "report", "viewer": "viewer",
 }  # fmt: skip
 
 

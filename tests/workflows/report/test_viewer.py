@@ -1,0 +1,108 @@
+"""RUN/viewer.html: made where there is an asset, made again when that changes, and no hindrance where anything is wrong."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.format import save
+from pipeline.run import Run
+from stages.io.pictures import opened
+from stages.viewer import page as viewer_page
+from stages.viewer.captured import PHOTOGRAPHS, SIDE, captured_views, photograph
+from tests.efficientnerf.trees import random_tree
+from tests.stages.balls import poses
+from workflows.report.viewer import write_run_viewer
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    found = Run.create(tmp_path / "run")
+    (found.path / "bake").mkdir()
+    save(random_tree(3), found.path / "bake/asset.nerftree", "compact")
+    poses(found.path / "poses")
+    return found
+
+
+def test_a_run_gets_a_page_with_its_cameras_and_photographs(run: Run) -> None:
+    path = write_run_viewer(run)
+    assert path == run.path / "viewer.html"
+    text = path.read_text(encoding="utf-8")
+    assert text.count("data:image/jpeg;base64,") == 8
+    assert "<title>run</title>" in text
+
+
+def test_a_page_is_made_again_when_the_asset_is_another(run: Run) -> None:
+    path = write_run_viewer(run)
+    assert path is not None
+    os.utime(path)
+    first = path.stat().st_ino
+    assert write_run_viewer(run) == path
+    assert path.stat().st_ino == first  # nothing changed: nothing is written
+    shutil.copytree(run.path / "bake", run.path / "new")
+    save(random_tree(4), run.path / "new/asset.nerftree", "compact")
+    shutil.rmtree(run.path / "bake")
+    (run.path / "new").rename(run.path / "bake")
+    write_run_viewer(run)
+    assert path.stat().st_ino != first
+    again = path.stat().st_ino
+    write_run_viewer(run, anew=True)
+    assert path.stat().st_ino != again
+
+
+def test_there_is_no_page_of_no_asset_a_damaged_one_or_one_too_large(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    asset = run.path / "bake/asset.nerftree"
+    assert write_run_viewer(run) is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(viewer_page, "LARGEST", 100)
+        assert write_run_viewer(run, anew=True) is None
+    assert not (run.path / "viewer.html").exists()
+    assert write_run_viewer(run) is not None
+    asset.write_bytes(asset.read_bytes()[:-1])
+    assert write_run_viewer(run, anew=True) is None
+    asset.unlink()
+    asset.symlink_to("/etc/passwd")
+    assert write_run_viewer(run) is None
+    asset.unlink()
+    assert write_run_viewer(run) is None
+    assert not (run.path / "viewer.html").exists()
+
+
+def test_a_run_without_cameras_gets_its_page(run: Run) -> None:
+    (run.path / "poses/scene.json").write_text("{")
+    path = write_run_viewer(run)
+    assert path is not None
+    assert "data:image/jpeg" not in path.read_text(encoding="utf-8")
+
+
+def test_photographs_are_few_and_small_and_as_a_pinhole_takes_them(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from stages.io import scene as scenes
+    from stages.io.png import write_png
+
+    folder = poses(tmp_path / "poses", count=PHOTOGRAPHS + 9)
+    cameras, photographs = captured_views(folder, tmp_path / "train")
+    assert (len(cameras), len(photographs)) == (PHOTOGRAPHS + 9, PHOTOGRAPHS)
+    assert {camera.model for camera in cameras} == {"PINHOLE"}
+    # A grid of lines through the distortion of its camera: straight again.
+    scene = scenes.load(folder)
+    view = scene.views[0]
+    side = 2 * SIDE
+    camera = replace(view.camera, width=side, height=side, model="SIMPLE_RADIAL", params=(float(side), side / 2, side / 2, 0.2))
+    from efficientnerf.geometry.cameras import rays
+
+    directions = rays(camera)[1] @ camera.world_from_camera[:3, :3]
+    x = (directions[:, 0] / directions[:, 2]).reshape(side, side)
+    write_png(np.repeat((128 + 127 * np.sin(30 * x)).astype(np.uint8)[..., None], 3, axis=2), folder / view.image)
+    (tmp_path / "small.jpg").write_bytes(photograph(scene, folder, replace(view, camera=camera), (1, 1, 1)))
+    with opened(tmp_path / "small.jpg") as image:
+        found = np.asarray(image.convert("L"), np.float64)
+    assert found.shape == (SIDE, SIDE)
+    expected = 128 + 127 * np.sin(30 * ((np.arange(SIDE) + 0.5) / SIDE - 0.5))
+    inner = slice(SIDE // 8, -SIDE // 8)
+    assert np.abs(found[inner, inner] - expected[inner]).mean() < 5
