@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stages.mesh import MeshSettings
     from workflows.cli.resolve import Settings
 
-CAMERAS = ".json"
+CAMERAS, VIEWER = ".json", ".html"
 VOLUME_VOXEL = 250  # bytes of a voxel while its grids are sorted into nodes
 Box = tuple[float, float, float, float, float, float]
 Progress = Callable[[int, int, str], None]
@@ -65,13 +65,17 @@ class Export:
         return [path for path in self.files if path.suffix.lower() == CAMERAS]
 
     @property
+    def viewers(self) -> list[Path]:
+        return [path for path in self.files if path.suffix.lower() == VIEWER]
+
+    @property
     def volumes(self) -> list[Path]:
         return [path for path in self.files if path.suffix.lower() in VOLUME_EXPORTERS]
 
     @property
     def surfaces(self) -> list[Path]:
         """The files that hold the surface."""
-        others = {*self.cameras, *self.volumes}
+        others = {*self.cameras, *self.viewers, *self.volumes}
         return [path for path in self.files if path not in others]
 
     @property
@@ -108,7 +112,7 @@ def check(export: Export) -> None:
     """Raise UsageError for what cannot be written, before anything is done."""
     from workflows.destination import check_files
 
-    known = [*export.formats, CAMERAS]
+    known = [*export.formats, CAMERAS, VIEWER]
     for path in export.files:
         if path.suffix.lower() not in known:
             kind = "points" if export.as_points else "a mesh or a volume"
@@ -204,6 +208,34 @@ def export_volumes(export: Export, settings: Settings) -> list[Written]:
     return [{"path": str(path.absolute()), "voxels": voxels} for path in export.volumes]
 
 
+def export_viewers(export: Export) -> list[Written]:
+    """The asset as a page for browsers: all of it, unless --region or --crop say what; with the cameras and photographs of a run."""
+    from efficientnerf.asset.format import FormatError, serialize
+    from pipeline.errors import CorruptArtifact
+    from pipeline.files import write_atomically
+    from stages.framing.restriction import restricted
+    from stages.viewer.page import compact_bytes, viewer_page
+    from workflows.cli.target import asset_of, is_run, load_asset
+    from workflows.destination import writing
+    from workflows.report.viewer import captured
+
+    if not export.viewers:
+        return []
+    try:
+        if export.region is None and export.crop is None:
+            asset = compact_bytes(asset_of(export.what))
+        else:
+            asset = serialize(restricted(load_asset(export.what), export.region or "all", export.crop), "compact")
+    except FormatError as error:
+        raise CorruptArtifact(f"{export.what}: {error}", (str(export.what),)) from error
+    cameras, photographs = captured(export.what) if is_run(export.what) else ([], {})
+    page = viewer_page(asset, cameras=cameras, photographs=photographs, title=export.what.absolute().stem)
+    for path in export.viewers:
+        with writing(path, force=export.force):
+            write_atomically(path, page)
+    return [{"path": str(path.absolute()), "bytes": len(page)} for path in export.viewers]
+
+
 def _refuse_what_does_not_fit(export: Export, tree: NerfTree, remedy: str, **needed: Any) -> None:
     from stages.memory.need import refuse_more_than
     from stages.memory.surface import surface_needed
@@ -292,6 +324,8 @@ def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]
 # What has no table: extension, of what, command, what it keeps and loses, who opens it.
 _OTHERS = (
     (CAMERAS, "cameras", "enerf export", "cameras and their lenses, of a run", "the surface", "nerfstudio, instant-ngp, gsplat"),
+    (VIEWER, "viewer", "enerf export", "all: the asset itself, and photographs of a run's cameras", "nothing, or what --region and --crop say",
+     "browsers with WebGL2, from disk and offline"),
     (".png", "pictures", "enerf render", "colour, 8 bits sRGB, and opacity over a transparent background", "depth", "everything"),
     (".exr", "pictures", "enerf render --exr all", "linear colour, opacity, depth, normals and positions, 32 bits; the capture's frame", "nothing",
      "Nuke, Blender, Fusion, Natron, DJV"),

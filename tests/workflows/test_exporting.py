@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import os
+import re
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +17,7 @@ import pytest
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.surface.mesh import Texture
-from pipeline.errors import UsageError
+from pipeline.errors import CorruptArtifact, UsageError
 from pipeline.run import Run
 from pipeline.stage import settings_dict
 from stages.artifacts import BakeOutputs, MeshOutputs, PosesOutputs
@@ -161,3 +164,23 @@ def test_a_full_disk_leaves_no_part_of_an_obj(run: Path, monkeypatch: pytest.Mon
     with pytest.raises(Exception, match=r"mesh\.obj"):
         export(run, "mesh.obj")
     assert sorted(run.parent.iterdir()) == before
+
+
+def test_a_page_for_browsers_holds_the_asset_or_what_is_asked_for_of_it(run: Path, tmp_path: Path) -> None:
+    def carried(path: Path) -> format.NerfTree:
+        parts = re.findall(r"data-part>([A-Za-z0-9+/=]*)<", path.read_text(encoding="utf-8"))
+        path.with_suffix(".nerftree").write_bytes(zlib.decompress(b"".join(base64.b64decode(part) for part in parts), -15))
+        return format.load(path.with_suffix(".nerftree"))
+
+    (entry,) = exporting.export_viewers(Export(run, (tmp_path / "a.html",)))
+    assert entry == {"path": str(tmp_path / "a.html"), "bytes": (tmp_path / "a.html").stat().st_size}
+    assert len(carried(tmp_path / "a.html").density_values) == 64
+    exporting.export_viewers(Export(BakeOutputs.of_run(run).asset, (tmp_path / "b.html",), crop=(-2.1, -2.1, -2.1, -0.1, 2.1, 2.1)))
+    assert len(carried(tmp_path / "b.html").density_values) == 32
+    exporting.check(Export(run, (tmp_path / "c.html",)))
+    with pytest.raises(UsageError, match="exists"):
+        exporting.check(Export(run, (tmp_path / "a.html",)))
+    BakeOutputs.of_run(run).asset.write_bytes(b"no asset")
+    with pytest.raises(CorruptArtifact, match="NerfTree"):
+        exporting.export_viewers(Export(run, (tmp_path / "c.html",)))
+    assert not (tmp_path / "c.html").exists()

@@ -22,7 +22,7 @@ EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
 Crop = tuple[float, float, float, float, float, float] | None
 
 
-@click.command(short_help="Write meshes, points, volumes or cameras in other formats.")
+@click.command(short_help="Write meshes, points, volumes, a viewer or cameras in other formats.")
 @click.argument("what", metavar="RUN|ASSET", required=False, type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
@@ -54,7 +54,7 @@ def export(
     **given: Any,
 ) -> None:
     """Write the surface of RUN or ASSET as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl, with --points as .ply, .xyz, .las or .laz; its voxels
-    as a volume (.vdb); or the cameras of RUN as .json (nerfstudio).
+    as a volume (.vdb); all of it as a page for browsers (.html); or the cameras of RUN as .json (nerfstudio).
 
     Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. What the run's stage mesh has made with
     the same settings is taken from there. Settings of the stages mesh and points apply: '--set mesh.max_faces=...'.
@@ -80,6 +80,7 @@ def export(
     with _shown(as_json, quiet) as show:
         written = exporting.export_cameras(asked)
         settings = _settings_for(what, (*sets, *options), _surface_stages())
+        written += exporting.export_viewers(asked)
         written += exporting.export_volumes(asked, settings)
         written += exporting.export_surface(asked, settings, _progress("export", show))
     if as_json:

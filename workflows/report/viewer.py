@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from stages.artifacts import BakeOutputs, PosesOutputs, TrainOutputs
 
 if TYPE_CHECKING:
+    from efficientnerf.geometry.cameras import Camera
     from pipeline.run import Run
 
 NAME = "viewer.html"
@@ -34,7 +35,7 @@ def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
         if size is None or size > LARGEST:
             path.unlink(missing_ok=True)
             return None
-        cameras, photographs = _captured(run)
+        cameras, photographs = captured(run.path)
         try:
             write_viewer(asset, path, cameras=cameras, photographs=photographs, title=run.path.name)
         except FormatError:  # `enerf verify` says what is wrong
@@ -45,13 +46,13 @@ def write_run_viewer(run: Run, *, anew: bool = False) -> Path | None:
     return path
 
 
-def _captured(run: Run) -> tuple[list, dict[str, bytes]]:  # type: ignore[type-arg]
-    """Cameras and photographs of the run; none where they are missing or damaged."""
+def captured(run: Path) -> tuple[list[Camera], dict[str, bytes]]:
+    """Cameras and photographs of the run in this folder, as `stages.viewer.page` takes them; none where they are missing or damaged."""
     from pipeline.errors import PipelineError
     from stages.viewer.captured import captured_views
 
     with suppress(PipelineError):
-        return captured_views(PosesOutputs.of_run(run.path).folder, TrainOutputs.of_run(run.path).folder)
+        return captured_views(PosesOutputs.of_run(run).folder, TrainOutputs.of_run(run).folder)
     return [], {}
 
 

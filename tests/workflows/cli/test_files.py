@@ -112,7 +112,7 @@ def test_an_obj_replaces_none_of_its_three_files_without_force(enerf: Enerf, bal
 def test_the_list_names_every_format(enerf: Enerf) -> None:
     lines = enerf("export", "--list").out.splitlines()
     rows = enerf("export", "--list", "--json").objects[-1]["formats"]
-    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *VOLUME_EXPORTERS, ".json", ".png", ".exr", ".mp4", ".nerftree"}
+    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *VOLUME_EXPORTERS, ".json", ".html", ".png", ".exr", ".mp4", ".nerftree"}
     assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
     assert sum("pip install 'efficientnerf[usd]'" in line for line in lines) == 2
     assert sum("pip install 'efficientnerf[las]'" in line for line in lines) == 2
