@@ -78,8 +78,8 @@ _POINTS = (
     Format(".laz", "the same, compressed", "nothing", "CloudCompare, PDAL, QGIS, ArcGIS, Potree", "las", "write_points", extra="las"),
 )  # fmt: skip
 _VOLUMES = (
-    Format(".vdb", "density and colour of each voxel, linear, sparse; the capture's frame", "the colours' change with the view; forward-facing scenes",
-           "Blender, Houdini, Omniverse, Unreal", "vdb", "write_volume"),
+    Format(".vdb", "density and colour of each voxel, linear, sparse; the capture's frame",
+           "the colours' change with the view; what lies beyond all voxels; forward-facing scenes", "Blender, Houdini, Omniverse", "vdb", "write_volume"),
 )  # fmt: skip
 
 MESH_EXPORTERS: dict[str, Format] = {each.extension: each for each in _MESHES}

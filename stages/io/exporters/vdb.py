@@ -1,10 +1,10 @@
-"""OpenVDB: sparse grids of density and colour, as Blender and Houdini read them, in the capture's frame. The colour is linear, of no direction.
+"""OpenVDB: sparse grids of density and colour, as Blender and Houdini read them, in the capture's frame.
 
 No wheel of OpenVDB's own library is to be had for every Python, and what is written here is a small part of its format, version 224: a tree of nodes of
 32^3, 16^3 and 8^3 children, leaves of 8^3 voxels, and of each leaf a mask of its voxels and the values of those alone. Blender's library reads it in tests.
 
     density    float  per unit of the capture's frame: light falls to exp(-density) along one unit
-    color      vec3s, 16 bits  linear light, 0 to 1, where there is density
+    color      vec3s, 16 bits  linear light, 0 to 1, where there is density; as seen from outside, for a volume has one colour for all directions
 
 The cascades around a whole scene follow as density_1 and color_1, and so on, their voxels twice as large each time, with what lies in the box before left out.
 
@@ -32,6 +32,7 @@ MAGIC, VERSION, LIBRARY = 0x56444220, 224, (12, 0)
 ACTIVE_VALUES = 2  # compression: of nodes the values of their active voxels alone
 LEAF, LOWER, UPPER = 3, 4, 5  # binary logarithms of the nodes' sides, in children
 ROOT = LEAF + LOWER + UPPER
+AT_ONCE = 1 << 16  # voxels whose colours are looked up
 _INACTIVE_ARE_BACKGROUND = b"\0"
 
 
@@ -87,15 +88,23 @@ def grids_of(tree: NerfTree, frame: SourceFrame, path: Path) -> list[Grid]:
 
 
 def _colours(tree: NerfTree, kept: np.ndarray) -> np.ndarray:
-    """(n, 3) float16, linear: of the harmonics of degree 0."""
+    """(n, 3) float16, linear: medians over views from outside, as `surface_colours` has them. The harmonic of degree 0 is no mean of these: nobody
+    photographed a surface from within, and what it looks like from there is whatever fitted the rest."""
+    from efficientnerf.asset.queries import normal_at
+    from efficientnerf.asset.region import voxel_centres
     from efficientnerf.rendering.colour import linear_from_srgb
-    from efficientnerf.rendering.harmonics import C0
+    from efficientnerf.rendering.harmonics import basis_numpy
+    from efficientnerf.surface.colours import outside_directions
 
-    voxels = np.flatnonzero(kept)
+    voxels, centres = np.flatnonzero(kept), voxel_centres(tree)
     out = np.empty((len(voxels), 3), np.float16)
-    for start in range(0, len(voxels), 1 << 18):
-        logits = np.clip(C0 * tree.coefficients(voxels[start : start + (1 << 18)])[:, 0], -80, 80)
-        out[start : start + (1 << 18)] = linear_from_srgb(1 / (1 + np.exp(-logits)))
+    for start in range(0, len(voxels), AT_ONCE):
+        chosen = voxels[start : start + AT_ONCE]
+        normal = np.asarray(normal_at(tree, centres[chosen]), np.float64)
+        normal[~normal.any(axis=1)] = (0.0, 0.0, 1.0)
+        coefficients = tree.coefficients(chosen)  # (n, K, 3)
+        logits = [np.einsum("nk,nkc->nc", basis_numpy(direction, tree.degree), coefficients) for direction in outside_directions(normal)]
+        out[start : start + AT_ONCE] = linear_from_srgb(1 / (1 + np.exp(-np.clip(np.median(logits, axis=0), -80, 80))))
     return out
 
 

@@ -102,10 +102,11 @@ def tree(voxel: float = 0.25, low: float = -1.0, shape: tuple[int, int, int] = (
 
 
 def test_density_and_colour_lie_where_the_asset_has_them_in_the_capture_s_units() -> None:
-    """What light loses along a way is the same in either frame; colours are linear, of no direction."""
+    """What light loses along a way is the same in either frame; of harmonics of degree 0 alone colours are as they are, in linear light."""
     from efficientnerf.asset.queries import colour_at, density_at
 
     asset = tree()
+    asset = asset.with_values(asset.density_values, asset.sh[:, :1])
     density, colour = grids_of(asset, Y_DOWN, Path("a.vdb"))
     assert (density.name, colour.name) == ("density", "color")
     np.testing.assert_array_equal(density.coordinates, colour.coordinates)
@@ -114,6 +115,20 @@ def test_density_and_colour_lie_where_the_asset_has_them_in_the_capture_s_units(
     world = Y_DOWN.world_from_capture.points(centres)
     np.testing.assert_allclose(density.values / Y_DOWN.world_from_capture.scale, density_at(asset, world), rtol=1e-5)
     np.testing.assert_allclose(colour.values, linear_from_srgb(colour_at(asset, world)), atol=1e-3)
+
+
+def test_colours_are_those_that_are_seen_from_outside() -> None:
+    """A ball that is white outside and, what nobody saw, black from within: harmonics of degree 1 that point along its normals."""
+    at = np.argwhere(np.ones((16, 16, 16), bool))
+    outward = (at + 0.5) / 8 - 1
+    inside = np.linalg.norm(outward, axis=1) < 0.8
+    sh = np.zeros((inside.sum(), 4, 3), np.float32)
+    sh[:, 1:] = 12 * (outward[inside] / np.linalg.norm(outward[inside], axis=1, keepdims=True) * (1, 1, -1))[:, (1, 2, 0), None]
+    density = 100 * (1 - np.linalg.norm(outward[inside], axis=1)) + 1
+    ball = tree_from_voxels((4, 4, 4), 0.125, np.full(3, -1.0), at[inside], density.astype(np.float32), sh)
+    _, colour = grids_of(ball, Z_UP, Path("a.vdb"))
+    far = np.linalg.norm((colour.coordinates + 0.5) / 8 - 1, axis=1) > 0.4
+    assert np.median(colour.values[far]) > 0.9, "0.21 is what the harmonic of degree 0 has"
 
 
 def test_cascades_are_grids_of_their_own_that_do_not_overlap() -> None:
