@@ -41,7 +41,7 @@ def surface_colours(
         share = np.take_along_axis(weight, best, 1)
         chosen = np.take_along_axis(samples, best[..., None], 1).reshape(-1, 3)
         views = []
-        for direction in _view_directions(normal) if view_directions is None else view_directions(point, normal):
+        for direction in outside_directions(normal) if view_directions is None else view_directions(point, normal):
             along = np.repeat(direction, best.shape[1], 0)
             found = np.asarray(volume.colour(chosen, along), np.float64).reshape(-1, best.shape[1], 3)
             views.append((found * share[..., None]).sum(1) / share.sum(1, keepdims=True))
@@ -50,7 +50,7 @@ def surface_colours(
     return colours
 
 
-def _view_directions(normal: np.ndarray) -> list[np.ndarray]:
+def outside_directions(normal: np.ndarray) -> list[np.ndarray]:
     """K unit ray directions (N, 3) each, towards a surface with these outward normals."""
     helper = np.where(np.abs(normal[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     first = np.cross(helper, normal)
