@@ -228,4 +228,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=3, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)
+STAGE = Stage(name="evaluate", version=4, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)

@@ -83,3 +83,14 @@ def looking(tree: NerfTree, side: int = 20) -> Camera:
 
 def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
     return [torch.from_numpy(a) for a in arrays]
+
+
+def in_codes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTree:
+    """The tree with random codes in place of its harmonics."""
+    from efficientnerf.asset.palettes import PaletteHarmonics
+
+    rng, count = np.random.default_rng(0), len(tree.density_values)
+    codes = rng.integers(entries, size=(count, len(groups))).astype(np.uint8 if entries <= 256 else np.uint16)
+    palette = rng.normal(size=(entries, sum(groups), 3)).astype(np.float32)
+    base, table = rng.integers(256, size=(count, 3)).astype(np.uint8), rng.normal(size=(256, 3)).astype(np.float32)
+    return replace(tree, harmonics=PaletteHarmonics(base, table, codes, palette, groups))

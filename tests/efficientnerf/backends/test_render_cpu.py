@@ -1,26 +1,21 @@
-"""The marching kernel and its packed tree: parts against their definitions, images of every camera model, and what skipping may not change."""
+"""Images of packed trees: against the torch reference, of every camera model, and what skipping may not change. Parts of the kernel: `test_render_parts`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 import torch
 
-from efficientnerf.asset.queries import density_block, normal_at
+from efficientnerf.asset.queries import normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
-from efficientnerf.asset.tree import NerfTree, tree_from_voxels, voxel_coordinates
-from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcount, sigmoid, split16, trilinear4, unpack4
-from efficientnerf.backends.numba.tree import march
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.numba.tree.packed import packed_of
-from efficientnerf.backends.numba.tree.packets import lanes
-from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, sh_basis
 from efficientnerf.geometry.cameras import Camera, rays, resized
-from efficientnerf.rendering.harmonics import basis_numpy
 from tests.efficientnerf.balls import pose
-from tests.efficientnerf.trees import random_tree, rays_at, uniform_tree
+from tests.efficientnerf.trees import in_codes, random_tree, rays_at, uniform_tree
+from tests.efficientnerf.walls import camera_at, wall
 
 FIELDS = ("colour", "opacity", "depth", "normal")
 LENSES = {
@@ -40,197 +35,9 @@ def camera_of(tree: NerfTree, model: str = "PINHOLE", distance: float = 2.5) -> 
     return Camera("view", 27, 22, model, LENSES[model], at)
 
 
-@pytest.mark.parametrize("degree", range(5))
-def test_the_kernels_harmonics_are_those_of_the_project(degree: int) -> None:
-    directions = np.random.default_rng(0).normal(size=(50, 3))
-    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
-    expected = basis_numpy(directions.astype(np.float64), degree)
-    for d, row in zip(directions, expected, strict=True):
-        out = np.zeros(len(row), np.float32)
-        sh_basis(*d, degree, out)
-        np.testing.assert_allclose(out, row, atol=2e-6)
-
-
-@numba.njit
-def logistics(a, b, c, d):  # type: ignore[no-untyped-def]
-    return unpack4(sigmoid(pack4(a, b, c, d)))
-
-
-@numba.njit
-def powers(a, b, c, d):  # type: ignore[no-untyped-def]
-    return unpack4(exp2_neg4(pack4(a, b, c, d)))
-
-
-def test_the_kernels_exponential_and_logistic() -> None:
-    x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 402), [0.0, np.inf]]).astype(np.float32)
-    np.testing.assert_allclose([march.exp2_neg(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
-    assert march.exp2_neg(np.float32(0)) == 1
-    np.testing.assert_allclose([powers(*v) for v in x.reshape(-1, 4)], np.exp2(-x.astype(np.float64)).reshape(-1, 4), atol=2e-7)
-    assert powers(*np.zeros(4, np.float32)) == (1, 1, 1, 1)
-    y = np.concatenate([-x, x, np.linspace(-20, 20, 2000).astype(np.float32)])
-    with np.errstate(over="ignore"):
-        np.testing.assert_allclose([logistics(*v) for v in y.reshape(-1, 4)], 1 / (1 + np.exp(-y.astype(np.float64).reshape(-1, 4))), atol=4e-6)
-
-
-@numba.njit
-def between(values, starts, x, y, z):  # type: ignore[no-untyped-def]
-    """Of a cube of three voxels a side with four numbers each."""
-    four = pack4(x[0], x[1], x[2], x[3]), pack4(y[0], y[1], y[2], y[3]), pack4(z[0], z[1], z[2], z[3])
-    first, mean = trilinear4(pointer(values), starts[0], starts[1], starts[2], starts[3], 12, 36, four[0], four[1], four[2])
-    a, b, c, d = split16(mean)
-    return unpack4(first), (unpack4(a), unpack4(b), unpack4(c), unpack4(d))
-
-
-def test_four_points_are_interpolated_over_the_stored_corners() -> None:
-    rng = np.random.default_rng(2)
-    values = rng.normal(size=(3, 3, 3, 4)).astype(np.float32)
-    values[..., 1:][rng.random((3, 3, 3)) < 0.4] = np.nan
-    values[:2, :2, :2, 1:] = np.nan
-    low = np.stack(np.meshgrid(*[range(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    for cells in low.reshape(2, 4, 3):
-        at = rng.random((4, 3)).astype(np.float32)
-        first, found = between(values, 4 * (cells @ [9, 3, 1]), *at.T.copy())
-        for (i, j, k), f, row in zip(cells, at, found, strict=True):
-            weight = np.einsum("i,j,k->ijk", *np.stack([1 - f, f], axis=1))
-            eight = values[i : i + 2, j : j + 2, k : k + 2]
-            share = weight[..., None] * ~np.isnan(eight)
-            expected = np.einsum("ijkc,ijkc->c", share, np.nan_to_num(eight)) / np.maximum(share.sum((0, 1, 2)), 1e-12)
-            np.testing.assert_allclose(row, expected, atol=2e-6)
-        assert np.isfinite(found).all()
-        np.testing.assert_allclose(first, np.array(found)[:, 0], atol=2e-6)
-
-
-@numba.njit
-def pair_of(row, k, rows):  # type: ignore[no-untyped-def]
-    """Of voxels k and k + 1 of a row, numbered over all bricks: the first that is stored, and which are: bit 0, bit 1."""
-    mask = np.int64(rows[2 * row + 1])
-    return rows[2 * row] + popcount(mask & ((np.int64(1) << k) - 1)), mask >> k & 3
-
-
-@numba.njit
-def pairs(rows, side):  # type: ignore[no-untyped-def]
-    """(B, side, side, side - 1, 2): of each two neighbours along z the first that is stored, and which are."""
-    out = np.empty((len(rows), side, side, side - 1, 2), np.int64)
-    for row in range(len(rows) * side * side):
-        for k in range(side - 1):
-            out[row // (side * side), row // side % side, row % side, k] = pair_of(row, k, pointer(rows))
-    return out
-
-
-@pytest.mark.parametrize("brick", [1, 2, 3, 4, 5])
-def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int) -> None:
-    tree = random_tree(brick, brick=brick, degree=2, share=0.5)
-    packed, side = packed_of(tree), brick + 2
-    count = len(tree.density_values)
-    assert np.array_equal(np.sort(packed.voxel_of[:-1]), np.arange(count))
-    assert np.array_equal(packed.density[:-1], tree.density_values[packed.voxel_of[:-1]])
-    assert packed.density[-1] == 0
-    cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
-    found = pairs(packed.rows, side)
-    for table, live, place in zip(found, packed.has_density, packed.cells, strict=True):
-        at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
-        local = (at - 1) % brick @ [brick**2, brick, 1]
-        owner = cells[tuple(at.reshape(-1, 3).T)].reshape(local.shape)
-        voxel = np.where(owner >= 0, tree.voxel_index[owner, local], -1)
-        low, high = voxel[..., :-1], voxel[..., 1:]
-        assert np.array_equal(table[..., 1], (low >= 0) + 2 * (high >= 0))
-        first, second = packed.voxel_of[table[..., 0]], packed.voxel_of[np.minimum(table[..., 0] + 1, count)]
-        assert np.array_equal(first[low >= 0], low[low >= 0])
-        assert np.array_equal(first[(low < 0) & (high >= 0)], high[(low < 0) & (high >= 0)])
-        assert np.array_equal(second[(low >= 0) & (high >= 0)], high[(low >= 0) & (high >= 0)])
-        density = np.where(voxel >= 0, tree.density_values[voxel], 0)
-        eight = np.stack([density[i : i + side - 1, j : j + side - 1, k : k + side - 1] for i, j, k in np.ndindex(2, 2, 2)])
-        bits = np.unpackbits(live.view(np.uint8), bitorder="little").astype(bool)
-        assert np.array_equal(bits[: side**3].reshape(side, side, side)[:-1, :-1, :-1], (eight > 0).any(axis=0))
-        assert bits.sum() == (eight > 0).any(axis=0).sum()
-
-
-@pytest.mark.parametrize("brick", [1, 2, 4, 5])
-@pytest.mark.parametrize("degree", range(5))
-@pytest.mark.parametrize("layout", ["floats", "codes"])
-def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, layout: str) -> None:
-    tree = random_tree(brick, brick=brick, degree=degree, share=0.5)
-    if layout == "codes":
-        tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
-    centre, packed = np.array([-31.0, 12.5, 57.0]), packed_of(tree)
-    direction, colours = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.float32)
-    compute_view_colours(0, len(packed.cells), 0, packed, tree.brick, direction, np.zeros(5), np.float32(2), tree.degree, colours)
-    order = packed.voxel_of[:-1]
-    assert np.array_equal(colours[:-1, 0], 2 * tree.density_values[order])
-    away = voxel_coordinates(tree)[order] + 0.5 - centre
-    basis = basis_numpy(away / np.linalg.norm(away, axis=1, keepdims=True), degree)
-    np.testing.assert_allclose(colours[:-1, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[order]), atol=1e-4)
-    assert not colours[-1].any()
-
-
-@numba.njit(error_model="numpy")
-def in_lanes(floats, ints, bytes_, out):  # type: ignore[no-untyped-def]
-    """What operators on sixteen lanes make of two rows of `floats`."""
-    x, y = lanes.load16(pointer(floats), 0), lanes.load16(pointer(floats), 16)
-    less = (x < y) & (x > np.float32(0)) | ~(y >= np.float32(-1))
-    whole = lanes.to_int16(lanes.abs16(x) + lanes.ceil16(lanes.abs16(y)))
-    masked = (whole + 3) * whole - 1 & 255 | whole >> 1
-    values = (
-        lanes.select16(less, x * y + np.float32(2), lanes.floor16(x) - y), lanes.min16(x, y) / lanes.max16(x, np.float32(0.5)),
-        lanes.to_float16(masked + (1 << whole)), lanes.to_float16(lanes.popcount16(masked)), lanes.sqrt16(lanes.abs16(x)),
-        lanes.to_float16(lanes.gather16(pointer(ints), whole & 7)), lanes.to_float16(lanes.gather16(pointer(bytes_), whole & 7)),
-        lanes.gather16(pointer(floats), whole & 31), lanes.exp2_neg16(lanes.abs16(y)),
-    )  # fmt: skip
-    for n in range(9):
-        lanes.store16(pointer(out), 16 * n, values[n])
-    a, b, c, d = lanes.channels16(pointer(floats), 0)
-    lanes.store16(pointer(out), 144, a - b + c * d)
-    lanes.store_channels16(pointer(out), 160, a, b, c, d)
-    return lanes.bits_of(less), lanes.lowest_bit(lanes.bits_of(lanes.mask_of(40)))
-
-
-def test_operators_on_lanes_are_numpys() -> None:
-    rng = np.random.default_rng(0)
-    floats, out = rng.normal(0, 3, 64).astype(np.float32), np.zeros(224, np.float32)
-    ints, bytes_ = rng.integers(-(2**20), 2**20, 8).astype(np.int32), rng.integers(0, 256, 8).astype(np.uint8)
-    bits, lowest = in_lanes(floats, ints, bytes_, out)
-    x, y = floats[:16], floats[16:32]
-    less = (x < y) & (x > 0) | ~(y >= -1)
-    whole = (np.abs(x) + np.ceil(np.abs(y))).astype(np.int32)
-    masked = (whole + 3) * whole - 1 & 255 | whole >> 1
-    expected = [
-        np.where(less, x * y + 2, np.floor(x) - y), np.minimum(x, y) / np.maximum(x, 0.5), masked + (1 << whole), [bin(n).count("1") for n in masked],
-        np.sqrt(np.abs(x)), ints[whole & 7], bytes_[whole & 7], floats[whole & 31], np.exp2(-np.abs(y)),
-        floats[::4] - floats[1::4] + floats[2::4] * floats[3::4],
-    ]  # fmt: skip
-    np.testing.assert_allclose(out[:160].reshape(10, 16), np.array(expected, np.float32), rtol=1e-6, atol=1e-6)
-    assert np.array_equal(out[160:], floats)
-    assert (bits, lowest) == (int((less << np.arange(16)).sum()), 3)
-
-
-def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> None:
-    tree = random_tree(7, shape=(8, 7, 6), brick=2, share=0.2)
-    dark = tree.density_values * (np.random.default_rng(1).random(len(tree.density_values)) < 0.1)
-    tree = replace(tree, density_values=dark.astype(np.float32))
-    absorbs = np.zeros(tree.shape, bool)
-    for cell in np.argwhere(tree.brick_index >= 0):
-        absorbs[tuple(cell)] = density_block(tree, tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
-    assert 0 < absorbs.sum() < (tree.brick_index >= 0).sum()
-    leap = packed_of(tree).leap.reshape(tree.shape)
-    assert not leap[absorbs].any()
-    for at in np.argwhere(~absorbs):
-        assert leap[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()
-
-
-def in_palettes(tree: NerfTree, groups: tuple[int, ...], entries: int) -> NerfTree:
-    """The tree with random codes in place of its harmonics."""
-    from efficientnerf.asset.palettes import PaletteHarmonics
-
-    rng, count = np.random.default_rng(0), len(tree.density_values)
-    codes = rng.integers(entries, size=(count, len(groups))).astype(np.uint8 if entries <= 256 else np.uint16)
-    palette = rng.normal(size=(entries, sum(groups), 3)).astype(np.float32)
-    base, table = rng.integers(256, size=(count, 3)).astype(np.uint8), rng.normal(size=(256, 3)).astype(np.float32)
-    return replace(tree, harmonics=PaletteHarmonics(base, table, codes, palette, groups))
-
-
 @pytest.mark.parametrize(("groups", "entries"), [((1,) * 8, 256), ((8,), 1000), ((3, 5), 17), ((), 1)])
 def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], entries: int) -> None:
-    tree = in_palettes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
+    tree = in_codes(random_tree(4, shape=(5, 4, 6), brick=4, share=0.5), groups, entries)
     origins, directions = rays_at(tree, 300)
     colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
     outputs = render_rays(tree, origins, directions)
@@ -242,7 +49,7 @@ def test_palette_codes_render_as_what_they_decode_to(groups: tuple[int, ...], en
 
 @pytest.mark.parametrize("brick", [1, 2, 4, 5])
 def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
-    tree = in_palettes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
+    tree = in_codes(random_tree(brick, brick=brick, share=0.6), (1, 1, 1), 256)
     origins, directions = rays_at(tree, 300)
     colour, _ = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
     np.testing.assert_allclose(render_rays(tree, origins, directions).colour, colour, atol=1e-3)
@@ -262,7 +69,7 @@ def test_images_match_the_torch_reference_from_near_and_far(degree: int, distanc
     """View colours and colours at each sample: the harmonics of neighbours are independent here, and surfaces opaque."""
     tree = random_tree(degree, shape=(6, 5, 7), brick=4, degree=degree, share=0.6, sigma=300.0)
     if layout == "codes":
-        tree = in_palettes(tree, (1,) * ((degree + 1) ** 2 - 1), 256)
+        tree = in_codes(tree, (1,) * ((degree + 1) ** 2 - 1), 256)
     camera = far_camera(tree, distance) if distance else replace(camera_of(tree, distance=0.02), params=(8.0, 8.0, 13.0, 11.0))
     origins, directions = rays(camera)
     colour, opacity = render_reference(tree, torch.from_numpy(origins), torch.from_numpy(directions))
@@ -283,6 +90,22 @@ def test_images_depend_not_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
             other = render(tree, camera, supersample=2)
         for name in FIELDS:
             assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
+@pytest.mark.parametrize("kind", ["packed", "supersampled", "nearest", "ndc"])
+def test_images_without_normals_are_otherwise_the_same(kind: str) -> None:
+    tree = random_tree(3, share=0.6, degree=1)
+    camera, more = camera_of(tree), {"supersample": 2 if kind == "supersampled" else 1}
+    if kind == "nearest":
+        tree = replace(tree, lookup="nearest")
+    if kind == "ndc":
+        tree, camera = wall(voxels=24), camera_at(0.1, 0.0, 0.0)
+    usual, without = render(tree, camera, **more), render(tree, camera, normals=False, **more)
+    assert without.normal.shape == (0, 0, 3)
+    assert usual.normal.shape == (camera.height, camera.width, 3)
+    assert np.isfinite(usual.depth).any()
+    for name in FIELDS[:3]:
+        assert np.array_equal(getattr(usual, name), getattr(without, name)), name
 
 
 def test_ray_statistics_are_consistent() -> None:
@@ -434,7 +257,7 @@ def test_nan_directions_render_as_empty() -> None:
 def test_the_order_of_voxels_does_not_change_images(layout: str) -> None:
     tree = random_tree(1, brick=4, degree=2, share=0.6)
     if layout == "codes":
-        tree = in_palettes(tree, (1,) * 8, 200)
+        tree = in_codes(tree, (1,) * 8, 200)
     rng = np.random.default_rng(0)
     bricks, voxels = rng.permutation(len(tree.voxel_index)), rng.permutation(len(tree.density_values))
     other = replace(

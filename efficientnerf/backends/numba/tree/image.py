@@ -61,7 +61,7 @@ def render_batch(  # type: ignore[no-untyped-def]
 
     background     (3,) float32 colour to composite over
     packed         see `Packed`
-    view_colours   (N + 2, 4) float32, finite: see `compute_view_colours`, from row 1 on; not read where distances of the views are infinity
+    view_colours   (N + 2, 4) uint16, half floats that are finite: see `compute_view_colours`, from row 1 on; not read where distances of the views are infinity
     views          see `Views`
     voxel          size of a voxel of cascade 0, world units
     tile           (rows, columns) of a tile

@@ -13,7 +13,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
 
-MIN_ADVANCE = 0.5  # voxels: a cone that advances by less has arrived
+MIN_ADVANCE = 2.0  # voxels: a cone that advances by less has arrived; docs/experiments/renderer.md
 MAX_ADVANCES = 64
 PINHOLE, DIRECTION_TABLE, GIVEN_RAYS = 0, 1, 2
 

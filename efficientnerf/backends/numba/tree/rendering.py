@@ -39,7 +39,7 @@ def _allocate(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np
 
 
 class ViewColours(NamedTuple):
-    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4), and where they may be used, see `View`."""
+    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`."""
 
     views: Views
     colours: np.ndarray
@@ -71,7 +71,7 @@ def _colour_buffer(tree: NerfTree) -> np.ndarray:
     try:
         return kept.pop()
     except IndexError:
-        return np.zeros((len(tree.density_values) + 2, 4), np.float32)  # finite, for what is not computed may be read and weighed by zero
+        return np.zeros((len(tree.density_values) + 2, 4), np.uint16)  # finite, for what is not computed may be read and weighed by zero
 
 
 def _keep_buffer(tree: NerfTree, colours: ViewColours) -> None:
@@ -129,7 +129,7 @@ def _render(
 
 def scratch_bytes(tree: NerfTree) -> int:
     """Memory of the view's colours while an image is rendered."""
-    return 16 * (len(tree.density_values) + 2)
+    return 8 * (len(tree.density_values) + 2)
 
 
 def render_rays(
@@ -160,7 +160,7 @@ def render_rays(
     if len(origins):
         shared = eye is not None and _any_far(tree, view_direction)
         never = np.full(len(packed_of(tree).grids), np.inf)
-        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((2, 4), np.float32))
+        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((2, 4), np.uint16))
         _render(tree, batch, colours, np.zeros(3, np.float32), (1, TILE * TILE) if rows == 1 else (TILE, TILE), out)
     colour, opacity, depth, normal = out
     return colour.reshape(-1, 3), opacity.reshape(-1), depth.reshape(-1), normal.reshape(-1, 3)

@@ -22,9 +22,9 @@ from efficientnerf.backends.numba.simd import (
     pointer,
     scale4,
     store,
-    store4,
     unpack4,
 )
+from efficientnerf.backends.numba.tree.packets.halves import store_halves4
 from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, sqrt16
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
 from efficientnerf.rendering import harmonics
@@ -226,7 +226,7 @@ def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type: ignore[no-untyped-def]
-    """Densities and colours of a brick's voxels into their rows of out (N, 4); directions and harmonics are those of sixteen neighbours at once.
+    """Densities and colours of a brick's voxels into their rows of out (N, 4), half floats; directions and harmonics are those of sixteen neighbours at once.
 
     steps   (3, G, 16) float32: see `_voxel_steps`
     stored  (b^3,) int64, scratch, and place likewise
@@ -247,10 +247,10 @@ def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type
             sh_basis(dx * inverse, dy * inverse, dz * inverse, view.degree, basis)
         voxel, lane, density = np.int64(index[first + local]), local & 15, grid.density[p] * view.density_scale
         if grid.coded:
-            store4(out, 4 * p, _palette_colour(voxel, density, grid, basis, lane))
+            store_halves4(out, 4 * p, _palette_colour(voxel, density, grid, basis, lane))
         else:
             r, g, b = sh_colour(voxel, grid, basis, lane, 16)
-            store4(out, 4 * p, pack4(density, r, g, b))
+            store_halves4(out, 4 * p, pack4(density, r, g, b))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -267,7 +267,7 @@ def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, parallel=True, error_model="numpy")
 def compute_view_colours(first, end, cascade, packed, brick, direction, cone, density_scale, degree, out):  # type: ignore[no-untyped-def]
     """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of the voxels of bricks first <= B < end, all of one cascade,
-    into out (N + 1, 4), in the packed order.
+    into out (N + 1, 4) uint16, the bits of half floats, in the packed order.
 
     cone  (5,) axis, cosine and sine of the half angle of a cone round all that is seen, in the frame of directions: bricks that are farther from it than any
           whose voxels a ray or its normal may need are left out. Zeros: none are

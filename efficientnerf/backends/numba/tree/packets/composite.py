@@ -11,6 +11,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import add_scaled4, advanced, load4, pack4, sigmoid, store4
 from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP, exp2_neg
+from efficientnerf.backends.numba.tree.packets.halves import mix_pairs
 from efficientnerf.backends.numba.tree.packets.lanes import (
     bits_of,
     broadcast16,
@@ -21,7 +22,6 @@ from efficientnerf.backends.numba.tree.packets.lanes import (
     load16,
     lowest_bit,
     mask_of,
-    mix_pairs,
     popcount16,
     select16,
     store16,

@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
-from efficientnerf.backends.numba.simd import Float32x16, broadcast_like, float32x4, float32x16, multiply_add, splat, store
+from efficientnerf.backends.numba.simd import Float32x16, broadcast_like, float32x16, splat, store
 
 LANES = 16
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
@@ -217,6 +217,20 @@ def store16(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
+def prefetch(typing_context: Any, address: Any, index: Any) -> Any:
+    """Asks for the cache line of p[index], and does not wait for it."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        place = builder.bitcast(builder.gep(args[0], [args[1]]), ir.IntType(8).as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [place.type, _I32, _I32, _I32])
+        to_read, into_all_caches, of_data = (ir.Constant(_I32, n) for n in (0, 3, 1))
+        builder.call(builder.module.declare_intrinsic("llvm.prefetch.p0", (), kind), [place, to_read, into_all_caches, of_data])
+        return context.get_dummy_value()
+
+    return types.void(address, types.int64), codegen
+
+
+@intrinsic
 def popcount16(typing_context: Any, bits: Any) -> Any:
     """Number of set bits of each lane of an Int32x16."""
 
@@ -280,29 +294,6 @@ def store_pairs16(typing_context: Any, address: Any, index: Any, a: Any, b: Any)
         return context.get_dummy_value()
 
     return types.void(types.CPointer(types.float32), types.int64, float32x16, float32x16), codegen
-
-
-@intrinsic
-def mix_pairs(typing_context: Any, weights: Any, at: Any, stride: Any, values: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Weighted sum of eight groups of four float32: those at q[a], q[b], q[c] and q[d], and the one after each, by two weights each, at p[at], p[at + stride]
-    and so on."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pair, eight = ir.VectorType(ir.FloatType(), 2), ir.VectorType(ir.FloatType(), 8)
-        sums: list[Any] = [None, None]
-        for n, index in enumerate(args[4:]):
-            place = builder.add(args[1], builder.mul(args[2], ir.Constant(_I64, n)))
-            two = builder.load(builder.bitcast(builder.gep(args[0], [place]), pair.as_pointer()), align=4)
-            weight = builder.shuffle_vector(two, two, ir.Constant(ir.VectorType(_I32, 8), [0, 0, 0, 0, 1, 1, 1, 1]))
-            value = builder.load(builder.bitcast(builder.gep(args[3], [index]), eight.as_pointer()), align=4)
-            total = sums[n % 2]
-            sums[n % 2] = builder.fmul(weight, value) if total is None else multiply_add(builder, weight, value, total)
-        both = builder.fadd(*sums)
-        halves = [builder.shuffle_vector(both, both, ir.Constant(ir.VectorType(_I32, 4), list(range(n, n + 4)))) for n in (0, 4)]
-        return builder.fadd(*halves)
-
-    index = types.int64
-    return float32x4(types.CPointer(types.float32), index, index, types.CPointer(types.float32), index, index, index, index), codegen
 
 
 @intrinsic

@@ -22,9 +22,11 @@ from efficientnerf.backends.numba.tree.packets.lanes import (
     floor16,
     gather16,
     load16,
+    lowest_bit,
     mask_of,
     max16,
     min16,
+    prefetch,
     select16,
     store16,
     to_float16,
@@ -50,6 +52,7 @@ from efficientnerf.backends.numba.tree.packets.layout import (
 
 _HALF, _ONE, _NONE, _FAR = np.float32(0.5), np.float32(1), np.float32(0), np.float32(1e30)
 _SKIP = np.float32(0.5 + SKIP_MARGIN)
+_LINE = 16  # int32 of a cache line
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -76,6 +79,18 @@ def _near(a, e, c, grid, view):  # type: ignore[no-untyped-def]
     w = x * np.float32(d[8]) + y * np.float32(d[9]) + z * np.float32(d[10]) + np.float32(d[11])
     least = np.float32(view.direction_rate * (view.min_distance + 2 * grid.brick + 4))
     return u * u + v * v + w * w < least * least
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _prefetch_rows(lanes, grid, ints):  # type: ignore[no-untyped-def]
+    """Asks for the tables of rows of the bricks in OWNER, before the first sample there needs them: docs/experiments/renderer.md"""
+    size, before = 2 * (grid.brick + 2) * (grid.brick + 2), np.int64(-1)
+    while lanes != 0:
+        owner = np.int64(ints[OWNER + lowest_bit(lanes)])
+        if owner != before:
+            for n in range(owner * size, owner * size + size, _LINE):
+                prefetch(grid.rows, n)
+        lanes, before = lanes & (lanes - 1), owner
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -126,6 +141,8 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
             filled = bits_of(full)
             if filled != 0:
                 owner = select16(full, gather16(grid.brick_index, select16(full, cell, 0)), owner)
+                store16(ints, OWNER, owner)
+                _prefetch_rows(filled, grid, ints)
                 bx = select16(full, ex - a * width + _HALF, bx)
                 by = select16(full, ey - e * width + _HALF, by)
                 bz = select16(full, ez - c * width + _HALF, bz)

@@ -1,0 +1,235 @@
+"""Parts of the kernel that renders packed trees against their definitions: harmonics, exponentials, half floats, lanes, rows, colours of a view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+
+from efficientnerf.asset.queries import density_block
+from efficientnerf.asset.tree import voxel_coordinates
+from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcount, sigmoid, split16, trilinear4, unpack4
+from efficientnerf.backends.numba.tree import march
+from efficientnerf.backends.numba.tree.packed import packed_of
+from efficientnerf.backends.numba.tree.packets import halves, lanes
+from efficientnerf.backends.numba.tree.packets.halves import mix_pairs, store_halves4
+from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, sh_basis
+from efficientnerf.rendering.harmonics import basis_numpy
+from tests.efficientnerf.trees import in_codes, random_tree
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_the_kernels_harmonics_are_those_of_the_project(degree: int) -> None:
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    expected = basis_numpy(directions.astype(np.float64), degree)
+    for d, row in zip(directions, expected, strict=True):
+        out = np.zeros(len(row), np.float32)
+        sh_basis(*d, degree, out)
+        np.testing.assert_allclose(out, row, atol=2e-6)
+
+
+@numba.njit
+def logistics(a, b, c, d):  # type: ignore[no-untyped-def]
+    return unpack4(sigmoid(pack4(a, b, c, d)))
+
+
+@numba.njit
+def powers(a, b, c, d):  # type: ignore[no-untyped-def]
+    return unpack4(exp2_neg4(pack4(a, b, c, d)))
+
+
+def test_the_kernels_exponential_and_logistic() -> None:
+    x = np.concatenate([np.linspace(0, 5, 3000), np.geomspace(1e-9, 1e30, 402), [0.0, np.inf]]).astype(np.float32)
+    np.testing.assert_allclose([march.exp2_neg(v) for v in x], np.exp2(-x.astype(np.float64)), atol=2e-7)
+    assert march.exp2_neg(np.float32(0)) == 1
+    np.testing.assert_allclose([powers(*v) for v in x.reshape(-1, 4)], np.exp2(-x.astype(np.float64)).reshape(-1, 4), atol=2e-7)
+    assert powers(*np.zeros(4, np.float32)) == (1, 1, 1, 1)
+    y = np.concatenate([-x, x, np.linspace(-20, 20, 2000).astype(np.float32)])
+    with np.errstate(over="ignore"):
+        np.testing.assert_allclose([logistics(*v) for v in y.reshape(-1, 4)], 1 / (1 + np.exp(-y.astype(np.float64).reshape(-1, 4))), atol=4e-6)
+
+
+@numba.njit
+def between(values, starts, x, y, z):  # type: ignore[no-untyped-def]
+    """Of a cube of three voxels a side with four numbers each."""
+    four = pack4(x[0], x[1], x[2], x[3]), pack4(y[0], y[1], y[2], y[3]), pack4(z[0], z[1], z[2], z[3])
+    first, mean = trilinear4(pointer(values), starts[0], starts[1], starts[2], starts[3], 12, 36, four[0], four[1], four[2])
+    a, b, c, d = split16(mean)
+    return unpack4(first), (unpack4(a), unpack4(b), unpack4(c), unpack4(d))
+
+
+def test_four_points_are_interpolated_over_the_stored_corners() -> None:
+    rng = np.random.default_rng(2)
+    values = rng.normal(size=(3, 3, 3, 4)).astype(np.float32)
+    values[..., 1:][rng.random((3, 3, 3)) < 0.4] = np.nan
+    values[:2, :2, :2, 1:] = np.nan
+    low = np.stack(np.meshgrid(*[range(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    for cells in low.reshape(2, 4, 3):
+        at = rng.random((4, 3)).astype(np.float32)
+        first, found = between(values, 4 * (cells @ [9, 3, 1]), *at.T.copy())
+        for (i, j, k), f, row in zip(cells, at, found, strict=True):
+            weight = np.einsum("i,j,k->ijk", *np.stack([1 - f, f], axis=1))
+            eight = values[i : i + 2, j : j + 2, k : k + 2]
+            share = weight[..., None] * ~np.isnan(eight)
+            expected = np.einsum("ijkc,ijkc->c", share, np.nan_to_num(eight)) / np.maximum(share.sum((0, 1, 2)), 1e-12)
+            np.testing.assert_allclose(row, expected, atol=2e-6)
+        assert np.isfinite(found).all()
+        np.testing.assert_allclose(first, np.array(found)[:, 0], atol=2e-6)
+
+
+@numba.njit
+def pair_of(row, k, rows):  # type: ignore[no-untyped-def]
+    """Of voxels k and k + 1 of a row, numbered over all bricks: the first that is stored, and which are: bit 0, bit 1."""
+    mask = np.int64(rows[2 * row + 1])
+    return rows[2 * row] + popcount(mask & ((np.int64(1) << k) - 1)), mask >> k & 3
+
+
+@numba.njit
+def pairs(rows, side):  # type: ignore[no-untyped-def]
+    """(B, side, side, side - 1, 2): of each two neighbours along z the first that is stored, and which are."""
+    out = np.empty((len(rows), side, side, side - 1, 2), np.int64)
+    for row in range(len(rows) * side * side):
+        for k in range(side - 1):
+            out[row // (side * side), row // side % side, row % side, k] = pair_of(row, k, pointer(rows))
+    return out
+
+
+@pytest.mark.parametrize("brick", [1, 2, 3, 4, 5])
+def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int) -> None:
+    tree = random_tree(brick, brick=brick, degree=2, share=0.5)
+    packed, side = packed_of(tree), brick + 2
+    count = len(tree.density_values)
+    assert np.array_equal(np.sort(packed.voxel_of[:-1]), np.arange(count))
+    assert np.array_equal(packed.density[:-1], tree.density_values[packed.voxel_of[:-1]])
+    assert packed.density[-1] == 0
+    cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
+    found = pairs(packed.rows, side)
+    for table, live, place in zip(found, packed.has_density, packed.cells, strict=True):
+        at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
+        local = (at - 1) % brick @ [brick**2, brick, 1]
+        owner = cells[tuple(at.reshape(-1, 3).T)].reshape(local.shape)
+        voxel = np.where(owner >= 0, tree.voxel_index[owner, local], -1)
+        low, high = voxel[..., :-1], voxel[..., 1:]
+        assert np.array_equal(table[..., 1], (low >= 0) + 2 * (high >= 0))
+        first, second = packed.voxel_of[table[..., 0]], packed.voxel_of[np.minimum(table[..., 0] + 1, count)]
+        assert np.array_equal(first[low >= 0], low[low >= 0])
+        assert np.array_equal(first[(low < 0) & (high >= 0)], high[(low < 0) & (high >= 0)])
+        assert np.array_equal(second[(low >= 0) & (high >= 0)], high[(low >= 0) & (high >= 0)])
+        density = np.where(voxel >= 0, tree.density_values[voxel], 0)
+        eight = np.stack([density[i : i + side - 1, j : j + side - 1, k : k + side - 1] for i, j, k in np.ndindex(2, 2, 2)])
+        bits = np.unpackbits(live.view(np.uint8), bitorder="little").astype(bool)
+        assert np.array_equal(bits[: side**3].reshape(side, side, side)[:-1, :-1, :-1], (eight > 0).any(axis=0))
+        assert bits.sum() == (eight > 0).any(axis=0).sum()
+
+
+@pytest.mark.parametrize("brick", [1, 2, 4, 5])
+@pytest.mark.parametrize("degree", range(5))
+@pytest.mark.parametrize("layout", ["floats", "codes"])
+def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, layout: str) -> None:
+    tree = random_tree(brick, brick=brick, degree=degree, share=0.5)
+    if layout == "codes":
+        tree = in_codes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
+    centre, packed = np.array([-31.0, 12.5, 57.0]), packed_of(tree)
+    direction, bits = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.uint16)
+    compute_view_colours(0, len(packed.cells), 0, packed, tree.brick, direction, np.zeros(5), np.float32(2), tree.degree, bits)
+    order, colours = packed.voxel_of[:-1], bits.view(np.float16)
+    assert np.array_equal(colours[:-1, 0], (2 * tree.density_values[order]).astype(np.float16))
+    away = voxel_coordinates(tree)[order] + 0.5 - centre
+    basis = basis_numpy(away / np.linalg.norm(away, axis=1, keepdims=True), degree)
+    np.testing.assert_allclose(colours[:-1, 1:], np.einsum("nk,nkc->nc", basis, tree.sh[order]), atol=1e-4, rtol=2**-11)
+    assert not bits[-1].any()
+
+
+def half_kernels():  # type: ignore[no-untyped-def]
+    """Rounding to half floats, and sums of pairs of groups of four, compiled now."""
+
+    @numba.njit(error_model="numpy")
+    def rounded(values, out):  # type: ignore[no-untyped-def]
+        for n in range(0, len(values), 4):
+            store_halves4(pointer(out), n, pack4(values[n], values[n + 1], values[n + 2], values[n + 3]))
+
+    @numba.njit(error_model="numpy")
+    def mixed(weights, bits, at):  # type: ignore[no-untyped-def]
+        return unpack4(mix_pairs(pointer(weights), 0, 2, pointer(bits), at[0], at[1], at[2], at[3]))
+
+    return rounded, mixed
+
+
+@pytest.mark.parametrize("converts", [True, False], ids=["as the processor does", "by integers"])
+def test_half_floats_are_numpys(converts: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not converts:
+        monkeypatch.setattr(halves, "_converts", lambda: False)
+    rounded, mixed = half_kernels()
+    rng = np.random.default_rng(3)
+    every = np.arange(2**16, dtype=np.uint16)
+    every = every[np.isfinite(every.view(np.float16))].view(np.float16).astype(np.float32)
+    middles = (every[:-1] + every[1:]) / 2
+    odd = np.array([np.nan, np.inf, -np.inf, 65519.0, -65519.0, 3e38, -0.0, 0.0], np.float32)
+    values = np.concatenate([every, middles, rng.normal(size=4000) * 10.0 ** rng.uniform(-6, 4, 4000), odd]).astype(np.float32)
+    values = values[: len(values) // 4 * 4]
+    bits = np.zeros(len(values), np.uint16)
+    rounded(values, bits)
+    expected = np.clip(np.where(np.isnan(values), -halves.GREATEST, values), -halves.GREATEST, halves.GREATEST).astype(np.float16)
+    assert np.array_equal(bits, expected.view(np.uint16))
+    weights, at = rng.random((4, 2)).astype(np.float32), 4 * rng.integers(0, len(bits) // 4 - 1, (300, 4))
+    for four in at:
+        eight = np.stack([expected[n : n + 8].reshape(2, 4) for n in four]).astype(np.float64)
+        exact = np.einsum("nr,nrc->c", weights, eight)
+        np.testing.assert_allclose(mixed(weights, bits, four), exact, rtol=1e-6, atol=1e-6 * np.abs(eight).max())
+
+
+@numba.njit(error_model="numpy")
+def in_lanes(floats, ints, bytes_, out):  # type: ignore[no-untyped-def]
+    """What operators on sixteen lanes make of two rows of `floats`."""
+    x, y = lanes.load16(pointer(floats), 0), lanes.load16(pointer(floats), 16)
+    less = (x < y) & (x > np.float32(0)) | ~(y >= np.float32(-1))
+    whole = lanes.to_int16(lanes.abs16(x) + lanes.ceil16(lanes.abs16(y)))
+    masked = (whole + 3) * whole - 1 & 255 | whole >> 1
+    values = (
+        lanes.select16(less, x * y + np.float32(2), lanes.floor16(x) - y), lanes.min16(x, y) / lanes.max16(x, np.float32(0.5)),
+        lanes.to_float16(masked + (1 << whole)), lanes.to_float16(lanes.popcount16(masked)), lanes.sqrt16(lanes.abs16(x)),
+        lanes.to_float16(lanes.gather16(pointer(ints), whole & 7)), lanes.to_float16(lanes.gather16(pointer(bytes_), whole & 7)),
+        lanes.gather16(pointer(floats), whole & 31), lanes.exp2_neg16(lanes.abs16(y)),
+    )  # fmt: skip
+    for n in range(9):
+        lanes.store16(pointer(out), 16 * n, values[n])
+    a, b, c, d = lanes.channels16(pointer(floats), 0)
+    lanes.store16(pointer(out), 144, a - b + c * d)
+    lanes.store_channels16(pointer(out), 160, a, b, c, d)
+    return lanes.bits_of(less), lanes.lowest_bit(lanes.bits_of(lanes.mask_of(40)))
+
+
+def test_operators_on_lanes_are_numpys() -> None:
+    rng = np.random.default_rng(0)
+    floats, out = rng.normal(0, 3, 64).astype(np.float32), np.zeros(224, np.float32)
+    ints, bytes_ = rng.integers(-(2**20), 2**20, 8).astype(np.int32), rng.integers(0, 256, 8).astype(np.uint8)
+    bits, lowest = in_lanes(floats, ints, bytes_, out)
+    x, y = floats[:16], floats[16:32]
+    less = (x < y) & (x > 0) | ~(y >= -1)
+    whole = (np.abs(x) + np.ceil(np.abs(y))).astype(np.int32)
+    masked = (whole + 3) * whole - 1 & 255 | whole >> 1
+    expected = [
+        np.where(less, x * y + 2, np.floor(x) - y), np.minimum(x, y) / np.maximum(x, 0.5), masked + (1 << whole), [bin(n).count("1") for n in masked],
+        np.sqrt(np.abs(x)), ints[whole & 7], bytes_[whole & 7], floats[whole & 31], np.exp2(-np.abs(y)),
+        floats[::4] - floats[1::4] + floats[2::4] * floats[3::4],
+    ]  # fmt: skip
+    np.testing.assert_allclose(out[:160].reshape(10, 16), np.array(expected, np.float32), rtol=1e-6, atol=1e-6)
+    assert np.array_equal(out[160:], floats)
+    assert (bits, lowest) == (int((less << np.arange(16)).sum()), 3)
+
+
+def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> None:
+    tree = random_tree(7, shape=(8, 7, 6), brick=2, share=0.2)
+    dark = tree.density_values * (np.random.default_rng(1).random(len(tree.density_values)) < 0.1)
+    tree = replace(tree, density_values=dark.astype(np.float32))
+    absorbs = np.zeros(tree.shape, bool)
+    for cell in np.argwhere(tree.brick_index >= 0):
+        absorbs[tuple(cell)] = density_block(tree, tuple(cell * 2 - 1), tuple(cell * 2 + 3)).any()
+    assert 0 < absorbs.sum() < (tree.brick_index >= 0).sum()
+    leap = packed_of(tree).leap.reshape(tree.shape)
+    assert not leap[absorbs].any()
+    for at in np.argwhere(~absorbs):
+        assert leap[tuple(at)] == np.abs(np.argwhere(absorbs) - at).max(axis=1).min()
