@@ -1,6 +1,7 @@
 """Speed of rendering assets on the CPU, and what bounds it: written to benchmarks/results/render_cpu.json.
 
-    python benchmarks/render.py ASSET... [--sizes 800x800 640x480] [--threads 1 2] [--frames 24] [--rounds 3] [--against CHECKOUT] [--json FILE]
+    python benchmarks/render.py ASSET... [--sizes 800x800 640x480] [--threads 1 2] [--frames 24] [--normals] [--rounds 3]
+        [--against CHECKOUT] [--json FILE]
     python benchmarks/render.py --whole-scene --sizes 640x480
 
 Cameras are spread evenly on the asset's orbit, or inside of the scene that `whole_scene.py` makes, of nested grids. Besides frames a second: samples and
@@ -12,6 +13,8 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import functools
+import inspect
 import json
 import os
 import platform
@@ -66,14 +69,18 @@ def cameras(tree: Any, width: int, height: int, count: int, fov: float) -> list[
     return list(turntable_cameras(tree, frames=count, width=width, height=height, fov=fov))
 
 
-def measure(tree: Any, views: list[Any], supersample: int) -> dict[str, Any]:
-    from efficientnerf.asset.rendering import render
-
+def measure(tree: Any, views: list[Any], supersample: int, normals: bool) -> dict[str, Any]:
     """Times of each render, after one that compiles and packs; `processor_ms` is the time of all cores together for one."""
-    first = _seconds(lambda: render(tree, views[0], supersample=supersample))
+    from efficientnerf.asset import rendering
+
+    more = {} if normals else {"normals": False}
+    if "normals" not in inspect.signature(rendering.render).parameters:  # of an older checkout, which always renders them
+        more = {}
+    render = functools.partial(rendering.render, tree, supersample=supersample, **more)
+    first = _seconds(lambda: render(views[0]))
     spent = time.process_time()
-    took = [_seconds(lambda view=view: render(tree, view, supersample=supersample)) for view in views]
-    again = [_seconds(lambda view=view: render(tree, view, supersample=supersample)) for view in views]
+    took = [_seconds(lambda view=view: render(view)) for view in views]
+    again = [_seconds(lambda view=view: render(view)) for view in views]
     spent = time.process_time() - spent
     best = [min(pair) for pair in zip(took, again, strict=True)]
     rays = views[0].width * views[0].height * supersample**2
@@ -97,8 +104,8 @@ def counts(tree: Any, views: list[Any]) -> dict[str, float]:
 
     work = np.concatenate([ray_statistics(tree, view).reshape(-1, 4) for view in views[:: max(1, len(views) // 3)][:3]])
     cells, tested, mixed, colours = (float(n) for n in work.mean(axis=0))
-    # A cell is 4 bytes, and so is a mask; an interpolated sample reads four rows, and the four numbers of eight voxels, colours among them.
-    read = 4 * cells + 4 * tested + (4 * 8 + 8 * 16) * mixed
+    # A cell is 4 bytes, and so is a mask; an interpolated sample reads four rows, and the four half floats of eight voxels, colours among them.
+    read = 4 * cells + 4 * tested + (4 * 8 + 8 * 8) * mixed
     return {
         "cells_per_ray": round(cells, 3),
         "samples_per_ray": round(tested, 3),
@@ -142,7 +149,7 @@ def measure_task(task: dict[str, Any]) -> dict[str, Any]:
     loading = time.perf_counter() - begin
     size = task["width"], task["height"], task["frames"]
     views = whole_scene.cameras(*size) if asset is None else cameras(tree, *size, task["fov"])
-    result: dict[str, Any] = {"speed": measure(tree, views, task["supersample"])}
+    result: dict[str, Any] = {"speed": measure(tree, views, task["supersample"], task["normals"])}
     if task["whole"]:
         result |= {
             "asset": {
@@ -183,7 +190,7 @@ def compare(task: dict[str, Any], other: Path | None, rounds: int) -> dict[str, 
         mine.append(_in_process(task | {"whole": n == 0}))
         if other is not None:
             others.append(_in_process(task | {"checkout": str(other.resolve())}))
-    row = {name: task[name] for name in ("width", "height", "supersample", "frames", "threads")} | mine[0] | {"speed": _mean(mine)}
+    row = {name: task[name] for name in ("width", "height", "supersample", "normals", "frames", "threads")} | mine[0] | {"speed": _mean(mine)}
     row["speed"]["read_gb_per_s"] = round(row["work"]["bytes_per_ray"] * row["speed"]["rays_per_s"] / 1e9, 1)
     if others:
         row["before"] = _mean(others)
@@ -204,6 +211,7 @@ def _options() -> argparse.ArgumentParser:
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--fov", type=float, default=39.6, help="vertical, degrees; by default that of the Realistic Synthetic scenes")
     parser.add_argument("--supersample", type=int, default=1)
+    parser.add_argument("--normals", action="store_true", help="render normals too, which videos do without")
     parser.add_argument("--threads", type=int, nargs="+", default=[os.cpu_count() or 1], help="of numba; all cores by default")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--against", type=Path, help="another checkout of this project, to be measured in turn with this one")
@@ -226,6 +234,7 @@ def main() -> int:
         for width, height in given.sizes:
             for threads in given.threads:
                 task = {"asset": source, "width": width, "height": height, "frames": given.frames, "fov": given.fov, "supersample": given.supersample}
+                task |= {"normals": given.normals}
                 rows.append(compare(task | {"threads": threads, "checkout": str(HERE.parent), "whole": False}, given.against, given.rounds))
                 row = rows[-1]
                 ratio = f", {row['times_as_fast']} times as fast as before" if given.against else ""

@@ -113,7 +113,9 @@ class BallTree:
         """As the evaluate stage sees it; margins of 2 % of the distance."""
         return EvaluatedAsset(self.render, limits=lambda origins, directions, distance: 0.98 * distance, nearer=self.opacity_nearer, **more)
 
-    def render(self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
+    def render(
+        self, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1, normals: bool = True
+    ) -> Rendering:
         origins, directions = rays(camera)
         flat = self.render_rays(origins, directions)
         size = (camera.height, camera.width)
@@ -121,7 +123,8 @@ class BallTree:
         if background is not None:
             colour = colour + (1.0 - flat.opacity[:, None]) * np.asarray(background, np.float32)
         depth = flat.depth * (directions @ camera.forward).astype(np.float32)
-        return Rendering(colour.reshape(*size, 3), flat.opacity.reshape(size), depth.reshape(size), flat.normal.reshape(*size, 3))
+        normal = flat.normal.reshape(*size, 3) if normals else np.zeros((0, 0, 3), np.float32)
+        return Rendering(colour.reshape(*size, 3), flat.opacity.reshape(size), depth.reshape(size), normal)
 
 
 @dataclass

@@ -35,7 +35,7 @@ class Rendering:
     opacity  (...)    float32, 0 to 1, of the voxels alone
     depth    (...)    float32, world units, along the view axis for cameras and along the ray for rays; where half of the light is
                       absorbed, infinity where less than half ever is
-    normal   (..., 3) float32, unit, world frame, out of the surface; zero where nothing is hit
+    normal   (..., 3) float32, unit, world frame, out of the surface; zero where nothing is hit; (0, 0, 3) where it was not wanted
     """
 
     colour: np.ndarray
@@ -45,12 +45,14 @@ class Rendering:
 
 
 def render(
-    tree: NerfTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1, rays_per_band: int = RAYS_PER_BAND
-) -> Rendering:
+    tree: NerfTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1, normals: bool = True,
+    rays_per_band: int = RAYS_PER_BAND,
+) -> Rendering:  # fmt: skip
     """The image that a camera in the training frame takes.
 
     background     sRGB colour to composite over; None: the tree's environment, or nothing where it has none: then the colour is premultiplied
     supersample    rays along each side of a pixel
+    normals        whether they are wanted; else they are (0, 0, 3), and most images take less time
     rays_per_band  of supersampled images at once; changes memory alone
 
     Raises ValueError for a camera without an image: of no size or of more than MOST_PIXELS, without a focal length, or with numbers that are not finite.
@@ -63,10 +65,12 @@ def render(
         from efficientnerf.backends.triton import tree as cuda_tree
 
         on_device = cuda_tree.render_image(cuda_tree.device_tree_of(tree), camera, background=background, supersample=supersample)
-        return Rendering(*(part.cpu().numpy() for part in on_device))
-    if tree.ndc is not None or tree.lookup == "nearest":
-        return _render_by_rays(tree, camera, background, supersample, rays_per_band)
-    return Rendering(*render_image(tree, camera, supersample, behind, normals=True, rays_per_band=rays_per_band))
+        rendering = Rendering(*(part.cpu().numpy() for part in on_device))
+    elif tree.ndc is not None or tree.lookup == "nearest":
+        rendering = _render_by_rays(tree, camera, background, supersample, rays_per_band)
+    else:
+        return Rendering(*render_image(tree, camera, supersample, behind, normals=normals, rays_per_band=rays_per_band))
+    return rendering if normals else replace(rendering, normal=np.zeros((0, 0, 3), np.float32))
 
 
 def _background(background: tuple[float, float, float] | None) -> np.ndarray | None:

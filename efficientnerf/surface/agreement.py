@@ -49,7 +49,7 @@ def asset_view(tree: NerfTree, camera: Camera) -> AssetView:
     """What a camera of the training frame sees."""
     from efficientnerf.asset.rendering import render
 
-    seen = render(tree, camera)
+    seen = render(tree, camera, normals=False)
     return AssetView(camera, seen.opacity, seen.depth)
 
 

@@ -255,7 +255,7 @@ def _previews(job: Job, s: Scene, point: Point, targets: Targets) -> Previews:
 
     def seen(camera: Camera) -> np.ndarray:
         tree = replace(point.state.tree)  # what a renderer makes of values is kept with a tree, and these change
-        return render(tree, camera, background=targets.background).colour
+        return render(tree, camera, background=targets.background, normals=False).colour
 
     return Previews(seen, targets.background, job.inputs[PosesOutputs.stage], s, job.work)
 

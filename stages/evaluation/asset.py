@@ -15,7 +15,7 @@ from stages.io.scene import Scene, View
 if TYPE_CHECKING:
     from efficientnerf.asset.tree import NerfTree
 
-RenderTree = Callable[..., Any]  # (camera, background=...) -> Rendering
+RenderTree = Callable[..., Any]  # (camera, background=..., normals=...) -> Rendering
 OnRays = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]  # origins (R, 3), directions (R, 3), distances (R,) -> (R,)
 
 
@@ -63,7 +63,7 @@ def render_asset(asset: EvaluatedAsset, scene: Scene, view: View, seen: Any, str
     background = constant_background(scene)
     if background is None and asset.inner is None:
         return over_field(asset.render, view, seen, stride)
-    output = asset.render(view.camera, background=background or asset.behind)
+    output = asset.render(view.camera, background=background or asset.behind, normals=False)
     return output.colour, output.opacity
 
 
@@ -72,7 +72,7 @@ def over_field(render_tree: RenderTree, view: View, seen: Any, stride: int) -> t
 
     before + (1 - before's alpha) (asset + (1 - asset's alpha) behind)
     """
-    output = render_tree(view.camera)
+    output = render_tree(view.camera, normals=False)
     size = (stride, view.camera.width, view.camera.height)
     before, behind = upsample(seen.before, *size), upsample(seen.behind, *size)
     middle = output.colour + (1.0 - output.opacity[..., None]) * behind

@@ -94,7 +94,7 @@ def mesh_image(mesh: EvaluatedMesh, asset: EvaluatedAsset, scene: Scene, view: V
     background = constant_background(scene)
     over_field = background is None and asset.inner is None
     behind = None if over_field else background or asset.behind
-    around = None if mesh.surroundings is None else mesh.surroundings(view.camera, background=behind)
+    around = None if mesh.surroundings is None else mesh.surroundings(view.camera, background=behind, normals=False)
     size = (view.camera.height, view.camera.width, 3)
     rest = np.broadcast_to(np.asarray(behind or (0.0, 0.0, 0.0), np.float32), size) if around is None else around.colour
     hidden = np.zeros(size[:2], bool) if around is None else around.depth < (1 - MARGIN) * textured.depth

@@ -78,7 +78,7 @@ def render_frames(
         with_exr = options.exr == "all" or (options.exr == "first" and k == 0)
         outputs = [png, exr] if with_exr else [png]
         if not (reuse and noted(folder / f"frame_{k:04d}.json", list[str], warn, partial(_check, outputs, camera)) is not None):
-            output = draw(tree, camera, supersample=options.supersample)
+            output = draw(tree, camera, supersample=options.supersample, normals=with_exr)
             opacity = np.ones_like(output.opacity) if surrounded else output.opacity  # nothing shows through the environment
             if with_exr:
                 passes = {"colour": output.colour, "opacity": opacity, "depth": output.depth, "normal": output.normal}

@@ -48,7 +48,7 @@ def _psnr_of_renders(a: NerfTree, b: NerfTree, views: int, size: int) -> list[fl
 
     background = None if a.environment is not None or b.environment is not None else a.background or (1.0, 1.0, 1.0)  # what lies beyond is compared too
     cameras = turntable_cameras(a, frames=views, width=size, height=size)
-    return [min(PSNR_CAP, psnr(*(render(tree, camera, background=background).colour.clip(0, 1) for tree in (a, b)))) for camera in cameras]
+    return [min(PSNR_CAP, psnr(*(render(tree, camera, background=background, normals=False).colour.clip(0, 1) for tree in (a, b)))) for camera in cameras]
 
 
 def in_words(found: dict[str, Any]) -> list[str]:

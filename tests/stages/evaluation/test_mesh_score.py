@@ -75,7 +75,7 @@ def test_the_texture_counts_and_the_vertices_beside_it(tmp_path: Path) -> None:
 
 
 def flat(colour: tuple[float, float, float], depth: float):  # type: ignore[no-untyped-def]
-    def render(camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
+    def render(camera: Camera, *, background: tuple[float, float, float] | None = None, normals: bool = True) -> Rendering:
         size = (camera.height, camera.width)
         return Rendering(np.full((*size, 3), colour, np.float32), np.ones(size, np.float32), np.full(size, depth, np.float32), np.zeros((*size, 3)))
 
