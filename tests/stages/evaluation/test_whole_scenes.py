@@ -28,7 +28,7 @@ from tests.efficientnerf.trees import random_cascades
 from tests.stages.evaluation.balls import BALL_MESH, TREE, figures_of, job_in, settings
 
 
-def reference_image(tree: NerfTree, camera: Camera, *, background: tuple[float, float, float] | None = None, supersample: int = 1) -> Rendering:
+def reference_image(tree: NerfTree, camera: Camera, *, background: tuple[float, float, float] | None = None, normals: bool = False) -> Rendering:
     """The image of a tree by the reference render: over its environment, or over a background in its place."""
     seen = replace(tree, environment=None) if background is not None else tree
     colour, opacity = (part.numpy() for part in render_reference(seen, *(torch.from_numpy(a) for a in rays(camera))))
