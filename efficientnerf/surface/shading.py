@@ -57,6 +57,8 @@ def pyramid_of(texture: Texture) -> Pyramid:
     levels = [(start, part.shape[1], part.shape[0]) for start, part in zip(first, parts)]
     return Pyramid(np.concatenate([part.reshape(-1, 3) for part in parts]), np.array(levels, np.int64))
 
+NO_TEXTURE = np.zeros((0, 3, 2)), np.zeros((0, 3), np.uint8), np.zeros((0, 3), np.int64)  # as the kernel takes it
+
 
 class Shader:
     """Draws a mesh from many cameras: from its texture, and from the colours of its vertices."""
@@ -77,16 +79,13 @@ class Shader:
         return plain if self.pyramid is None else self._shaded(seen, pixels, depth, samples, textured=True), plain
 
     def _shaded(self, seen: MeshImage, pixels: np.ndarray, depth: np.ndarray, samples: int, *, textured: bool) -> ColouredImage:
-        from efficientnerf.backends.numba.mesh.shade import shade_texture, shade_vertices
+        from efficientnerf.backends.numba.mesh.shade import shade
 
         height, width = (side // samples for side in seen.face.shape)
         colour = np.zeros((height, width, 3), np.float32)
+        texture = NO_TEXTURE if self.pyramid is None or not textured else (self.coordinates, self.pyramid.texels, self.pyramid.levels)
         for part in pieces(height, first=FIRST_ROWS):
-            rows = (seen.face, part.start, part.stop, colour)
-            if textured and self.pyramid is not None:
-                shade_texture(pixels, depth, self.faces, self.coordinates, self.pyramid.texels, self.pyramid.levels, *rows)
-            else:
-                shade_vertices(pixels, depth, self.faces, self.colours, *rows)
+            shade(pixels, depth, self.faces, *texture, self.colours, seen.face, part.start, part.stop, colour)
         colour *= np.float32(1 / (samples**2 * (255 if textured else 1)))
         covered = _over_samples(seen.covered, samples)
         nearest = _over_samples(seen.depth, samples)

@@ -36,16 +36,31 @@ def _texel(texels, first, width, height, u, v, out):  # type: ignore[no-untyped-
         out[channel] += (1.0 - down) * upper + down * lower
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _add_texture(place, area, weight, texels, levels, out):  # type: ignore[no-untyped-def]
+    """Adds the texture's colour at a sample to `out` (3,): `place` (3, 2) of its face's corners, `area` of the face twice, in pixels."""
+    spread = (place[1, 0] - place[0, 0]) * (place[2, 1] - place[0, 1]) - (place[2, 0] - place[0, 0]) * (place[1, 1] - place[0, 1])
+    ratio = abs(spread) * levels[0, 1] * levels[0, 2] / area  # texels to a sample
+    level = 0
+    while ratio >= 4.0 and level + 1 < len(levels):
+        ratio /= 4.0
+        level += 1
+    u = weight[0] * place[0, 0] + weight[1] * place[1, 0] + weight[2] * place[2, 0]
+    v = weight[0] * place[0, 1] + weight[1] * place[1, 1] + weight[2] * place[2, 1]
+    _texel(texels, levels[level, 0], levels[level, 1], levels[level, 2], u, v, out)
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def shade_texture(pixels, depth, faces, coordinates, texels, levels, shown, begin, end, colour):  # type: ignore[no-untyped-def]
-    """Rows `begin` to `end` of the image of a textured mesh: sums over the samples of each pixel, as many as are covered.
+def shade(pixels, depth, faces, coordinates, texels, levels, colours, shown, begin, end, colour):  # type: ignore[no-untyped-def]
+    """Rows `begin` to `end` of the image of a mesh: sums over the samples of each pixel, as many as are covered.
 
     pixels, depth  of the vertices, in samples, as `rasterise` takes them
-    coordinates    (F, 3, 2) float64, v up
+    coordinates    (F, 3, 2) float64, v up; (0, 3, 2): the mesh has no texture but colours of its vertices
     texels         (T, 3) uint8 of all levels, row by row
     levels         (L, 3) int64: first texel, width, height of each; a level has half the sides of the one before
+    colours        (V, 3) float32 of the vertices, where there is no texture, in the unit of `colour`
     shown          (H s, W s) int32 face of each sample, -1: none
-    colour         (H, W, 3) float32, 0-255, written
+    colour         (H, W, 3) float32, 0-255 of a texture, written
     """
     height, width = colour.shape[:2]
     samples = shown.shape[0] // height
@@ -59,35 +74,9 @@ def shade_texture(pixels, depth, faces, coordinates, texels, levels, shown, begi
                 if face < 0:
                     continue
                 area = _weights(pixels, depth, faces[face], x + 0.5, y + 0.5, weight)
-                place = coordinates[face]
-                spread = (place[1, 0] - place[0, 0]) * (place[2, 1] - place[0, 1]) - (place[2, 0] - place[0, 0]) * (place[1, 1] - place[0, 1])
-                ratio = abs(spread) * levels[0, 1] * levels[0, 2] / area  # texels to a sample
-                level = 0
-                while ratio >= 4.0 and level + 1 < len(levels):
-                    ratio /= 4.0
-                    level += 1
-                u = weight[0] * place[0, 0] + weight[1] * place[1, 0] + weight[2] * place[2, 0]
-                v = weight[0] * place[0, 1] + weight[1] * place[1, 1] + weight[2] * place[2, 1]
-                _texel(texels, levels[level, 0], levels[level, 1], levels[level, 2], u, v, out)
-            for channel in range(3):
-                colour[row, column, channel] = out[channel]
-
-
-@numba.njit(cache=True, parallel=True, error_model="numpy")
-def shade_vertices(pixels, depth, faces, colours, shown, begin, end, colour):  # type: ignore[no-untyped-def]
-    """The same from colours (V, 3) of the vertices, in their unit."""
-    height, width = colour.shape[:2]
-    samples = shown.shape[0] // height
-    for row in numba.prange(begin, end):
-        weight, out = np.empty(3), np.empty(3)
-        for column in range(width):
-            out[:] = 0.0
-            for n in range(samples * samples):
-                y, x = row * samples + n // samples, column * samples + n % samples
-                face = shown[y, x]
-                if face < 0:
+                if len(coordinates) > 0:
+                    _add_texture(coordinates[face], area, weight, texels, levels, out)
                     continue
-                _weights(pixels, depth, faces[face], x + 0.5, y + 0.5, weight)
                 for corner in range(3):
                     for channel in range(3):
                         out[channel] += weight[corner] * colours[faces[face, corner], channel]
