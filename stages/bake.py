@@ -69,12 +69,7 @@ class BakeSettings:
     visibility_rays: Annotated[int, Meta(ge=1000)] = setting(
         1_000_000, "Training pixels that the field is rendered for, to find the visible voxels.", advanced=True
     )
-    weight_threshold: Fraction | Auto = setting(
-        "auto",
-        "A voxel is kept where its weight in some pixel exceeds this; auto: 0.001, and of a forward-facing capture 0.03 until voxels are refined, which are"
-        " finer then.",
-        advanced=True,
-    )
+    weight_threshold: Fraction = setting(1e-3, "A voxel is kept where its weight in some pixel exceeds this.", advanced=True)
     max_mib: Annotated[float, Meta(gt=0.0)] | Auto = setting(
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
@@ -234,7 +229,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=13,
+    version=12,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

@@ -13,7 +13,6 @@ import numpy as np
 
 from pipeline.stage import Job
 from stages.baking.holes import find_holes, voxels_of_holes
-from stages.baking.resolution import weight_threshold
 
 if TYPE_CHECKING:
     from efficientnerf.asset.field_samples import FieldSamples
@@ -107,7 +106,7 @@ def greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.n
 
 def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:
     """(N,) bool: voxels whose weight exceeds bake.weight_threshold, at most `most`."""
-    keep = greatest > weight_threshold(job.settings)
+    keep = greatest > job.settings.weight_threshold
     if keep.sum() > most:
         order = np.argsort(-greatest, kind="stable")
         keep = np.zeros(len(keep), bool)

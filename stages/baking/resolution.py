@@ -14,10 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from efficientnerf.settings import given
-
 if TYPE_CHECKING:
-    from stages.bake import BakeSettings
     from stages.framing.forward_facing import ForwardFacing
     from stages.io.scene import Scene
 
@@ -31,8 +28,6 @@ MAX_MIB = 38
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
 NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
-# docs/experiments/bake-resolution.md: weight in some pixel that a voxel needs; to be baked in normalised device coordinates
-WEIGHT_THRESHOLD, NDC_WEIGHT_THRESHOLD = 1e-3, 3e-2
 MIN_FILL = 0.93  # of the size that is used, at least
 MAX_TRIES = 4
 
@@ -43,13 +38,6 @@ class Choice:
 
     resolution: int
     why: str
-
-
-def weight_threshold(settings: BakeSettings, *, ndc: bool = False) -> float:
-    """The weight in some pixel that a voxel needs. With `ndc`, to be baked in normalised device coordinates: the field's surfaces are several voxels thick
-    there, of which few show once they are refined, and their bytes are worth more in finer ones."""
-    stated = given(settings.weight_threshold)
-    return stated if stated is not None else NDC_WEIGHT_THRESHOLD if ndc else WEIGHT_THRESHOLD
 
 
 def baked_resolution(resolution: int, splits: int) -> int:
@@ -96,14 +84,14 @@ def pixel_at_centre(s: Scene, bounds: np.ndarray) -> float:
     return float(np.median([np.linalg.norm(view.camera.centre - centre) / view.camera.intrinsics["fx"] for view in s.views]))
 
 
-def budget_of(s: Scene, stated: float | None, *, packed: bool = False) -> float:
+def budget_of(s: Scene, given: float | None, *, packed: bool = False) -> float:
     """MiB that an asset may have: those given, or else MAX_MIB. In normalised device coordinates, where nothing is empty
     and each pixel needs voxels of its own, NDC_BYTES to each pixel of the box's face, from NDC_MIN_MIB to NDC_MAX_MIB. An asset is as
     large as its voxels are, of which the finest have the width that pixels tell apart (`finest_resolution`). A packed one has a third of that."""
-    if stated is None and packed:
+    if given is None and packed:
         return math.ceil(budget_of(s, None) / 3)
-    if stated is not None or s.forward is None:
-        return MAX_MIB if stated is None else stated
+    if given is not None or s.forward is None:
+        return MAX_MIB if given is None else given
     across, down = (s.forward.bounds[1] - s.forward.bounds[0])[:2] / ndc_pixel(s, s.forward)
     return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
 

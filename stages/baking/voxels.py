@@ -11,7 +11,6 @@ import numpy as np
 
 from efficientnerf.settings import given
 from pipeline.stage import Job
-from stages.baking.resolution import weight_threshold
 from stages.baking.scratch import read_arrays, write_arrays
 from stages.scratch import unusable
 
@@ -50,7 +49,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     from stages.baking.resolution import affordable_resolution, baked_resolution
 
     settings: BakeSettings = job.settings
-    bounds, brick, threshold = space.bounds, settings.brick_size, weight_threshold(settings, ndc=space.ndc is not None)
+    bounds, brick = space.bounds, settings.brick_size
 
     def room(resolution: int) -> int:
         shape, _ = bake.grid_of(bounds, resolution, brick)
@@ -60,7 +59,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     if (given(settings.resolution) or given(m.settings.discretise)) is not None:
         shape, voxel = bake.grid_of(bounds, baked_resolution(choice.resolution, splits), brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
-        return choice, visibility, _heaviest_voxels(job, visibility, shape, threshold, MAX_OVERSHOOT * room(choice.resolution))
+        return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
 
     top_shape, top_voxel = bake.grid_of(bounds, finest.resolution, brick)
     visibility = _visibility(job, m, pixels, top_shape, top_voxel, np.asarray(bounds[0], np.float64), space)
@@ -74,8 +73,8 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
             shape, voxel = bake.grid_of(bounds, resolution, brick)
             coarse = visibility
             if resolution != finest.resolution:
-                coarse = bake.coarsened(visibility, top_shape, top_voxel, shape, voxel, brick, threshold)
-            last = resolution, coarse, bake.chosen_voxels(coarse, shape, brick, threshold, settings.dilate)
+                coarse = bake.coarsened(visibility, top_shape, top_voxel, shape, voxel, brick, settings.weight_threshold)
+            last = resolution, coarse, bake.chosen_voxels(coarse, shape, brick, settings.weight_threshold, settings.dilate)
         return last
 
     choice = affordable_resolution(finest, lambda at: len(at_resolution(at)[2]), lambda at: int(OVERSHOOT * room(at)))
@@ -83,7 +82,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     _, coarse, indices = at_resolution(baked)
     most = MAX_OVERSHOOT * room(choice.resolution)
     if len(indices) > most:
-        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, baked, brick)[0], threshold, most)
+        indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, baked, brick)[0], most)
     return choice, coarse, indices
 
 
@@ -126,11 +125,12 @@ def _fits(found: Visibility, cells: int, per_cell: int) -> bool:
     return bool(ascending and found.greatest.shape == (len(found.cells), per_cell))
 
 
-def _heaviest_voxels(job: Job, visibility: Visibility, shape: tuple[int, int, int], threshold: float, most: int) -> np.ndarray:
-    """Coordinates (N, 3) of the voxels whose weight exceeds the threshold, dilated: about `most` at most, and then those of greatest weight."""
+def _heaviest_voxels(job: Job, visibility: Visibility, shape: tuple[int, int, int], most: int) -> np.ndarray:
+    """Coordinates (N, 3) of the visible voxels: about `most` at most, and then those of greatest weight."""
     from efficientnerf.asset import bake
 
     settings: BakeSettings = job.settings
+    threshold = settings.weight_threshold
     indices = bake.chosen_voxels(visibility, shape, settings.brick_size, threshold, settings.dilate)
     weights = np.sort(visibility.greatest[visibility.greatest > threshold])
     while len(indices) > most and len(weights) > 1:

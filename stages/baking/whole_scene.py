@@ -21,7 +21,6 @@ from pipeline.errors import BadInput, CorruptArtifact
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.baking.plan import Plan
-from stages.baking.resolution import weight_threshold
 from stages.baking.scratch import read_arrays, write_arrays
 from stages.io.json_file import read_json
 from stages.scratch import unusable
@@ -81,8 +80,8 @@ def choose_scene_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space
             last = None
             job.safe_point()
             grids = grids_at(resolution)
-            seen = cascade_visibility(samples, grids, settings.brick_size, weight_threshold(settings))
-            last = resolution, grids, seen, chosen_of(seen, grids, settings, weight_threshold(settings))
+            seen = cascade_visibility(samples, grids, settings.brick_size, settings.weight_threshold)
+            last = resolution, grids, seen, chosen_of(seen, grids, settings, settings.weight_threshold)
         return last
 
     stated = given(settings.resolution)
@@ -185,7 +184,7 @@ def chosen_of(seen: Sequence[Visibility], grids: Sequence[Grid], settings: BakeS
 def heaviest_of(job: Job, seen: Sequence[Visibility], grids: Sequence[Grid], indices: list[np.ndarray], most: int) -> list[np.ndarray]:
     """The voxels of all cascades, or where these are more than about `most` those of greatest weight."""
     settings: BakeSettings = job.settings
-    weights = np.sort(np.concatenate([one.greatest[one.greatest > weight_threshold(settings)] for one in seen]))
+    weights = np.sort(np.concatenate([one.greatest[one.greatest > settings.weight_threshold] for one in seen]))
     while (count := sum(map(len, indices))) > most and len(weights) > 1:
         job.safe_point()
         # Dilated voxels are about in proportion to the visible ones; a little less, so that this ends soon.
@@ -233,7 +232,7 @@ def _samples(job: Job, m: Any, pixels: Pixels) -> FieldSamples:
         job.progress(done, total, "rendering for visible voxels")
         job.safe_point()
 
-    samples = field_samples(m, pixels, settings.visibility_rays, weight_threshold(settings), progress)
+    samples = field_samples(m, pixels, settings.visibility_rays, settings.weight_threshold, progress)
     write_arrays({field.name: getattr(samples, field.name) for field in fields(samples)}, job.work / "samples")
     return samples
 

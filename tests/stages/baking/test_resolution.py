@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from stages.bake import BakeSettings
-from stages.baking.resolution import MIN_FILL, MIN_RESOLUTION, Choice, affordable_resolution, finest_resolution, weight_threshold
+from stages.baking.resolution import MIN_FILL, MIN_RESOLUTION, Choice, affordable_resolution, finest_resolution
 from stages.io.scene import load
 from tests.stages.balls import poses
 
@@ -62,13 +61,3 @@ def test_without_room_for_the_coarsest_it_is_taken_all_the_same() -> None:
 
 def test_nothing_at_all_is_looked_for_on_the_finest_grid() -> None:
     assert affordable_resolution(Choice(400, "pixels"), lambda resolution: 0, lambda resolution: 1000).resolution == 400
-
-
-@pytest.mark.parametrize("stated", [0.0, 1e-3, 0.2])
-def test_a_stated_threshold_holds_before_and_after_the_refinement(stated: float) -> None:
-    settings = BakeSettings(weight_threshold=stated)
-    assert weight_threshold(settings) == weight_threshold(settings, ndc=True) == stated
-
-
-def test_without_one_faint_voxels_of_forward_facing_captures_are_left_out() -> None:
-    assert 0 < weight_threshold(BakeSettings()) < weight_threshold(BakeSettings(), ndc=True) < 1
