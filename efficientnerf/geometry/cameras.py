@@ -187,6 +187,13 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, width=width, height=height, model=model, params=tuple(named[p] for p in MODELS[model]))
 
 
+def rows_of(camera: Camera, begin: int, end: int) -> Camera:
+    """The camera of the rows `begin` to `end` of an image alone."""
+    named = camera.intrinsics
+    named |= {"cy": named["cy"] - begin, "f": named["fx"]}
+    return replace(camera, height=end - begin, params=tuple(named[p] for p in MODELS[camera.model]))
+
+
 def rotated_clockwise(camera: Camera) -> Camera:
     """The camera of the image rotated clockwise by 90 degrees; width and height are swapped. A world point stays at its place in the image."""
     k = camera.intrinsics

@@ -5,17 +5,18 @@ H x W pixels, s x s samples in each.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from efficientnerf.backends.pieces import pieces
-from efficientnerf.geometry.cameras import Camera, project, resized
+from efficientnerf.geometry.cameras import Camera, project, resized, rows_of
 from efficientnerf.surface.mesh import Mesh, Texture
 from efficientnerf.surface.rasteriser import MeshImage, mesh_image
 
-SAMPLES = 2  # along each side of a pixel
+SAMPLES = 4  # along each side of a pixel. docs/experiments/textures.md
+AT_ONCE = 2**22  # samples: more of an image are drawn in bands of rows
 FIRST_ROWS = 16  # in the first piece
 
 
@@ -73,10 +74,15 @@ class Shader:
     def images(self, camera: Camera, samples: int = SAMPLES) -> tuple[ColouredImage, ColouredImage]:
         """The mesh in the colours of its texture (of its vertices, where it has none), and in those of its vertices."""
         fine = resized(camera, camera.width * samples, camera.height * samples)
-        pixels, depth = project(fine, self.mesh.vertices)
-        seen = mesh_image(self.mesh.vertices, self.faces, fine)
-        plain = self._shaded(seen, pixels, depth, samples, textured=False)
-        return plain if self.pyramid is None else self._shaded(seen, pixels, depth, samples, textured=True), plain
+        rows = max(1, AT_ONCE // (samples**2 * camera.width)) * samples
+        bands = []
+        for begin in range(0, fine.height, rows):
+            band = rows_of(fine, begin, min(begin + rows, fine.height))
+            pixels, depth = project(band, self.mesh.vertices)
+            seen = mesh_image(self.mesh.vertices, self.faces, band)
+            bands.append([self._shaded(seen, pixels, depth, samples, textured=textured) for textured in ((False,) if self.pyramid is None else (False, True))])
+        images = [_stacked(parts) for parts in zip(*bands, strict=True)]
+        return images[-1], images[0]
 
     def _shaded(self, seen: MeshImage, pixels: np.ndarray, depth: np.ndarray, samples: int, *, textured: bool) -> ColouredImage:
         from efficientnerf.backends.numba.mesh.shade import shade
@@ -90,6 +96,13 @@ class Shader:
         covered = _over_samples(seen.covered, samples)
         nearest = _over_samples(seen.depth, samples)
         return ColouredImage(np.clip(colour, 0, 1), covered.mean(2, dtype=np.float32), nearest.min(2))
+
+
+def _stacked(parts: Sequence[ColouredImage]) -> ColouredImage:
+    """One image of bands of rows."""
+    if len(parts) == 1:
+        return parts[0]
+    return ColouredImage(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("colour", "covered", "depth")))
 
 
 def _over_samples(values: np.ndarray, samples: int) -> np.ndarray:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 # Times the tree's arrays: these, and what renderers make of them. Bytes of a pixel: of a frame with all its channels while it is written as EXR; of a
 # test view with its photograph, renders, errors and windows of SSIM.
 TREE, FRAME, COMPARED = 3, 116, 160
-DRAWN = 120  # bytes of a pixel of a view in which the mesh is drawn, four samples each
+DRAWN, SAMPLE = 90, 40  # bytes of a pixel of a view in which the mesh is drawn; of a sample of those that are drawn at a time
 BAND = 160 * MIB  # rays at a time where each is rendered on its own
 FIELD = 150  # bytes of a ray through the field, with what lies before and behind the box
 FIELD_BLOCK = 400 * MIB  # the samples of a block of rays through a field whose density voxels prune nothing yet
@@ -46,10 +46,12 @@ def views_needed(tree: NerfTree, cameras: Sequence[Camera], rays: int, field: in
     field  bytes of the field's file
     mesh   bytes of the mesh that is measured
     """
+    from efficientnerf.surface.shading import AT_ONCE
+
     most = max((camera.width * camera.height for camera in cameras), default=0)
     return Need({
         "a view": most * (COMPARED + DRAWN),
-        "the mesh": mesh,
+        "the mesh": mesh + SAMPLE * AT_ONCE,
         "its rays": rays * FIELD + FIELD_BLOCK,
         "the asset": tree_bytes(tree) * (3 if tree.outer else 1),  # cascade 0 alone, and what surrounds the mesh
         "the field": 3 * field,

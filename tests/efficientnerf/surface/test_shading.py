@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from efficientnerf.geometry.cameras import Camera, project, rays
+from efficientnerf.surface import shading
 from efficientnerf.surface.mesh import Mesh, Texture
 from efficientnerf.surface.shading import Shader, pyramid_of, vertex_colours
+from tests.efficientnerf.surface.texturing.shapes import ball, cameras
 
 FRONT = np.eye(4)
 FRONT[:3, 3] = [0, 0, -2.0]
@@ -123,3 +125,26 @@ def test_the_image_is_the_same_on_one_thread_and_on_two() -> None:
         np.testing.assert_array_equal(shader.images(VIEW)[0].colour, first)
     finally:
         numba.set_num_threads(threads)
+
+
+def test_bands_of_rows_are_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = ball(2)
+    mesh = Mesh(vertices, faces, vertices, (0.5 + 0.5 * vertices).astype(np.float32))
+    camera = cameras(3, 37)[1]
+    whole = Shader(mesh).images(camera)[0]
+    monkeypatch.setattr(shading, "AT_ONCE", 16 * 37 * 5)
+    banded = Shader(mesh).images(camera)[0]
+    assert whole.covered.any()
+    np.testing.assert_allclose(banded.covered, whole.covered, atol=1 / 16)
+    assert (banded.covered == whole.covered).mean() > 0.99
+    np.testing.assert_allclose(banded.colour, whole.colour, atol=0.1)
+    np.testing.assert_allclose(banded.depth, whole.depth, rtol=0.01)
+
+
+def test_more_samples_come_nearer_to_the_area_that_is_covered() -> None:
+    vertices, faces = ball(3)
+    mesh = Mesh(vertices, faces, vertices, np.zeros_like(vertices, np.float32))
+    camera = cameras(3, 33)[0]
+    true = Shader(mesh).images(camera, 16)[0].covered
+    errors = [float(np.abs(Shader(mesh).images(camera, samples)[0].covered - true).mean()) for samples in (1, 2, 4)]
+    assert errors[2] < 0.6 * errors[1] < 0.36 * errors[0]
