@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,7 +55,7 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
     surveys, steps = [], 2 * len(views)
     for number, photo in enumerate(photographs(inputs.poses.folder, views)):
         progress(number, steps, "texture")
-        surveys.append(survey(mesh.vertices, mesh.faces, mesh.normals, mesh.colours, photo))
+        surveys.append(survey(mesh.vertices, mesh.faces, mesh.normals, mesh.colours, photo, partial(progress, number, steps, "texture")))
     density = np.max([each.density for each in surveys], axis=0)
     atlas = atlas_of(mesh.vertices, mesh.faces, texels_wanted(mesh.vertices, mesh.faces, density), largest)
     sharpness = float(np.median([each.sharpness for each in surveys]))
@@ -62,8 +63,8 @@ def _from_photographs(mesh: Mesh, inputs: MeshInputs, largest: int, progress: Pr
     texels = PhotographTexture(mesh.vertices, mesh.faces, mesh.normals, atlas, density, sharpness)
     for number, photo in enumerate(photographs(inputs.poses.folder, views)):
         progress(len(views) + number, steps, "texture")
-        texels.look(photo, surveys[number])
-    colours, known = texels.finished(mesh)
+        texels.look(photo, surveys[number], partial(progress, len(views) + number, steps, "texture"))
+    colours, known = texels.finished(mesh, partial(progress, steps, steps, "texture"))
     progress(steps, steps, "texture")
     facts = {
         "texture": "photographs",

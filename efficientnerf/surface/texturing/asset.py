@@ -55,10 +55,11 @@ def asset_colours(tree: NerfTree, mesh: Mesh, atlas: Atlas, progress: Callable[[
     return out
 
 
-def interpolated(mesh: Mesh, atlas: Atlas) -> np.ndarray:
+def interpolated(mesh: Mesh, atlas: Atlas, tick: Callable[[], None] = lambda: None) -> np.ndarray:
     """(T, 3) uint8 the colours of the mesh's vertices, which are those of the tree, at the texels."""
     out = np.empty((len(atlas.texels.place), 3), np.uint8)
     for start in range(0, len(out), CHUNK):
         part = slice(start, start + CHUNK)
+        tick()
         out[part] = np.round(np.clip(atlas.texels.values(mesh.colours, mesh.faces, part), 0, 1) * 255).astype(np.uint8)
     return out

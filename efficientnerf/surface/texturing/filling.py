@@ -3,6 +3,8 @@ of the texture have no seams."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from efficientnerf.backends.pieces import pieces
@@ -29,7 +31,10 @@ def texture_from(atlas: Atlas, colours: np.ndarray) -> np.ndarray:
     return np.asarray(colours[source])
 
 
-def carried_on(faces: np.ndarray, vertex_colours: np.ndarray, atlas: Atlas, colours: np.ndarray, known: np.ndarray, expected: np.ndarray) -> np.ndarray:
+def carried_on(
+    faces: np.ndarray, vertex_colours: np.ndarray, atlas: Atlas, colours: np.ndarray, known: np.ndarray, expected: np.ndarray,
+    tick: Callable[[], None] = lambda: None,
+) -> np.ndarray:  # fmt: skip
     """(V, 3) float32 colours of vertices, 0-1: what photographs show round each; where they show nothing, the mean of the vertices beside it that are known,
     ring by ring; further away those that they have, `vertex_colours` (V, 3). An asset has no colours of its own where no photograph looks.
 
@@ -45,6 +50,7 @@ def carried_on(faces: np.ndarray, vertex_colours: np.ndarray, atlas: Atlas, colo
         at, share = faces[texels.face, corner], texels.share[:, corner]
         total += np.bincount(at, share * known, minlength=count)
         for channel in range(3):
+            tick()
             shown = np.where(known > 0, colours[:, channel] - (1 - known) * expected[:, channel], 0)
             sums[:, channel] += np.bincount(at, share * shown, minlength=count)
     reached = total >= SEEN

@@ -7,6 +7,7 @@ and coarse photographs count less), times the cosine to the normal, its sharpnes
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -37,6 +38,10 @@ SHARP = 2.0  # times its sharpness over the median of all, at most 1, is what a 
 MIN_SAMPLES = 200  # vertices that a photograph has to show for its gains to be known
 GAIN = 0.12  # logarithm up to which gains are left out: differences with the direction of view look the same. docs/experiments/textures.md
 MOST_GAIN = 0.7
+
+
+def _untold() -> None:
+    """Work that nobody stops."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +84,9 @@ class Survey:
     gains: np.ndarray
 
 
-def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours: np.ndarray, photo: Photograph) -> Survey:
-    """What a photograph is like on a mesh with normals (V, 3) and colours (V, 3) sRGB 0-1."""
-    seen = _seen(vertices, faces, normals, photo)
+def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours: np.ndarray, photo: Photograph, tick: Callable[[], None] = _untold) -> Survey:
+    """What a photograph is like on a mesh with normals (V, 3) and colours (V, 3) sRGB 0-1. `tick` is called often; what it raises stops the work."""
+    seen = _seen(vertices, faces, normals, photo, tick)
     p = seen.pixels[faces]
     edge, other = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0])
@@ -95,7 +100,7 @@ def survey(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, colours
     visible[at[shown]] = True
     density = np.where(visible[faces].any(1), np.sqrt(area), 0.0)
     values = photo.colours[row[shown], column[shown]].astype(np.float64) / 255
-    return Survey(np.nan_to_num(density).astype(np.float32), _sharpness(photo, seen.clear), _gains(values, colours[at[shown]].astype(np.float64)))
+    return Survey(np.nan_to_num(density).astype(np.float32), _sharpness(photo, seen.clear, tick), _gains(values, colours[at[shown]].astype(np.float64)))
 
 
 def _beside(photo: Photograph) -> float:
@@ -132,12 +137,16 @@ def _gains(values: np.ndarray, expected: np.ndarray) -> np.ndarray:
     return np.asarray(np.exp(np.clip(found, -MOST_GAIN, MOST_GAIN))) if np.abs(found).max() > GAIN else np.ones(3)
 
 
-def _sharpness(photo: Photograph, clear: np.ndarray) -> float:
+def _sharpness(photo: Photograph, clear: np.ndarray, tick: Callable[[], None]) -> float:
     """Variance of the Laplacian of what shows the mesh away from edges, over that of the photograph at half its size: the variance itself would tell what is
     shown rather than how sharply."""
-    grey = photo.colours.astype(np.float32).mean(2)
+    grey = np.empty(photo.usable.shape, np.float32)
+    for part in pieces(len(grey), first=256):
+        tick()
+        grey[part] = photo.colours[part].mean(2, dtype=np.float32)
     height, width = grey.shape[0] // 2 * 2, grey.shape[1] // 2 * 2
     half = grey[:height, :width].reshape(height // 2, 2, width // 2, 2).mean((1, 3))
+    tick()
     fine, coarse = _laplacian_variance(grey, clear), _laplacian_variance(half, clear[:height:2, :width:2])
     return fine / coarse if coarse > 0 else 0.0
 
@@ -161,18 +170,34 @@ class _Seen:
     clear: np.ndarray
 
 
-def _seen(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: Photograph) -> _Seen:
-    from efficientnerf.backends.numba.mesh.photographs import edge_distance
-
+def _seen(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, photo: Photograph, tick: Callable[[], None]) -> _Seen:
+    tick()
     image: MeshImage = mesh_image(vertices, faces, photo.camera)
     near = (np.float32(1) / image.depth).astype(np.float32)
-    clear = np.empty(near.shape, np.float32)
-    edge_distance(photo.usable, near, JUMP, np.float32(4 * REACH), clear)
+    clear = edge_distance(photo.usable, near, tick)
     clear = np.minimum(clear, _from_border(near.shape) * (REACH / max(BORDER * max(near.shape), REACH)))
     pixels, depth = project(photo.camera, vertices)
     away = photo.camera.centre - vertices
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
     return _Seen(pixels, depth, (away * normals).sum(1).astype(np.float32), near, np.ascontiguousarray(clear, np.float32))
+
+
+def edge_distance(usable: np.ndarray, near: np.ndarray, tick: Callable[[], None] = _untold) -> np.ndarray:
+    """(H, W) float32 pixels from what may not be used (H, W) bool, and from jumps in the inverse depth (H, W) float32; 4 REACH at most."""
+    from efficientnerf.backends.numba.mesh.photographs import mark_edges, sweep_down, sweep_up
+
+    clear = np.where(usable, np.float32(4 * REACH), np.float32(0))
+    rows = len(clear)
+    for part in pieces(rows, first=64):
+        tick()
+        mark_edges(near, JUMP, part.start, part.stop, clear)
+    for part in pieces(rows, first=64):
+        tick()
+        sweep_down(part.start, part.stop, clear)
+    for part in pieces(rows, first=64):
+        tick()
+        sweep_up(rows - part.stop, rows - part.start, clear)
+    return clear
 
 
 def _from_border(shape: tuple[int, ...]) -> np.ndarray:
@@ -219,35 +244,39 @@ class PhotographTexture:
         ratio = np.divide(self.atlas.scale * np.sqrt(2 * areas), self.density, out=np.zeros(len(areas)), where=self.density > 0)
         return float(f"{_weighted_median(ratio, np.where(self.density > 0, areas, 0)):.4g}")
 
-    def look(self, photo: Photograph, found: Survey) -> None:
+    def look(self, photo: Photograph, found: Survey, tick: Callable[[], None] = _untold) -> None:
         """Let all texels see a photograph."""
         from efficientnerf.backends.numba.mesh.photographs import observe
 
         done = 0
         while done < self.halvings and min(photo.usable.shape) >= 2 * SMALLEST_PHOTOGRAPH:
             photo, done = halved(photo), done + 1
-        seen = _seen(self.vertices, self.faces, self.normals, photo)
+        seen = _seen(self.vertices, self.faces, self.normals, photo, tick)
         weight = np.float32(np.clip(SHARP * found.sharpness / self.sharpness, 0.05, 1.0)) if self.sharpness > 0 else np.float32(1)
         gains = np.ascontiguousarray(found.gains, np.float32)
         density = self.density / np.float32(2**done)
         for part in pieces(len(self.faces), first=4096):
+            tick()
             observe(
                 part.start, part.stop, self.texels.begin, self.texels.share, self.faces, seen.pixels, seen.depth, seen.facing, seen.near, seen.clear,
                 photo.colours, gains, np.float32(REACH), np.float32(SLACK), np.float32(_beside(photo)), density, weight, self.seen, self.grades,
             )  # fmt: skip
 
-    def finished(self, mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    def finished(self, mesh: Mesh, tick: Callable[[], None] = _untold) -> tuple[np.ndarray, np.ndarray]:
         """Colours (T, 3) uint8 of the texels, and what share of each is from photographs (T,). `mesh`: this one, with the colours that the asset has at its
         vertices, which tell outliers at first."""
-        expected = interpolated(mesh, self.atlas)
-        around = carried_on(self.faces, mesh.colours, self.atlas, *self.colours(expected), expected)
-        return self.colours(interpolated(replace(mesh, colours=around), self.atlas))
+        expected = interpolated(mesh, self.atlas, tick)
+        around = carried_on(self.faces, mesh.colours, self.atlas, *self.colours(expected, tick=tick), expected, tick)
+        return self.colours(interpolated(replace(mesh, colours=around), self.atlas, tick), tick=tick)
 
-    def colours(self, expected: np.ndarray, views: int = KEPT, power: float = POWER, scale: float = SCALE) -> tuple[np.ndarray, np.ndarray]:
+    def colours(
+        self, expected: np.ndarray, views: int = KEPT, power: float = POWER, scale: float = SCALE, tick: Callable[[], None] = _untold
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Colours of the texels (T, 3) uint8, and what share of each is from photographs (T,); `expected` (T, 3) uint8 where they show nothing."""
         from efficientnerf.backends.numba.mesh.photographs import blend
 
         out, known = np.empty((len(self.seen), 3), np.uint8), np.empty(len(self.seen), np.float32)
         for part in pieces(len(self.seen), first=4096):
+            tick()
             blend(part.start, part.stop, self.seen, self.grades, min(views, self.kept), power, scale, expected, VOTE, TRUST, out, known)
         return out, known

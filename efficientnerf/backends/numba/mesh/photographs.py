@@ -8,20 +8,14 @@ from efficientnerf.backends.numba.runtime import numba
 
 
 @numba.njit(cache=True, error_model="numpy")
-def edge_distance(usable, near, jump, most, out):  # type: ignore[no-untyped-def]
-    """Distance of pixels from pixels that may not be used, and from jumps in depth.
+def mark_edges(near, jump, begin, end, out):  # type: ignore[no-untyped-def]
+    """Sets `out` (H, W) to zero at jumps in depth between pixels of the rows `begin` to `end`, and between these and the row after them.
 
-    usable  (H, W) bool
     near    (H, W) float32 inverse depth of the mesh, zero where it is not
     jump    by which share of itself the inverse depth of pixels side by side has to differ from what the pixels beyond them lead to expect
-    most    distance that is told, at most
-    out     (H, W) float32 pixels: zero at such places; chamfer distance with steps of 1 and 1.4
     """
     height, width = near.shape
-    for row in range(height):
-        for column in range(width):
-            out[row, column] = most if usable[row, column] else 0.0
-    for row in range(height):
+    for row in range(begin, end):
         for column in range(width):
             here = near[row, column]
             if column + 1 < width:
@@ -38,7 +32,13 @@ def edge_distance(usable, near, jump, most, out):  # type: ignore[no-untyped-def
                 if _jumps(left, here, other, right, jump):
                     out[row, column] = 0.0
                     out[row + 1, column] = 0.0
-    for row in range(height):
+
+
+@numba.njit(cache=True, error_model="numpy")
+def sweep_down(begin, end, out):  # type: ignore[no-untyped-def]
+    """Half of a chamfer distance with steps of 1 and 1.4, from the zeros of `out` (H, W) float32: the rows `begin` to `end`, after all before them."""
+    width = out.shape[1]
+    for row in range(begin, end):
         for column in range(width):
             found = out[row, column]
             if column > 0:
@@ -50,17 +50,23 @@ def edge_distance(usable, near, jump, most, out):  # type: ignore[no-untyped-def
                 if column + 1 < width:
                     found = min(found, out[row - 1, column + 1] + np.float32(1.4))
             out[row, column] = found
-    for row in range(height - 1, -1, -1):
+
+
+@numba.njit(cache=True, error_model="numpy")
+def sweep_up(begin, end, out):  # type: ignore[no-untyped-def]
+    """The other half: the rows `begin` to `end`, after all behind them, from the last one on."""
+    height, width = out.shape
+    for row in range(end - 1, begin - 1, -1):
         for column in range(width - 1, -1, -1):
             found = out[row, column]
             if column + 1 < width:
                 found = min(found, out[row, column + 1] + np.float32(1.0))
             if row + 1 < height:
                 found = min(found, out[row + 1, column] + np.float32(1.0))
-                if column > 0:
-                    found = min(found, out[row + 1, column - 1] + np.float32(1.4))
                 if column + 1 < width:
                     found = min(found, out[row + 1, column + 1] + np.float32(1.4))
+                if column > 0:
+                    found = min(found, out[row + 1, column - 1] + np.float32(1.4))
             out[row, column] = found
 
 

@@ -11,7 +11,7 @@ from numba import get_num_threads, set_num_threads
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.texturing.atlas import atlas_of
-from efficientnerf.surface.texturing.photographs import Photograph, PhotographTexture, halved, photograph, survey, texels_wanted
+from efficientnerf.surface.texturing.photographs import REACH, Photograph, PhotographTexture, edge_distance, halved, photograph, survey, texels_wanted
 
 from .shapes import ball, box, cameras, pattern, photographed, textured
 
@@ -232,3 +232,41 @@ def test_no_photograph_shows_what_lies_close_behind_a_thin_sheet(tilt: float, ga
     behind = atlas.texels.face >= len(corners)
     assert (known[behind] < 0.01).all()
     assert (known[~behind] > 0.9).mean() > 0.3  # the rest is near the edges
+
+
+def test_distances_are_those_of_a_chamfer_from_what_may_not_be_used() -> None:
+    """On a plane, where depths do not jump: the least way of steps of 1 along rows and columns, and of 1.4 along diagonals."""
+    rng = np.random.default_rng(3)
+    usable = rng.random((70, 33)) > 0.004
+    found = edge_distance(usable, np.full(usable.shape, 0.5, np.float32))
+    y, x = np.mgrid[: usable.shape[0], : usable.shape[1]]
+    expected = np.full(usable.shape, 4 * REACH)
+    for row, column in np.argwhere(~usable):
+        along, across = np.abs(y - row), np.abs(x - column)
+        expected = np.minimum(expected, np.maximum(along, across) + 0.4 * np.minimum(along, across))
+    assert (~usable).sum() > 3
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert (edge_distance(usable, np.where(x < 16, 0.5, 0.4).astype(np.float32))[:, 15:17] == 0).all()
+
+
+@pytest.mark.parametrize("after", [0, 2, 5, 8])
+def test_a_signal_stops_it_within_a_photograph(after: int) -> None:
+    """In the survey of one, in what texels see of one, and when all have been seen."""
+    vertices, faces = ball(2)
+    normals, photo, left = vertex_normals(vertices, faces), photographed(*ball(2), cameras(1)[0]), [after]
+    found = survey(vertices, faces, normals, pattern(vertices), photo)
+    texels = PhotographTexture(vertices, faces, normals, atlas_of(vertices, faces, np.inf, 64), found.density, found.sharpness)
+    mesh = Mesh(vertices, faces, normals, pattern(vertices).astype(np.float32))
+
+    def tick() -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise InterruptedError
+
+    for work in (lambda: survey(vertices, faces, normals, pattern(vertices), photo, tick), lambda: texels.finished(mesh, tick)):
+        left[0] = after
+        with pytest.raises(InterruptedError):
+            work()
+    left[0] = min(after, 4)
+    with pytest.raises(InterruptedError):
+        texels.look(photo, found, tick)
