@@ -140,10 +140,10 @@ def _gains(values: np.ndarray, expected: np.ndarray) -> np.ndarray:
 def _sharpness(photo: Photograph, clear: np.ndarray, tick: Callable[[], None]) -> float:
     """Variance of the Laplacian of what shows the mesh away from edges, over that of the photograph at half its size: the variance itself would tell what is
     shown rather than how sharply."""
-    grey = np.empty(photo.usable.shape, np.float32)
+    grey: np.ndarray = np.empty(photo.usable.shape, np.float32)
     for part in pieces(len(grey), first=256):
         tick()
-        grey[part] = photo.colours[part].mean(2, dtype=np.float32)
+        grey[part] = photo.colours[part].astype(np.float32).mean(axis=2)
     height, width = grey.shape[0] // 2 * 2, grey.shape[1] // 2 * 2
     half = grey[:height, :width].reshape(height // 2, 2, width // 2, 2).mean((1, 3))
     tick()
