@@ -24,13 +24,19 @@ def present_page(what: Path, asset: Path) -> Path | None:
     return what / NAME if stat.S_ISREG(page.st_mode) and page.st_size and page.st_mtime_ns >= of.st_mtime_ns else None
 
 
-def make_page(asset: Path, target: Path, title: str) -> None:
-    """Write the page, whole or not at all. Raises CorruptArtifact for a damaged asset, DiskFull, and BadInput where it cannot be written."""
+def make_page(what: Path, asset: Path, target: Path) -> None:
+    """Write the page of a run's asset, with the cameras and photographs of the run, or of an asset file; whole or not at all.
+
+    Raises CorruptArtifact for a damaged asset, DiskFull, and BadInput where it cannot be written.
+    """
     from efficientnerf.asset.format import FormatError
     from stages.viewer.page import write_viewer
+    from workflows.cli.target import is_run
+    from workflows.report.viewer import captured
 
+    cameras, photographs = captured(what) if is_run(what) else ([], {})
     try:
-        write_viewer(asset, target, title=title)
+        write_viewer(asset, target, cameras=cameras, photographs=photographs, title=title_of(what, asset))
     except FormatError as error:
         raise CorruptArtifact(f"{asset}: {error}", (str(asset),)) from error
     except OSError as error:

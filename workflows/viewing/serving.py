@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pipeline.errors import UsageError
 from pipeline.interrupt import stopping
 from stages.viewer.page import NAME
-from workflows.viewing.page import make_page, present_page, title_of
+from workflows.viewing.page import make_page, present_page
 
 if TYPE_CHECKING:
     from pipeline.stage import Stage
@@ -31,7 +31,7 @@ def page_of(what: Path, *, force: bool) -> tuple[Path, bool]:
     if there is not None:
         return there, False
     target = (what if is_run(what) else Path(tempfile.mkdtemp(prefix="enerf-view-"))) / NAME
-    make_page(asset, target, title_of(what, asset))
+    make_page(what, asset, target)
     return target, True
 
 
@@ -79,7 +79,7 @@ def serve(what: Path, stages: Sequence[Stage], address: str | None, port: int, r
             site: AssetSite | RunSite = RunSite(Path(os.path.abspath(what)), stages, folder, force=force)
         else:
             asset = asset_of(what)
-            make_page(asset, folder / NAME, title_of(what, asset))
+            make_page(what, asset, folder / NAME)
             site = AssetSite(folder / NAME)
         with Server(site, address or LOOPBACK, port) as server:
             threading.Thread(target=server.serve_forever, kwargs={"poll_interval": LOOK}, daemon=True).start()

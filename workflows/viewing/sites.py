@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.errors import PipelineError
 from stages.viewer.page import NAME
-from workflows.viewing.page import make_page, present_page, title_of
+from workflows.viewing.page import make_page, present_page
 from workflows.viewing.progress import PREVIEW, Progress, asset_identity
 from workflows.viewing.server import Answer, open_inside
 
@@ -87,7 +87,7 @@ class RunSite:
                 if identity is None:
                     return None
                 if identity != self._made:
-                    make_page(asset, page, title_of(self.run, asset))
+                    make_page(self.run, asset, page)
                     self._made = identity
             except PipelineError:  # no asset yet, or one that is just replaced: status.json says
                 return None

@@ -4,7 +4,7 @@ No wheel of OpenVDB's own library is to be had for every Python, and what is wri
 32^3, 16^3 and 8^3 children, leaves of 8^3 voxels, and of each leaf a mask of its voxels and the values of those alone. Blender's library reads it in tests.
 
     density    float  per unit of the capture's frame: light falls to exp(-density) along one unit
-    color      vec3s, 16 bits  linear light, 0 to 1, where there is density; as seen from outside, for a volume has one colour for all directions
+    color      vec3s, 16 bits  linear light, 0 to 1, where there is density; as the captured cameras see it, for a volume has one colour
 
 The cascades around a whole scene follow as density_1 and color_1, and so on, their voxels twice as large each time, with what lies in the box before left out.
 
@@ -33,6 +33,7 @@ ACTIVE_VALUES = 2  # compression: of nodes the values of their active voxels alo
 LEAF, LOWER, UPPER = 3, 4, 5  # binary logarithms of the nodes' sides, in children
 ROOT = LEAF + LOWER + UPPER
 AT_ONCE = 1 << 16  # voxels whose colours are looked up
+EYES = 16  # captured cameras that colours are seen from
 _INACTIVE_ARE_BACKGROUND = b"\0"
 
 
@@ -88,24 +89,48 @@ def grids_of(tree: NerfTree, frame: SourceFrame, path: Path) -> list[Grid]:
 
 
 def _colours(tree: NerfTree, kept: np.ndarray) -> np.ndarray:
-    """(n, 3) float16, linear: medians over views from outside, as `surface_colours` has them. The harmonic of degree 0 is no mean of these: nobody
-    photographed a surface from within, and what it looks like from there is whatever fitted the rest."""
+    """(n, 3) float16, linear: of an asset that keeps its captured cameras the mean over some of these, by how squarely each looks at the surface; else
+    the median over views from outside, as `surface_colours` has it. The harmonic of degree 0 is no such mean: what nobody photographed, a surface from
+    within, looks like whatever fitted the rest. docs/experiments/volume-colours.md"""
     from efficientnerf.asset.queries import normal_at
     from efficientnerf.asset.region import voxel_centres
     from efficientnerf.rendering.colour import linear_from_srgb
     from efficientnerf.rendering.harmonics import basis_numpy
     from efficientnerf.surface.colours import outside_directions
 
-    voxels, centres = np.flatnonzero(kept), voxel_centres(tree)
+    voxels, centres, eyes = np.flatnonzero(kept), voxel_centres(tree), _eyes(tree)
     out = np.empty((len(voxels), 3), np.float16)
     for start in range(0, len(voxels), AT_ONCE):
         chosen = voxels[start : start + AT_ONCE]
         normal = np.asarray(normal_at(tree, centres[chosen]), np.float64)
         normal[~normal.any(axis=1)] = (0.0, 0.0, 1.0)
         coefficients = tree.coefficients(chosen)  # (n, K, 3)
-        logits = [np.einsum("nk,nkc->nc", basis_numpy(direction, tree.degree), coefficients) for direction in outside_directions(normal)]
-        out[start : start + AT_ONCE] = linear_from_srgb(1 / (1 + np.exp(-np.clip(np.median(logits, axis=0), -80, 80))))
+        directions = outside_directions(normal) if eyes is None else [_towards(centres[chosen], eye) for eye in eyes]
+        views = [np.einsum("nk,nkc->nc", basis_numpy(direction, tree.degree), coefficients) for direction in directions]
+        if eyes is None:
+            logits = np.median(views, axis=0)
+        else:
+            facing = np.stack([np.maximum(-(direction * normal).sum(axis=1), 0) + 1e-3 for direction in directions])  # (C, n)
+            logits = (facing[..., None] * views).sum(axis=0) / facing.sum(axis=0)[:, None]
+        out[start : start + AT_ONCE] = linear_from_srgb(1 / (1 + np.exp(-np.clip(logits, -80, 80))))
     return out
+
+
+def _eyes(tree: NerfTree) -> np.ndarray | None:
+    """(C, 3) where some of the captured cameras stood, spread over their path; None where the asset keeps none."""
+    from stages.framing.captured import captured_of
+
+    found = captured_of(tree.metadata)
+    if found is None:
+        return None
+    eyes = found.centres
+    return np.asarray(eyes[np.unique(np.linspace(0, len(eyes) - 1, EYES).round().astype(int))])
+
+
+def _towards(points: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """(n, 3) unit directions of rays from an eye to points."""
+    away = points - eye
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12))
 
 
 def write_grids(grids: list[Grid], path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from efficientnerf.asset.cascades import cascade_grids, nested
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.rendering.colour import linear_from_srgb
 from pipeline.errors import BadInput, UsageError
@@ -129,6 +130,21 @@ def test_colours_are_those_that_are_seen_from_outside() -> None:
     _, colour = grids_of(ball, Z_UP, Path("a.vdb"))
     far = np.linalg.norm((colour.coordinates + 0.5) / 8 - 1, axis=1) > 0.4
     assert np.median(colour.values[far]) > 0.9, "0.21 is what the harmonic of degree 0 has"
+
+
+def test_colours_are_those_that_the_captured_cameras_see() -> None:
+    """Two cameras above: yellow from there, blue from below."""
+    from stages.framing.captured import captured_metadata
+
+    poses = [np.array([[1.0, 0, 0, x], [0, -1, 0, 0], [0, 0, -1, 5], [0, 0, 0, 1]]) for x in (-0.5, 0.5)]
+    path = captured_metadata([Camera("", 8, 8, "SIMPLE_PINHOLE", (8.0, 4.0, 4.0), pose) for pose in poses])
+    at = np.argwhere(np.ones((4, 4, 4), bool))
+    sh = np.zeros((64, 4, 3), np.float32)
+    sh[:, 2] = (-12, -12, 12)  # times z of a ray's direction
+    slab = tree_from_voxels((1, 1, 1), 0.25, np.full(3, -0.5), at, np.full(64, 9, np.float32), sh, metadata={"captured_path": path})
+    _, colour = grids_of(slab, Z_UP, Path("a.vdb"))
+    assert colour.values[:, :2].min() > 0.9
+    assert colour.values[:, 2].max() < 0.1
 
 
 def test_cascades_are_grids_of_their_own_that_do_not_overlap() -> None:

@@ -220,8 +220,8 @@ def asset(path: Path) -> None:
 def test_the_viewer_comes_with_the_asset_and_changes_with_it(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
 
-    def make(asset: Path, target: Path, title: str) -> None:
-        made.append(title)
+    def make(what: Path, asset: Path, target: Path) -> None:
+        made.append(what.name)
         target.write_text(f"page {len(made)}", encoding="utf-8")
 
     monkeypatch.setattr(sites, "make_page", make)

@@ -35,8 +35,8 @@ def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
 
-    def make(asset: Path, target: Path, title: str) -> None:
-        target.write_text(f"{title} of {asset.stat().st_size} bytes", encoding="utf-8")
+    def make(what: Path, asset: Path, target: Path) -> None:
+        target.write_text(f"{what.name} of {asset.stat().st_size} bytes", encoding="utf-8")
 
     for module in (serving, sites):
         monkeypatch.setattr(module, "make_page", make)
@@ -111,8 +111,14 @@ def test_what_is_refused(
     assert not list((tmp_path / "temporary").iterdir())
 
 
+def test_the_page_holds_the_asset_under_the_name_of_its_run(enerf: Enerf, run: Path) -> None:
+    assert enerf("view", run, "--no-browser", "--quiet").code == 0
+    text = (run / "viewer.html").read_text(encoding="utf-8")
+    assert "<title>run</title>" in text
+    assert "data-part" in text
+
+
 def test_a_damaged_asset_makes_no_page(enerf: Enerf, run: Path, tmp_path: Path) -> None:
-    pytest.importorskip("stages.viewer.page")
     damaged = tmp_path / "damaged.nerftree"
     damaged.write_bytes(BakeOutputs.of_run(run).asset.read_bytes()[:-9])
     result = enerf("view", damaged, "--no-browser")
