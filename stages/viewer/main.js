@@ -3,7 +3,7 @@
 import { FormatError, readAsset } from "./asset.js";
 import { Eye } from "./camera.js";
 import { Controls } from "./controls.js";
-import { facts, fromBase64, inflated } from "./payload.js";
+import { facts, fromBase64, fromBase64Slow, inflated } from "./payload.js";
 import { Renderer, Unsupported } from "./renderer.js";
 import { sha256Slow } from "./sha256.js";
 
@@ -73,10 +73,15 @@ class Viewer {
   }
 
   settings(rough) {
-    const { eye } = this.eye.view(1, 1), corner = (n) => this.box.map((x) => x)[n];
-    const middle = [0, 1, 2].map((axis) => (corner(0)[axis] + corner(1)[axis]) / 2), reach = Math.hypot(...middle.map((x, axis) => corner(1)[axis] - x));
-    const distance = Math.hypot(...middle.map((x, axis) => x - eye[axis])), nearest = Math.max(distance - reach, 0.15 * distance, 1e-6);
-    return { ...this.options, rough: rough || this.options.rough, range: [nearest, distance + (this.options.surroundings || this.tree.ndc ? 4 : 1) * reach] };
+    return { ...this.options, rough: rough || this.options.rough, range: this.range() };
+  }
+
+  // Depths between which colours tell: those of the scene, and some of what is behind it.
+  range() {
+    if (this.tree.ndc) return [this.tree.ndc.near, 12 * this.tree.ndc.near];
+    const { eye } = this.eye.view(1, 1), [low, high] = this.box, middle = low.map((x, axis) => (x + high[axis]) / 2);
+    const reach = Math.hypot(...middle.map((x, axis) => high[axis] - x)), distance = Math.hypot(...middle.map((x, axis) => x - eye[axis]));
+    return [Math.max(distance - reach, 0.3 * distance, 1e-6), distance + (this.options.surroundings ? 4 : 1) * reach];
   }
 
   tick(now) {
@@ -165,15 +170,17 @@ async function start() {
     last = performance.now();
   };
   const bytes = await inflated(page.bytes, step("Unpacking …", 0, 0.5));
+  const unpacked = performance.now();
   const tree = await readAsset(bytes, step("Checking …", 0.5, 0.7));
+  const checked = performance.now();
   await step("Bricks …", 0.75, 0.75)(1);
   await breath();
   const graphics = renderer.load(tree, false), viewer = new Viewer(tree, renderer, page.cameras, page.home);
   const controls = new Controls(viewer, page);
   element("loading").hidden = true;
   document.body.classList.add("ready");
-  const seconds = (performance.now() - began) / 1000;
-  return { viewer, controls, tree, seconds, graphics };
+  const times = { unpacking: unpacked - began, checking: checked - unpacked, textures: performance.now() - checked };
+  return { viewer, controls, tree, times, seconds: (performance.now() - began) / 1000, graphics };
 }
 
 globalThis.enerf = {
@@ -202,6 +209,7 @@ globalThis.enerf = {
     }
   },
   sha256: sha256Slow,
+  fromBase64: fromBase64Slow,
   async render(width, height) {
     return (await this.ready).viewer.still(width, height);
   },

@@ -8,6 +8,17 @@ const DIGITS = new Int16Array(128).fill(-1);
 [..."ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"].forEach((digit, n) => (DIGITS[digit.charCodeAt(0)] = n));
 
 export function fromBase64(text) {
+  if (Uint8Array.fromBase64) {
+    try {
+      return Uint8Array.fromBase64(text);
+    } catch {
+      throw new FormatError("the page's data are no base64; the page is damaged");
+    }
+  }
+  return fromBase64Slow(text);
+}
+
+export function fromBase64Slow(text) {
   const end = text.endsWith("==") ? 2 : text.endsWith("=") ? 1 : 0, length = text.length - end, out = new Uint8Array(Math.floor((length * 3) / 4));
   let wrong = text.length % 4 ? 1 : 0;
   for (let from = 0, to = 0; from < length; from += 4) {

@@ -5,7 +5,7 @@ import { volumeOf } from "./volume.js";
 
 export class Unsupported extends Error {}
 
-const LEAST_WEIGHT = 1e-3, ROUGH_WEIGHT = 0.02;
+const LEAST_WEIGHT = 1e-3, ROUGH_WEIGHT = 0.02; // docs/experiments/viewer.md
 const UNITS = ["coarse", "density", "base", "palette", "environment", "codes0", "codes1", "codes2"];
 
 export class Renderer {

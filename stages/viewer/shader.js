@@ -120,8 +120,13 @@ ${tree.nearest ? "  sum = corner(ivec3(floor(u)), cell, tile, n, 1.0);" : `  vec
   return 1.0 / (1.0 + exp(-sum.rgb / max(sum.a, 1e-12)));
 }
 
-float depthAt(vec3 u, ivec3 cell, ivec3 tile) {
-  return textureLod(density, (vec3(tile * (B + 2) + 1) + u - vec3(cell * B)) * densityScale, 0.0).r;
+// Density, as an optical depth of a voxel's side, at voxel coordinates of cascade n.
+float densityAt(int n, vec3 u) {
+  if (any(lessThan(u, vec3(0.0))) || any(greaterThanEqual(u, vec3(shape[n] * B)))) return 0.0;
+  ivec3 cell = min(ivec3(u / float(B)), shape[n] - 1);
+  uint found = texelFetch(coarse, cell + ivec3(0, 0, above[n]), 0).r;
+  if (found < 0x80000000u) return 0.0;
+  return textureLod(density, (vec3(tileOf(found) * (B + 2) + 1 - cell * B) + u) * densityScale, 0.0).r;
 }
 
 // Samples from distance enter to distance leave, in voxels, of the ray from p along d through cascade n.
@@ -154,11 +159,11 @@ void march(int n, vec3 p, vec3 d, float enter, float leave) {
     float left = transmittance * exp(-thickness);
     pending += transmittance - left;
     if (left < 0.5 && halfway < 0.0) {
-      halfway = (t + (log(2.0 * transmittance) / thickness - 0.5) * STEP) * side[n];
-      place = low[n] + u * side[n];
-      facing = -vec3(depthAt(u + vec3(0.5, 0, 0), cell, tile) - depthAt(u - vec3(0.5, 0, 0), cell, tile),
-                     depthAt(u + vec3(0, 0.5, 0), cell, tile) - depthAt(u - vec3(0, 0.5, 0), cell, tile),
-                     depthAt(u + vec3(0, 0, 0.5), cell, tile) - depthAt(u - vec3(0, 0, 0.5), cell, tile));
+      float middle = t + (log(2.0 * transmittance) / thickness - 0.5) * STEP;
+      vec3 v = p + middle * d, x = vec3(1, 0, 0), y = vec3(0, 1, 0), z = vec3(0, 0, 1);
+      halfway = middle * side[n];
+      place = low[n] + v * side[n];
+      facing = vec3(densityAt(n, v - x) - densityAt(n, v + x), densityAt(n, v - y) - densityAt(n, v + y), densityAt(n, v - z) - densityAt(n, v + z));
     }
     transmittance = left;
     if (pending > least && (mode == 0 || mode == 3)) {

@@ -98,6 +98,16 @@ def test_a_page_renders_what_the_cpu_renders(kind: str, chromium: Any, tmp_path:
             expected = render(tree, camera, background=behind).colour
             assert expected.std() > 0.02  # there is something to see
             assert decibels(found, expected) > 45
+        camera = cameras_at(tree)[0]
+        expected = render(tree, camera)
+        hit = np.isfinite(expected.depth)
+        assert 0.05 < hit.mean() < 0.98
+        shown = page.rendered(camera, background=(0, 1, 0), surroundings=False, mode=1)
+        assert ((shown != (0, 255, 0)).any(axis=-1) == hit).mean() > 0.99  # what it is thick enough to have a depth
+        shown = page.rendered(camera, background=(0, 1, 0), surroundings=False, mode=2) / 127.5 - 1
+        both = hit & (np.abs(np.linalg.norm(shown, axis=-1) - 1) < 0.03)
+        assert both.sum() > 0.9 * hit.sum()
+        assert np.median((shown * expected.normal).sum(axis=-1)[both]) > 0.95
         assert page.console == []
         assert [each for each in page.requests if not each.startswith(("file:", "data:"))] == []
 
@@ -218,11 +228,15 @@ def test_a_browser_without_webgl2_is_told(chromium: Any, tmp_path: Path) -> None
     context.close()
 
 
-def test_its_own_digests_are_those_of_the_standard(chromium: Any, tmp_path: Path) -> None:
+def test_its_own_digests_and_base64_are_those_of_the_standards(chromium: Any, tmp_path: Path) -> None:
     with browser.opened(chromium, written(tmp_path, serialize(random_tree(1), "compact"))) as page:
         for length in (0, 3, 55, 56, 63, 64, 65, 119, 120, 1000):
             content = bytes(n % 251 for n in range(length))
             assert page.page.evaluate("x => enerf.sha256(Uint8Array.from(x))", list(content)) == hashlib.sha256(content).hexdigest()
+            assert page.page.evaluate("x => Array.from(enerf.fromBase64(x))", base64.b64encode(content).decode()) == list(content)
+        for wrong in ("a", "ab", "abc", "a===", "ab=c", "abc\u0141", "ab c", "ab-d"):
+            said = page.page.evaluate("x => { try { enerf.fromBase64(x); return 'taken' } catch (error) { return error.message } }", wrong)
+            assert said.startswith("the page's data")
 
 
 JPEG = (
