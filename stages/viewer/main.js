@@ -9,7 +9,7 @@ import { sha256Slow } from "./sha256.js";
 
 const element = (id) => document.getElementById(id);
 const breath = () => new Promise((resolve) => setTimeout(resolve, 0));
-const BUDGET = 28; // milliseconds that a picture may take while the eye moves
+const BUDGET = 40; // milliseconds that a picture may take while the eye moves
 const REST = 180; // milliseconds without a movement until the picture is made whole
 
 function say(text, share) {
@@ -127,7 +127,7 @@ class Viewer {
       this.state = "done";
     } else {
       const wanted = this.share * Math.sqrt(BUDGET / milliseconds);
-      this.share = Math.min(1, Math.max(0.12, 0.7 * this.share + 0.3 * wanted));
+      this.share = Math.min(1, Math.max(0.15, 0.7 * this.share + 0.3 * wanted));
       this.frames.push(performance.now());
       this.frames = this.frames.filter((time) => time > performance.now() - 1000);
     }
