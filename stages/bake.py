@@ -229,7 +229,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=12,
+    version=13,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,
