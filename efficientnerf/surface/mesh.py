@@ -298,6 +298,7 @@ def sample(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> tu
     return face, np.stack([1 - root, root * (1 - v), root * v], 1)
 
 
+LEAST_ROUNDS = 6
 FITS, DRIFT_ROUNDS = 40, 24  # of vertices to normals at most, and of averaging what all vertices of a place have in common. docs/experiments/surface.md
 
 
@@ -330,6 +331,12 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
     for _ in range(DRIFT_ROUNDS):
         drift = 0.5 * drift + 0.5 * (neighbours @ drift) / degree
     return fitted - drift * outward
+
+
+def rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
+    """How many rounds of smoothing spread over about `reach`, at least LEAST_ROUNDS: a round spreads over an edge, n rounds over the root of n edges."""
+    edge = float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean())
+    return max(LEAST_ROUNDS, int(min((reach / max(edge, 1e-300)) ** 2, 1e6)))
 
 
 def _bilateral_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float) -> np.ndarray:

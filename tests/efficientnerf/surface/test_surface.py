@@ -9,7 +9,22 @@ import trimesh
 from efficientnerf.surface.colours import surface_colours
 from efficientnerf.surface.extraction import points, surface
 from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface
-from efficientnerf.surface.mesh import Mesh, decimate, face_areas, face_vectors, face_volumes, moved, sample, separate, smooth, smooth_normals, tidy, topology
+from efficientnerf.surface.mesh import (
+    LEAST_ROUNDS,
+    Mesh,
+    decimate,
+    face_areas,
+    face_vectors,
+    face_volumes,
+    moved,
+    rounds_within,
+    sample,
+    separate,
+    smooth,
+    smooth_normals,
+    tidy,
+    topology,
+)
 
 LEVEL = 40.0
 NOBODY = np.zeros((0, 3))
@@ -258,3 +273,14 @@ def test_smoothing_normals_leaves_a_plane_and_takes_no_rounds_for_nothing() -> N
     np.testing.assert_allclose(smooth_normals(plane, faces, 8), plane, atol=1e-12)
     assert smooth_normals(plane, faces, 0) is plane
     assert len(smooth_normals(plane[:0], faces[:0], 3)) == 0
+
+
+def test_rounds_of_smoothing_go_with_the_number_of_faces() -> None:
+    """Each face in four: edges half as long, and four times the rounds spread as far. Too few faces: the least."""
+    fine = trimesh.creation.icosphere(4)
+    coarse = trimesh.creation.icosphere(3)
+    rounds = [rounds_within(0.5, mesh.vertices, mesh.faces) for mesh in (coarse, fine)]
+    assert rounds[0] > LEAST_ROUNDS
+    assert rounds[1] == pytest.approx(4 * rounds[0], rel=0.08)
+    assert rounds_within(0.5, 7 * fine.vertices, fine.faces) == LEAST_ROUNDS
+    assert rounds_within(3.5, 7 * fine.vertices, fine.faces) == rounds[1]
