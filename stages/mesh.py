@@ -63,8 +63,8 @@ class MeshSettings:
     )
     normal_map: bool = setting(
         False,
-        "A normal map beside the texture, of the surface before it was decimated. Materials are lit then, not unlit: lamps show its relief, over the light of"
-        " the capture.",
+        "A normal map beside the texture, of the surface before it was decimated; materials are lit then, so that lamps show its relief over the light of the"
+        " capture.",
         advanced=True,
     )
 

@@ -14,6 +14,7 @@ from efficientnerf.asset.queries import colour_at, density_at, normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.backends.numba.tree import rendering
+from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
 from efficientnerf.geometry.cameras import rays
 from tests.efficientnerf.walls import DEPTH, NEAR, camera_at, wall
 
@@ -99,7 +100,10 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
     # Rays of which nothing is known are summed sample by sample.
     alone = render_rays(tree, origins, directions)
     np.testing.assert_allclose(seen.colour.reshape(-1, 3), alone.colour, atol=2e-3)
-    np.testing.assert_allclose(seen.opacity.reshape(-1), alone.opacity, atol=1e-5)
+    # A ray ends where less light than PACKED_EARLY_STOP is left: one that hardly has more goes on in one of the two alone.
+    opaque = np.float32(1 - PACKED_EARLY_STOP)
+    np.testing.assert_allclose(np.minimum(seen.opacity.reshape(-1), opaque), np.minimum(alone.opacity, opaque), atol=1e-5)
+    assert (np.abs(seen.opacity.reshape(-1) - alone.opacity) > 1e-5).mean() < 2e-3
     np.testing.assert_allclose(seen.normal.reshape(-1, 3), np.where(alone.opacity[:, None] >= 0.5, alone.normal, 0), atol=1e-4)
     # Close by, colours are those of each ray, but for rounding.
     assert (np.abs(seen.colour.reshape(-1, 3) - alone.colour).max() > 1e-5) == (place != "close")
