@@ -1,19 +1,27 @@
-"""What holds for all tests: one thread, in this process and in those that tests start.
+"""What holds for all tests: one thread, in this process and in those that tests start; and their folders in memory.
 
 The kernels give the same bytes on any number of threads; bundles as small as the tests' only make threads wait for each other, many times
 longer than the work takes where the machine is busy. Set before anything is imported: numba and torch read it when they are.
+
+Artifacts are flushed to the disk step by step. On a disk, a flush waits for all that other workers write; in a file system in memory it waits for nothing.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import threading
+from pathlib import Path
 
 import pytest
 
 for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ[variable] = "1"
+
+IN_MEMORY, ROOM = Path("/dev/shm"), 4 << 30  # all tests together leave under a tenth of it
+if "PYTEST_DEBUG_TEMPROOT" not in os.environ and os.access(IN_MEMORY, os.W_OK) and shutil.disk_usage(IN_MEMORY).free >= ROOM:
+    os.environ["PYTEST_DEBUG_TEMPROOT"] = str(IN_MEMORY)
 
 # A test run that was started in the background inherits an ignored SIGINT, and would hand it on to the programs that the tests interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN and threading.current_thread() is threading.main_thread():
