@@ -29,6 +29,7 @@ from stages.baking.metadata import metadata_of, sources_of
 from stages.compiling import compiling_kernels
 from stages.cores import use_all_cores
 
+SIZE_NOTE = "size_limit.json"
 PSNR_BYTES = 16  # by which a header grows at most, once the PSNR of what is written is known
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ class BakeSettings:
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"
         " 34 bytes for each pixel of a forward-facing capture, from 24 to 56; a third of that with layout packed; less where voxels as fine as pixels"
-        " resolve are fewer.",
+        " resolve are fewer, or where time_budget is too short for as many.",
         unit="MiB",
     )
     layout: Literal["compact", "packed", "small", "sparse"] = setting(
@@ -133,7 +134,6 @@ def run(job: Job) -> None:
     from stages.baking.economy import packed_tree
     from stages.baking.memory import refuse_more_than_fits, rows_for_baking
     from stages.baking.refinement import refined
-    from stages.baking.resolution import budget_of
     from stages.baking.values import baked_tree
     from stages.baking.whole_scene import bounds_are_given
     from stages.evaluation.views import constant_background
@@ -149,7 +149,7 @@ def run(job: Job) -> None:
         raise UsageError("train.field=nerf: its colours depend on the direction inside the network, which can't be baked. Use mlp or hash, or --until train.")
     s = load_scene(job.inputs["poses"], job.inputs["train"])
     whole = constant_background(s) is None
-    mib, views = budget_of(s, given(settings.max_mib), packed=settings.layout == "packed"), scene.views_of(s, "train")
+    mib, views = _size_limit(job, s, whole=whole), scene.views_of(s, "train")
     phases = schedule.PHASES
     splits = schedule.count_splits(phases)
     pixels = pixels_of(job.inputs["poses"], views, rows_for_baking(job, m, s, views, mib, splits=splits, whole=whole))
@@ -177,6 +177,27 @@ def run(job: Job) -> None:
     if whole:
         found |= {"cascades": np.bincount(voxel_cascades(tree), minlength=len(plan.grids)).tolist(), "voxel": tree.voxel}
     outputs.report.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _size_limit(job: Job, s: Scene, *, whole: bool) -> float:
+    """MiB that the asset may have; where it is left to us, no more than can be refined in bake.time_budget. Noted, for another attempt may have other cores."""
+    from stages.baking.resolution import budget_of, timed_budget
+    from stages.cores import count_cores
+    from stages.scratch import note, noted
+
+    settings: BakeSettings = job.settings
+    packed, seconds = settings.layout == "packed", given(settings.time_budget)
+    mib = budget_of(s, given(settings.max_mib), packed=packed)
+    if seconds is None or settings.max_mib != "auto" or job.device != "cpu":
+        return mib
+    found = noted(job.work / SIZE_NOTE, float, job.warn)
+    if found is not None:
+        return found
+    timed = timed_budget(mib, seconds, count_cores(), whole=whole, packed=packed)
+    if timed < mib:
+        job.say(f"of {mib:g} MiB, about {timed:.3g} can be refined in {seconds:g} s")
+    note(job.work / SIZE_NOTE, timed)
+    return timed
 
 
 def _room(settings: BakeSettings, m: Any, plan: Plan, mib: float, splits: int) -> int:
@@ -229,7 +250,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=13,
+    version=14,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,

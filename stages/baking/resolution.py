@@ -28,6 +28,9 @@ MAX_MIB = 38
 MAX_CASCADES, MAX_BEYOND, MAX_CELLS = 8, 0.01, 2**24
 # In normalised device coordinates: bytes for each pixel of the box's face; MiB at least and at most. docs/experiments/ndc.md
 NDC_BYTES, NDC_MIN_MIB, NDC_MAX_MIB = 34, 24, 56
+# With bake.time_budget: MiB for each second of a core, which are refined to within little of what longer gives; MiB at least. A voxel of a whole scene takes
+# fewer rays. docs/experiments/tree-training.md
+TIMED_MIB, SCENE_TIMED_MIB, MIN_TIMED_MIB = 0.115, 0.23, 2.0
 MIN_FILL = 0.93  # of the size that is used, at least
 MAX_TRIES = 4
 
@@ -96,6 +99,12 @@ def budget_of(s: Scene, given: float | None, *, packed: bool = False) -> float:
     return int(np.clip(NDC_BYTES * across * down / 2**20, NDC_MIN_MIB, NDC_MAX_MIB))
 
 
+def timed_budget(mib: float, seconds: float, cores: int, *, whole: bool, packed: bool = False) -> float:
+    """MiB of those that an asset may have, which can be refined in so many seconds: fewer voxels that rays have met often are better than more of them."""
+    timed = max(MIN_TIMED_MIB, (SCENE_TIMED_MIB if whole else TIMED_MIB) * seconds * cores)
+    return min(mib, timed / 3 if packed else timed)
+
+
 def ndc_pixel(s: Scene, forward: ForwardFacing) -> float:
     """Width of a pixel of the median camera in normalised device coordinates, at any depth."""
     return forward.ndc.slopes[0] / float(np.median([view.camera.intrinsics["fx"] for view in s.views]))
@@ -128,4 +137,4 @@ def affordable_resolution(finest: Choice, count: Callable[[int], int], room: Cal
             break
         at = following
     best = best or at
-    return finest if best == top else Choice(best, f"as fine as bake.max_mib has room for, where voxels grow with the resolution to the power {power:.1f}")
+    return finest if best == top else Choice(best, f"as fine as its size allows, where voxels grow with the resolution to the power {power:.1f}")

@@ -23,6 +23,7 @@ from stages import bake, train
 from stages.artifacts import BakeOutputs
 from stages.bake import BakeSettings
 from stages.baking import refinement, timing
+from stages.baking.resolution import MAX_MIB, timed_budget
 from stages.figures import plots
 from stages.training.log import read_lines
 from tests.efficientnerf.balls import settings
@@ -152,3 +153,34 @@ def test_while_the_number_of_steps_is_not_known_nothing_depends_on_it() -> None:
         known = open_ended.with_phase(1, replace(timing.timed_schedule(), iterations=iterations))
         assert [known.fraction(step) for step in range(10 + timing.HOLD + 1)] == [open_ended.fraction(step) for step in range(10 + timing.HOLD + 1)]
         assert known.fraction(10 + iterations) == pytest.approx(1.0)
+
+
+def test_an_asset_is_no_larger_than_the_time_refines(inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def limit(made: Job) -> float:
+        return float(json.loads((made.out / BakeOutputs.report).read_text())["max_mib"])
+
+    def baked(folder: str, **changed: Any) -> Job:
+        made = job(tmp_path / folder, replace(QUICK, **changed), **inputs)
+        bake.run(made)
+        return made
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert limit(baked("a minute")) == timed_budget(MAX_MIB, SECONDS, 2, whole=False) < MAX_MIB
+    assert limit(baked("stated", max_mib=20)) == 20
+    assert limit(baked("steps", time_budget="off", refine_steps=2)) == MAX_MIB
+    stopped = job(tmp_path / "stopped", QUICK, stop=StopAt(3), **inputs)
+    with pytest.raises(Interrupted):
+        bake.run(stopped)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    resumed = job(tmp_path / "stopped", QUICK, **inputs)
+    bake.run(resumed)
+    assert limit(resumed) == timed_budget(MAX_MIB, SECONDS, 2, whole=False)  # the cores of the first attempt
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("packed", [False, True])
+def test_more_time_and_more_cores_refine_more(whole: bool, packed: bool) -> None:
+    sizes = [timed_budget(38, seconds, 2, whole=whole, packed=packed) for seconds in (1, 20, 42, 84, 168, 1000)]
+    assert sizes == sorted(sizes)
+    assert sizes[-1] == 38
+    assert timed_budget(38, 42, 4, whole=whole, packed=packed) == timed_budget(38, 84, 2, whole=whole, packed=packed)
