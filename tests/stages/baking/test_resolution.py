@@ -42,7 +42,7 @@ def test_the_room_is_used_where_voxels_grow_by_a_power(power: float, room: int) 
         assert choice == finest
     elif count(MIN_RESOLUTION) <= room - MIN_RESOLUTION:
         assert MIN_FILL * (room - choice.resolution) - 0.1 * room <= count(choice.resolution) <= room - choice.resolution
-        assert "bake.max_mib" in choice.why
+        assert "as its size allows" in choice.why
     assert MIN_RESOLUTION <= choice.resolution <= 800
 
 
