@@ -1,4 +1,7 @@
-"""Formats that a capture can come in: one file each, a plain dict as the table. Nothing heavy is imported until something is read."""
+"""Formats that a capture can come in: one file each, by family (apps, photogrammetry, datasets), a plain dict as the table.
+
+Nothing heavy is imported until something is read.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ from stages.io.pictures import NOT_THE_FILES_FAULT
 class Importer:
     """How one format is read.
 
-    module   of this package, with recognises(folder), files(folder, settings) and, where the format states cameras, read(folder, settings)
+    module   of this package or one below it, with recognises(folder), files(folder, settings) and, where the format states cameras, read(folder, settings)
     posed    whether the format states cameras; else they are found from the photographs
     renders  whether its images may be renders of an object on a constant background, whose alpha is coverage
     dialect  passed on to `recognises` and `read` where one module reads several formats
@@ -76,6 +79,10 @@ IMPORTERS: dict[str, Importer] = {
     "blender": Importer("transforms", renders=True, dialect="blender"),
     "nerfstudio": Importer("transforms", renders=True, dialect="nerfstudio"),
     "instant-ngp": Importer("transforms", renders=True, dialect="instant-ngp"),
+    "polycam": Importer("apps.polycam"),
+    "metashape": Importer("photogrammetry.metashape"),
+    "realitycapture": Importer("photogrammetry.realitycapture"),
+    "opensfm": Importer("photogrammetry.opensfm"),
     "llff": Importer("llff"),
     "colmap": Importer("colmap"),
     "photographs": Importer("photographs", posed=False),

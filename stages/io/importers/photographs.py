@@ -15,7 +15,7 @@ from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, I
 
 MASKS = "masks"
 # What conversions leave beside the photographs: reductions, depth maps, masks.
-_NOT_PHOTOGRAPHS = {MASKS, "mask", "depth", "depths", "sparse", "dense", "stereo"}
+NOT_PHOTOGRAPHS = {MASKS, "mask", "depth", "depths", "sparse", "dense", "stereo"}
 
 
 def recognises(folder: Path, allow_outside: bool = False) -> bool:
@@ -28,7 +28,7 @@ def photographs(source: Source) -> list[Path]:
     found = images_in(folder) or images_in(folder / "images")
     if not found:
         everything = source.walk()
-        found = sorted(path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not _NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1]))
+        found = sorted(path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1]))
         if not found:
             raise BadInput(_nothing(folder, everything))
     if len(found) > MAX_FRAMES:

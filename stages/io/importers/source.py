@@ -75,6 +75,7 @@ class Source:
     _taken: set[str] = field(default_factory=set)
     _folders: dict[Path, dict[str, list[Path]]] = field(default_factory=dict)
     _by_name: dict[str, list[Path]] | None = None
+    _by_stem: dict[str, list[Path]] | None = None
 
     def __post_init__(self) -> None:
         self.root = Path(os.path.abspath(self.root))
@@ -170,6 +171,15 @@ class Source:
                     stems.setdefault(entry.stem.lower(), []).append(entry)
             self._folders[folder] = stems
         return self._folders[folder]
+
+    def images_by_stem(self) -> dict[str, list[Path]]:
+        """Every image of the source by stem in lower case; links to folders are not followed."""
+        if self._by_stem is None:
+            self._by_stem = {}
+            for path in self.walk():
+                if path.suffix.lower() in IMAGE_SUFFIXES:
+                    self._by_stem.setdefault(path.stem.lower(), []).append(path)
+        return self._by_stem
 
     def _index(self) -> dict[str, list[Path]]:
         """Every file of the source by name in lower case; links to folders are not followed."""

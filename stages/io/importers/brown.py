@@ -1,0 +1,100 @@
+"""Brown's lens model as photogrammetry programs state it, and the camera model that describes the same lens here.
+
+    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p2 (r^2 + 2 x^2) + 2 p1 x y          p1, p2 in OpenCV's order
+    u  = fx x' + s y' + cx                                                               s: skew, pixels
+
+Our models have neither k4 of r^8 nor a skew. A radial polynomial with k4 becomes the quotient of two cubics in r^2 (FULL_OPENCV) that is the same to
+`MAX_ERROR` pixels as far as the image reaches; a skew that moves no pixel by more than `MAX_SKEW` is left out. What cannot be had like this is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import BadInput
+
+MAX_ERROR = 0.05  # pixels
+MAX_SKEW = 0.5  # pixels, at the border of the image
+_RADII = 400  # places on a radius at which models are compared
+_FARTHEST = 3.0  # tangent of the widest angle to the axis that is compared: 143 degrees across
+_REMEDY = "Export undistorted images and their cameras instead."
+
+
+def brown_camera(
+    name: str,
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    radial: Sequence[float],
+    tangential: tuple[float, float],
+    where: str,
+) -> Camera:
+    """A camera at the origin.
+
+    focal       fx, fy, pixels
+    centre      cx, cy, pixels, the centre of the first pixel being at 0.5, 0.5
+    radial      k1 to k4 at most
+    tangential  p1, p2 in OpenCV's order
+    Raises BadInput for a lens that no camera model describes.
+    """
+    k1, k2, k3, k4 = (*map(float, radial), 0.0, 0.0, 0.0, 0.0)[:4]
+    fx, fy, cx, cy, p1, p2 = map(float, (*focal, *centre, *tangential))
+    width, height = size
+    if k4:
+        top, bottom = quotient_of_cubics(np.array([1.0, k1, k2, k3, k4]), max(fx, fy), _reach(size, (fx, fy), (cx, cy)), where)
+        params: tuple[float, ...] = (fx, fy, cx, cy, top[1], top[2], p1, p2, top[3], *bottom[1:])
+        return Camera(name, width, height, "FULL_OPENCV", tuple(map(float, params)), np.eye(4))
+    if k3:
+        return Camera(name, width, height, "FULL_OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), np.eye(4))
+    if k1 or k2 or p1 or p2:
+        return Camera(name, width, height, "OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2), np.eye(4))
+    if fx == fy:
+        return Camera(name, width, height, "SIMPLE_PINHOLE", (fx, cx, cy), np.eye(4))
+    return Camera(name, width, height, "PINHOLE", (fx, fy, cx, cy), np.eye(4))
+
+
+def _reach(size: tuple[int, int], focal: tuple[float, float], centre: tuple[float, float]) -> float:
+    """Distorted radius, on the plane z = 1, of the corner that lies farthest out."""
+    across = max(abs(centre[0]), abs(size[0] - centre[0])) / max(focal[0], 1e-6)
+    along = max(abs(centre[1]), abs(size[1] - centre[1])) / max(focal[1], 1e-6)
+    return float(np.hypot(across, along))
+
+
+def quotient_of_cubics(factor: np.ndarray, focal: float, reach: float, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """(top, bottom), coefficients of s = r^2 from the constant 1 up to s^3, whose quotient is the radial factor, a polynomial of s, to `MAX_ERROR` pixels.
+
+    reach  the distorted radius up to which it has to be. Raises BadInput where there is none.
+    """
+    r = np.linspace(0, _FARTHEST, _RADII)
+    distorted = r * polynomial.polyval(r * r, factor)
+    beyond = np.flatnonzero((distorted >= reach) | (np.diff(distorted, append=np.inf) <= 0))  # the image ends, or the model folds over
+    r_max = r[beyond[0]] if len(beyond) else _FARTHEST
+    r = np.linspace(0, max(r_max, r[1]), _RADII)
+    s, d = r * r, polynomial.polyval(r * r, factor)
+    unit = s / s[-1]  # for the conditioning
+    columns = np.stack([unit, unit**2, unit**3, -d * unit, -d * unit**2, -d * unit**3], -1)
+    found = np.linalg.lstsq(columns * r[:, None], (d - 1) * r, rcond=None)[0]
+    scale = s[-1] ** -np.arange(1.0, 4.0)
+    top, bottom = np.array([1.0, *found[:3] * scale]), np.array([1.0, *found[3:] * scale])
+    below = polynomial.polyval(s, bottom)
+    error = np.abs(polynomial.polyval(s, top) / np.where(below == 0, 1, below) - d) * r * focal
+    if below.min() < 0.05 or not error.max() <= MAX_ERROR:
+        raise BadInput(f"{where}: the radial distortion (k4 = {factor[4]:.4g}) is in no camera model that is supported. {_REMEDY}")
+    return top, bottom
+
+
+def without_skew(skew: float, focal: float, size: tuple[int, int], centre: float, what: str, where: str) -> str | None:
+    """A sentence about a skew that is left out; None: there is none. Raises BadInput for one that shows.
+
+    skew    pixels that x moves by for a y' of 1
+    focal   fy
+    centre  cy
+    """
+    farthest = abs(skew) * max(abs(centre), abs(size[1] - centre)) / max(focal, 1e-6)
+    if not farthest <= MAX_SKEW:
+        raise BadInput(f"{where}: {what} {skew:g} moves pixels by up to {farthest:.2g}; no camera model that is supported has a skew. {_REMEDY}")
+    return f"{what} is left out (at most {farthest:.2g} pixels)" if farthest > 0.01 else None

@@ -1,0 +1,1 @@
+"""Cameras that photogrammetry programs found."""

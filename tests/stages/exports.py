@@ -1,0 +1,202 @@
+"""One small capture as photogrammetry programs, phone apps and data sets write it.
+
+Each writer makes the files from known cameras and returns, beside the folder, where the points `POINTS` lie in each image: by the projection that the format's
+own documentation states, computed from the numbers in the files, so that no axis can be wrong in writer and reader alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera, opengl_from_pose
+from tests.stages import captures
+from tests.stages.captures import FOCAL, HEIGHT, WIDTH
+
+POINTS = np.random.default_rng(7).uniform(-0.6, 0.6, (9, 3))
+Pixels = dict[str, np.ndarray]  # name of an image -> (9, 2), the centre of the first pixel being at 0.5, 0.5
+
+
+def cameras(suffix: str = ".png") -> list[Camera]:
+    """Six cameras round the origin, each rolled by another angle, so that no axis stands for another."""
+    made = []
+    for index, camera in enumerate(captures.cameras()):
+        c, s = np.cos(0.2 * index), np.sin(0.2 * index)
+        pose = camera.world_from_camera.copy()
+        pose[:3, :3] = pose[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        made.append(replace(camera, name=f"img_{index}{suffix}", world_from_camera=pose))
+    return made
+
+
+def local(camera_from_world: np.ndarray) -> np.ndarray:
+    """(9, 3) the points in a camera's frame."""
+    return POINTS @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+
+
+def words(values: object) -> str:
+    return " ".join(repr(float(value)) for value in np.asarray(values, np.float64).ravel())
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# --- photogrammetry
+
+METASHAPE = {"f": 41.0, "cx": 0.7, "cy": -0.4, "b1": 0.6, "b2": 0.01, "k1": -0.12, "k2": 0.03, "k3": -0.01, "k4": 0.02, "p1": 0.004, "p2": -0.003}
+CHUNK = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]), np.array([3.0, -2.0, 10.0]), 2.5
+
+
+def metashape(folder: Path, lens: dict[str, float] = METASHAPE, kind: str = "frame") -> tuple[Path, Pixels]:
+    turn, shift, scale = CHUNK
+    rows, pixels = [], {}
+    for index, camera in enumerate(cameras()):
+        pose = np.eye(4)  # in the chunk's frame: world = scale turn x + shift
+        pose[:3, :3] = turn.T @ camera.world_from_camera[:3, :3]
+        pose[:3, 3] = turn.T @ (camera.centre - shift) / scale
+        label = camera.name if index % 2 else Path(camera.name).stem  # Metashape writes either
+        rows.append(f'<camera id="{index}" sensor_id="3" component_id="0" label="{label}"><transform>{words(pose)}</transform></camera>')
+        x, y, z = local(np.linalg.inv(camera.world_from_camera)).T
+        k = dict.fromkeys(("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | lens
+        x, y = x / z, y / z
+        if kind == "fisheye":
+            r0 = np.hypot(x, y)
+            x, y = x * np.arctan(r0) / r0, y * np.arctan(r0) / r0
+        r2 = x * x + y * y
+        radial = 1 + k["k1"] * r2 + k["k2"] * r2**2 + k["k3"] * r2**3 + k["k4"] * r2**4
+        xd = x * radial + k["p1"] * (r2 + 2 * x * x) + 2 * k["p2"] * x * y
+        yd = y * radial + k["p2"] * (r2 + 2 * y * y) + 2 * k["p1"] * x * y
+        pixels[camera.name] = np.stack([WIDTH / 2 + k["cx"] + xd * k["f"] + xd * k["b1"] + yd * k["b2"], HEIGHT / 2 + k["cy"] + yd * k["f"]], -1)
+    last = f'<group id="0" label="g">{rows.pop()}</group><camera id="9" sensor_id="3" label="img_9"/>'  # in a group; and one that is not aligned
+    parameters = "".join(f"<{key}>{value!r}</{key}>" for key, value in lens.items())
+    text = f"""<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0"><chunk label="Chunk 1" enabled="true">
+<sensors next_id="4"><sensor id="3" label="X" type="{kind}"><resolution width="{WIDTH}" height="{HEIGHT}"/>
+<calibration type="{kind}" class="initial"><resolution width="{WIDTH}" height="{HEIGHT}"/><f>1</f></calibration>
+<calibration type="{kind}" class="adjusted"><resolution width="{WIDTH}" height="{HEIGHT}"/>{parameters}</calibration></sensor></sensors>
+<components next_id="1" active_id="0"><component id="0" label="Component 1"><transform><rotation>{words(turn)}</rotation>
+<translation>{words(shift)}</translation><scale>{scale!r}</scale></transform></component></components>
+<cameras next_id="6" next_group_id="1">{"".join(rows)}{last}</cameras></chunk></document>
+"""
+    write(folder / "cameras.xml", text)
+    captures.write_pictures(folder / "images", [camera.name for camera in cameras()])
+    return folder, pixels
+
+
+CAPTURED = {"f": 45.0, "px": 0.02, "py": -0.03, "k": (-0.1, 0.02, 0.005, -0.01), "t": (0.004, -0.003)}
+
+
+def captured_pixels(camera: Camera) -> np.ndarray:
+    """By the equations of RealityCapture's article: shares of the longer side, from the middle of the image."""
+    x, y, z = local(np.linalg.inv(camera.world_from_camera)).T
+    x, y = x / z, y / z
+    r2 = x * x + y * y
+    (k1, k2, k3, k4), (t1, t2) = CAPTURED["k"], CAPTURED["t"]  # type: ignore[misc]
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+    xd = x * radial + t1 * (r2 + 2 * x * x) + 2 * t2 * x * y
+    yd = y * radial + t2 * (r2 + 2 * y * y) + 2 * t1 * x * y
+    longer = max(WIDTH, HEIGHT)
+    u, v = xd * CAPTURED["f"] / 36 + CAPTURED["px"], yd * CAPTURED["f"] / 36 + CAPTURED["py"]  # type: ignore[operator]
+    return np.stack([u * longer + WIDTH / 2, v * longer + HEIGHT / 2], -1)
+
+
+def realitycapture_csv(folder: Path) -> tuple[Path, Pixels]:
+    lines = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for camera in cameras():
+        r = opengl_from_pose(camera.world_from_camera)[:3, :3]  # Rz(-heading) Rx(pitch) Ry(roll)
+        pitch = np.arcsin(r[2, 1])
+        heading, roll = np.arctan2(r[0, 1], r[1, 1]), np.arctan2(-r[2, 0], r[2, 2])
+        lens = [CAPTURED["f"], CAPTURED["px"], CAPTURED["py"], *CAPTURED["k"], *CAPTURED["t"]]  # type: ignore[misc]
+        lines.append(f"{camera.name},{words([*camera.centre, *np.degrees([heading, pitch, roll]), *lens]).replace(' ', ',')}")
+    write(folder / "registration.csv", "\n".join(lines) + "\n")
+    captures.write_pictures(folder / "images", [camera.name for camera in cameras()])
+    return folder, {camera.name: captured_pixels(camera) for camera in cameras()}
+
+
+def realitycapture_xmp(folder: Path) -> tuple[Path, Pixels]:
+    for camera in cameras():
+        text = f"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description xcr:Version="3" xcr:PosePrior="locked" xcr:Coordinates="absolute" xcr:DistortionModel="brown4t2" xcr:FocalLength35mm="{CAPTURED["f"]}"
+ xcr:Skew="0" xcr:AspectRatio="1" xcr:PrincipalPointU="{CAPTURED["px"]}" xcr:PrincipalPointV="{CAPTURED["py"]}"
+ xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"><xcr:Rotation>{words(camera.world_from_camera[:3, :3].T)}</xcr:Rotation>
+<xcr:Position>{words(camera.centre)}</xcr:Position><xcr:DistortionCoeficients>{words([*CAPTURED["k"], *CAPTURED["t"]])}</xcr:DistortionCoeficients>
+</rdf:Description></rdf:RDF></x:xmpmeta>"""  # type: ignore[misc]
+        write((folder / "images" / camera.name).with_suffix(".xmp"), text)
+    captures.write_pictures(folder / "images", [camera.name for camera in cameras()])
+    return folder, {camera.name: captured_pixels(camera) for camera in cameras()}
+
+
+OPENSFM = {"focal_x": 1.3, "focal_y": 1.25, "c_x": 0.02, "c_y": -0.01, "k1": -0.1, "k2": 0.02, "k3": 0.01, "p1": 0.004, "p2": -0.003}
+
+
+def opensfm(folder: Path, place: str = "opensfm") -> tuple[Path, Pixels]:
+    shots, pixels = {}, {}
+    longer = max(WIDTH, HEIGHT)
+    for camera in cameras():
+        inverse = np.linalg.inv(camera.world_from_camera)
+        w, *axis = captures.quaternion(inverse[:3, :3])
+        sine = np.linalg.norm(axis)
+        vector = np.array(axis) / sine * 2 * np.arctan2(sine, w)
+        shots[camera.name] = {"rotation": vector.tolist(), "translation": inverse[:3, 3].tolist(), "camera": "v2 x", "orientation": 1}
+        x, y, z = local(inverse).T
+        x, y = x / z, y / z
+        k, r2 = OPENSFM, x * x + y * y
+        radial = 1 + k["k1"] * r2 + k["k2"] * r2**2 + k["k3"] * r2**3
+        u = k["focal_x"] * (x * radial + 2 * k["p1"] * x * y + k["p2"] * (r2 + 2 * x * x)) + k["c_x"]
+        v = k["focal_y"] * (y * radial + 2 * k["p2"] * x * y + k["p1"] * (r2 + 2 * y * y)) + k["c_y"]
+        pixels[camera.name] = np.stack([u * longer + WIDTH / 2, v * longer + HEIGHT / 2], -1)
+    points = {str(index): {"coordinates": point.tolist(), "color": [10.0, 20.0, 30.0 + index]} for index, point in enumerate(POINTS)}
+    lens = {"projection_type": "brown", "width": WIDTH, "height": HEIGHT} | OPENSFM
+    whole = {"cameras": {"v2 x": lens}, "shots": shots, "points": points, "reference_lla": {"latitude": 48.0, "longitude": 11.0, "altitude": 500.0}}
+    part = {"cameras": {"v2 x": lens}, "shots": {"img_0.png": shots["img_0.png"]}, "points": {}}
+    captures.write_json(folder / place / "reconstruction.json", [part, whole])
+    tracks = [f"{camera.name}\t{index}\t7\t0.1\t0.2\t0.003\t1\t2\t3" for camera in cameras()[:4] for index in range(3)]
+    write(folder / place / "tracks.csv", "\n".join(["OPENSFM_TRACKS_VERSION_v2", *tracks]) + "\n")
+    captures.write_pictures(folder / "images", [camera.name for camera in cameras()])
+    return folder, pixels
+
+
+# --- apps
+
+
+def pinhole(camera: Camera, fx: float = FOCAL, fy: float = FOCAL, cx: float = WIDTH / 2, cy: float = HEIGHT / 2) -> np.ndarray:
+    """(9, 2) K (R x + t) by the camera's matrix, x right, y down, z forward."""
+    x, y, z = local(np.linalg.inv(camera.world_from_camera)).T
+    return np.stack([fx * x / z + cx, fy * y / z + cy], -1)
+
+
+def opengl_pinhole(matrix: np.ndarray, fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """(9, 2) by a camera-to-world matrix with x right, y up, looking along -z: v grows downwards."""
+    x, y, z = local(np.linalg.inv(matrix)).T
+    return np.stack([cx + fx * x / -z, cy - fy * y / -z], -1)
+
+
+def polycam(folder: Path, corrected: bool = True) -> tuple[Path, Pixels]:
+    pixels = {}
+    for index, camera in enumerate(cameras(".jpg")):
+        matrix, lens = opengl_from_pose(camera.world_from_camera), {"fx": 40.0 + index, "fy": 41.0 + index, "cx": 15.5, "cy": 12.5}
+        document = lens | {"width": WIDTH, "height": HEIGHT, "blur_score": 100.0, "timestamp": index}
+        document |= {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
+        captures.write_json(folder / f"keyframes/cameras/img_{index}.json", document | ({"t_03": 99.0} if corrected else {}))
+        if corrected:
+            captures.write_json(folder / f"keyframes/corrected_cameras/img_{index}.json", document)
+        pixels[camera.name] = opengl_pinhole(matrix, **lens)
+    names = [camera.name for camera in cameras(".jpg")]
+    for place in ("images", "depth", *(["corrected_images"] if corrected else [])):
+        captures.write_pictures(folder / "keyframes" / place, [name if place != "depth" else f"{Path(name).stem}.png" for name in names])
+    captures.write_json(folder / "mesh_info.json", {"vertexCount": 3})
+    return folder, pixels
+
+
+EXPORTS: dict[str, tuple[str, Callable[[Path], tuple[Path, Pixels]]]] = {
+    "polycam": ("polycam", polycam),
+    "metashape": ("metashape", metashape),
+    "realitycapture csv": ("realitycapture", realitycapture_csv),
+    "realitycapture xmp": ("realitycapture", realitycapture_xmp),
+    "opensfm": ("opensfm", opensfm),
+}
