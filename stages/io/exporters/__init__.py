@@ -1,8 +1,8 @@
-"""Meshes, points and volumes as files, one module per format. The tables say which formats there are, by extension.
+"""Meshes, points, volumes and 3D Gaussians as files, one module per format. The tables say which formats there are, by extension.
 
-Every exporter is called as `write(what, path, frame)`: a mesh or points in the capture's frame, the file, and what is known of that frame; those of meshes
-whose format keeps textures take `picture`, "png" or "jpeg", too; those of volumes take the asset. It raises BadInput, before anything is written, for what
-would make a broken file.
+Every exporter is called as `write(what, path, frame)`: a mesh, points or Gaussians in the capture's frame, the file, and what is known of that frame; those
+of meshes whose format keeps textures take `picture`, "png" or "jpeg", too; those of volumes take the asset. It raises BadInput, before anything is written,
+for what would make a broken file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Format:
-    """What a format of meshes, of points or of volumes is.
+    """What a format of meshes, of points, of volumes or of Gaussians is.
 
     extension  with its dot
     keeps      of a mesh, of points or of an asset
@@ -82,6 +82,16 @@ _VOLUMES = (
            "the colours' change with the view; what lies beyond all voxels; forward-facing scenes", "Blender, Houdini, Omniverse", "vdb", "write_volume"),
 )  # fmt: skip
 
+_SPLATS = (
+    Format(".ply", "3D Gaussians with view-dependent colours, as 3DGS writes them; the capture's frame", "what fewer Gaussians than voxels cannot show",
+           "SuperSplat, Spark, PlayCanvas, Babylon.js, Unity, Unreal, Blender (add-ons), nerfstudio", "splats.ply", "write_splats"),
+    Format(".spz", "the same in a tenth of the bytes; y up", "precision: colours, sizes and opacities of 8 bits; the capture's axes",
+           "Scaniverse, SuperSplat, Spark, Babylon.js, Cesium", "splats.spz", "write_splats"),
+    Format(".glb", "the same, in single precision (KHR_gaussian_splatting); y up; points where the extension is unknown",
+           "the capture's axes (kept as a matrix in its extras)", "Cesium, Babylon.js, PlayCanvas", "splats.gltf", "write_splats"),
+)  # fmt: skip
+
 MESH_EXPORTERS: dict[str, Format] = {each.extension: each for each in _MESHES}
 POINT_EXPORTERS: dict[str, Format] = {each.extension: each for each in _POINTS}
 VOLUME_EXPORTERS: dict[str, Format] = {each.extension: each for each in _VOLUMES}
+SPLAT_EXPORTERS: dict[str, Format] = {each.extension: each for each in _SPLATS}

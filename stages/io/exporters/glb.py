@@ -31,7 +31,7 @@ from stages.io.exporters.textures import MIME, Picture, encoded, open_faces
 from stages.io.exporters.writing import CAPTURE_IS_Z_UP, SourceFrame, check_mesh, write_parts
 
 _KINDS = {"<f4": 5126, "<u2": 5123, "<u4": 5125}
-_VERTICES, _INDICES = 34962, 34963  # buffer view targets
+VERTICES, _INDICES = 34962, 34963  # buffer view targets
 _LINEAR, _MIPMAPPED, _CLAMPED = 9729, 9987, 33071
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
@@ -45,8 +45,23 @@ def gltf_from_capture(up: np.ndarray) -> np.ndarray:
     return np.eye(3) + axis + axis @ axis / (1 + y)
 
 
+def source_extras(frame: SourceFrame) -> dict[str, Any]:
+    """The extras of a node that say which frame it comes from."""
+    rotation = np.eye(4)
+    rotation[:3, :3] = gltf_from_capture(frame.up)
+    recorded = frame.world_from_capture
+    return {
+        "source_frame": {
+            "gltf_from_capture": (rotation + 0.0).tolist(),  # rows
+            "capture_up": (frame.up + 0.0).tolist(),
+            "unit": "metre" if frame.metric else "unknown",
+            "world_from_capture": {"scale": recorded.scale, "rotation": recorded.rotation.tolist(), "translation": recorded.translation.tolist()},
+        }
+    }
+
+
 @dataclass
-class _Buffer:
+class Buffer:
     """The binary part as it grows, and the document's lists about it."""
 
     parts: list[bytes] = field(default_factory=list)
@@ -74,18 +89,24 @@ def write_mesh(mesh: Mesh, path: Path, frame: SourceFrame = CAPTURE_IS_Z_UP, pic
     """Write a mesh given in the capture's frame. Raises BadInput."""
     check_mesh(mesh, path)
     rotation = gltf_from_capture(frame.up)
-    buffer = _Buffer()
+    buffer = Buffer()
     primitive = {**_geometry(mesh, rotation, buffer), "material": 0, "mode": 4}
     pictures = [] if mesh.texture is None else [(mesh.texture.colours, picture)]
     if mesh.texture is not None and mesh.texture.normals is not None:
         pictures.append((mesh.texture.normals, "png"))
-    described = json.dumps(_document(buffer, primitive, pictures, frame, open_faces(mesh.faces)), separators=(",", ":"), allow_nan=False).encode()
+    write_document(_document(buffer, primitive, pictures, frame, open_faces(mesh.faces)), buffer, path)
+
+
+def write_document(document: dict[str, Any], buffer: Buffer, path: Path) -> None:
+    """Write a document with its one buffer, whose lists it is given here."""
+    listed = document | {"accessors": buffer.accessors, "bufferViews": buffer.views, "buffers": [{"byteLength": buffer.size}]}
+    described = json.dumps(listed, separators=(",", ":"), allow_nan=False).encode()
     described += b" " * (-len(described) % 4)
     header = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(described) + 8 + buffer.size)
     write_parts(path, [header, struct.pack("<I4s", len(described), b"JSON"), described, struct.pack("<I4s", buffer.size, b"BIN\0"), *buffer.parts])
 
 
-def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: _Buffer) -> dict[str, Any]:
+def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: Buffer) -> dict[str, Any]:
     """Attributes and indices of the primitive, put into the buffer."""
     faces, vertex = mesh.faces, np.arange(len(mesh.vertices))
     if mesh.texture is not None:
@@ -95,33 +116,24 @@ def _geometry(mesh: Mesh, rotation: np.ndarray, buffer: _Buffer) -> dict[str, An
     normals = mesh.normals @ rotation.T
     normals = np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True), "<f4")[vertex]
     attributes = {
-        "POSITION": buffer.accessor(positions, _VERTICES, min=positions.min(0).tolist(), max=positions.max(0).tolist()),
-        "NORMAL": buffer.accessor(normals, _VERTICES),
+        "POSITION": buffer.accessor(positions, VERTICES, min=positions.min(0).tolist(), max=positions.max(0).tolist()),
+        "NORMAL": buffer.accessor(normals, VERTICES),
     }
     if mesh.texture is not None:
-        attributes["TEXCOORD_0"] = buffer.accessor(np.asarray(corners.coordinates * [1, -1] + [0, 1], "<f4"), _VERTICES)
+        attributes["TEXCOORD_0"] = buffer.accessor(np.asarray(corners.coordinates * [1, -1] + [0, 1], "<f4"), VERTICES)
         if mesh.texture.normals is not None:
             frame = tangents(positions.astype(np.float64), normals.astype(np.float64), corners.coordinates.astype(np.float64), corners.faces)
-            attributes["TANGENT"] = buffer.accessor(np.asarray(frame, "<f4"), _VERTICES)
+            attributes["TANGENT"] = buffer.accessor(np.asarray(frame, "<f4"), VERTICES)
     else:
         linear = np.concatenate([linear_from_srgb(np.clip(mesh.colours.astype(np.float64), 0, 1)), np.ones((len(mesh.colours), 1))], 1)
-        attributes["COLOR_0"] = buffer.accessor(np.asarray(np.round(linear * 65535), "<u2"), _VERTICES, normalized=True)
+        attributes["COLOR_0"] = buffer.accessor(np.asarray(np.round(linear * 65535), "<u2"), VERTICES, normalized=True)
     return {"attributes": attributes, "indices": buffer.accessor(np.asarray(faces, "<u4").reshape(-1), _INDICES)}
 
 
 def _document(
-    buffer: _Buffer, primitive: dict[str, Any], pictures: Sequence[tuple[np.ndarray, Picture]], frame: SourceFrame, both_sides: bool
+    buffer: Buffer, primitive: dict[str, Any], pictures: Sequence[tuple[np.ndarray, Picture]], frame: SourceFrame, both_sides: bool
 ) -> dict[str, Any]:
     """The JSON part; pictures go into the buffer."""
-    rotation = np.eye(4)
-    rotation[:3, :3] = gltf_from_capture(frame.up)
-    recorded = frame.world_from_capture
-    source = {
-        "gltf_from_capture": (rotation + 0.0).tolist(),  # rows
-        "capture_up": (frame.up + 0.0).tolist(),
-        "unit": "metre" if frame.metric else "unknown",
-        "world_from_capture": {"scale": recorded.scale, "rotation": recorded.rotation.tolist(), "translation": recorded.translation.tolist()},
-    }
     lit = len(pictures) > 1
     material: dict[str, Any] = {"name": "captured light", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}}
     images = [
@@ -139,12 +151,9 @@ def _document(
         **({} if lit else {"extensionsUsed": ["KHR_materials_unlit"]}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "surface", "mesh": 0, "extras": {"source_frame": source}}],
+        "nodes": [{"name": "surface", "mesh": 0, "extras": source_extras(frame)}],
         "meshes": [{"name": "surface", "primitives": [primitive]}],
         "materials": [material | ({"doubleSided": True} if both_sides else {})],
         **({"textures": [{"source": n, "sampler": 0} for n in range(len(images))], "images": images,
             "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPPED, "wrapS": _CLAMPED, "wrapT": _CLAMPED}]} if images else {}),
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": buffer.size}],
     }  # fmt: skip

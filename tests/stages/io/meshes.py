@@ -49,7 +49,7 @@ def accessor(document: dict, blob: bytes, index: int) -> np.ndarray:
     entry = document["accessors"][index]
     view = document["bufferViews"][entry["bufferView"]]
     width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[entry["type"]]
-    kind = {5126: "<f4", 5123: "<u2", 5125: "<u4"}[entry["componentType"]]
+    kind = {5126: "<f4", 5121: "u1", 5123: "<u2", 5125: "<u4"}[entry["componentType"]]
     assert view["byteOffset"] % 4 == 0
     assert entry["count"] * width * np.dtype(kind).itemsize == view["byteLength"]
     return np.frombuffer(blob, kind, entry["count"] * width, view["byteOffset"]).reshape(-1, width)
