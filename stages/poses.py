@@ -71,8 +71,10 @@ class PosesSettings:
     )
     strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
     allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
-    matching: Literal["auto", "exhaustive", "sequential"] = setting(
-        "auto", "Which photographs are matched: all pairs (exhaustive), or each with those that follow (sequential); auto: by their number."
+    matching: Literal["auto", "exhaustive", "retrieval", "sequential"] = setting(
+        "auto",
+        "Which photographs are matched: all pairs (exhaustive), each with those that look most like it (retrieval), or with those that follow (sequential);"
+        " auto: exhaustive for up to 60, else retrieval.",
     )
     max_features: Annotated[int, Meta(ge=256, le=65536)] = setting(4096, "Most features detected in a photograph.", advanced=True)
     feature_image_size: Annotated[int, Meta(ge=320, le=8192)] = setting(
@@ -140,7 +142,7 @@ def run(job: Job) -> None:
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
 
-STAGE = Stage(name="poses", version=3, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
+STAGE = Stage(name="poses", version=4, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:

@@ -27,13 +27,16 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     max_side  of the photographs in which features are detected, pixels
     features  of a photograph, at most
     """
-    from stages.sfm.matches import UPSAMPLE_BELOW
+    from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
+    from stages.sfm.pairs import BLOCK_SIZE
 
     reduced = {working_size(*size, max_side) for size in sizes}
     most = max((width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced), default=0)
     decoded = decoding_needed(sizes).terms
+    workers = min(threads, MAX_WORKERS)
+    matching = workers * (COLMAP + 4 * BLOCK_SIZE * DESCRIPTOR * features) if workers > 1 and len(sizes) > 2 * BLOCK_SIZE else 0
     return Need({
-        "a photograph, or features on each thread": max(decoded["a photograph"], SIFT * most * threads),
+        "a photograph, or features on each thread": max(decoded["a photograph"], SIFT * most * threads, matching),
         "descriptors": DESCRIPTOR * features * len(sizes),
         "libraries": decoded["libraries"] + COLMAP,
     })  # fmt: skip

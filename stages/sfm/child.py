@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1  # prctl(2), Linux alone
@@ -58,7 +59,7 @@ class Channel:
 
 
 def main() -> None:
-    """Find cameras for the parent's arguments, and end."""
+    """Do the parent's task for its arguments, and end."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
@@ -66,9 +67,7 @@ def main() -> None:
     request = channel.receive()
     _end_with(request["parent"])
     try:
-        from stages.sfm.reconstruction import capture_for
-
-        value = capture_for(request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
+        value = _work(request["task"])(request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
     except BaseException as error:
         if not _was_stopped(error):
             _send_error(channel, error)
@@ -76,6 +75,16 @@ def main() -> None:
         channel.send("result", value=value)
     sys.stderr.flush()
     os._exit(0)  # libraries that take the process down while they are unloaded have no say
+
+
+def _work(task: str) -> Callable[..., Any]:
+    if task == "pairs":
+        from stages.sfm.pair_workers import match_for
+
+        return match_for
+    from stages.sfm.reconstruction import capture_for
+
+    return capture_for
 
 
 def _end_with(parent: int) -> None:

@@ -97,6 +97,16 @@ def _first_guess(image: WorkImage) -> Any:
     return camera
 
 
+def copy_rows(source: Path, target: Path, tables: Sequence[tuple[str, str]], keys: Sequence[int]) -> None:
+    """Copy the rows of these keys, all or none, from one database to another that has none of them."""
+    with contextlib.closing(sqlite3.connect(source)) as old, contextlib.closing(sqlite3.connect(target, timeout=60.0)) as fresh, fresh:
+        for key in keys:
+            rows = _rows(old, tables, key)
+            if rows is None:
+                raise StageFailed(f"poses: COLMAP has matched no pair {image_ids_of_pair(key)}. Run again: what is done is kept.")
+            _insert(fresh, tables, rows)
+
+
 def record(work: Path, name: str, tables: Sequence[tuple[str, str]], keys: Sequence[int]) -> None:
     """Note that the rows of these keys are written: the next call copies them, and no others."""
     with contextlib.closing(sqlite3.connect(database_path(work))) as connection:
@@ -206,6 +216,12 @@ def verified_pairs(path: Path) -> list[tuple[int, int]]:
     """Image ids of each pair in the table of two-view geometries, in order."""
     with contextlib.closing(sqlite3.connect(path)) as connection:
         return [image_ids_of_pair(row[0]) for row in connection.execute("SELECT pair_id FROM two_view_geometries ORDER BY pair_id")]
+
+
+def inlier_counts(path: Path) -> dict[tuple[int, int], int]:
+    """Verified matches of each pair of image ids that was compared, in order."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        return {image_ids_of_pair(row[0]): int(row[1]) for row in connection.execute("SELECT pair_id, rows FROM two_view_geometries ORDER BY pair_id")}
 
 
 def pair_id_of(first: int, second: int) -> int:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.files import write_atomically
 from stages.io.png import FAST, write_png
+from stages.sfm import pair_workers
 from stages.sfm.colmap import num_threads, quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, pair_id_of, record, verified_pairs
 from stages.sfm.images import Progress, SafePoint, WorkImage
+from stages.sfm.pairs import Pair, in_blocks, likeness_of, ordered
 
-BLOCK_SIZE = 8  # images along a side of a block of pairs: between two blocks lies a safe point, a second or three apart
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md
-OVERLAP = 10  # of sequential matching: images that follow each one
-KEYFRAMES = 40  # images of a sequence that are all matched with each other, for loop closure
+MAX_WORKERS = 8  # processes that match pairs
+PAIRS_A_WORKER = 96  # a process is not worth its start for fewer
 
 
 def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, threads: int | None = None, progress: Progress, safe_point: SafePoint) -> None:
@@ -75,58 +75,55 @@ def _check_readable(work: Path, files: Sequence[str]) -> bool:
     return bool(files)
 
 
-def pairs_to_match(count: int, how: str) -> list[list[tuple[int, int]]]:
-    """Blocks of pairs (i < j) of positions in the sorted list of images.
-
-    exhaustive  every pair
-    sequential  each image with the OVERLAP that follow and those 2, 4, 8 times as far; and up to KEYFRAMES images, evenly spaced, with each other
-                for loop closure
-    """
-    if how == "exhaustive":
-        wanted = {(i, j) for i in range(count) for j in range(i + 1, count)}
-    elif how == "sequential":
-        offsets = [*range(1, OVERLAP + 1), *(OVERLAP * 2**k for k in range(1, 4))]
-        wanted = {(i, i + offset) for i in range(count) for offset in offsets if i + offset < count}
-        key = range(0, count, max(1, -(-count // KEYFRAMES)))
-        wanted |= {(i, j) for i in key for j in key if i < j}
-    else:
-        raise ValueError(f"matching {how!r}: expected 'exhaustive' or 'sequential'")
-    blocks: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for i, j in sorted(wanted):
-        blocks.setdefault((i // BLOCK_SIZE, j // BLOCK_SIZE), []).append((i, j))
-    return [blocks[place] for place in sorted(blocks)]
-
-
-def match_pairs(work: Path, images: Sequence[WorkImage], *, how: str, seed: int, progress: Progress, safe_point: SafePoint) -> None:
-    """Matches and two-view geometries of the pairs that have none yet, a block at a time.
-
-    On one thread: COLMAP's FAISS multiplies matrices by an OpenBLAS that is not thread-safe, which gave wrong matches in about one of sixty runs
-    (docs/experiments/sfm.md). COLMAP verifies in another thread meanwhile, without BLAS.
-    """
-    with quiet_pycolmap() as pycolmap:
-        with pycolmap.Database.open(database_path(work)) as database:
-            ids = {image.name: image.image_id for image in database.read_all_images()}
-            verified = {(min(pair), max(pair)) for pair in verified_pairs(database_path(work))}
-        matching = pycolmap.FeatureMatchingOptions()
-        matching.use_gpu = False
-        matching.num_threads = 1
-        geometry = pycolmap.TwoViewGeometryOptions()
-        geometry.ransac.random_seed = seed
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = pairs = work / "pairs.txt"
-        blocks = pairs_to_match(len(images), how)
-        total, done = sum(map(len, blocks)), 0
-        for number, block in enumerate(blocks):
+def likeness(work: Path, seed: int, safe_point: SafePoint) -> np.ndarray:
+    """(n, n) of the photographs, larger is more alike, by their features."""
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
+        descriptors = []
+        for image in sorted(database.read_all_images(), key=lambda image: image.name):
             safe_point()
-            keys = {(i, j): _ordered(ids[images[i].file], ids[images[j].file]) for i, j in block}
-            todo = [pair for pair in block if keys[pair] not in verified]
-            if todo:
-                write_atomically(pairs, "".join(f"{images[i].file} {images[j].file}\n" for i, j in todo).encode(), durable=False)
-                pycolmap.match_image_pairs(database_path(work), matching, pairing, geometry, pycolmap.Device.cpu)
-                record(work, f"pairs_{number:06d}", PAIRS, [pair_id_of(*pair) for pair in keys.values()])
-            done += len(block)
-            progress(done, total, "matching pairs")
+            descriptors.append(np.asarray(database.read_descriptors(image.image_id).data, np.uint8).reshape(-1, 128))
+    safe_point()
+    return likeness_of(descriptors, seed)
 
 
-def _ordered(first: int, second: int) -> tuple[int, int]:
-    return min(first, second), max(first, second)
+def match_pairs(
+    work: Path, images: Sequence[WorkImage], wanted: Iterable[Pair], *, seed: int, workers: int = 1, name: str = "", progress: Progress, safe_point: SafePoint
+) -> None:
+    """Matches and two-view geometries of those of the wanted pairs that have none yet, a block at a time.
+
+    workers  processes that may be busy at the same time; a pair's matches do not depend on them
+    name     of the notes, one for each call on the same photographs
+
+    A process compares on one thread: COLMAP's FAISS multiplies matrices by an OpenBLAS that is not thread-safe, which gave wrong matches in about one of
+    sixty runs (docs/experiments/sfm.md). COLMAP verifies in another thread meanwhile, without BLAS.
+    """
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
+        ids = {image.name: image.image_id for image in database.read_all_images()}
+    verified = set(verified_pairs(database_path(work)))
+    blocks: dict[str, list[tuple[int, int]]] = {}
+    total = done = 0
+    for number, block in enumerate(in_blocks(wanted)):
+        keys = [ordered(ids[images[i].file], ids[images[j].file]) for i, j in block]
+        total += len(keys)
+        todo = [key for key in keys if key not in verified]
+        done += len(keys) - len(todo)
+        if todo:
+            blocks[f"pairs_{name}{number:06d}"] = todo
+    left = total - done
+    progress(done, total, "matching pairs")
+
+    def more(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(done, total, "matching pairs")
+
+    busy = min(workers, MAX_WORKERS, left // PAIRS_A_WORKER)
+    if busy > 1:
+        pair_workers.match(work, blocks, seed=seed, workers=busy, more=more, safe_point=safe_point)
+        return
+    names = {image_id: file for file, image_id in ids.items()}
+    for note, block in blocks.items():
+        safe_point()
+        pair_workers.match_block(database_path(work), work / "pairs.txt", block, names, seed)
+        record(work, note, PAIRS, [pair_id_of(*pair) for pair in block])
+        more(len(block))

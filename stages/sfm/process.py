@@ -3,7 +3,7 @@ error of the stage and not the end of the run.
 
 The child is a fresh interpreter (`stages.sfm.child`), never a fork: threads of torch would not survive one. It speaks lines of JSON over two pipes:
 
-    to the child    {"parent": pid, "arguments": ...}, then a line "go" or "stop" for each safe point
+    to the child    {"parent": pid, "task": ..., "arguments": ...}, then a line "go" or "stop" for each safe point
     from the child  {"event": "progress" | "warning" | "safe point", ...}, in the end "result", "error" or "stopped"
 
 At each safe point the child waits for the answer, so that signals are the parent's alone: the child ignores Ctrl-C and SIGTERM, and ends with its parent.
@@ -42,13 +42,17 @@ class _ChildTraceback(Exception):
     """Where an error was raised in the child: its cause, for a traceback."""
 
 
-def run(arguments: Mapping[str, Any], *, progress: Callable[..., None], safe_point: Callable[[], None], warn: Callable[..., None]) -> Any:
+def run(
+    arguments: Mapping[str, Any], *, progress: Callable[..., None], safe_point: Callable[[], None], warn: Callable[..., None], task: str = "cameras"
+) -> Any:
     """What `stages.sfm.child` returns for `arguments`, which JSON can hold.
+
+    task  "cameras" of photographs, or "pairs" to match
 
     The callables are called here, in the order in which the child calls them; what they raise stops the child at its next safe point and passes.
     An error of the child is raised again, of the same class. Raises ChildAborted where it ended without an answer.
     """
-    child = _Child(arguments)
+    child = _Child(task, arguments)
     try:
         while (message := child.receive()) is not None:
             match message["event"]:
@@ -77,7 +81,7 @@ def run(arguments: Mapping[str, Any], *, progress: Callable[..., None], safe_poi
 class _Child:
     """The child process and its pipes."""
 
-    def __init__(self, arguments: Mapping[str, Any]) -> None:
+    def __init__(self, task: str, arguments: Mapping[str, Any]) -> None:
         # Signals that arrive while the interpreter starts wait until the child ignores them; the mask is inherited.
         former = signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED)
         try:
@@ -87,7 +91,7 @@ class _Child:
         self._tail = bytearray()
         self._listener = threading.Thread(target=self._listen, name="last words of structure from motion", daemon=True)
         self._listener.start()
-        self._write(json.dumps({"parent": os.getpid(), "arguments": arguments}))
+        self._write(json.dumps({"parent": os.getpid(), "task": task, "arguments": arguments}))
 
     def receive(self) -> dict[str, Any] | None:
         """The next message; None once the child has ended."""

@@ -22,12 +22,11 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
 from stages.io.capture import Capture, Photo, SparsePoints
-from stages.sfm import mapping, matches, process
-from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import database_path, open_database, remove_database, verified_pairs
+from stages.sfm import ladder, mapping, matches, process
+from stages.sfm.colmap import num_threads, quiet_pycolmap
+from stages.sfm.database import database_path, inlier_counts, open_database, remove_database
 from stages.sfm.images import Masks, WorkImage, prepare_images
 
-MAX_EXHAUSTIVE = 100  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
 WAIT = 0.05  # seconds between two looks at a lock
 MAX_NAMES = 8  # photographs that an error lists by name
 
@@ -52,8 +51,8 @@ def find_cameras(
     folder, names   the photographs, paths relative to the folder, any order; or for each the file that is read
     max_side        longest side of the photographs in which features are detected, pixels
     features        most features of a photograph
-    threads         on which features are detected; None: as many as the process may use. Changes no bit
-    matching        "exhaustive", "sequential" (the sorted names follow a path), or "auto": exhaustive up to 100 photographs
+    threads         on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
+    matching        "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
     masks           of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
@@ -144,11 +143,11 @@ def reconstruct(
             + (f" Unreadable: {_abbreviated([name for name, _ in unreadable])}." if unreadable else "")
         )
     if matching == "auto":
-        matching = "exhaustive" if len(images) <= MAX_EXHAUSTIVE else "sequential"
+        matching = ladder.matching_for(len(images))
     with _full_disk_named(work):
         open_database(work, images, warn)
         matches.extract_features(work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
-        matches.match_pairs(work, images, how=matching, seed=seed, progress=progress, safe_point=safe_point)
+        ladder.match(work, images, matching, seed=seed, workers=threads or num_threads(), progress=progress, safe_point=safe_point)
         models = mapping.best_models(work, images, seed, progress, safe_point)
     rejected = [*unreadable, *_unregistered(work, images, models)]
     if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
@@ -218,8 +217,7 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
         ids = {image.name: image.image_id for image in database.read_all_images()}
         features = {image.file: database.num_keypoints_for_image(ids[image.file]) for image in missing}
         best: dict[int, int] = {}
-        for pair in verified_pairs(database_path(work)):
-            inliers = len(database.read_two_view_geometry(*pair).inlier_matches)
+        for pair, inliers in inlier_counts(database_path(work)).items():
             for image_id in pair:
                 best[image_id] = max(best.get(image_id, 0), inliers)
     rejected = []

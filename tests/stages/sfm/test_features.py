@@ -1,4 +1,4 @@
-"""Which pairs of photographs are compared, and that masked parts give no features."""
+"""Masked parts give no features."""
 
 from __future__ import annotations
 
@@ -14,22 +14,6 @@ from stages.sfm.database import database_path, open_database
 from stages.sfm.images import prepare_images
 
 STILL_LIFE = Path(__file__).resolve().parents[3] / "examples" / "still_life"
-
-
-def test_exhaustive_pairs_are_all_pairs_once() -> None:
-    blocks = matches.pairs_to_match(23, "exhaustive")
-    pairs = [pair for block in blocks for pair in block]
-    assert len(pairs) == len(set(pairs)) == 23 * 22 // 2
-    assert max(map(len, blocks)) <= matches.BLOCK_SIZE**2
-
-
-def test_sequential_pairs_reach_neighbours_and_close_loops() -> None:
-    pairs = {pair for block in matches.pairs_to_match(400, "sequential") for pair in block}
-    assert all((i, i + 1) in pairs for i in range(399))
-    assert any(i < 10 and j > 385 for i, j in pairs)
-    assert len(pairs) < 400 * 20
-    with pytest.raises(ValueError, match="matching"):
-        matches.pairs_to_match(3, "vocabulary")
 
 
 def test_masked_parts_give_no_features(tmp_path: Path) -> None:

@@ -19,10 +19,11 @@ from PIL import Image
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput, StageFailed
 from stages.io.capture import Capture
-from stages.sfm import mapping, matches
+from stages.sfm import mapping, matches, pair_workers, pairs, process
 from stages.sfm.colmap import num_threads, quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, open_database, record
 from stages.sfm.images import WorkImage, prepare_images
+from stages.sfm.pairs import all_pairs
 from stages.sfm.reconstruction import find_cameras, reconstruct
 from tests.stages.spoilers import SPOILERS
 
@@ -374,8 +375,73 @@ def test_one_thread_compares_descriptors(ten: tuple[list[str], Path, Capture], t
         STILL_LIFE, names, max_side=SIDE, features=4096, seed=0, masks={}, work=tmp_path / "work",
         progress=lambda *a, **k: None, safe_point=lambda: None, warn=lambda *a, **k: None,
     )  # fmt: skip
-    matches.match_pairs(tmp_path / "work", images, how="exhaustive", seed=0, progress=lambda *a, **k: None, safe_point=lambda: None)
+    monkeypatch.setattr(pair_workers, "record", lambda *a: None)
+    monkeypatch.setattr(matches, "record", lambda *a: None)
+    matches.match_pairs(tmp_path / "work", images, all_pairs(10), seed=0, progress=lambda *a, **k: None, safe_point=lambda: None)
     assert set(asked) == {1}
+
+
+def without_pairs(work: Path) -> dict[str, list[Any]]:
+    """Remove all pairs from the database; what they were."""
+    with contextlib.closing(sqlite3.connect(database_path(work))) as connection, connection:
+        found = {table: connection.execute(f"SELECT * FROM {table} ORDER BY {column}").fetchall() for table, column in PAIRS}
+        for table, _ in PAIRS:
+            connection.execute(f"DELETE FROM {table}")
+    return found
+
+
+def test_pairs_matched_by_several_processes_are_the_same(resumed: tuple[Path, list[WorkImage]], monkeypatch: pytest.MonkeyPatch) -> None:
+    work, images = resumed
+    before = without_pairs(work)
+    monkeypatch.setattr(matches, "PAIRS_A_WORKER", 8)
+    seen: list[tuple[int, int]] = []
+    quiet: dict[str, Any] = {"progress": lambda done, total, text: seen.append((done, total)), "safe_point": lambda: None}
+    monkeypatch.setattr(pair_workers, "match_block", lambda *a: pytest.fail("matched in this process"))
+    matches.match_pairs(work, images, all_pairs(10), seed=0, workers=2, **quiet)
+    assert without_pairs(work) == before
+    assert (seen[0], seen[-1]) == ((0, 45), (45, 45))
+    assert not list(work.glob("worker_*"))
+    matches.match_pairs(work, images, [], seed=0, workers=2, **quiet)
+
+
+def test_workers_end_with_the_call_that_is_interrupted(resumed: tuple[Path, list[WorkImage]], monkeypatch: pytest.MonkeyPatch) -> None:
+    work, images = resumed
+    before = without_pairs(work)
+    monkeypatch.setattr(matches, "PAIRS_A_WORKER", 8)
+    monkeypatch.setattr(pairs, "BLOCK_SIZE", 3)
+
+    class Stop(Exception):
+        pass
+
+    done = 0
+
+    def progress(so_far: int, total: int, text: str) -> None:
+        nonlocal done
+        done = so_far
+
+    def safe_point() -> None:
+        if done:
+            raise Stop
+
+    with pytest.raises(Stop):
+        matches.match_pairs(work, images, all_pairs(10), seed=0, workers=2, progress=progress, safe_point=safe_point)
+    assert not list(work.glob("worker_*"))
+    assert open_database(work, images, lambda *a: pytest.fail("a note that does not hold"))  # what was done is kept
+    kept = rows_of(work)["matches"]
+    assert 0 < len(kept) < 45
+    matches.match_pairs(work, images, all_pairs(10), seed=0, progress=progress, safe_point=lambda: None)
+    assert without_pairs(work) == before
+
+
+def test_an_error_of_a_worker_is_one_of_the_stage(resumed: tuple[Path, list[WorkImage]], monkeypatch: pytest.MonkeyPatch) -> None:
+    work, images = resumed
+    without_pairs(work)
+    monkeypatch.setattr(matches, "PAIRS_A_WORKER", 8)
+    failing = "import stages.sfm.pair_workers as w\ndef fail(*a):\n    raise ValueError('no luck')\nw.match_block = fail\n"
+    monkeypatch.setattr(process, "_BOOTSTRAP", process._BOOTSTRAP.replace("from stages", f"{failing}from stages", 1).replace("; import", "\nimport"))
+    with pytest.raises(ValueError, match="no luck"):
+        matches.match_pairs(work, images, all_pairs(10), seed=0, workers=2, progress=lambda *a: None, safe_point=lambda: None)
+    assert not list(work.glob("worker_*"))
 
 
 def test_threads_are_those_allowed() -> None:

@@ -1,0 +1,143 @@
+"""Pairs matched in several processes, each with a database of its own: one process has one thread that compares (`matches.match_pairs`).
+
+A worker is a child as that of structure from motion (`stages.sfm.process`), started from it. For each block of pairs it copies the features of these images
+into its database, matches, and says so; the rows are then copied into the database of all, which one process alone writes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.files import remove, write_atomically
+from stages.sfm import process
+from stages.sfm.colmap import quiet_pycolmap
+from stages.sfm.database import FEATURES, PAIRS, copy_rows, database_path, pair_id_of, record
+from stages.sfm.images import SafePoint
+
+LOOK = 0.1  # seconds between two looks at the workers
+Block = Sequence[tuple[int, int]]  # of image ids, the smaller first
+
+
+class _Stopped(Exception):
+    """Another worker has failed, or the user has asked to stop."""
+
+
+def match(work: Path, blocks: Mapping[str, Block], *, seed: int, workers: int, more: Callable[[int], None], safe_point: SafePoint) -> None:
+    """Match blocks of pairs, by the name of the note of each.
+
+    more  is told of the number of pairs that are done
+    """
+    stop, one_at_a_time, failures, counts = threading.Event(), threading.Lock(), list[BaseException](), list[int]()
+    names = list(blocks)
+
+    def go_on() -> None:
+        if stop.is_set():
+            raise _Stopped
+
+    def run_worker(number: int) -> None:
+        scratch = work / f"worker_{number}"
+
+        def finished(position: int, *_: Any) -> None:
+            name = mine[position]
+            with one_at_a_time:
+                copy_rows(database_path(scratch), database_path(work), PAIRS, [pair_id_of(*pair) for pair in blocks[name]])
+                record(work, name, PAIRS, [pair_id_of(*pair) for pair in blocks[name]])
+                counts.append(len(blocks[name]))
+
+        mine = names[number::workers]
+        arguments = {"work": str(work), "scratch": str(scratch), "seed": seed, "blocks": [list(map(list, blocks[name])) for name in mine]}
+        try:
+            process.run(arguments, task="pairs", progress=finished, safe_point=go_on, warn=lambda *_, **__: None)
+        except _Stopped:
+            pass
+        except BaseException as error:
+            failures.append(error)
+            stop.set()
+        finally:
+            remove(scratch)
+
+    threads = [threading.Thread(target=run_worker, args=(number,), name=f"pairs {number}") for number in range(workers)]
+    for thread in threads:
+        thread.start()
+    try:
+        for thread in threads:
+            while thread.is_alive():
+                safe_point()
+                thread.join(LOOK)
+                while counts:
+                    more(counts.pop(0))
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+    if failures:
+        raise failures[0]
+
+
+def match_for(arguments: Mapping[str, Any], *, progress: Callable[..., None], safe_point: SafePoint, warn: Callable[..., None]) -> None:
+    """The work of one worker. The parent copies its rows between `progress` and the return of `safe_point`."""
+    work, scratch = Path(arguments["work"]), Path(arguments["scratch"])
+    remove(scratch)
+    scratch.mkdir()
+    names = _make_database(work, scratch)
+    for position, block in enumerate(arguments["blocks"]):
+        safe_point()
+        _take_features(work, scratch, sorted({image for pair in block for image in pair}))
+        match_block(database_path(scratch), scratch / "pairs.txt", [(i, j) for i, j in block], names, arguments["seed"])
+        progress(position)
+    safe_point()
+
+
+def match_block(database: Path, listed: Path, block: Block, names: Mapping[int, str], seed: int) -> None:
+    """Match pairs of images on one thread.
+
+    listed  scratch file
+    """
+    with quiet_pycolmap() as pycolmap:
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.use_gpu = False
+        matching.num_threads = 1
+        geometry = pycolmap.TwoViewGeometryOptions()
+        geometry.ransac.random_seed = seed
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = listed
+        write_atomically(listed, "".join(f"{names[i]} {names[j]}\n" for i, j in block).encode(), durable=False)
+        pycolmap.match_image_pairs(database, matching, pairing, geometry, pycolmap.Device.cpu)
+
+
+def _make_database(work: Path, scratch: Path) -> dict[int, str]:
+    """A database of the same images and cameras without features; returns the name of each image by its id."""
+    with quiet_pycolmap() as pycolmap:
+        pycolmap.Database.open(database_path(scratch)).close()
+    own = {table for table, _ in (*FEATURES, *PAIRS)}
+    with contextlib.closing(_both(work, scratch)) as connection, connection:
+        tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")]
+        for table in tables:
+            if table not in own:
+                connection.execute(f"DELETE FROM {table}")
+                connection.execute(f"INSERT INTO {table} SELECT * FROM everything.{table}")
+        return dict(connection.execute("SELECT image_id, name FROM images"))
+
+
+def _take_features(work: Path, scratch: Path, images: Sequence[int]) -> None:
+    """Put the features of these images in the place of all that is in the database."""
+    marks = ", ".join("?" * len(images))
+    with contextlib.closing(_both(work, scratch)) as connection, connection:
+        for table, _ in PAIRS:
+            connection.execute(f"DELETE FROM {table}")
+        for table, column in FEATURES:
+            connection.execute(f"DELETE FROM {table}")
+            connection.execute(f"INSERT INTO {table} SELECT * FROM everything.{table} WHERE {column} IN ({marks})", images)
+
+
+def _both(work: Path, scratch: Path) -> sqlite3.Connection:
+    """The worker's database, with that of all attached as `everything`."""
+    connection = sqlite3.connect(database_path(scratch), timeout=60.0)
+    connection.execute("PRAGMA synchronous = OFF")
+    connection.execute("ATTACH DATABASE ? AS everything", (str(database_path(work)),))
+    return connection

@@ -1,0 +1,96 @@
+"""Which pairs of photographs are compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stages.sfm import ladder, pairs
+
+
+def views(count: int, seen: int, step: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """Descriptors of images along a closed path: each shows `seen` of a ring of things, `step` on from the one before, with noise."""
+    things = rng.gamma(0.6, 25.0, (count * step, 128)).clip(0, 255)
+    rows = [[(i * step + k) % len(things) for k in range(seen)] for i in range(count)]
+    return [(things[some] + rng.normal(0, 4.0, (seen, 128))).clip(0, 255).astype(np.uint8) for some in rows]
+
+
+def test_exhaustive_pairs_are_all_pairs_once() -> None:
+    found = [pair for block in pairs.in_blocks(pairs.all_pairs(23)) for pair in block]
+    assert len(found) == len(set(found)) == 23 * 22 // 2
+    assert all(i < j for i, j in found)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
+def test_blocks_hold_every_pair_once_and_stay_small(share: float) -> None:
+    rng = np.random.default_rng(0)
+    wanted = {pair for pair in pairs.all_pairs(60) if rng.random() < share}
+    blocks = pairs.in_blocks(wanted)
+    assert sorted(pair for block in blocks for pair in block) == sorted(wanted)
+    assert max(map(len, blocks)) <= pairs.BLOCK_SIZE**2
+    assert len(blocks) <= 2 * len(wanted) / pairs.BLOCK_SIZE**2 + 2 * 60 / pairs.BLOCK_SIZE
+    assert pairs.in_blocks(sorted(wanted, reverse=True)) == blocks
+
+
+def test_sequential_pairs_reach_neighbours_and_close_loops() -> None:
+    found = pairs.sequential_pairs(400)
+    assert all((i, i + 1) in found for i in range(399))
+    assert any(i < 10 and j > 385 for i, j in found)
+    assert len(found) < 400 * 20
+
+
+def test_retrieval_finds_what_shows_the_same_things_whatever_the_order_of_the_files() -> None:
+    rng = np.random.default_rng(1)
+    count = 90
+    ring = views(count, 120, 12, rng)  # each shares things with the nine before and after it
+    order = rng.permutation(count)
+    likeness = pairs.likeness_of([ring[i] for i in order], seed=0)
+    found = {pairs.ordered(int(order[i]), int(order[j])) for i, j in pairs.retrieved_pairs(likeness)}
+    near = {pairs.ordered(i, (i + k) % count) for i in range(count) for k in range(1, 7)}  # also from the last to the first
+    assert len(near & found) > 0.98 * len(near)
+    assert len(found) < 0.5 * count * (count - 1) / 2
+
+
+def test_likeness_is_symmetric_whole_and_largest_for_the_same() -> None:
+    rng = np.random.default_rng(2)
+    images = [*views(8, 60, 20, rng), np.zeros((0, 128), np.uint8)]
+    images.append(images[3])
+    likeness = pairs.likeness_of(images, seed=3)
+    assert (likeness == likeness.T).all()
+    assert (likeness == np.rint(likeness)).all()
+    assert likeness[3, 9] == likeness[3, 3] == likeness[3].max()
+    assert (likeness[8] == 0).all()
+    assert (pairs.ranks(likeness)[3, 0], pairs.ranks(likeness)[9, 0]) == (9, 3)
+    shuffled = [image[rng.permutation(len(image))] for image in images]  # few enough that all are aggregated
+    words = pairs.visual_words(images, 3)
+    assert all((pairs.vlad(a, words) == pairs.vlad(b, words)).all() for a, b in zip(images, shuffled, strict=True))
+
+
+def test_nearest_words_are_those_of_exact_arithmetic() -> None:
+    rng = np.random.default_rng(4)
+    some, words = rng.integers(0, 256, (300, 128), np.uint8), rng.integers(0, 256, (40, 128), np.uint8)
+    some[:100], words[:3] = 255, np.array([[0], [255], [254]])  # the largest sums there are
+    distances = ((some[:, None].astype(np.int64) - words[None].astype(np.int64)) ** 2).sum(2)
+    assert (pairs._nearest(some, words) == distances.argmin(1)).all()
+
+
+def test_few_images_are_all_compared() -> None:
+    likeness = np.ones((6, 6))
+    assert pairs.retrieved_pairs(likeness) == pairs.all_pairs(6)
+
+
+def test_weak_images_are_compared_with_more_and_with_the_neighbours_of_their_neighbours() -> None:
+    likeness = -np.abs(np.subtract.outer(np.arange(100.0), np.arange(100.0)))
+    near = {i: {i - 1, i + 1} & set(range(100)) for i in range(100)} | {0: {50}, 50: {0, 90}}
+    found = pairs.wider_pairs(likeness, [0], near, 12)
+    assert found == {(0, j) for j in [*range(1, 13), 90]}
+    assert pairs.wider_pairs(likeness, [], near, 12) == set()
+
+
+def test_components_are_parts_without_a_path_between_them() -> None:
+    near = {0: {1}, 1: {0, 2}, 2: {1}, 3: {4}, 4: {3}, 5: set[int]()}
+    assert ladder.components(near) == [[0, 1, 2], [3, 4], [5]]
+
+
+def test_all_pairs_of_few_photographs_and_retrieval_of_many() -> None:
+    assert [ladder.matching_for(count) for count in (3, 60, 61, 1000)] == ["exhaustive", "exhaustive", "retrieval", "retrieval"]
