@@ -84,11 +84,12 @@ class PosesSettings:
 
 
 def run(job: Job) -> None:
-    """Write scene.json, images/, masks/, points.safetensors, contact_sheet.png and report.json. Raises BadInput."""
+    """Write scene.json, images/, masks/, points.safetensors, verdict.json, pictures and report.json. Raises BadInput."""
     from stages.figures.contact_sheet import write_contact_sheet
     from stages.framing import training_frame
     from stages.io.silhouettes import SmallPictures
     from stages.memory.poses import refuse_large_photographs
+    from stages.verdict.writing import judge
 
     settings: PosesSettings = job.settings
     if job.source is None:
@@ -137,6 +138,7 @@ def run(job: Job) -> None:
         forward=framed.forward,
     )
     save(scene, job.out)
+    judge(job, capture, scene, _may_be_renders(capture), warn)
     _write_report(PosesOutputs(job.out).report, capture, scene, {"framing": framed.facts, "masks": mask_facts}, notes)
     job.safe_point()
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)

@@ -79,6 +79,7 @@ class Capture:
     warnings    sentences for the user
     reprojection_error  mean, pixels, where known
     metric      whether a unit of the capture's frame is known to be a metre
+    overlaps    (name, name, verified matches) of pairs of photographs, registered or not, where they were compared
     """
 
     kind: str
@@ -94,3 +95,4 @@ class Capture:
     metric: bool = False
     facts: dict[str, object] = field(default_factory=dict)
     rejected_files: dict[str, Path] = field(default_factory=dict)
+    overlaps: tuple[tuple[str, str, int], ...] = ()

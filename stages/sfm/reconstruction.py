@@ -21,13 +21,17 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
+from pipeline.files import write_json
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import ladder, mapping, matches, process
 from stages.sfm.colmap import num_threads, quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, remove_database
 from stages.sfm.images import Masks, WorkImage, prepare_images
+from stages.verdict.looks import look_at_all
+from stages.verdict.verdict import failed, triangulation_angle
 
 WAIT = 0.05  # seconds between two looks at a lock
+VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
 MAX_NAMES = 8  # photographs that an error lists by name
 
 
@@ -151,8 +155,9 @@ def reconstruct(
         models = mapping.best_models(work, images, seed, progress, safe_point)
     rejected = [*unreadable, *_unregistered(work, images, models)]
     if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
-        raise BadInput(_failure(folder, images, models, rejected, matching))
-    capture = _capture(folder, work, images, mapping.bundle_adjusted(work, images, models[0], safe_point), masks, rejected)
+        raise BadInput(_failure(folder, work, images, models, rejected, matching))
+    facts = _facts_of_matching(work, images, models, matching)
+    capture = _capture(folder, work, images, mapping.bundle_adjusted(work, images, models[0], safe_point), masks, rejected, facts)
     for sentence in capture.warnings:
         warn(sentence)
     return capture
@@ -172,6 +177,7 @@ def _plain(capture: Capture) -> dict[str, Any]:
         "warnings": capture.warnings,
         "reprojection_error": capture.reprojection_error,
         "facts": capture.facts,
+        "overlaps": capture.overlaps,
     }
 
 
@@ -189,6 +195,7 @@ def _capture_from(found: Mapping[str, Any], folder: Path, paths: Mapping[str, Pa
         warnings=tuple(found["warnings"]),
         reprojection_error=found["reprojection_error"],
         facts=found["facts"],
+        overlaps=tuple((first, second, count) for first, second, count in found["overlaps"]),
     )
 
 
@@ -236,20 +243,43 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
     return rejected
 
 
-def _failure(folder: Path, images: Sequence[WorkImage], models: Sequence[Any], rejected: Sequence[tuple[str, str]], how: str) -> str:
+def _facts_of_matching(work: Path, images: Sequence[WorkImage], models: Sequence[Any], how: str) -> dict[str, object]:
+    """How the photographs were matched, and the sizes of the parts that they fall into: by overlap, and of the sub-models."""
+    return {
+        "matching": how,
+        "components": [len(part) for part in ladder.components(ladder.neighbours(work, len(images)))],
+        "models": [int(model.num_reg_images()) for model in models],
+    }
+
+
+def _overlaps(work: Path, images: Sequence[WorkImage]) -> tuple[tuple[str, str, int], ...]:
+    """(name, name, verified matches) of each pair that has any."""
+    counts = inlier_counts(database_path(work))
+    return tuple((images[i - 1].name, images[j - 1].name, count) for (i, j), count in counts.items() if count)
+
+
+def _failure(folder: Path, work: Path, images: Sequence[WorkImage], models: Sequence[Any], rejected: Sequence[tuple[str, str]], how: str) -> str:
     hints = ["more photographs with at least 60 % overlap between neighbours, sharp, of a subject with texture"]
     if how == "sequential":
         hints.append("--set poses.matching=exhaustive if the names do not follow the path of the camera")
     hints.append("--set poses.max_features=8192")
     worst = dict(rejected)
     fewest = max(mapping.MIN_MODEL_SIZE, -(-len(images) // 2))
+    registered = mapping.num_registered(models)
+    what = f"cameras found for {registered} of {len(images)} photographs; at least {fewest} are needed."
+    looks = look_at_all({image.name: work / "images" / image.file for image in images})
+    verdict = failed(what, "; ".join(hints), registered, rejected, looks, _facts_of_matching(work, images, models, how), _overlaps(work, images))
+    write_json(work / VERDICT, {"source": str(folder), **verdict.document()})
+    also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")
     return (
-        f"{folder}: cameras found for {mapping.num_registered(models)} of {len(images)} photographs; at least {fewest} are needed. "
-        f"Not registered: {_abbreviated(list(worst))} ({next(iter(worst.values()), 'no model')}).\nTry {'; '.join(hints)}."
+        f"{folder}: {what} Not registered: {_abbreviated(list(worst))} ({next(iter(worst.values()), 'no model')}).{also and ' '}{also}"
+        f"\nTry {'; '.join(hints)}. Of each photograph: {work / VERDICT}"
     )
 
 
-def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Masks, rejected: list[tuple[str, str]]) -> Capture:
+def _capture(
+    folder: Path, work: Path, images: Sequence[WorkImage], model: Any, masks: Masks, rejected: list[tuple[str, str]], found: Mapping[str, object]
+) -> Capture:
     by_file = {image.file: image for image in images}
     registered = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     at_work = [mapping.camera_of(model, image, by_file[image.name]) for image in registered]  # at working size
@@ -266,6 +296,7 @@ def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, 
         "points": len(points.xyz),
         "triangulation_angle": round(triangulation_angle(points, photos), 3),
         "pairs_agreeing": round(agreement, 4),
+        **found,
     }
     warnings = _model_warnings(photos, points, agreement, [by_file[image.name].focal for image in registered])
     if rejected:
@@ -279,6 +310,7 @@ def _capture(folder: Path, work: Path, images: Sequence[WorkImage], model: Any, 
         warnings=tuple(warnings),
         reprojection_error=float(model.compute_mean_reprojection_error()),
         facts=facts,
+        overlaps=_overlaps(work, images),
     )
 
 
@@ -290,20 +322,6 @@ def _points(model: Any, index: Mapping[int, int]) -> SparsePoints:
         error=np.array([point.error for point in ordered], np.float64),
         tracks=tuple(tuple(sorted({index[element.image_id] for element in point.track.elements})) for point in ordered),
     )
-
-
-def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
-    """Median over the points of the largest angle between two rays of a track, degrees; below about two, depth is unreliable."""
-    if not len(points.xyz):
-        return 0.0
-    centres = np.array([photo.camera.centre for photo in photos])
-    step = max(1, len(points.xyz) // 2000)
-    widest = []
-    for xyz, track in zip(points.xyz[::step], points.tracks[::step], strict=True):
-        towards = centres[list(track)] - xyz
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        widest.append(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1, 1))))
-    return float(np.median(widest))
 
 
 def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: float, priors: Sequence[float | None]) -> list[str]:

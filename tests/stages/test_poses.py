@@ -67,7 +67,7 @@ def test_the_same_source_gives_the_same_bytes(tmp_path: Path) -> None:
     for out in ("a", "b"):
         run(source, tmp_path / out)
     files = sorted(path.relative_to(tmp_path / "a") for path in (tmp_path / "a").rglob("*") if path.is_file())
-    assert len(files) == 10
+    assert len(files) == 13
     assert all((tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes() for path in files)
 
 

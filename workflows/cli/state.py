@@ -19,6 +19,7 @@ def status(run_folder: Path, as_json: bool) -> None:
     A file of unchanged size and modification time counts as unchanged; 'enerf verify' hashes it.
     """
     from pipeline.decide import survey
+    from pipeline.text import printable
     from workflows.cli.output import listing, write_json
     from workflows.cli.progress import duration, size
     from workflows.cli.target import check_names, open_run
@@ -38,6 +39,8 @@ def status(run_folder: Path, as_json: bool) -> None:
         listing(line.rstrip())
         if entry["extra"]:
             listing(f"{'':<10} not written by it: {', '.join(entry['extra'][:5])}{' ...' if len(entry['extra']) > 5 else ''}")
+    if found["verdict"] is not None:
+        listing(printable(found["verdict"]["summary"], 300))
     if found["written_by"] is not None:
         listing(f"It is being written by {found['written_by']}.")
 

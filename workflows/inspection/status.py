@@ -14,7 +14,21 @@ def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
     """A run, who is writing it, and its stages."""
     holder = run.holder()
     facts = {"run": str(run.path), "source": run.source, "preset": run.preset, "seed": run.seed, "device": run.device}
-    return {**facts, "written_by": None if holder is None else holder.text(), "stages": [_stage(each) for each in decisions]}
+    return {**facts, "verdict": _verdict(run), "written_by": None if holder is None else holder.text(), "stages": [_stage(each) for each in decisions]}
+
+
+def _verdict(run: Run) -> dict[str, Any] | None:
+    """The grade of the cameras and a sentence; None where there are none yet, or they say nothing that can be read."""
+    from pipeline import files
+    from stages.artifacts import PosesOutputs
+
+    try:
+        found = files.read_json(PosesOutputs(run.folder(PosesOutputs.stage)).verdict)
+    except (OSError, files.Unreadable):
+        return None
+    if not isinstance(found, dict) or not all(isinstance(found.get(key), str) for key in ("grade", "summary")):
+        return None
+    return {"grade": found["grade"], "summary": found["summary"]}
 
 
 def _stage(decision: Decision) -> dict[str, Any]:

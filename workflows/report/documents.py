@@ -97,6 +97,22 @@ class PosesReport(msgspec.Struct):
     warnings: list[str] | None = None
 
 
+class CameraProblem(msgspec.Struct):
+    """Something that stands against the cameras, and what to do."""
+
+    sentence: str = ""
+    remedy: str = ""
+    grade: str = ""
+
+
+class CameraVerdict(msgspec.Struct):
+    """The verdict on the cameras, as far as it is shown."""
+
+    grade: str = ""
+    summary: str = ""
+    problems: list[CameraProblem] = []
+
+
 def read(path: Path, kind: type[T]) -> tuple[T, dict[str, Any]] | None:
     """A document by its schema, and all that it holds; None where there is none. Raises Damaged."""
     name = f"{path.parent.name}/{path.name}"

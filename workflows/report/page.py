@@ -22,7 +22,7 @@ from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOu
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents
-from workflows.report.documents import Damaged, Metrics, PosesReport, Quality
+from workflows.report.documents import CameraVerdict, Damaged, Metrics, PosesReport, Quality
 from workflows.report.summary import against_network, findings_of, quality_in_words, split_of
 
 if TYPE_CHECKING:
@@ -129,6 +129,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         previews=_previews(folder, TRAIN.previews),
         asset_previews=_previews(folder, BAKE.previews),
         cameras=_cameras(folder, damaged),
+        verdict=_verdict(folder, damaged),
         damaged=damaged,
         stages=[_stage(each) for each in decisions],
         settings=run.settings,
@@ -185,6 +186,14 @@ def _cameras(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
     if report.reprojection_error is not None:
         text += f", mean reprojection error {report.reprojection_error:.2f} px"
     return {"text": text, "rejected": [(each.name, each.reason) for each in report.rejected or []], "warnings": report.warnings or []}
+
+
+def _verdict(folder: Path, damaged: list[str]) -> dict[str, Any] | None:
+    """The verdict on the cameras: a sentence, and a row for each problem."""
+    found: CameraVerdict | None = _read(folder / POSES.verdict, CameraVerdict, damaged)
+    if found is None:
+        return None
+    return {"summary": found.summary, "problems": [(each.grade, each.sentence, each.remedy) for each in found.problems]}
 
 
 def _figures(quality: Quality | None, sign: str = "") -> tuple[str, str]:

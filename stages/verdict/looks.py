@@ -1,0 +1,146 @@
+"""How each photograph of a capture looks: sharp or blurred, bright or dark, and which of them are the same picture twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stages.io.photo import apply_exif_orientation
+from stages.io.pictures import UnreadableImage, opened, orientation_of
+
+SIDE = 640  # px, longest side that photographs are looked at with; docs/experiments/sfm.md
+NOISE = 0.8  # px, standard deviation of a blur that takes noise away
+COARSE = 8  # px between pixels that differ in a blurred photograph, too
+SMALL = (24, 16)  # px, of the picture that others are compared with
+CLIPPED = (4, 250)  # levels that nothing is told by
+BLURRED = 0.13  # sharpness below which a photograph is blurred, whatever the others are
+LESS_SHARP = 0.77  # share of the capture's median, below which it is blurred among sharp ones
+STEP = 0.75  # stops from the capture's median that are a step of exposure
+MOST_CLIPPED = 0.4  # share of pixels without detail
+SAME = 1.5  # of 255, root mean square between two small pictures that are the same
+FLAT = 4.0  # of 255, standard deviation of a small picture that all others of its kind would be the same as
+
+
+@dataclass(frozen=True)
+class Look:
+    """Of one photograph.
+
+    sharpness   root of the mean square of differences between neighbouring pixels, over that of pixels COARSE apart; 0 of no texture
+    brightness  stops: log2 of the mean of linear light, 0 is white
+    clipped     share of pixels that are black or white
+    small       (16, 24) float32 levels
+    """
+
+    sharpness: float
+    brightness: float
+    clipped: float
+    small: np.ndarray
+
+
+def look_at(path: Path) -> Look:
+    """Raises UnreadableImage."""
+    with opened(path) as image:
+        image.draft("RGB", (SIDE, SIDE))
+        orientation = orientation_of(image)
+        if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+            from PIL import Image
+
+            paper = Image.new("RGBA", image.size, (128, 128, 128, 255))
+            paper.alpha_composite(image.convert("RGBA"))
+            grey = np.asarray(paper.convert("L"))
+        else:
+            grey = np.asarray(image.convert("L"))
+    return look(np.ascontiguousarray(apply_exif_orientation(grey, orientation)))
+
+
+def look(grey: np.ndarray) -> Look:
+    """
+    grey  (H, W) uint8, sRGB
+    """
+    import cv2
+
+    scale = SIDE / max(grey.shape)
+    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+    picture = (grey if scale >= 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)).astype(np.float32)
+    linear = (picture / 255.0) ** 2.2
+    return Look(
+        sharpness=_sharpness(picture),
+        brightness=float(np.log2(max(float(linear.mean(dtype=np.float64)), 2.0**-12))),
+        clipped=float(((picture <= CLIPPED[0]) | (picture >= CLIPPED[1])).mean()),
+        small=cv2.resize(picture, SMALL, interpolation=cv2.INTER_AREA),
+    )
+
+
+def _sharpness(picture: np.ndarray) -> float:
+    """The lesser of both axes: a camera that is moved blurs along one."""
+    import cv2
+
+    picture = cv2.GaussianBlur(picture, (0, 0), NOISE)
+    found = []
+    for axis in (0, 1):
+        if picture.shape[axis] <= COARSE:
+            continue
+        near, far = (_squares(picture, step, axis) for step in (1, COARSE))
+        found.append(np.sqrt(near / far) if far > 0 else 0.0)
+    return float(min(found, default=0.0))
+
+
+def _squares(picture: np.ndarray, step: int, axis: int) -> float:
+    """Mean square of the differences between pixels `step` apart."""
+    difference = picture[step:] - picture[:-step] if axis == 0 else picture[:, step:] - picture[:, :-step]
+    return float((difference**2).mean(dtype=np.float64))
+
+
+def look_at_all(paths: Mapping[str, Path]) -> dict[str, Look]:
+    """Of each photograph that can be read, by its name."""
+    found = {}
+    for name, path in paths.items():
+        try:
+            found[name] = look_at(path)
+        except UnreadableImage:
+            continue
+    return found
+
+
+def blurred(looks: Mapping[str, Look]) -> list[str]:
+    """The names of those that are blurred, by themselves or among sharper ones."""
+    if not looks:
+        return []
+    least = max(BLURRED, LESS_SHARP * float(np.median([each.sharpness for each in looks.values()])))
+    return sorted(name for name, each in looks.items() if each.sharpness < least)
+
+
+def of_other_exposure(looks: Mapping[str, Look]) -> list[str]:
+    """The names of those that are brighter or darker than the others."""
+    if not looks:
+        return []
+    middle = float(np.median([each.brightness for each in looks.values()]))
+    return sorted(name for name, each in looks.items() if abs(each.brightness - middle) > STEP)
+
+
+def clipped(looks: Mapping[str, Look]) -> list[str]:
+    """The names of those of which much is black or white."""
+    return sorted(name for name, each in looks.items() if each.clipped > MOST_CLIPPED)
+
+
+def duplicates(looks: Mapping[str, Look]) -> dict[str, str]:
+    """Name -> name of the first photograph that is the same picture."""
+    names = sorted(looks)
+    small = np.stack([looks[name].small.ravel() for name in names]).astype(np.float64) if names else np.zeros((0, 1))
+    found: dict[str, str] = {}
+    for i in range(1, len(names)):
+        if small[i].std() < FLAT:
+            continue
+        apart = np.sqrt(((small[:i] - small[i]) ** 2).mean(1))
+        first = int(np.argmax(apart < SAME))
+        if apart[first] < SAME:
+            found[names[i]] = found.get(names[first], names[first])
+    return found
+
+
+def in_order_of_sharpness(looks: Mapping[str, Look]) -> Sequence[str]:
+    """The names, the most blurred first."""
+    return sorted(looks, key=lambda name: (looks[name].sharpness, name))

@@ -1,0 +1,242 @@
+"""What is to be thought of the cameras of a capture: a grade, and for each problem the photographs that show it and what to do.
+
+    good    nothing stands against it
+    usable  it will give an asset, of which parts may be worse than they need be
+    poor    the asset is likely to be wrong or incomplete
+    failed  no asset can be made of it
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.importers.source import MIN_IMAGES, abbreviated
+from stages.verdict import looks as looks_of
+from stages.verdict.looks import Look
+
+GRADES = ("good", "usable", "poor", "failed")
+NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
+FEW = 12  # views all round a subject
+FEW_POINTS = 60  # sparse points of a photograph, below which its pose is doubtful
+SHARE = 0.1  # of the photographs, from which a problem of single ones is one of the capture
+LARGE_ERROR = 2.0  # px at LONGEST
+LONGEST = 1600  # px that reprojection errors are stated at
+MORE_PHOTOGRAPHS = "Take more photographs between those that do not fit together, with at least 60 % overlap between neighbours."
+
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    what      a word for it
+    grade     the best that a capture with this problem can have
+    sentence  it, in words
+    remedy    what to do
+    images    names of the photographs that show it
+    """
+
+    what: str
+    grade: str
+    sentence: str
+    remedy: str
+    images: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    grade     one of GRADES
+    problems  worst first
+    figures   of the capture
+    images    of each photograph
+    """
+
+    grade: str
+    problems: tuple[Problem, ...]
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    images: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {"grade": self.grade, "summary": self.summary(), **self.figures, "problems": [asdict(each) for each in self.problems], "images": self.images}
+
+    def summary(self) -> str:
+        """A sentence."""
+        of, registered = self.figures.get("photographs"), self.figures.get("registered")
+        words = [f"{registered} of {of} photographs have a camera"]
+        if self.figures.get("reprojection_error") is not None:
+            words.append(f"reprojection error {self.figures['reprojection_error']:.2f} px")
+        if self.figures.get("triangulation_angle") is not None:
+            words.append(f"parallax {self.figures['triangulation_angle']:.0f} degrees")
+        return f"Cameras: {self.grade}; {', '.join(words)}."
+
+
+def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | None = None) -> Verdict:
+    """The verdict on cameras that were found or read.
+
+    looks      of the photographs, registered or not, that can be read
+    in_folder  photographs in the source's folder, where the cameras were read from a model of some of them
+    """
+    names = [photo.camera.name for photo in capture.photos]
+    total = max(len(names) + len(capture.rejected), in_folder or 0)
+    angle = None if capture.points is None or not any(capture.points.tracks) else triangulation_angle(capture.points, capture.photos)
+    counts = points_of_images(capture)
+    figures: dict[str, Any] = {
+        "photographs": total,
+        "registered": len(names),
+        "reprojection_error": capture.reprojection_error,
+        "triangulation_angle": angle if angle is None else round(angle, 2),
+        "points": 0 if capture.points is None else len(capture.points.xyz),
+        "points_per_image": None if counts is None else float(np.median(counts)),
+        **{key: capture.facts[key] for key in ("matching", "components", "models", "pairs_agreeing", "rungs") if key in capture.facts},
+        "sharpness": round(float(np.median([each.sharpness for each in looks.values()])), 3) if looks else None,
+    }
+    problems = [
+        *_of_registration(capture, len(names), total, in_folder),
+        *_of_geometry(capture, angle, counts),
+        *of_looks(looks),
+    ]
+    rows = _rows(capture, looks, counts)
+    ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
+    return Verdict(ordered[0].grade if ordered else "good", ordered, figures, rows)
+
+
+def failed(
+    sentence: str,
+    remedy: str,
+    registered: int,
+    rejected: Sequence[tuple[str, str]],
+    looks: Mapping[str, Look],
+    facts: dict[str, object],
+    overlaps: tuple[tuple[str, str, int], ...],
+) -> Verdict:
+    """The verdict on photographs that no cameras were found of."""
+    capture = Capture(kind="photographs", photos=(), background=None, rejected=tuple(rejected), facts=facts, overlaps=overlaps)
+    others = [*_of_parts(capture), *of_looks(looks)]
+    problems = (Problem("failed", "failed", sentence, remedy, tuple(name for name, _ in rejected)), *others)
+    return Verdict("failed", problems, {"photographs": len(looks), "registered": registered, **facts}, _rows(capture, looks, None))
+
+
+def _of_registration(capture: Capture, registered: int, total: int, in_folder: int | None) -> list[Problem]:
+    found = []
+    lost = tuple(name for name, _ in capture.rejected)
+    share = registered / max(1, total)
+    if in_folder is not None and registered < in_folder:
+        if share < 0.9:
+            remedy = "--as photographs finds the cameras of all of them afresh."
+            sentence = f"The model that was read has cameras of {registered} of the {in_folder} photographs in the folder."
+            found.append(Problem("few of the folder", "poor" if share < 0.5 else "usable", sentence, remedy, lost))
+    elif lost:
+        sentence = f"{len(lost)} of {total} photographs have no camera: {abbreviated(list(lost))}."
+        grade = "poor" if share < 0.5 else "usable" if share < 0.95 else "good"
+        found.append(Problem("not registered", grade, sentence, MORE_PHOTOGRAPHS, lost))
+    found += _of_parts(capture)
+    if registered < FEW:
+        sentence = f"Only {registered} photographs have cameras."
+        found.append(Problem("few", "usable", sentence, "20 or more all round a subject are better."))
+    return found
+
+
+def _of_parts(capture: Capture) -> list[Problem]:
+    components, models = (capture.facts.get(key) for key in ("components", "models"))
+    parts = [count for count in components if count >= MIN_IMAGES] if isinstance(components, list) else []
+    found = []
+    if len(parts) > 1:
+        sentence = f"The photographs fall into {len(parts)} groups that do not overlap, of {', '.join(map(str, parts))}; the largest is used."
+        found.append(Problem("components", "usable", sentence, MORE_PHOTOGRAPHS))
+    if isinstance(models, list) and len(models) > 1:
+        sentence = f"There are {len(models)} sub-models, of {', '.join(map(str, models))} photographs; the largest is used."
+        found.append(Problem("sub-models", "good", sentence, MORE_PHOTOGRAPHS))
+    return found
+
+
+def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | None) -> list[Problem]:
+    found = []
+    agreeing = capture.facts.get("pairs_agreeing")
+    if isinstance(agreeing, float) and agreeing < 0.8:
+        sentence = f"Only {agreeing:.0%} of the matches agree with the cameras: repeated structure may have folded the scene."
+        found.append(Problem("folded", "poor", sentence, "Look at cameras.png. Photographs with more of the surroundings tell repeated parts apart."))
+    if angle is not None and angle < 4.0:
+        sentence = f"The photographs were taken from almost one place (parallax {angle:.1f} degrees): depth will be poor."
+        found.append(Problem("parallax", "poor" if angle < 2.0 else "usable", sentence, "Move sideways between photographs, not only turn."))
+    if capture.reprojection_error is not None and capture.photos:
+        longest = float(np.median([max(photo.camera.width, photo.camera.height) for photo in capture.photos]))
+        if capture.reprojection_error > LARGE_ERROR * max(1.0, longest / LONGEST):
+            sentence = f"The reprojection error is large: {capture.reprojection_error:.1f} px."
+            remedy = "Use one lens at one zoom, and a shutter fast enough for a moving camera; nothing in the scene should move."
+            found.append(Problem("reprojection error", "usable", sentence, remedy))
+    if counts is not None and len(counts):
+        few = tuple(photo.camera.name for photo, count in zip(capture.photos, counts, strict=True) if count < FEW_POINTS)
+        if few:
+            grade = "usable" if len(few) > SHARE * len(counts) else "good"
+            sentence = f"{len(few)} photographs see fewer than {FEW_POINTS} sparse points; their cameras are less sure: {abbreviated(list(few))}."
+            found.append(Problem("few points", grade, sentence, "Texture helps: leave more of the surroundings in view.", few))
+    return found
+
+
+def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
+    """Problems of the pictures themselves."""
+    found = []
+    for what, names, words, remedy in (
+        ("blurred", looks_of.blurred(looks), "are blurred", "Move slower, give more light, or film at a faster shutter speed."),
+        ("exposure", looks_of.of_other_exposure(looks), "are brighter or darker than the others by more than 0.75 stops", "Lock exposure and white balance."),
+        ("clipped", looks_of.clipped(looks), "are black or white in more than 40 % of their pixels", "Expose for the subject; black and white hold no detail."),
+    ):
+        if names:
+            share = len(names) / len(looks)
+            sentence = f"{len(names)} of {len(looks)} photographs ({share:.0%}) {words}: {abbreviated(names)}."
+            found.append(Problem(what, "usable" if share > SHARE else "good", sentence, remedy, tuple(names)))
+    same = looks_of.duplicates(looks)
+    if same:
+        sentence = f"{len(same)} photographs are the same picture as another: {abbreviated([f'{name} as {first}' for name, first in same.items()])}."
+        grade = "poor" if len(looks) - len(same) < 3 else "usable" if len(same) > 0.4 * len(looks) else "good"
+        found.append(Problem("duplicates", grade, sentence, "They add nothing; photographs from other places would.", tuple(same)))
+    return found
+
+
+def _rows(capture: Capture, looks: Mapping[str, Look], counts: np.ndarray | None) -> dict[str, dict[str, Any]]:
+    """Of each photograph what is known of it."""
+    same = looks_of.duplicates(looks)
+    registered = {photo.camera.name for photo in capture.photos}
+    rows: dict[str, dict[str, Any]] = {}
+    for index, photo in enumerate(capture.photos):
+        rows[photo.camera.name] = {"registered": True, "points": None if counts is None else int(counts[index])}
+    for name, reason in capture.rejected:
+        near = sorted(((n, b if a == name else a) for a, b, n in capture.overlaps if name in (a, b)), reverse=True)
+        beside = [{"image": other, "matches": n} for n, other in near if other in registered or not registered][:NEAREST]
+        rows[name] = {"registered": False, "reason": reason, "nearest": beside}
+    for name, row in rows.items():
+        if name in looks:
+            each = looks[name]
+            row |= {"sharpness": round(each.sharpness, 3), "brightness": round(each.brightness, 2), "clipped": round(each.clipped, 3)}
+            if name in same:
+                row["same_as"] = same[name]
+    return dict(sorted(rows.items()))
+
+
+def points_of_images(capture: Capture) -> np.ndarray | None:
+    """(C,) sparse points that each photograph sees; None where nothing is known of it."""
+    if capture.points is None or not any(capture.points.tracks):
+        return None
+    return np.bincount([photo for track in capture.points.tracks for photo in set(track)], minlength=len(capture.photos))
+
+
+def triangulation_angle(points: SparsePoints, photos: Sequence[Photo]) -> float:
+    """Median over the points of the largest angle between two rays of a track, degrees; below about two, depth is unreliable."""
+    if not len(points.xyz):
+        return 0.0
+    centres = np.array([photo.camera.centre for photo in photos])
+    step = max(1, len(points.xyz) // 2000)
+    widest = []
+    for xyz, track in zip(points.xyz[::step], points.tracks[::step], strict=True):
+        if len(track) < 2:
+            continue
+        towards = centres[list(track)] - xyz
+        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
+        widest.append(np.degrees(np.arccos(np.clip((towards @ towards.T).min(), -1, 1))))
+    return float(np.median(widest)) if widest else 0.0
+

@@ -1,0 +1,207 @@
+"""The verdict on cameras: how photographs look, what stands against a capture, and its pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from efficientnerf.geometry.cameras import Camera
+from stages.io.capture import Capture, Photo, SparsePoints
+from stages.verdict import looks, pictures
+from stages.verdict.looks import Look, look
+from stages.verdict.verdict import GRADES, verdict_on
+
+RNG = np.random.default_rng(0)
+PICTURE = cv2.resize(RNG.integers(40, 216, (120, 160), np.uint8), (640, 480), interpolation=cv2.INTER_LANCZOS4)
+
+
+def moved(picture: np.ndarray, pixels: int) -> np.ndarray:
+    return np.asarray(cv2.blur(picture, (pixels, 1)))
+
+
+@pytest.mark.parametrize("blur", [lambda p: cv2.GaussianBlur(p, (0, 0), 4.0), lambda p: moved(p, 15), lambda p: moved(p.T, 15).T])
+def test_blur_takes_sharpness_whatever_contrast_and_brightness(blur) -> None:  # type: ignore[no-untyped-def]
+    sharp, soft = look(PICTURE), look(np.ascontiguousarray(blur(PICTURE)))
+    assert soft.sharpness < looks.LESS_SHARP * sharp.sharpness
+    faint = look(np.rint(PICTURE * 0.4 + 60).astype(np.uint8))
+    assert faint.sharpness == pytest.approx(sharp.sharpness, rel=0.05)
+    noisy = np.clip(PICTURE + np.random.default_rng(1).normal(0, 2.0, PICTURE.shape), 0, 255).astype(np.uint8)
+    assert look(noisy).sharpness == pytest.approx(sharp.sharpness, rel=0.1)
+    assert look(np.full((48, 64), 90, np.uint8)).sharpness == 0.0
+
+
+def test_brightness_is_in_stops_of_light() -> None:
+    linear = (PICTURE / 255.0) ** 2.2
+    darker = np.rint((linear / 4) ** (1 / 2.2) * 255).astype(np.uint8)
+    assert look(PICTURE).brightness - look(darker).brightness == pytest.approx(2.0, abs=0.02)
+    assert look(np.zeros((30, 40), np.uint8)).clipped == 1.0
+    assert look(PICTURE).clipped < 0.01
+
+
+def picture_of(seed: int) -> np.ndarray:
+    return cv2.resize(np.random.default_rng(seed).integers(40, 216, (12, 16), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+
+
+def test_the_same_picture_twice_is_found_and_another_is_not() -> None:
+    jpeg = cv2.imdecode(cv2.imencode(".jpg", picture_of(0), [cv2.IMWRITE_JPEG_QUALITY, 60])[1], cv2.IMREAD_GRAYSCALE)
+    shifted = np.roll(picture_of(0), 24, axis=1)
+    white = np.full((240, 320), 250, np.uint8)
+    seen = {name: look(p) for name, p in {"a": picture_of(0), "b": picture_of(1), "c": jpeg, "d": shifted, "e": picture_of(0), "w": white, "x": white}.items()}
+    assert looks.duplicates(seen) == {"c": "a", "e": "a"}
+    assert looks.duplicates({}) == {}
+
+
+def test_files_are_looked_at_upright_and_what_is_no_picture_is_left_out(tmp_path: Path) -> None:
+    upright = Image.fromarray(picture_of(3))
+    upright.save(tmp_path / "upright.png")
+    exif = Image.Exif()
+    exif[274] = 6
+    upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "turned.png", exif=exif)
+    (tmp_path / "text.png").write_bytes(b"no picture")
+    found = looks.look_at_all({name: tmp_path / f"{name}.png" for name in ("upright", "turned", "text")})
+    assert sorted(found) == ["turned", "upright"]
+    assert looks.duplicates(found) == {"upright": "turned"}
+
+
+# ------------------------------------------------------------------------------------------------------------ grades
+
+
+def capture(count: int = 24, radius: float = 4.0, **changes: object) -> Capture:
+    """Cameras on a circle round points that each of them sees."""
+    photos = []
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        pose = np.eye(4)
+        pose[:3, 3] = radius * np.cos(angle), radius * np.sin(angle), 10.0
+        photos.append(Photo(Camera(f"{k:02d}.jpg", 640, 480, "SIMPLE_PINHOLE", (500.0, 320.0, 240.0), pose), Path("none")))
+    xyz = np.random.default_rng(0).normal(0, 1, (200, 3))
+    points = SparsePoints(xyz, np.zeros((200, 3), np.uint8), np.ones(200), tuple(tuple(range(count)) for _ in range(200)))
+    given: dict[str, object] = {"reprojection_error": 0.5, "facts": {"pairs_agreeing": 0.97, "components": [count], "models": [count]}}
+    return Capture(kind="photographs", photos=tuple(photos), background=None, points=points, **(given | changes))  # type: ignore[arg-type]
+
+
+def sharp(names: list[str], **changes: dict[str, object]) -> dict[str, Look]:
+    base = {"sharpness": 0.25, "brightness": -2.0, "clipped": 0.0}
+    return {
+        name: Look(**(base | changes.get(name, {})), small=np.random.default_rng(k).uniform(0, 255, (16, 24)).astype(np.float32))  # type: ignore[arg-type]
+        for k, name in enumerate(names)
+    }
+
+
+NAMES = [f"{k:02d}.jpg" for k in range(24)]
+
+
+def test_nothing_stands_against_a_good_capture() -> None:
+    found = verdict_on(capture(), sharp(NAMES))
+    assert (found.grade, found.problems) == ("good", ())
+    assert found.summary() == "Cameras: good; 24 of 24 photographs have a camera, reprojection error 0.50 px, parallax 43 degrees."
+    assert found.images["03.jpg"]["points"] == 200
+    assert json.loads(json.dumps(found.document()))["grade"] == "good"
+
+
+LOST = tuple((f"lost{k}.jpg", "overlaps no other photograph well enough") for k in range(30))
+
+
+@pytest.mark.parametrize(
+    ("changes", "what", "grade"),
+    [
+        ({"rejected": LOST[:1]}, "not registered", "good"),
+        ({"rejected": LOST[:6]}, "not registered", "usable"),
+        ({"rejected": LOST}, "not registered", "poor"),
+        ({"facts": {"pairs_agreeing": 0.6}}, "folded", "poor"),
+        ({"facts": {"components": [24, 7, 1]}}, "components", "usable"),
+        ({"facts": {"models": [24, 5]}}, "sub-models", "good"),
+        ({"radius": 0.05}, "parallax", "poor"),
+        ({"count": 5}, "few", "usable"),
+        ({"reprojection_error": 3.0}, "reprojection error", "usable"),
+    ],
+)
+def test_each_problem_has_its_grade_words_and_remedy(changes: dict[str, object], what: str, grade: str) -> None:
+    made = capture(**changes)  # type: ignore[arg-type]
+    found = verdict_on(made, sharp([photo.camera.name for photo in made.photos]))
+    assert [(problem.what, problem.grade) for problem in found.problems] == [(what, grade)]
+    assert found.grade == grade
+    assert found.problems[0].sentence.endswith(".")
+    assert found.problems[0].remedy.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("change", "what"), [({"sharpness": 0.1}, "blurred"), ({"sharpness": 0.18}, "blurred"), ({"brightness": -3.0}, "exposure"), ({"clipped": 0.5}, "clipped")]
+)
+def test_pictures_that_differ_are_named_and_count_where_they_are_many(change: dict[str, object], what: str) -> None:
+    one = verdict_on(capture(), sharp(NAMES, **{"05.jpg": change}))
+    assert [(problem.what, problem.grade, problem.images) for problem in one.problems] == [(what, "good", ("05.jpg",))]
+    many = verdict_on(capture(), sharp(NAMES, **dict.fromkeys(NAMES[:8], change)))
+    assert (many.grade, many.problems[0].images) == ("usable", tuple(NAMES[:8]))
+
+
+def test_a_model_of_few_of_the_photographs_says_how_to_start_afresh() -> None:
+    found = verdict_on(capture(), sharp(NAMES), in_folder=292)
+    assert found.grade == "poor"
+    assert "24 of the 292 photographs" in found.problems[0].sentence
+    assert "--as photographs" in found.problems[0].remedy
+    assert verdict_on(capture(), sharp(NAMES), in_folder=24).grade == "good"
+
+
+def test_lost_photographs_have_the_registered_ones_that_they_failed_against() -> None:
+    overlaps = (("00.jpg", "lost0.jpg", 12), ("01.jpg", "lost0.jpg", 19), ("lost0.jpg", "lost1.jpg", 90), ("00.jpg", "01.jpg", 500))
+    made = capture(rejected=LOST[:2], overlaps=overlaps)
+    found = verdict_on(made, {})
+    assert found.images["lost0.jpg"]["nearest"] == [{"image": "01.jpg", "matches": 19}, {"image": "00.jpg", "matches": 12}]
+    assert found.images["lost1.jpg"]["nearest"] == []
+
+
+def test_problems_are_in_order_and_the_worst_is_the_grade() -> None:
+    found = verdict_on(capture(rejected=LOST[:6], facts={"pairs_agreeing": 0.5}), sharp(NAMES, **{"05.jpg": {"sharpness": 0.1}}))
+    places = [GRADES.index(problem.grade) for problem in found.problems]
+    assert places == sorted(places, reverse=True)
+    assert (found.grade, len(places)) == ("poor", 3)
+
+
+# ---------------------------------------------------------------------------------------------------------- pictures
+
+
+def test_lost_photographs_are_placed_among_those_that_they_match() -> None:
+    centres = np.array([[0.0, 0, 0], [3, 0, 0], [9, 9, 9]])
+    places = pictures.lost_places(["a", "b", "c"], centres, ["x", "y"], [("a", "x", 10), ("b", "x", 20), ("x", "y", 50)])
+    np.testing.assert_allclose(places, [[2.0, 0, 0]])
+
+
+def test_pictures_show_cameras_in_blue_and_lost_ones_in_red_and_repeat(tmp_path: Path) -> None:
+    made = capture()
+    centres = np.array([photo.camera.centre for photo in made.photos])
+    forward = np.tile([0.0, 0.0, -1.0], (24, 1))
+    assert made.points is not None
+    for name, lost in (("a", np.zeros((0, 3))), ("b", np.array([[0.0, 0.0, 10.0]])), ("c", np.array([[0.0, 0.0, 10.0]]))):
+        pictures.camera_plot(centres, forward, made.points.xyz, lost, "title", tmp_path / f"{name}.png")
+    a, b = (np.asarray(Image.open(tmp_path / f"{name}.png")).reshape(-1, 3) for name in "ab")
+    for pixels, reds in ((a, False), (b, True)):
+        assert (pixels == pictures.GOOD).all(1).sum() > 24 * 10
+        assert bool((pixels == pictures.LOST).all(1).any()) == reds
+    assert (tmp_path / "b.png").read_bytes() == (tmp_path / "c.png").read_bytes()
+
+
+def test_matches_are_squares_of_their_pair(tmp_path: Path) -> None:
+    names = ["a", "b", "c", "d"]
+    pictures.match_picture(names, ["d"], [("a", "b", 1000), ("c", "d", 600), ("a", "zz", 5)], tmp_path / "m.png")
+    top = np.asarray(Image.open(tmp_path / "m.png"))[pictures.MARGIN + 32 + 8 :: 16, pictures.MARGIN + 8 :: 16][:4, :4].astype(int)
+    assert (top == top.transpose(1, 0, 2)).all()
+    assert tuple(top[0, 1]) == pictures.GOOD
+    assert tuple(top[2, 3]) == pictures.LOST
+    assert tuple(top[0, 2]) == pictures.PAPER
+
+
+def test_the_most_blurred_come_first(tmp_path: Path) -> None:
+    files = {}
+    for k, name in enumerate("abc"):
+        Image.new("RGB", (64, 48), (0, 0, 80 * k)).save(tmp_path / f"{name}.png")
+        files[name] = tmp_path / f"{name}.png"
+    pictures.sharpness_sheet(files | {"gone": tmp_path / "text"}, {"a": 0.5, "b": 0.1, "c": 0.3}, ["b"], tmp_path / "sheet.png")
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png")).reshape(-1, 3)
+    seen = [int(value) for value in dict.fromkeys(sheet[(sheet[:, 0] == 0) & (sheet[:, 1] == 0)][:, 2].tolist())]
+    assert seen[:3] == [80, 160, 0]
