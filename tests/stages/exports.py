@@ -193,10 +193,153 @@ def polycam(folder: Path, corrected: bool = True) -> tuple[Path, Pixels]:
     return folder, pixels
 
 
+def record3d(folder: Path) -> tuple[Path, Pixels]:
+    poses, lenses, pixels = [], [], {}
+    for index, camera in enumerate(cameras(".jpg")):
+        matrix = opengl_from_pose(camera.world_from_camera)
+        w, x, y, z = captures.quaternion(matrix[:3, :3])
+        poses.append([x, y, z, w, *matrix[:3, 3]])
+        lenses.append([40.0 + index, 41.0, 15.5, 12.5])
+        pixels[f"{index}.jpg"] = opengl_pinhole(matrix, *lenses[-1])
+    document = {"w": WIDTH, "h": HEIGHT, "fps": 60, "K": [1, 0, 0, 0, 1, 0, 0, 0, 1], "poses": poses, "perFrameIntrinsicCoeffs": lenses}
+    captures.write_json(folder / "EXR_RGBD/metadata.json", document)
+    captures.write_pictures(folder / "EXR_RGBD/rgb", list(pixels))
+    return folder, pixels
+
+
+# --- data sets
+
+
+def scannetpp(folder: Path) -> tuple[Path, Pixels]:
+    """A fisheye lens, by OpenCV's equations."""
+    lens = {"fl_x": 30.0, "fl_y": 31.0, "cx": 16.5, "cy": 11.5, "k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": -0.001}
+    entries, pixels = [], {}
+    for camera in cameras(".JPG"):
+        entries.append({"file_path": camera.name, "transform_matrix": opengl_from_pose(camera.world_from_camera).tolist(), "is_bad": False})
+        x, y, z = local(np.linalg.inv(camera.world_from_camera)).T
+        r = np.hypot(x, y)
+        theta = np.arctan2(r, z)
+        d = theta * (1 + lens["k1"] * theta**2 + lens["k2"] * theta**4 + lens["k3"] * theta**6 + lens["k4"] * theta**8) / r
+        pixels[camera.name] = np.stack([lens["fl_x"] * x * d + lens["cx"], lens["fl_y"] * y * d + lens["cy"]], -1)
+    bad = {**entries[0], "file_path": "img_9.JPG", "is_bad": True}
+    document = lens | {"camera_model": "OPENCV_FISHEYE", "w": WIDTH, "h": HEIGHT, "frames": [*entries[:4], bad], "test_frames": entries[4:]}
+    captures.write_json(folder / "dslr/nerfstudio/transforms.json", document)
+    captures.write_json(folder / "dslr/train_test_lists.json", {"train": ["img_0.JPG", "img_1.JPG", "img_2.JPG"], "test": ["img_4.JPG", "img_5.JPG"]})
+    names = [camera.name for camera in cameras(".JPG")]
+    for index, name in enumerate([*names, "img_9.JPG"]):
+        captures.write_picture(folder / "dslr/resized_images" / name, captures.picture(index), format="JPEG")
+    return folder, pixels
+
+
+def kapture(folder: Path) -> tuple[Path, Pixels]:
+    """Two cameras on a rig: the odd images are those of the second."""
+    second = np.eye(4)  # sensor from rig
+    second[:3, :3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    second[:3, 3] = 0.3, -0.1, 0.2
+
+    def pose(matrix: np.ndarray) -> str:
+        return words([*captures.quaternion(matrix[:3, :3]), *matrix[:3, 3]]).replace(" ", ", ")
+
+    trajectories, records, pixels = [], [], {}
+    for index, camera in enumerate(cameras()):
+        device = np.linalg.inv(camera.world_from_camera)
+        if index % 2:
+            device = np.linalg.inv(second) @ device  # rig from world
+        trajectories.append(f"{index}, rig, {pose(device)}")
+        records.append(f"{index}, cam{index % 2}, map/{camera.name}")
+        pixels[camera.name] = pinhole(camera, 41.0, 41.0, 16.5, 11.5) if index % 2 else pinhole(camera, 40.0, 42.0, 15.0, 13.0)
+    first = "# kapture format: 1.1\n"
+    sensors = ["cam0, , camera, PINHOLE, 32, 24, 40, 42, 15, 13", f"cam1, , camera, SIMPLE_PINHOLE, {WIDTH}, {HEIGHT}, 41, 16.5, 11.5", "w, , wifi"]
+    write(folder / "sensors/sensors.txt", first + "\n".join(sensors) + "\n")
+    write(folder / "sensors/rigs.txt", f"{first}rig, cam0, 1, 0, 0, 0, 0, 0, 0\nrig, cam1, {pose(second)}\n")
+    write(folder / "sensors/trajectories.txt", first + "\n".join(trajectories) + "\n")
+    write(folder / "sensors/records_camera.txt", first + "\n".join(records) + "\n7, cam0, map/lost.png\n")
+    write(folder / "reconstruction/points3d.txt", first + "\n".join(f"{words(point).replace(' ', ', ')}, 10, 20, 30" for point in POINTS) + "\n")
+    write(folder / "reconstruction/observations.txt", first + "2, sift, map/img_0.png, 5, map/img_3.png, 6\n4, sift, map/img_1.png, 0, map/x.png, 6\n")
+    captures.write_pictures(folder / "sensors/records_data/map", [camera.name for camera in cameras()])
+    return folder, pixels
+
+
+K = np.array([[40.0, 0, 15.5], [0, 42.0, 12.5], [0, 0, 1]])
+
+
+def mvsnet(folder: Path, place: str = "cams", images: str = "images") -> tuple[Path, Pixels]:
+    pixels = {}
+    for index, camera in enumerate(cameras()):
+        rows = "\n".join(words(row) for row in np.linalg.inv(camera.world_from_camera))
+        lens = "\n".join(words(row) for row in K)
+        write(folder / place / f"{index:08d}_cam.txt", f"extrinsic\n{rows}\n\nintrinsic\n{lens}\n\n2.5 0.05 192 7.0\n")
+        pixels[f"{index:08d}.jpg"] = pinhole(camera, 40, 42, 15.5, 12.5)
+    write(folder / "pair.txt", "0\n")
+    captures.write_pictures(folder / images, list(pixels))
+    return folder, pixels
+
+
+def dtu(folder: Path) -> tuple[Path, Pixels]:
+    """Two lights of six views."""
+    _, pixels = mvsnet(folder, "Cameras")
+    for path in (folder / "images").iterdir():
+        path.unlink()
+    (folder / "images").rmdir()
+    names = [f"rect_{index + 1:03d}_{light}_r5000.png" for index in range(6) for light in (2, 3)]
+    captures.write_pictures(folder / "Rectified/scan9", names)
+    return folder, dict(zip(names[1::2], pixels.values(), strict=True))
+
+
+def idr(folder: Path) -> tuple[Path, Pixels]:
+    matrices, pixels = {}, {}
+    for index, camera in enumerate(cameras()):
+        lens = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # the centre of the first pixel is at 0, 0
+        world = np.eye(4)
+        world[:3] = 1.7 * lens @ np.linalg.inv(camera.world_from_camera)[:3]  # of any scale, and any sign
+        matrices[f"world_mat_{index}"] = world * (-1 if index % 2 else 1)
+        matrices[f"scale_mat_{index}"] = np.array([[2.0, 0, 0, 0.1], [0, 2.0, 0, 0.2], [0, 0, 2.0, 0.3], [0, 0, 0, 1]])
+        p = world @ np.concatenate([POINTS, np.ones((9, 1))], 1).T
+        pixels[f"{index:06d}.png"] = (p[:2] / p[2]).T + 0.5
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(folder / "cameras_sphere.npz", **matrices)
+    captures.write_pictures(folder / "image", list(pixels))
+    for index in range(6):
+        captures.write_picture(folder / f"mask/{index:03d}.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    return folder, pixels
+
+
+def nsvf(folder: Path) -> tuple[Path, Pixels]:
+    pixels = {}
+    for index, camera in enumerate(cameras()):
+        stem = f"{index // 2}_train_{index:04d}"
+        write(folder / f"pose/{stem}.txt", "\n".join(words(row) for row in camera.world_from_camera) + "\n")
+        pixels[f"{stem}.png"] = pinhole(camera, 40, 40, 16, 12)
+    write(folder / "intrinsics.txt", f"40. 16. 12. 0.\n0. 0. 0.\n0.\n1.\n{HEIGHT} {WIDTH}\n")
+    write(folder / "bbox.txt", "-1 -1.5 -2 1 1.5 2 0.4\n")
+    captures.write_pictures(folder / "rgb", list(pixels), channels=4)
+    return folder, pixels
+
+
+def tanks(folder: Path) -> tuple[Path, Pixels]:
+    lines, pixels = [], {}
+    for index, camera in enumerate(cameras()):
+        lines += [f"{index} {index} 0", *(words(row) for row in camera.world_from_camera)]
+        pixels[f"{index + 1:06d}.jpg"] = pinhole(camera, 40, 42, 15.5, 12.5)
+    write(folder / "Barn_COLMAP_SfM.log", "\n".join(lines) + "\n")
+    write(folder / "intrinsics.txt", "40 42 15.5 12.5\n")
+    captures.write_pictures(folder / "images", list(pixels))
+    return folder, pixels
+
+
 EXPORTS: dict[str, tuple[str, Callable[[Path], tuple[Path, Pixels]]]] = {
     "polycam": ("polycam", polycam),
     "metashape": ("metashape", metashape),
     "realitycapture csv": ("realitycapture", realitycapture_csv),
     "realitycapture xmp": ("realitycapture", realitycapture_xmp),
     "opensfm": ("opensfm", opensfm),
+    "record3d": ("record3d", record3d),
+    "kapture": ("kapture", kapture),
+    "mvsnet": ("mvsnet", mvsnet),
+    "blended mvs": ("mvsnet", lambda folder: mvsnet(folder, images="blended_images")),
+    "dtu": ("mvsnet", dtu),
+    "idr": ("idr", idr),
+    "nsvf": ("nsvf", nsvf),
+    "tanks and temples": ("tanks-and-temples", tanks),
+    "scannet++": ("scannetpp", scannetpp),
 }

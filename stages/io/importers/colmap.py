@@ -17,6 +17,7 @@ from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.colmap_model import MAX_NAME, Model, Points, count_images, model_files, read_model
+from stages.io.importers.frames import relocated
 from stages.io.importers.photographs import masks_of
 from stages.io.importers.source import MIN_IMAGES, ImportSettings, Source, abbreviated, missing_images_warning, moved_images_warnings
 from stages.io.pictures import UnreadableImage, read_header
@@ -102,14 +103,18 @@ def _find_images(source: Source, model: Model) -> tuple[dict[int, Path | None], 
     candidates = [path for path in dict.fromkeys(places_to_look) if path.is_dir() and path.is_relative_to(source.root)]
     counts = {folder: sum(os.path.isfile(folder / name) for name in names.values()) for folder in candidates}
     best = max(candidates, key=lambda folder: counts[folder])  # the first of equals
+    results = {number: source.find(name, best) for number, name in names.items()}
+    taken = {result.path for result in results.values() if result.path is not None}
+    missing = [names[number] for number, result in results.items() if result.path is None]
+    present = [names[number] for number, result in results.items() if result.path is not None]
+    elsewhere = relocated(source, missing, present, taken) if missing else {}
     found: dict[int, Path | None] = {}
     places: list[tuple[str, str]] = []
     extensions: list[tuple[str, str]] = []
-    for number, name in names.items():
-        result = source.find(name, best)
-        found[number] = result.path
-        if result.path is not None and result.how != "listed":
-            (places if result.how == "elsewhere" else extensions).append((printable(name, MAX_NAME), source.name_of(result.path)))
+    for number, result in results.items():
+        path = found[number] = result.path or elsewhere.get(names[number])
+        if path is not None and (result.path is None or result.how != "listed"):
+            (extensions if result.how == "extension" else places).append((printable(names[number], MAX_NAME), source.name_of(path)))
     return found, places, extensions
 
 

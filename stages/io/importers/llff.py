@@ -110,7 +110,7 @@ def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
         raise BadInput(f"{path}: {error.strerror or 'not a NumPy array'}. Name the folder of an LLFF data set, or choose a format with --as.") from error
     if len(data) > 17 * 8 * max_frames + 4096:
         raise BadInput(f"{path}: {path.stat().st_size} bytes; more than {max_frames} poses are not read.")
-    shape, fortran, kind, start = _npy_header(path, data)
+    shape, fortran, kind, start = npy_header(path, data)
     if len(shape) != 2 or shape[1] != 17 or kind.kind not in "fiu":
         found = f"{kind} {shape}"
         raise BadInput(f"{path}: {found:.80}; expected numbers of shape (N, 17): 3x5 poses, near and far. Write it again with LLFF's imgs2poses.")
@@ -124,7 +124,7 @@ def read_rows(path: Path, max_frames: int = MAX_FRAMES) -> np.ndarray:
     return rows
 
 
-def _npy_header(path: Path, data: bytes) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+def npy_header(path: Path, data: bytes) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     """Shape, whether columns come first, type, and where the numbers begin, of a .npy file; nothing is allocated on its word."""
     file = io.BytesIO(data)
     try:

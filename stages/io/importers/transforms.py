@@ -11,34 +11,32 @@ The capture's frame is that of the matrices; `applied_transform` is recorded onl
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from efficientnerf.geometry.cameras import MODELS, Camera, pose_from_opengl
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
-from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, missing_images_warning, moved_images_warnings
+from stages.io.importers.frames import relocated
+from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, Found, ImportSettings, Source, missing_images_warning, moved_images_warnings
+from stages.io.importers.transforms_camera import lens_of, pose_of
 from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
 from stages.io.pictures import UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 MAX_PLY = 1 << 30  # bytes
-MIN_ANGLE = 1e-9  # radians; its tangent is a number yet
 MAX_NAME = 200  # characters of a listed name that are shown
 _REMEDY = "Copy them into the source folder, or take their frames out of the JSON."
 _NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_file_path")
 _NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
 _NGP_FACTS = ("aabb_scale", "scale", "offset")
 _NGP_KEYS = (*_NGP_FACTS, "is_fisheye", "from_na", "n_extra_learnable_dims", "enable_depth_loading", "integer_depth_scale", "render_aabb")
-_UNSUPPORTED = ("ftheta_p0", "latlong", "equirectangular")
 _NGP_SCALE = 0.33  # of instant-ngp, where the file states none
 
 
@@ -172,28 +170,37 @@ def read_document(file: Path, max_frames: int = MAX_FRAMES) -> dict[str, Any]:
 
 def _list_frames(source: Source) -> _Listing:
     listing = _Listing()
-    seen: set[Path] = set()
     documents = _documents(source)
+    entries: list[tuple[_Frame, Found]] = []
     for file, document in documents:
         split_of_file = SPLIT_FILES.get(file.name) if len(documents) > 1 else None
         split_of_name = dict(_listed_splits(document, file))
         for index, entry in enumerate(document["frames"]):
             if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
                 raise BadInput(f"{file}: frame {index} has no `file_path`. Write the data set again, or take it out.")
-            listing.total += 1
             name = entry["file_path"]
             found = source.find(name, file.parent)
-            if found.path is None:
-                listing.missing.append(printable(name, MAX_NAME))
-            elif found.path in seen:
-                listing.repeated.append((printable(name, MAX_NAME), f"the same image as an earlier frame ({source.name_of(found.path)})"))
-            else:
-                seen.add(found.path)
-                place = {"elsewhere": listing.places, "extension": listing.extensions}.get(found.how)
-                if place is not None:
-                    place.append((printable(name, MAX_NAME), source.name_of(found.path)))
-                split = split_of_file or split_of_name.get(_plain(name))
-                listing.frames.append(_Frame(document, file, index, entry, split, name, found.path))
+            split = split_of_file or split_of_name.get(_plain(name))
+            entries.append((_Frame(document, file, index, entry, split, name, found.path or file), found))
+    listing.total = len(entries)
+    missing = [frame.listed for frame, found in entries if found.path is None]
+    present = [frame.listed for frame, found in entries if found.path is not None]
+    taken = {found.path for _, found in entries if found.path is not None}
+    elsewhere = relocated(source, missing, present, taken) if missing else {}
+    seen: set[Path] = set()
+    for frame, found in entries:
+        path, name = found.path or elsewhere.get(frame.listed), printable(frame.listed, MAX_NAME)
+        if path is None:
+            listing.missing.append(name)
+        elif path in seen:
+            listing.repeated.append((name, f"the same image as an earlier frame ({source.name_of(path)})"))
+        else:
+            seen.add(path)
+            how = found.how if found.path is not None else "elsewhere"
+            place = {"elsewhere": listing.places, "extension": listing.extensions}.get(how)
+            if place is not None:
+                place.append((name, source.name_of(path)))
+            listing.frames.append(replace(frame, image=path))
     return listing
 
 
@@ -224,9 +231,9 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
             rejected.append((name, str(error), source.real(frame.image)))
             warnings.append(f"{name}: {error}; left out.")
             continue
-        pose = _pose(frame)
+        pose = pose_of(frame.entry, frame.where)
         rolling += "transform_matrix" not in frame.entry
-        camera, remark = lenses.fit_to_image(_lens(frame, name, header.size, pose), header, frame.where)
+        camera, remark = lenses.fit_to_image(lens_of(frame.document | frame.entry, name, header.size, pose, frame.where), header, frame.where)
         if remark is not None:
             remarks.setdefault(remark, []).append(name)
         mask, ignore = _mask(source, frame)
@@ -240,82 +247,6 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
     if len(centred) < len(photos):
         warnings.append(f"{len(photos) - len(centred)} cameras have their principal point outside the image: cx, cy may belong to another size.")
     return photos, rejected, remarks, warnings
-
-
-def _pose(frame: _Frame) -> np.ndarray:
-    entry = frame.entry
-    if "transform_matrix" in entry:
-        return pose_from_opengl(lenses.rigid(entry["transform_matrix"], f"{frame.where}: transform_matrix"))
-    if "transform_matrix_start" in entry and "transform_matrix_end" in entry:
-        start, end = (lenses.rigid(entry[key], f"{frame.where}: {key}") for key in ("transform_matrix_start", "transform_matrix_end"))
-        middle = 0.5 * (start + end)
-        left, _, right = np.linalg.svd(middle[:3, :3])  # the rotation half way
-        middle[:3, :3] = left @ right
-        return pose_from_opengl(middle)
-    raise BadInput(f"{frame.where}: no `transform_matrix`. Write the data set again, or take that frame out.")
-
-
-def _lens(frame: _Frame, name: str, actual: tuple[int, int], pose: np.ndarray) -> Camera:
-    """The camera at the size that the file states, or at the image's own where it states none."""
-    given = {key: value for key, value in (frame.document | frame.entry).items() if key != "frames"}
-
-    def number(key: str, default: float = 0.0) -> float:
-        value = finite(given.get(key, default))
-        if value is None:
-            raise BadInput(f"{frame.where}: {key} is {shown(given[key])}, expected a finite number. Write the data set again.")
-        return value
-
-    for key in _UNSUPPORTED:
-        if given.get(key):
-            raise BadInput(f"{frame.where}: lens model {key} is not supported. Undistort the images first, e.g. to a pinhole or OPENCV_FISHEYE camera.")
-    width, height = (number("w", actual[0]), number("h", actual[1])) if "w" in given and "h" in given else actual
-    if width != int(width) or height != int(height) or not (0 < width <= 65535 and 0 < height <= 65535):
-        raise BadInput(f"{frame.where}: w, h are {width:g}x{height:g}; expected the image size in whole pixels.")
-    fx, fy = _focal(frame, given, number, width, height)
-    named = {"f": fx, "fx": fx, "fy": fy, "cx": number("cx", width / 2), "cy": number("cy", height / 2)}
-    named |= {key: number(key) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
-    model = _model(frame, given, named)
-    camera = Camera(name, int(width), int(height), model, tuple(named[parameter] for parameter in MODELS[model]), pose)
-    return lenses.validated(camera, frame.where)
-
-
-def _focal(frame: _Frame, given: dict[str, Any], number: Any, width: float, height: float) -> tuple[float, float]:
-    focal = {}
-    for axis, side in (("x", width), ("y", height)):
-        if f"fl_{axis}" in given:
-            focal[axis] = number(f"fl_{axis}")
-        elif f"camera_angle_{axis}" in given:
-            angle = number(f"camera_angle_{axis}")
-            if not MIN_ANGLE < angle < math.pi:
-                raise BadInput(f"{frame.where}: camera_angle_{axis} is {angle:g}; expected an angle between 0 and pi, in radians.")
-            focal[axis] = 0.5 * side / math.tan(0.5 * angle)
-    if not focal:
-        raise BadInput(f"{frame.where}: no focal length: expected fl_x or camera_angle_x, at the top or in the frame.")
-    fx = focal.get("x", focal.get("y", 0.0))
-    return fx, focal.get("y", fx)
-
-
-def _model(frame: _Frame, given: dict[str, Any], named: dict[str, float]) -> str:
-    """COLMAP's name of the lens that a frame states."""
-    stated = given.get("camera_model")
-    if given.get("is_fisheye") is True:
-        stated = "OPENCV_FISHEYE"
-    if stated is None or stated == "OPENCV":
-        if named["k4"] or named["k5"] or named["k6"]:
-            raise BadInput(f"{frame.where}: k4 to k6 without `camera_model`; their meaning differs between models. State FULL_OPENCV or OPENCV_FISHEYE.")
-        if named["k3"]:
-            return "FULL_OPENCV"
-        if stated == "OPENCV" or any(named[key] for key in ("k1", "k2", "p1", "p2")):
-            return "OPENCV"
-        return "SIMPLE_PINHOLE" if named["fx"] == named["fy"] else "PINHOLE"
-    if not isinstance(stated, str) or stated not in MODELS:
-        raise BadInput(f"{frame.where}: camera_model {shown(stated)}; supported are {', '.join(MODELS)}. Undistort the images first.")
-    unused = [key for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2") if named[key] and key not in MODELS[stated]]
-    if unused:
-        raise BadInput(f"{frame.where}: camera_model {stated} with {', '.join(unused)}, which that model does not have. State the model that fits.")
-    if "f" in MODELS[stated] and named["fx"] != named["fy"]:  # SIMPLE_... and RADIAL have one focal length
-        return "PINHOLE" if stated == "SIMPLE_PINHOLE" else "OPENCV"
-    return str(stated)
 
 
 def _mask(source: Source, frame: _Frame) -> tuple[Path | None, str]:
