@@ -59,6 +59,9 @@ class PosesOutputs(Outputs):
     cameras = Name("cameras.png")  # from above and from the side
     matches = Name("matches.png")  # which photographs match, where they were compared
     sharpness = Name("sharpness.png")  # photographs, the most blurred first
+    frames = Name("frames.json")  # of videos: which frames were chosen and why, by time, sharpness and motion
+    frames_plot = Name("frames_plot.png")
+    frames_sheet = Name("frames.png")
 
 
 class TrainOutputs(Outputs):

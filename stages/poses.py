@@ -24,7 +24,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
 from stages.io import importers
 from stages.io.capture import Capture, Photo, Silhouettes, SparsePoints
-from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
+from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.io.scene import SPLITS, Scene, View, save, save_points
 
 if TYPE_CHECKING:
@@ -69,6 +69,9 @@ class PosesSettings:
     llff_factor: PositiveInt | Auto = setting(
         "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
     )
+    frames: Annotated[int, Meta(ge=3, le=10_000)] = setting(
+        150, "Most frames that are chosen of videos, of all of them together: the sharpest ones that differ.", advanced=True
+    )
     strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
     allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
     matching: Literal["auto", "exhaustive", "retrieval", "sequential"] = setting(
@@ -93,7 +96,7 @@ def run(job: Job) -> None:
 
     settings: PosesSettings = job.settings
     if job.source is None:
-        raise BadInput("the poses stage needs a source: name a folder of photographs or of a posed data set.")
+        raise BadInput("the poses stage needs a source: name a folder of photographs, a video, or a posed data set.")
     notes: list[str] = []
 
     def warn(text: str, **facts: Any) -> None:
@@ -167,21 +170,17 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
 
 def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
-    from stages.io.importers.photographs import masks_of, photographs
+    from stages.io.material import find_material, with_frames
     from stages.io.pictures import UnreadableImage, read_header
     from stages.memory.poses import feature_threads
     from stages.sfm.background import silhouettes_with_surroundings
     from stages.sfm.matches import num_threads
     from stages.sfm.reconstruction import find_cameras
 
-    assert job.source is not None
-    source = Source(job.source, settings.allow_outside)
-    with importers.one_line_errors(source.root):
-        images = photographs(source)
-        paths = {source.name_of(path): source.real(path) for path in images}
-        masks = {source.name_of(image): source.real(mask) for image, mask in masks_of(source, images).items()}
-    for sentence in source.run_warnings():
-        warn(sentence)
+    source = job.source
+    assert source is not None
+    found = with_frames(job, find_material(source, settings.allow_outside, warn), max(settings.max_image_size, settings.feature_image_size), warn)
+    paths, masks = found.paths, found.masks
     sizes = []
     for path in paths.values():
         job.safe_point()
@@ -190,7 +189,7 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
     def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
         return find_cameras(
-            source.root,
+            source,
             paths,
             max_side=settings.feature_image_size,
             features=settings.max_features,
@@ -206,8 +205,8 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
     kind = silhouettes_with_surroundings(paths, masks, settings.masks, job.safe_point)
     # Alpha channels leave pixels out where these are no silhouettes.
-    found = _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths)) if kind else find("cameras", masks)
-    return replace(found, rejected_files={name: paths[name] for name, _ in found.rejected})
+    capture = _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths)) if kind else find("cameras", masks)
+    return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected})
 
 
 def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None]) -> Capture:

@@ -12,6 +12,7 @@ from stages.memory.need import IMAGING, MIB, Need, refuse_what_does_not_fit
 # Bytes. Of a pixel of the photograph that is decoded, turned, reduced and written; of a pixel of a photograph in which features are detected, on a thread
 # of its own (SIFT's first octave), four times as many where that is twice as large; of an image's descriptors while they are matched.
 DECODED, SIFT, DESCRIPTOR = 26, 80, 640
+FRAME = 60  # of a pixel of a video: what its decoder keeps, 16 frames of 10 bits, and the frame that is looked at or written
 COLMAP = 200 * MIB  # the process in which structure from motion runs
 REMEDY = "Lower poses.feature_image_size, or reduce the largest photographs."
 
@@ -45,6 +46,12 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
 def refuse_large_photographs(job: Job, sizes: Sequence[tuple[int, int]]) -> None:
     """UsageError where the largest photograph does not fit into memory while it is decoded."""
     refuse_what_does_not_fit(job, decoding_needed(sizes), "Reduce the largest photographs.")
+
+
+def refuse_large_videos(job: Job, sizes: Sequence[tuple[int, int]]) -> None:
+    """UsageError where the frames of a video do not fit into memory while it is decoded."""
+    most = max((width * height for width, height in sizes), default=0)
+    refuse_what_does_not_fit(job, Need({"frames of a video": FRAME * most, "libraries": IMAGING}), "Export the video at a lower resolution.")
 
 
 def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int) -> int:

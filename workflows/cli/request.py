@@ -31,6 +31,7 @@ class Options:
     seed: int | None = None
     budget: str | None = None
     target_mib: float | None = None
+    frames: int | None = None
     device: str | None = None
     memory: str | None = None
     strict: bool = False
@@ -117,6 +118,8 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
+    if options.frames is not None:
+        settings.put("poses", "frames", [options.frames], f"--frames {options.frames}")
     memory, limit = _memory(options.memory, standing, warnings)
     run = Run(
         path,
@@ -162,14 +165,17 @@ def _standing(path: Path) -> Run | None:
 
 def _source(given: Path | None, standing: Run | None) -> Path | None:
     """The source to record. It cannot change once poses have been made of it, unless it no longer exists."""
+    from stages.video.reading import KNOWN, SUFFIXES
+
     recorded = standing.source if standing is not None else None
     if given is None:
         return recorded
     if not given.exists():
-        raise BadInput(f"{given}: no such file or folder. Give the folder of the photographs or of the data set.")
-    if not given.is_dir():
-        raise BadInput(f"{given}: is a file; expected the folder of the photographs or of the data set. Give {given.absolute().parent}")
-    if not os.listdir(given):
+        raise BadInput(f"{given}: no such file or folder. Give the folder of the photographs or of the data set, or a video.")
+    if not given.is_dir() and given.suffix.lower() not in SUFFIXES:
+        kinds = f"the folder of the photographs or of the data set, or a video ({KNOWN})"
+        raise BadInput(f"{given}: is a file; expected {kinds}. Give {given.absolute().parent}")
+    if given.is_dir() and not os.listdir(given):
         raise BadInput(f"{given}: the folder is empty; expected photographs or a data set.")
     source = Path(os.path.abspath(given))
     unchanged = recorded is None or os.path.realpath(source) == os.path.realpath(recorded)

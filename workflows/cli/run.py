@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 @click.option("--seed", type=int, help="Seed of every stage with random choices.")
 @click.option("--budget", metavar="TIME", help="Time for training the field and the asset, as 90s, 10m or 1h; sets train.time_budget and bake.time_budget.")
 @click.option("--target-mib", type=float, metavar="N", help="Largest size of the asset in MiB; sets bake.max_mib.")
+@click.option("--frames", type=int, metavar="N", help="Most frames that are chosen of videos, 150 by default; sets poses.frames.")
 @click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Show what would be done and why; do nothing.")
@@ -41,8 +42,8 @@ if TYPE_CHECKING:
 def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or resume RUN.
 
-    SOURCE is a folder of photographs, or of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Without it, RUN is resumed with the
-    settings that it recorded; options change them. Stages that are up to date are skipped.
+    SOURCE is a folder of photographs, a video, or the folder of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Without it, RUN is
+    resumed with the settings that it recorded; options change them. Stages that are up to date are skipped.
     """
     from workflows.cli.request import Options, plan_run
 

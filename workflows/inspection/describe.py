@@ -37,6 +37,8 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _describe_file(path: Path) -> dict[str, Any]:
+    from stages.video.reading import SUFFIXES
+
     suffix = path.suffix.lower()
     if suffix == ".nerftree":
         return {"what": "asset", "path": str(path), **describe_asset(path)}
@@ -46,10 +48,10 @@ def _describe_file(path: Path) -> dict[str, Any]:
         from stages.io import scene
 
         return scene.describe(path.parent)
-    if suffix in (".json", ".npy", ".bin", ".txt"):
+    if suffix in SUFFIXES or suffix in (".json", ".npy", ".bin", ".txt"):
         from stages.io.importers.description import describe_source
 
-        return describe_source(path.parent)
+        return describe_source(path if suffix in SUFFIXES else path.parent)
     raise BadInput(f"{path}: of no kind that can be described; expected an asset (.nerftree), a mesh ({', '.join(MESHES)}), a run or the folder of a data set.")
 
 

@@ -17,6 +17,7 @@ from pipeline.text import printable
 from stages.io.capture import Capture
 from stages.io.importers.source import ImportSettings, Source
 from stages.io.pictures import NOT_THE_FILES_FAULT
+from stages.video.reading import KNOWN, SUFFIXES
 
 
 @dataclass(frozen=True)
@@ -105,9 +106,11 @@ def detect(folder: Path, allow_outside: bool = False) -> str:
 def candidates(folder: Path, allow_outside: bool = False) -> list[str]:
     """Every format that the folder could be read as, the one to choose first; BadInput where there is none."""
     if not folder.exists():
-        raise BadInput(f"{folder}: no such folder. Expected a folder of photographs or a posed data set.")
+        raise BadInput(f"{folder}: no such folder. Expected a folder of photographs, a video or a posed data set.")
     if not folder.is_dir():
-        raise BadInput(f"{folder}: a file; expected a folder of photographs or of a posed data set. Name the folder that holds it.")
+        if folder.suffix.lower() in SUFFIXES:
+            return ["photographs"]
+        raise BadInput(f"{folder}: a file; expected a folder of photographs or of a posed data set, or a video ({KNOWN}). Name the folder that holds it.")
     found = [name for name, importer in IMPORTERS.items() if importer.recognises(folder, allow_outside)]
     if not found:
         from stages.io.importers.photographs import photographs

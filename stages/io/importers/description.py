@@ -12,7 +12,7 @@ import numpy as np
 from efficientnerf.settings import Auto
 from stages.io.capture import Capture
 from stages.io.importers import IMPORTERS, candidates, one_line_errors
-from stages.io.importers.photographs import masks_of, photographs
+from stages.io.importers.photographs import is_video, masks_of, photographs
 from stages.io.importers.source import Source
 from stages.io.pictures import UnreadableImage, read_header
 
@@ -78,9 +78,40 @@ def _posed(capture: Capture) -> dict[str, Any]:
     }
 
 
+def _videos(source: Source, videos: list[Path]) -> dict[str, Any]:
+    from stages.video.reading import UnreadableVideo, opened
+
+    described: list[dict[str, Any]] = []
+    rejected: list[dict[str, str]] = []
+    for path in videos:
+        name = path.name if path == source.root else source.name_of(path)
+        try:
+            with opened(path) as video:
+                frame = next(video.frames(), None)
+                if frame is None:
+                    raise UnreadableVideo("unreadable: no frame in it can be decoded")
+                facts = {"width": video.width, "height": video.height, "seconds": round(video.duration, 3), "frames": video.count, "camera": video.maker}
+                described.append({"name": name, **facts})
+        except UnreadableVideo as error:
+            rejected.append({"name": name, "reason": str(error)})
+    return {
+        "count": len(described),
+        "videos": described,
+        "resolution": _sizes([(video["width"], video["height"]) for video in described]),
+        "models": [],
+        "bounds": None,
+        "masks": 0,
+        "rejected": rejected,
+        "warnings": [f"{entry['name']}: {entry['reason']}" for entry in rejected],
+        "cameras": [],
+    }
+
+
 def _photographs(folder: Path) -> dict[str, Any]:
     source = Source(folder)
-    images = photographs(source)
+    images = photographs(source) if folder.is_dir() else [folder]
+    if is_video(images[0]):
+        return _videos(source, images)
     sizes, rejected, turned = [], [], 0
     for image in images:
         try:

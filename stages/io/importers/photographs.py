@@ -1,4 +1,6 @@
-"""Folders of photographs: which files are photographs, and the masks beside them.
+"""Folders of photographs or videos: which files are photographs, the masks beside them, and which are videos.
+
+Videos count where there are no photographs: a phone keeps a short clip beside each of its own.
 
 A mask lies in a folder `masks` beside or inside that of the images, or at the top of the source, at the image's own relative path, as
 IMG_1.png or (COLMAP's way) IMG_1.jpg.png for IMG_1.jpg; where it is black, the image is left out.
@@ -6,12 +8,14 @@ IMG_1.png or (COLMAP's way) IMG_1.jpg.png for IMG_1.jpg; where it is black, the 
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.errors import BadInput
 from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in
+from stages.video.reading import KNOWN, SUFFIXES
 
 MASKS = "masks"
 # What conversions leave beside the photographs: reductions, depth maps, masks.
@@ -19,16 +23,31 @@ NOT_PHOTOGRAPHS = {MASKS, "mask", "depth", "depths", "sparse", "dense", "stereo"
 
 
 def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return bool(images_in(folder) or images_in(folder / "images"))
+    return bool(images_in(folder) or images_in(folder / "images") or _videos_in(folder))
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file has the name of a video."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def _videos_in(folder: Path) -> list[Path]:
+    if not os.path.isdir(folder):
+        return []
+    return sorted(path for path in folder.iterdir() if is_video(path) and not path.name.startswith(".") and path.is_file())
 
 
 def photographs(source: Source) -> list[Path]:
-    """The photographs of a source: directly in it, else in its folder images/, else anywhere below it; sorted by path. Raises BadInput."""
+    """The photographs of a source: directly in it, else in its folder images/, else anywhere below it; sorted by path. Where there are none, its videos.
+
+    Raises BadInput.
+    """
     folder = source.root
-    found = images_in(folder) or images_in(folder / "images")
+    found = images_in(folder) or images_in(folder / "images") or _videos_in(folder)
     if not found:
         everything = source.walk()
-        found = sorted(path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and not NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1]))
+        usable = [path for path in everything if not NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1])]
+        found = sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES) or sorted(filter(is_video, usable))
         if not found:
             raise BadInput(_nothing(folder, everything))
     if len(found) > MAX_FRAMES:
@@ -62,18 +81,20 @@ def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The photographs and their masks."""
+    """The photographs and their masks, or the videos."""
+    if not folder.is_dir():
+        return [folder]
     source = Source(folder, settings.allow_outside)
     images = photographs(source)
     return [*images, *masks_of(source, images).values()]
 
 
 def _nothing(folder: Path, everything: Sequence[Path]) -> str:
-    known = "png, jpg, webp, tif, bmp or heic"
+    known = f"png, jpg, webp, tif, bmp, heic or avif; {KNOWN}"
     if not everything:
-        return f"{folder}: the folder is empty. Expected at least {MIN_IMAGES} photographs ({known}) or a posed data set."
+        return f"{folder}: the folder is empty. Expected at least {MIN_IMAGES} photographs or a video ({known}), or a posed data set."
     common = Counter(path.suffix.lower() or "(no extension)" for path in everything).most_common(3)
     return (
-        f"{folder}: no images of a known type ({known}); found {', '.join(f'{count} {suffix}' for suffix, count in common)}. "
+        f"{folder}: no images of a known type, and no videos ({known}); found {', '.join(f'{count} {suffix}' for suffix, count in common)}. "
         "Convert the photographs to JPEG or PNG, or name another folder."
     )

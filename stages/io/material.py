@@ -1,0 +1,92 @@
+"""What sources without cameras hold: photographs and their masks by name, and frames of videos, which become photographs here."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.errors import BadInput
+from pipeline.files import write_json
+from pipeline.stage import Job
+from stages.artifacts import PosesOutputs
+from stages.io.importers import one_line_errors
+from stages.io.importers.photographs import is_video, masks_of, photographs
+from stages.io.importers.source import MIN_IMAGES, Source
+
+Warn = Callable[[str], object]
+
+
+@dataclass
+class Material:
+    """Files by the name that they have from here on.
+
+    paths   photographs
+    masks   by the name of the photograph
+    videos  videos whose frames are to be chosen
+    """
+
+    paths: dict[str, Path] = field(default_factory=dict)
+    masks: dict[str, Path] = field(default_factory=dict)
+    videos: dict[str, Path] = field(default_factory=dict)
+
+
+def find_material(path: Path, allow_outside: bool, warn: Warn) -> Material:
+    """What a folder or a video holds; nothing is decoded. Raises BadInput."""
+    found = Material()
+    if not path.is_dir():
+        found.videos[path.name] = path
+        return found
+    source = Source(path, allow_outside)
+    with one_line_errors(source.root):
+        files = photographs(source)
+        into = found.videos if is_video(files[0]) else found.paths
+        into |= {source.name_of(file): source.real(file) for file in files}
+        if into is found.paths:
+            found.masks |= {source.name_of(image): source.real(mask) for image, mask in masks_of(source, files).items()}
+    for sentence in source.run_warnings():
+        warn(sentence)
+    return found
+
+
+def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Material:
+    """The material with frames of its videos among the photographs; writes which were chosen, and why, into the artifact. Raises BadInput.
+
+    max_side  longest side of the frames, pixels
+    """
+    from stages.memory.poses import refuse_large_videos
+    from stages.sfm.matches import num_threads
+    from stages.video.frames import Reader, frames_of
+    from stages.video.reading import UnreadableVideo, opened
+
+    if not found.videos:
+        return found
+    sizes = []
+    for path in found.videos.values():
+        with contextlib.suppress(UnreadableVideo), opened(path) as video:  # said where it is read
+            sizes.append(video.stored)
+    refuse_large_videos(job, sizes)
+    reader = Reader(num_threads(), job.work / "videos", job.progress, job.safe_point, warn)
+    try:
+        chosen = frames_of(found.videos, count=job.settings.frames, max_side=max_side, reader=reader)
+    except UnreadableVideo as error:
+        raise BadInput(f"{job.source}: {error}. Copy or export the video again.") from error
+    for about in chosen.record:
+        job.say(f"{about['video']}: {about['chosen']} of {about['frames']} frames chosen", video=about["video"], chosen=about["chosen"])
+    if len(found.paths) + len(chosen.paths) < MIN_IMAGES:
+        raise BadInput(
+            f"{job.source}: {len(chosen.paths)} frames that differ; at least {MIN_IMAGES} are needed, and 50 or more all round a subject are better."
+            " Walk round the subject while filming."
+        )
+    _write_record(job, chosen.record, chosen.paths)
+    return Material(found.paths | chosen.paths, found.masks)
+
+
+def _write_record(job: Job, record: list[dict[str, object]], paths: Mapping[str, Path]) -> None:
+    from stages.video.figure import write_frames_plot, write_frames_sheet
+
+    outputs = PosesOutputs(job.out)
+    write_json(outputs.frames, {"videos": record})
+    write_frames_plot(record, outputs.frames_plot)
+    write_frames_sheet(record, paths, outputs.frames_sheet)

@@ -1,0 +1,216 @@
+"""Videos to photographs: each is read twice, once to choose its frames, once to write those that are chosen.
+
+    RUN/.work/.../video_0.json    what the first reading found
+    RUN/.work/.../frames_0.json   which files the second one wrote, below frames_0/
+
+Memory does not grow with the length of a video but for three numbers a frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.files import atomic, remove
+from stages.io.png import FAST
+from stages.scratch import note, noted, once
+from stages.video import choice
+from stages.video.reading import Frame, UnreadableVideo, Video, opened
+
+SLOWEST = 12.0  # frames a second that are looked at at least; of videos with more than twice as many, every n-th
+_MAKER = 271  # EXIF's tag
+Progress = Callable[..., None]
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What the first reading of a video found: of each frame that was looked at its number, time, sharpness and motion.
+
+    width, height  upright, pixels
+    """
+
+    width: int
+    height: int
+    duration: float
+    maker: str
+    hdr: str
+    damaged: int
+    index: list[int]
+    time: list[float]
+    sharpness: list[float]
+    motion: list[float]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The frames of the videos.
+
+    paths   name -> PNG, in order of time within each video; a name is that of the video, /, the frame's number
+    camera  name -> the camera that took it, in words; frames of one video have one
+    record  for frames.json
+    """
+
+    paths: dict[str, Path]
+    camera: dict[str, str]
+    record: list[dict[str, object]]
+
+
+@dataclass(frozen=True)
+class Reader:
+    """What reading videos needs of the stage.
+
+    threads  that decode
+    work     scratch folder
+    """
+
+    threads: int
+    work: Path
+    progress: Progress
+    safe_point: Callable[[], None]
+    warn: Callable[[str], object]
+
+
+def frames_of(videos: Mapping[str, Path], *, count: int, max_side: int, reader: Reader) -> Chosen:
+    """Choose frames of videos and write them. Raises UnreadableVideo, whose text names the video.
+
+    videos    file of each by name
+    count     frames of all together, at most
+    max_side  longest side of what is written, pixels
+    """
+    looked = {name: _looked(name, path, place, reader) for place, (name, path) in enumerate(videos.items())}
+    limits = choice.shares([found.motion[-1] for found in looked.values()], count)
+    paths: dict[str, Path] = {}
+    camera: dict[str, str] = {}
+    record: list[dict[str, object]] = []
+    for place, (name, found) in enumerate(looked.items()):
+        verdicts = choice.choose(np.array(found.motion), np.array(found.sharpness), limits[place])
+        numbers = [number for number, verdict in zip(found.index, verdicts, strict=True) if verdict == choice.CHOSEN]
+        written = _written(name, videos[name], place, numbers, max_side, found, reader)
+        named = {f"{name}/{number:06d}.png": path for number, path in written.items()}
+        paths |= named
+        camera |= dict.fromkeys(named, found.maker or f"video {name}")
+        record.append(_record(name, found, verdicts))
+    return Chosen(paths, camera, record)
+
+
+def _looked(name: str, path: Path, place: int, reader: Reader) -> Looked:
+    """The first reading, or what an earlier call found."""
+    file = reader.work / f"video_{place}.json"
+    found = noted(file, Looked, once(reader.warn), _check)
+    if found is None:
+        reader.work.mkdir(parents=True, exist_ok=True)
+        with _naming(name):
+            found = look(path, reader)
+        note(file, {field: getattr(found, field) for field in Looked.__dataclass_fields__})
+    if found.damaged:
+        reader.warn(f"{name}: damaged; {found.damaged} of its frames or packets are left out.")
+    if found.hdr:
+        reader.warn(f"{name}: high dynamic range ({found.hdr}); its colours are taken as those of a usual screen. Film with HDR off for true ones.")
+    return found
+
+
+def _check(found: Looked, outputs: object) -> None:
+    if not len(found.index) == len(found.time) == len(found.sharpness) == len(found.motion) >= 1:
+        raise ValueError("lists of different lengths")
+
+
+class _naming:
+    """UnreadableVideo with the video's name before its text."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, UnreadableVideo):
+            raise UnreadableVideo(f"{self.name}: {error}") from error
+
+
+def look(path: Path, reader: Reader) -> Looked:
+    """Sharpness and motion of the frames of a video. Raises UnreadableVideo."""
+    found = _look(path, reader, reader.threads)
+    return _look(path, reader, 1) if found.damaged and reader.threads > 1 else found
+
+
+def _look(path: Path, reader: Reader, threads: int) -> Looked:
+    import cv2
+
+    from stages.video.motion import DETAIL, TRACKED, Motion, sharpness
+
+    motion = Motion()
+    rows: list[tuple[int, float, float, float]] = []
+    with opened(path, threads) as video:
+        every = max(1, int(video.rate / SLOWEST / 2))
+        for frame in video.frames():
+            reader.safe_point()
+            reader.progress(frame.index, max(video.count, frame.index + 1), "looking at frames")
+            if frame.index % every:
+                continue
+            grey = frame.grey(DETAIL)
+            scale = TRACKED / max(grey.shape)
+            small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+            rows.append((frame.index, round(frame.time, 6), sharpness(grey), motion.add(small)))
+        about = (video.width, video.height, round(video.duration, 3), video.maker, video.hdr, video.damaged)
+    if not rows:
+        raise UnreadableVideo("unreadable: no frame in it can be decoded (truncated?)")
+    return Looked(*about, *(list(column) for column in zip(*rows, strict=True)))
+
+
+def _written(name: str, path: Path, place: int, numbers: list[int], max_side: int, found: Looked, reader: Reader) -> dict[int, Path]:
+    """The second reading: the chosen frames as PNG by number, or those that an earlier call wrote."""
+    folder, file = reader.work / f"frames_{place}", reader.work / f"frames_{place}.json"
+    targets = {number: folder / f"{number:06d}.png" for number in numbers}
+    if noted(file, list[int], once(reader.warn), partial(_same, numbers)) is not None:
+        return targets
+    remove(folder)
+    folder.mkdir(parents=True)
+    left = set(numbers)
+    with _naming(name), opened(path, 1 if found.damaged else reader.threads) as video:
+        for frame in video.frames():
+            reader.safe_point()
+            if frame.index in left:
+                _write(frame, targets[frame.index], max_side, video, name)
+                left.remove(frame.index)
+                reader.progress(len(numbers) - len(left), len(numbers), "writing frames")
+            if not left:
+                break
+    if left:
+        raise UnreadableVideo(f"{name}: unreadable: {len(left)} frames that were there a moment ago are not. Was the file changed?")
+    note(file, numbers, list(targets.values()))
+    return targets
+
+
+def _same(numbers: list[int], found: list[int], outputs: object) -> None:
+    if found != numbers:
+        raise ValueError("of another choice of frames")
+
+
+def _write(frame: Frame, path: Path, max_side: int, video: Video, name: str) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[_MAKER] = video.maker or f"video {name}"  # photographs of one maker and size share a camera
+    with atomic(path, durable=False) as temporary:
+        Image.fromarray(frame.rgb(max_side)).save(temporary, "PNG", compress_level=FAST, exif=exif)
+
+
+def _record(name: str, found: Looked, verdicts: list[str]) -> dict[str, object]:
+    """What frames.json says of a video: columns with an entry for each frame that was looked at."""
+    return {
+        "video": name,
+        "size": [found.width, found.height],
+        "duration": found.duration,
+        "camera": found.maker,
+        "frames": len(found.index),
+        "chosen": verdicts.count(choice.CHOSEN),
+        "frame": found.index,
+        "time": found.time,
+        "sharpness": [round(value, 5) for value in found.sharpness],
+        "motion": [round(value, 5) for value in found.motion],
+        "verdict": verdicts,
+    }

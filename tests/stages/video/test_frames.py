@@ -1,0 +1,163 @@
+"""Videos become photographs: which frames, under which names, again after a kill."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.errors import BadInput, Interrupted
+from pipeline.stage import Job
+from stages import poses
+from stages.io.capture import Capture
+from stages.io.importers import candidates, files
+from stages.io.material import find_material, with_frames
+from stages.io.photo import read_photo
+from stages.poses import PosesSettings
+from stages.sfm import reconstruction
+from stages.video.frames import Chosen, Reader, frames_of
+from tests.stages import captures, clips
+
+BLURRED = (4, 5, 9, 13, 17, 18)
+
+
+def job_for(source: Path, out: Path, **settings: Any) -> tuple[Job, list[str]]:
+    events: list[dict[str, Any]] = []
+    warnings: list[str] = []
+
+    def report(event: dict[str, Any]) -> None:
+        events.append(event)
+        if event["event"] == "warning":
+            warnings.append(event["text"])
+
+    return Job(settings=PosesSettings(**settings), out=out / "poses", work=out / "work", source=source, stage="poses", report=report), warnings
+
+
+def chosen(source: Path, work: Path, count: int = 8, safe_point: Callable[[], None] = lambda: None) -> tuple[Chosen, list[str]]:
+    """The chosen frames of a clip, and warnings."""
+    warnings: list[str] = []
+    reader = Reader(1, work, lambda *values: None, safe_point, warnings.append)
+    return frames_of({source.name: source}, count=count, max_side=1000, reader=reader), warnings
+
+
+def contents(found: Chosen) -> dict[str, bytes]:
+    return {name: path.read_bytes() for name, path in found.paths.items()}
+
+
+def record_of(source: Path, out: Path, **settings: Any) -> tuple[dict[str, Path], dict[str, Any], list[str]]:
+    """Names and files, frames.json, warnings."""
+    job, warnings = job_for(source, out, **settings)
+    found = with_frames(job, find_material(source, False, job.warn), 1000, job.warn)
+    return found.paths, json.loads((out / "poses" / "frames.json").read_text()), warnings
+
+
+def clip(folder: Path, name: str = "clip.mp4", **options: Any) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return clips.write_clip(folder / name, clips.pan(24, 6.0, blur=BLURRED), **options)
+
+
+def test_the_sharp_frames_of_a_clip_are_chosen_and_recorded(tmp_path: Path) -> None:
+    paths, record, warnings = record_of(clip(tmp_path), tmp_path, frames=8)
+    (video,) = record["videos"]
+    numbers = [int(Path(name).stem) for name in paths]
+    assert [name.split("/")[0] for name in paths] == ["clip.mp4"] * len(paths)
+    assert numbers == sorted(numbers)
+    assert 6 <= len(numbers) <= 8
+    assert not set(numbers) & set(BLURRED)
+    assert numbers == [number for number, verdict in zip(video["frame"], video["verdict"], strict=True) if verdict == "chosen"]
+    assert len(video["time"]) == len(video["sharpness"]) == len(video["motion"]) == 24
+    assert video["time"] == pytest.approx([i / 10 for i in range(24)])
+    assert not warnings
+    frames = clips.pan(24, 6.0, blur=BLURRED)
+    for number, path in zip(numbers, paths.values(), strict=True):
+        assert np.abs(np.asarray(Image.open(path)).astype(float) - frames[number]).mean() < 2.5
+    for sheet in ("frames.png", "frames_plot.png"):
+        with Image.open(tmp_path / "poses" / sheet) as image:
+            assert image.width > 500
+
+
+def test_frames_of_one_video_share_a_camera_and_those_of_two_do_not(tmp_path: Path) -> None:
+    clip(tmp_path / "source", "a.mp4")
+    clip(tmp_path / "source", "b.mov")
+    paths, record, _ = record_of(tmp_path / "source", tmp_path, frames=12)
+    assert [video["video"] for video in record["videos"]] == ["a.mp4", "b.mov"]
+    assert {name: {read_photo(path, 1000).maker for other, path in paths.items() if other.startswith(name)} for name in ("a.mp4", "b.mov")} == {
+        "a.mp4": {"video a.mp4"},
+        "b.mov": {"video b.mov"},
+    }
+
+
+def test_killed_at_any_moment_it_gives_the_same_frames(tmp_path: Path) -> None:
+    source = clip(tmp_path)
+    expected = contents(chosen(source, tmp_path / "whole")[0])
+    for moment in (3, 20, 26, 5):  # the last two while frames are written
+        points = iter(range(1000))
+
+        def stop(points: Any = points, moment: int = moment) -> None:
+            if next(points) == moment:
+                raise Interrupted(2)
+
+        with pytest.raises(Interrupted):
+            chosen(source, tmp_path / "killed", safe_point=stop)
+    assert contents(chosen(source, tmp_path / "killed")[0]) == expected
+
+
+def test_frames_that_are_not_as_they_were_written_are_written_again(tmp_path: Path) -> None:
+    source = clip(tmp_path)
+    first, _ = chosen(source, tmp_path / "work")
+    expected = contents(first)
+    next(iter(first.paths.values())).write_bytes(b"half")
+    again, warnings = chosen(source, tmp_path / "work")
+    assert contents(again) == expected
+    assert len(warnings) == 1
+
+
+def test_a_clip_that_shows_one_picture_is_refused(tmp_path: Path) -> None:
+    source = clips.write_clip(tmp_path / "clip.mp4", clips.pan(2))
+    with pytest.raises(BadInput, match=r"2 frames that differ; at least 3 are needed"):
+        record_of(source, tmp_path)
+    with pytest.raises(BadInput, match=r"1 frames that differ"):
+        record_of(clips.write_clip(tmp_path / "still.mp4", clips.pan(8, 0.0)), tmp_path / "still")
+
+
+def test_a_damaged_clip_is_bad_input_that_names_it(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").write_bytes(clip(tmp_path).read_bytes()[:300])
+    with pytest.raises(BadInput, match=r"clip\.mp4: unreadable: .*Copy or export the video again"):
+        record_of(tmp_path / "clip.mp4", tmp_path)
+
+
+def test_photographs_come_before_the_videos_beside_them(tmp_path: Path) -> None:
+    clip(tmp_path, "IMG_0.mov")
+    captures.write_pictures(tmp_path, ["IMG_0.png", "IMG_1.png", "IMG_2.png"])
+    found = find_material(tmp_path, False, lambda text: None)
+    assert list(found.paths) == ["IMG_0.png", "IMG_1.png", "IMG_2.png"]
+    assert not found.videos
+
+
+def test_a_video_is_the_source_of_a_run_by_its_content(tmp_path: Path) -> None:
+    source = clip(tmp_path)
+    settings = PosesSettings()
+    assert candidates(source) == ["photographs"]
+    assert files(source, settings) == [source]
+    assert files(tmp_path, settings) == [source]
+
+
+def test_cameras_are_found_for_the_chosen_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = clip(tmp_path)
+    seen: dict[str, Path] = {}
+
+    def find(folder: Path, names: Any, **options: Any) -> Capture:
+        seen.update(names)
+        return Capture("photographs", (), None, rejected=((next(iter(names)), "no reason"),))
+
+    monkeypatch.setattr(reconstruction, "find_cameras", find)
+    job, _ = job_for(source, tmp_path, frames=5)
+    capture = poses.read(job, job.settings, job.warn)
+    assert 3 <= len(seen) <= 5
+    assert all(path.is_file() for path in seen.values())
+    assert capture.rejected_files == dict([next(iter(seen.items()))])

@@ -1,0 +1,143 @@
+"""Reading videos: orientation, times, colours, and what is no video."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from stages.video.reading import UnreadableVideo, opened
+from tests.stages import clips
+
+CODECS = {"clip.mp4": "libx264", "clip.mov": "libx264", "clip.mkv": "libx264", "clip.webm": "libvpx-vp9", "clip.avi": "mjpeg"}
+
+
+def read(path: Path, threads: int = 1, longest: int = 1000) -> tuple[list[np.ndarray], list[float]]:
+    with opened(path, threads) as video:
+        frames = [(frame.rgb(longest), frame.time) for frame in video.frames()]
+    return [frame for frame, _ in frames], [time for _, time in frames]
+
+
+def assert_alike(found: list[np.ndarray], expected: list[np.ndarray], most: float = 2.5) -> None:
+    assert [frame.shape for frame in found] == [frame.shape for frame in expected]
+    assert all(float(np.abs(a.astype(float) - b).mean()) < most for a, b in zip(found, expected, strict=True))
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_every_kind_of_video_is_read(name: str, tmp_path: Path) -> None:
+    frames = clips.pan(5)
+    pixels = "yuvj444p" if CODECS[name] == "mjpeg" else "yuv444p"
+    found, times = read(clips.write_clip(tmp_path / name, frames, codec=CODECS[name], pixels=pixels, color_range=2 if CODECS[name] == "mjpeg" else 1))
+    assert_alike(found, frames, 12 if CODECS[name] == "mjpeg" else 2.5)
+    np.testing.assert_allclose(times, np.arange(5) / 10, atol=0.002)
+
+
+@pytest.mark.parametrize("rotation", [90, 180, -90])
+def test_frames_are_upright(rotation: int, tmp_path: Path) -> None:
+    frames = clips.pan(2)
+    found, _ = read(clips.write_clip(tmp_path / "clip.mp4", frames, rotation=rotation))
+    assert_alike(found, [np.rot90(frame, rotation // 90) for frame in frames])
+    with opened(tmp_path / "clip.mp4") as video:
+        next(video.frames())
+        assert (video.width, video.height) == ((clips.HEIGHT, clips.WIDTH) if rotation != 180 else (clips.WIDTH, clips.HEIGHT))
+
+
+def test_mirrored_frames_are_put_right(tmp_path: Path) -> None:
+    frames = clips.pan(2)
+    assert_alike(read(clips.write_clip(tmp_path / "clip.mp4", frames, mirrored=True))[0], [frame[:, ::-1] for frame in frames])
+
+
+def test_times_are_those_of_the_file_at_any_rate(tmp_path: Path) -> None:
+    times = [0, 33, 66, 500, 533, 1900]
+    assert read(clips.write_clip(tmp_path / "clip.mkv", clips.pan(6), times=times))[1] == pytest.approx([time / 1000 for time in times], abs=0.002)
+
+
+def test_pixels_that_are_not_square_become_square(tmp_path: Path) -> None:
+    found, _ = read(clips.write_clip(tmp_path / "clip.mp4", clips.pan(2), aspect=Fraction(3, 2)))
+    assert found[0].shape == (clips.HEIGHT, clips.WIDTH * 3 // 2, 3)
+
+
+@pytest.mark.parametrize("colour", [{"color_range": 1, "colorspace": 1}, {"color_range": 2, "colorspace": 1}, {"color_range": 1, "colorspace": 5}, {}])
+def test_colours_are_those_that_the_file_means(colour: dict[str, int], tmp_path: Path) -> None:
+    colours = np.array([[[255, 255, 255], [0, 0, 0], [200, 40, 40]], [[40, 200, 40], [40, 40, 200], [128, 128, 128]]], np.uint8)
+    patches = colours.repeat(32, 0).repeat(32, 1)
+    found, _ = read(clips.write_clip(tmp_path / "clip.mp4", [patches] * 2, **colour))
+    assert np.abs(found[0].astype(int) - patches).max() <= 6
+
+
+def test_large_frames_are_reduced_and_keep_their_aspect(tmp_path: Path) -> None:
+    found, _ = read(clips.write_clip(tmp_path / "clip.mp4", clips.pan(2)), longest=48)
+    assert found[0].shape == (32, 48, 3)
+
+
+def test_threads_change_no_bit(tmp_path: Path) -> None:
+    path = clips.write_clip(tmp_path / "clip.mp4", clips.pan(12), pixels="yuv420p")
+    assert all(np.array_equal(a, b) for a, b in zip(read(path, 1)[0], read(path, 4)[0], strict=True))
+
+
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.mkv"])
+def test_a_truncated_video_gives_what_is_there_or_a_reason(name: str, tmp_path: Path) -> None:
+    frames = clips.pan(6)
+    whole = clips.write_clip(tmp_path / name, frames).read_bytes()
+    path = tmp_path / f"cut_{name}"
+    counts = []
+    for size in np.linspace(0, len(whole) - 1, 24).astype(int):
+        path.write_bytes(whole[:size])
+        found = []
+        with contextlib.suppress(UnreadableVideo):
+            found, _ = read(path)
+        counts.append(len(found))
+        assert_alike(found[:-1], frames[: max(0, len(found) - 1)])
+    assert counts[0] == 0
+    assert counts == sorted(counts)
+    assert name == "clip.mp4" or counts[-1] >= 4
+
+
+def test_damage_in_the_middle_ends_nothing_and_is_counted(tmp_path: Path) -> None:
+    data = bytearray(clips.write_clip(tmp_path / "clip.mkv", clips.pan(10)).read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 200] = bytes(200)
+    (tmp_path / "clip.mkv").write_bytes(data)
+    with opened(tmp_path / "clip.mkv") as video:
+        count = sum(1 for _ in video.frames())
+    assert 1 <= count <= 10
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"x" * 100,
+        b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n",
+        b"ffconcat version 1.0\nfile /etc/passwd\n",
+        b"\0\0\0\x18ftypisom" + bytes(90),
+        b"\x1aE\xdf\xa3" + bytes(99),
+    ],
+)
+def test_what_is_no_video_is_refused_whatever_its_name(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(content)
+    with pytest.raises(UnreadableVideo, match="unreadable"):
+        read(path)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "clip.mp4")
+    with pytest.raises(UnreadableVideo, match="not a regular file"):
+        read(tmp_path / "clip.mp4")
+
+
+def test_sound_alone_is_refused(tmp_path: Path) -> None:
+    with av.open(str(tmp_path / "clip.mkv"), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        frame.sample_rate, frame.pts = 8000, 0
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    with pytest.raises(UnreadableVideo, match="no stream of pictures"):
+        read(tmp_path / "clip.mkv")
