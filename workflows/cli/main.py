@@ -38,6 +38,7 @@ def enerf() -> None:
 for command in (
     run.run,
     run.stage,
+    state.check,
     state.status,
     state.verify,
     state.report,

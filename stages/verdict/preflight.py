@@ -1,0 +1,279 @@
+"""Whether photographs will do, before their cameras are looked for: how they look, whether they overlap, and what a run of them will take.
+
+Overlap is told on small pictures: SIFT features of each, compared with those of the pictures most like it and with the next ones (`stages.sfm.pairs`), and one
+epipolar geometry that the matches fit. It is coarser than structure from motion, and quicker by far. docs/experiments/sfm.md
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import BadInput
+from stages.io import importers
+from stages.io.importers.photographs import photographs
+from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
+from stages.io.photo import apply_exif_orientation, focal_from_exif, read_photo, working_size
+from stages.io.pictures import UnreadableImage, exif_of, opened, orientation_of
+from stages.sfm import ladder, pairs
+from stages.verdict import looks
+from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, Problem, Verdict, of_looks
+
+SIDE = 560  # px, longest side of the pictures that overlap is told on
+FEATURES = 800  # of a picture
+CHOSEN = 150  # pictures of a larger folder, evenly spaced
+MOST_LIKE, NEXT = 3, 2  # pictures that each is compared with
+OVERLAP = 14  # matches that fit one geometry, from which two pictures overlap
+RATIO, EPIPOLAR_ERROR = 0.8, 1.5  # of the distances of the two best; px
+STILL = 1.0  # px that a feature of a background that stands still moves by, at most
+SMALL = 640  # px; photographs whose longest side is shorter are small
+ZOOM = 1.05  # between focal lengths, from which they differ
+_EXIF = 34665
+
+# Seconds of a processor that detects the features of a small picture in REFERENCE, by which others are scaled; docs/experiments/sfm.md
+REFERENCE = 0.028
+FEATURES_A_MEGAPIXEL, A_PAIR, AN_IMAGE = 0.4, 0.012, 0.2
+PAIRS_AN_IMAGE = 20  # of retrieval
+
+
+@dataclass(frozen=True)
+class Small:
+    """A small picture.
+
+    keypoints    (N, 2) px
+    descriptors  (N, 128) uint8
+    size         of the photograph, as stored, pixels
+    focal        pixels of the photograph by its EXIF data, or None
+    seconds      of the processor, that its features took
+    """
+
+    keypoints: np.ndarray
+    descriptors: np.ndarray
+    size: tuple[int, int]
+    focal: float | None
+    seconds: float
+
+
+def check(folder: Path, settings: Any, threads: int) -> Verdict:
+    """The verdict on a source before anything is run.
+
+    settings  of the poses stage
+    threads   that a run may use
+    Raises BadInput where there is nothing that could be read.
+    """
+    source = Source(folder, settings.allow_outside)
+    kind = importers.detect(folder, settings.allow_outside) if settings.format == "auto" else settings.format
+    files = {source.name_of(path): source.real(path) for path in photographs(source)}
+    names = sorted(files)
+    chosen = names[:: -(-len(names) // CHOSEN)]
+    small: dict[str, Small] = {}
+    seen: dict[str, looks.Look] = {}
+    unreadable: list[tuple[str, str]] = []
+    for name in chosen:
+        try:
+            seen[name] = looks.look_at(files[name])
+            small[name] = _small(files[name])
+        except UnreadableImage as error:
+            unreadable.append((name, str(error)))
+    if not small:
+        raise BadInput(f"{folder}: no photograph can be read: {abbreviated([f'{name} {why}' for name, why in unreadable])}.")
+    overlaps = _overlaps(list(small.values()), settings.seed)
+    posed = importers.IMPORTERS[kind].posed
+    problems = [*of_looks(seen), *_of_files(small, unreadable, len(names)), *([] if posed else _of_overlap(list(small), overlaps))]
+    ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
+    figures = {
+        "source": str(folder),
+        "format": kind,
+        "photographs": len(names),
+        "looked_at": len(chosen),
+        "sizes": sorted({f"{a}x{b}" for a, b in (each.size for each in small.values())}),
+        "overlapping": round(_share_in_largest(len(small), overlaps), 3),
+        **_layout(list(small), overlaps),
+        "forecast": forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed),
+    }
+    rows = {
+        name: {"sharpness": round(each.sharpness, 3), "brightness": round(each.brightness, 2), "clipped": round(each.clipped, 3)} for name, each in seen.items()
+    }
+    return Verdict(ordered[0].grade if ordered else "good", ordered, figures, rows)
+
+
+def _small(path: Path) -> Small:
+    import cv2
+
+    with opened(path) as image:
+        size, exif = image.size, exif_of(image)
+        focal = focal_from_exif(dict(exif.get_ifd(_EXIF)), *size)
+        orientation = orientation_of(image)
+        image.draft("L", (SIDE, SIDE))
+        grey = np.asarray(image.convert("L"))
+    grey = apply_exif_orientation(grey, orientation)
+    width, height = working_size(grey.shape[1], grey.shape[0], SIDE)
+    grey = cv2.resize(np.ascontiguousarray(grey), (width, height), interpolation=cv2.INTER_AREA)
+    before = time.thread_time()
+    keypoints, descriptors = cv2.SIFT_create(FEATURES).detectAndCompute(grey, None)  # type: ignore[attr-defined]
+    seconds = time.thread_time() - before
+    found = np.zeros((0, 128)) if descriptors is None else descriptors
+    return Small(np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2), found.astype(np.uint8), size, focal, seconds)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Of two pictures.
+
+    matches  that fit one epipolar geometry
+    still    share of them that do not move
+    plane    share of them that fit one homography, as of a camera that turns on its spot
+    """
+
+    matches: int
+    still: float
+    plane: float
+
+
+def _overlaps(small: Sequence[Small], seed: int) -> dict[pairs.Pair, Overlap]:
+    """Of those that were compared and overlap."""
+    count = len(small)
+    likeness = pairs.likeness_of([each.descriptors for each in small], seed)
+    ranked = pairs.ranks(likeness)
+    wanted = {pairs.ordered(i, int(j)) for i in range(count) for j in ranked[i, :MOST_LIKE]}
+    wanted |= {(i, i + step) for i in range(count) for step in range(1, NEXT + 1) if i + step < count}
+    found = {}
+    for i, j in sorted(wanted):
+        overlap = overlap_of(small[i], small[j])
+        if overlap is not None:
+            found[i, j] = overlap
+    return found
+
+
+def overlap_of(one: Small, other: Small) -> Overlap | None:
+    """None where too few matches fit one geometry."""
+    import cv2
+
+    if min(len(one.descriptors), len(other.descriptors)) < OVERLAP:
+        return None
+    matched = cv2.BFMatcher(cv2.NORM_L2).knnMatch(one.descriptors.astype(np.float32), other.descriptors.astype(np.float32), k=2)
+    best = [pair[0] for pair in matched if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    if len(best) < OVERLAP:
+        return None
+    a, b = one.keypoints[[match.queryIdx for match in best]], other.keypoints[[match.trainIdx for match in best]]
+    cv2.setRNGSeed(0)
+    fitting = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, EPIPOLAR_ERROR, 0.99)[1]
+    inside = np.zeros(len(a), bool) if fitting is None else fitting.ravel() > 0
+    if inside.sum() < OVERLAP:
+        return None
+    a, b = a[inside], b[inside]
+    flat = cv2.findHomography(a, b, cv2.RANSAC, 2 * EPIPOLAR_ERROR)[1]
+    return Overlap(int(inside.sum()), float((np.linalg.norm(a - b, axis=1) < STILL).mean()), 0.0 if flat is None else float(flat.mean()))
+
+
+def _groups(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> list[list[int]]:
+    near: dict[int, set[int]] = {i: set() for i in range(count)}
+    for i, j in overlaps:
+        near[i].add(j)
+        near[j].add(i)
+    return ladder.components(near)
+
+
+def _share_in_largest(count: int, overlaps: Mapping[pairs.Pair, Overlap]) -> float:
+    return len(_groups(count, overlaps)[0]) / count
+
+
+def _layout(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) -> dict[str, Any]:
+    """What the photographs probably show: one after the other round something, or all of them the same."""
+    if len(names) < 4 or not overlaps:
+        return {"closed": None}
+    return {"closed": any(j - i > len(names) // 2 for i, j in overlaps)}
+
+
+def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) -> list[Problem]:
+    groups = _groups(len(names), overlaps)
+    share = len(groups[0]) / len(names)
+    found = []
+    lost = tuple(names[i] for group in groups[1:] for i in group)
+    if lost:
+        sentence = f"{len(lost)} of {len(names)} photographs that were looked at overlap with no other, or only among themselves: {abbreviated(list(lost))}."
+        grade = "failed" if len(groups[0]) < MIN_IMAGES else "poor" if share < 0.5 else "usable" if share < 0.9 else "good"
+        found.append(Problem("overlap", grade, sentence, MORE_PHOTOGRAPHS, lost))
+    if overlaps:
+        still = [overlap.still for overlap in overlaps.values()]
+        if float(np.median(still)) > 0.9:
+            sentence = "Nothing moves between the photographs: the camera stood still."
+            found.append(Problem("stands still", "poor", sentence, "Walk round the subject; one place shows no depth."))
+        elif np.mean([0.2 < share < 0.9 for share in still]) > 0.5:
+            sentence = "Part of the picture stands still while the rest moves: probably a subject that turns before a camera on a stand."
+            remedy = "Give masks of the subject (a folder masks/), or take it before a background without texture."
+            found.append(Problem("background", "usable", sentence, remedy))
+        elif float(np.median([overlap.plane for overlap in overlaps.values()])) > 0.95:
+            sentence = "Neighbouring photographs differ as if the camera had only turned, or as if all were flat and far away."
+            found.append(Problem("parallax", "usable", sentence, "Move sideways between photographs, not only turn."))
+    return found
+
+
+def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]], count: int) -> list[Problem]:
+    found = []
+    if unreadable:
+        which = abbreviated([f"{name} {why}" for name, why in unreadable])
+        grade = "usable" if len(unreadable) > 0.1 * (len(small) + len(unreadable)) else "good"
+        sentence = f"{len(unreadable)} photographs cannot be read: {which}."
+        found.append(Problem("unreadable", grade, sentence, "Copy or convert them again.", tuple(dict(unreadable))))
+    if count < FEW:
+        grade = "failed" if count < MIN_IMAGES else "poor" if count < 6 else "usable"
+        found.append(Problem("few", grade, f"There are only {count} photographs.", "20 or more all round a subject are better."))
+    tiny = tuple(name for name, each in small.items() if max(each.size) < SMALL)
+    if len(tiny) > 0.5 * len(small):
+        found.append(Problem("small", "usable", f"{len(tiny)} photographs are smaller than {SMALL} px.", "Give the originals, of 1000 px or more.", tiny))
+    zooms = _zooms(small)
+    if len(zooms) > 1:
+        words = ", ".join(f"{len(group)} at {focal:.0f} px" for focal, group in zooms)
+        rest = tuple(name for _, group in zooms[1:] for name in group)
+        grade = "usable" if len(zooms) > max(3, 0.2 * len(small)) else "good"
+        found.append(Problem("zoom", grade, f"The photographs have {len(zooms)} focal lengths: {words}.", "Use one lens at one zoom.", rest))
+    return found
+
+
+def _zooms(small: Mapping[str, Small]) -> list[tuple[float, list[str]]]:
+    """(focal length for a longest side of 1000 px, names) of each focal length, the commonest first; those that are about the same are one."""
+    groups: list[tuple[float, list[str]]] = []
+    for name, each in sorted(small.items(), key=lambda item: item[1].focal or 0.0):
+        if each.focal is None:
+            continue
+        focal = 1000.0 * each.focal / max(each.size)
+        same = next((group for known, group in groups if 1 / ZOOM < focal / known < ZOOM), None)
+        if same is None:
+            groups.append((focal, [name]))
+        else:
+            same.append(name)
+    return sorted(groups, key=lambda group: (-len(group[1]), group[0]))
+
+
+def forecast(
+    first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool
+) -> dict[str, Any]:
+    """Seconds of the stage poses on a machine that does nothing else, and bytes at its peak; both roughly."""
+    from stages.memory.poses import decoding_needed, features_needed
+    from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
+
+    sizes, side = [each.size for each in small.values()], settings.feature_image_size
+    before = time.thread_time()
+    with contextlib.suppress(UnreadableImage):
+        read_photo(files[first], side)
+    reading = 2.5 * (time.thread_time() - before) * count  # for structure from motion, as a working image, and to be looked at
+    if posed:
+        return {"poses_seconds": round(reading, 1), "poses_bytes": int(decoding_needed(sizes).total), "pairs": 0}
+    memory = features_needed(sizes * -(-count // len(sizes)), side, settings.max_features, threads).total
+    slower = float(np.median([each.seconds for each in small.values()])) / REFERENCE
+    reduced = [working_size(*size, side) for size in sizes]
+    pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
+    how = ladder.matching_for(count) if settings.matching == "auto" else settings.matching
+    compared = min(count * (count - 1) // 2, 10**9 if how == "exhaustive" else PAIRS_AN_IMAGE * count)
+    finding = count * float(np.mean(pixels)) / 1e6 * FEATURES_A_MEGAPIXEL / threads
+    textured = float(np.mean([len(each.keypoints) for each in small.values()])) / FEATURES
+    matching = compared * A_PAIR * min(1.0, textured) / min(threads, MAX_WORKERS)
+    mapping = AN_IMAGE * count * max(1.0, count / 50) ** 0.4
+    return {"poses_seconds": round(reading + slower * (finding + matching + mapping), 1), "poses_bytes": int(memory), "pairs": compared}

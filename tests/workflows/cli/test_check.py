@@ -1,0 +1,39 @@
+"""`enerf check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from tests.workflows.command import Enerf
+
+
+def noise(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    for k in range(count):
+        Image.fromarray(np.random.default_rng(k).integers(0, 255, (48, 64, 3), np.uint8)).save(folder / f"{k}.png")
+    return folder
+
+
+def test_check_says_what_is_wrong_and_exits_with_2_where_nothing_can_come_of_it(enerf: Enerf, tmp_path: Path) -> None:
+    folder = noise(tmp_path / "photos", 4)
+    text = enerf("check", folder)
+    assert text.code == 2
+    assert f"{folder}: failed; 4 photographs, 64x48, read as photographs" in text.err + text.out
+    assert "overlap with no other" in text.out + text.err
+    told = enerf("check", folder, "--json", "--memory", "1m").object
+    assert (told["ok"], told["grade"], told["exit_code"]) == (False, "failed", 2)
+    assert {"overlap", "few", "small"} <= {problem["what"] for problem in told["problems"]}
+    assert told["forecast"]["fits"] is False
+    assert sorted(told["images"]) == ["0.png", "1.png", "2.png", "3.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]  # nothing is written
+
+
+def test_check_refuses_what_is_no_folder_of_photographs(enerf: Enerf, tmp_path: Path) -> None:
+    assert enerf("check", tmp_path / "none").code == 2
+    assert "no such folder" in enerf("check", tmp_path / "none").err
+    assert enerf("check", noise(tmp_path / "photos", 3), "--set", "poses.nonsense=1").code == 2
+    (tmp_path / "empty").mkdir()
+    assert "empty" in enerf("check", tmp_path / "empty").err
