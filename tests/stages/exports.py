@@ -62,7 +62,7 @@ def metashape(folder: Path, lens: dict[str, float] = METASHAPE, kind: str = "fra
         label = camera.name if index % 2 else Path(camera.name).stem  # Metashape writes either
         rows.append(f'<camera id="{index}" sensor_id="3" component_id="0" label="{label}"><transform>{words(pose)}</transform></camera>')
         x, y, z = local(np.linalg.inv(camera.world_from_camera)).T
-        k = dict.fromkeys(("b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | lens
+        k = dict.fromkeys(("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2"), 0.0) | lens
         x, y = x / z, y / z
         if kind == "fisheye":
             r0 = np.hypot(x, y)

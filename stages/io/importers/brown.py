@@ -17,7 +17,7 @@ from numpy.polynomial import polynomial
 from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 
-MAX_ERROR = 0.05  # pixels
+MAX_ERROR = 0.25  # pixels; half of what structure from motion leaves
 MAX_SKEW = 0.5  # pixels, at the border of the image
 _RADII = 400  # places on a radius at which models are compared
 _FARTHEST = 3.0  # tangent of the widest angle to the axis that is compared: 143 degrees across
