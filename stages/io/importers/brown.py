@@ -21,6 +21,7 @@ MAX_ERROR = 0.25  # pixels; half of what structure from motion leaves
 MAX_SKEW = 0.5  # pixels, at the border of the image
 _RADII = 400  # places on a radius at which models are compared
 _FARTHEST = 3.0  # tangent of the widest angle to the axis that is compared: 143 degrees across
+_LEAST = 0.1  # of the denominator
 _REMEDY = "Export undistorted images and their cameras instead."
 
 
@@ -76,15 +77,17 @@ def quotient_of_cubics(factor: np.ndarray, focal: float, reach: float, where: st
     r = np.linspace(0, max(r_max, r[1]), _RADII)
     s, d = r * r, polynomial.polyval(r * r, factor)
     unit = s / s[-1]  # for the conditioning
-    columns = np.stack([unit, unit**2, unit**3, -d * unit, -d * unit**2, -d * unit**3], -1)
-    found = np.linalg.lstsq(columns * r[:, None], (d - 1) * r, rcond=None)[0]
+    columns = np.stack([unit, unit**2, unit**3, -d * unit, -d * unit**2, -d * unit**3], -1) * r[:, None]
     scale = s[-1] ** -np.arange(1.0, 4.0)
-    top, bottom = np.array([1.0, *found[:3] * scale]), np.array([1.0, *found[3:] * scale])
-    below = polynomial.polyval(s, bottom)
-    error = np.abs(polynomial.polyval(s, top) / np.where(below == 0, 1, below) - d) * r * focal
-    if below.min() < 0.05 or not error.max() <= MAX_ERROR:
-        raise BadInput(f"{where}: the radial distortion (k4 = {factor[4]:.4g}) is in no camera model that is supported. {_REMEDY}")
-    return top, bottom
+    for terms in (6, 5, 4, 3):  # with fewer in the denominator, where more give it a root
+        found = np.zeros(6)
+        found[:terms] = np.linalg.lstsq(columns[:, :terms], (d - 1) * r, rcond=None)[0]
+        top, bottom = np.array([1.0, *found[:3] * scale]), np.array([1.0, *found[3:] * scale])
+        below = polynomial.polyval(s, bottom)
+        error = np.abs(polynomial.polyval(s, top) / np.where(below > _LEAST, below, np.inf) - d) * r * focal
+        if below.min() > _LEAST and error.max() <= MAX_ERROR:
+            return top, bottom
+    raise BadInput(f"{where}: the radial distortion (k4 = {factor[4]:.4g}) is in no camera model that is supported. {_REMEDY}")
 
 
 def without_skew(skew: float, focal: float, size: tuple[int, int], centre: float, what: str, where: str) -> str | None:
