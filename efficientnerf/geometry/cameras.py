@@ -175,6 +175,11 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return pixels, depth
 
 
+def fold_radius(camera: Camera) -> float:
+    """The distance from the view axis, on the plane at distance one (of a fisheye: the angle), up to which the lens's model holds; infinity for most."""
+    return _fold(*_radial_polynomials(camera), np.pi if camera.model == "OPENCV_FISHEYE" else np.inf)
+
+
 def resized(camera: Camera, width: int, height: int) -> Camera:
     """The camera of the same image at another size; exact also where rounding scales width and height by different amounts."""
     along_x, along_y = width / camera.width, height / camera.height

@@ -1,0 +1,199 @@
+"""Steps of Gaussians down the error of an image, sixteen at a time (numba): back through the projection, then Adam.
+
+Each Gaussian owns the sums of its pairs, adds them in their order, and takes its step alone. Those without a pair stay as they are, and their moments too.
+The derivative of the projection, and the direction that harmonics are seen along, count as constants in the derivative by a mean: they change little over a
+Gaussian's size. 3DGS carries them along.
+
+Squares of gradients are averaged over a Gaussian's mean, scales, rotation, opacity, base colour and other harmonics, one number each.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer, sigmoid
+from efficientnerf.backends.numba.splats.lanes import LANES
+from efficientnerf.backends.numba.splats.projection import HARMONICS, MEAN, OPACITY, ROTATION, SCALE, basis16, colour16, conic16, image16
+from efficientnerf.backends.numba.splats.raster import ERROR, SUMS
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max16, min16, select16, sqrt16, store16
+
+GROUPS_A_TASK = 64
+PARTS = 6  # mean, scales, rotation, opacity, base colour, other harmonics
+VISITS, SQUARES, GRADIENTS = 0, 1, 1 + PARTS  # rows of moments: steps taken; running means of squares; running means of gradients
+_NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+
+
+class Rates(NamedTuple):
+    """Of a step.
+
+    rates            (PARTS,) float32 learning rates: of means, in standard deviations along the longest axis; of logarithms of scales; of quaternions; of
+                     logits; of colours' base and of their other harmonics
+    momentum, decay  of the running means of gradients and of their squares
+    epsilon          added to the root of the latter
+    of_mean, of_square  (V,) float32: 1 / (1 - momentum^n) and 1 / (1 - decay^n) after n steps, the last for all beyond
+    least, greatest  logarithms of the scales
+    """
+
+    rates: np.ndarray
+    momentum: np.float32
+    decay: np.float32
+    epsilon: np.float32
+    of_mean: np.ndarray
+    of_square: np.ndarray
+    least: np.float32
+    greatest: np.float32
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _gather_sums(group, first, sums, total):  # type: ignore[no-untyped-def]
+    """Sums of the pairs of a group, `total` (SUMS, 16) by kinds; returns bits of the Gaussians that have any, as float32 0 or 1 in row SUMS."""
+    some = False
+    for lane in range(LANES):
+        n = group * LANES + lane
+        begin, end = first[n], first[n + 1]
+        some |= end > begin
+        for kind in range(ERROR + 1):
+            value = _NONE
+            for slot in range(begin, end):
+                value += sums[slot, kind]
+            total[16 * kind + lane] = value
+        total[16 * SUMS + lane] = _ONE if end > begin else _NONE
+    return some
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _geometry_gradients(p, at, lens, total, out):  # type: ignore[no-untyped-def]
+    """Gradients by mean, logarithms of scales, quaternion and logit into rows MEAN to OPACITY of `out`; returns the longest standard deviation."""
+    _x, _y, _depth, _seen, wx, wy, nx, ny, s, turned = image16(p, at, lens)
+    ax, ay, _covariance, (a, b, c) = conic16(nx, ny, s)
+    v, vx, vy, vxx, vxy, vyy = load16(total, 0), load16(total, 16), load16(total, 32), load16(total, 48), load16(total, 64), load16(total, 80)
+    px, py = a * vx + b * vy, b * vx + c * vy
+    store16(out, 16 * MEAN, px * wx[0] + py * wy[0])
+    store16(out, 16 * (MEAN + 1), px * wx[1] + py * wy[1])
+    store16(out, 16 * (MEAN + 2), px * wx[2] + py * wy[2])
+    # By the covariance in the image: half of Q V Q, Q the conic; by its root A twice that times A.
+    qx, qy, rx, ry = a * vxx + b * vxy, a * vxy + b * vyy, b * vxx + c * vxy, b * vxy + c * vyy
+    hxx, hxy, hyy = qx * a + qy * b, qx * b + qy * c, rx * b + ry * c
+    dx0, dx1, dx2 = hxx * ax[0] + hxy * ay[0], hxx * ax[1] + hxy * ay[1], hxx * ax[2] + hxy * ay[2]
+    dy0, dy1, dy2 = hxy * ax[0] + hyy * ay[0], hxy * ax[1] + hyy * ay[1], hxy * ax[2] + hyy * ay[2]
+    store16(out, 16 * SCALE, dx0 * ax[0] + dy0 * ay[0])
+    store16(out, 16 * (SCALE + 1), dx1 * ax[1] + dy1 * ay[1])
+    store16(out, 16 * (SCALE + 2), dx2 * ax[2] + dy2 * ay[2])
+    dx0, dx1, dx2, dy0, dy1, dy2 = dx0 * s[0], dx1 * s[1], dx2 * s[2], dy0 * s[0], dy1 * s[1], dy2 * s[2]
+    (w, x, y, z), length, _matrix = turned
+    g00, g01, g02 = wx[0] * dx0 + wy[0] * dy0, wx[0] * dx1 + wy[0] * dy1, wx[0] * dx2 + wy[0] * dy2
+    g10, g11, g12 = wx[1] * dx0 + wy[1] * dy0, wx[1] * dx1 + wy[1] * dy1, wx[1] * dx2 + wy[1] * dy2
+    g20, g21, g22 = wx[2] * dx0 + wy[2] * dy0, wx[2] * dx1 + wy[2] * dy1, wx[2] * dx2 + wy[2] * dy2
+    by_w = _TWO * (y * (g02 - g20) + z * (g10 - g01) + x * (g21 - g12))
+    by_x = _TWO * (y * (g01 + g10) + z * (g02 + g20) + w * (g21 - g12) - _TWO * x * (g11 + g22))
+    by_y = _TWO * (x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20) - _TWO * y * (g00 + g22))
+    by_z = _TWO * (x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01) - _TWO * z * (g00 + g11))
+    along = by_w * w + by_x * x + by_y * y + by_z * z
+    store16(out, 16 * ROTATION, (by_w - along * w) / length)
+    store16(out, 16 * (ROTATION + 1), (by_x - along * x) / length)
+    store16(out, 16 * (ROTATION + 2), (by_y - along * y) / length)
+    store16(out, 16 * (ROTATION + 3), (by_z - along * z) / length)
+    store16(out, 16 * OPACITY, v * (_ONE - sigmoid(load16(p, at + 16 * OPACITY))))
+    return max16(s[0], max16(s[1], s[2]))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _colour_gradients(p, at, lens, degree, total, basis, out):  # type: ignore[no-untyped-def]
+    """Gradients by the harmonics into rows from HARMONICS on."""
+    basis16(p, at, lens, degree, basis)
+    red, green, blue = colour16(p, at, degree, basis)
+    red, green = select16(red > _NONE, load16(total, 96), _NONE), select16(green > _NONE, load16(total, 112), _NONE)
+    blue = select16(blue > _NONE, load16(total, 128), _NONE)
+    for k in range((degree + 1) * (degree + 1)):
+        value, row = load16(basis, 16 * k), 16 * (HARMONICS + 3 * k)
+        store16(out, row, value * red)
+        store16(out, row + 16, value * green)
+        store16(out, row + 32, value * blue)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _step_part(p, at, m, to, part, begin, end, rate, ahead, correction, moves, h, gradient):  # type: ignore[no-untyped-def]
+    """Adam on rows `begin` to `end` of a group whose lanes `moves` are to move."""
+    square = broadcast16(_NONE)
+    for row in range(begin, end):
+        g = load16(gradient, 16 * row)
+        square = square + g * g
+    old = load16(m, to + 16 * (SQUARES + part))
+    square = old * h.decay + square * ((_ONE - h.decay) / np.float32(end - begin))
+    store16(m, to + 16 * (SQUARES + part), select16(moves, square, old))
+    scale = ahead * rate / (sqrt16(square * correction) + h.epsilon)
+    for row in range(begin, end):
+        place, before = to + 16 * (GRADIENTS + row), at + 16 * row
+        old = load16(m, place)
+        mean = old * h.momentum + load16(gradient, 16 * row) * (_ONE - h.momentum)
+        store16(m, place, select16(moves, mean, old))
+        value = load16(p, before)
+        store16(p, before, select16(moves, value - scale * mean, value))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):  # type: ignore[no-untyped-def]
+    """A step of a group with such sums of its pairs."""
+    moves = load16(total, 16 * SUMS) > _HALF
+    visits = load16(m, to)
+    for lane in range(LANES):
+        visit = np.int64(m[to + lane])
+        correct[lane] = h.of_mean[min(visit, len(h.of_mean) - 1)]
+        correct[16 + lane] = h.of_square[min(visit, len(h.of_square) - 1)]
+    ahead, correction = load16(correct, 0), load16(correct, 16)
+    longest = _geometry_gradients(p, at, lens, total, gradient)
+    _colour_gradients(p, at, lens, degree, total, basis, gradient)
+    store16(m, to, select16(moves, visits + _ONE, visits))
+    terms = 3 * (degree + 1) * (degree + 1)
+    _step_part(p, at, m, to, 0, MEAN, SCALE, longest * h.rates[0], ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 1, SCALE, ROTATION, broadcast16(h.rates[1]), ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 2, ROTATION, OPACITY, broadcast16(h.rates[2]), ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 3, OPACITY, HARMONICS, broadcast16(h.rates[3]), ahead, correction, moves, h, gradient)
+    _step_part(p, at, m, to, 4, HARMONICS, HARMONICS + 3, broadcast16(h.rates[4]), ahead, correction, moves, h, gradient)
+    if degree > 0:
+        _step_part(p, at, m, to, 5, HARMONICS + 3, HARMONICS + terms, broadcast16(h.rates[5]), ahead, correction, moves, h, gradient)
+    for n in range(3):
+        row = at + 16 * (SCALE + n)
+        store16(p, row, min16(max16(load16(p, row), h.least), h.greatest))
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def step(values, moments, lens, degree, first, sums, h, errors):  # type: ignore[no-untyped-def]
+    """A step of all Gaussians that have pairs, in place.
+
+    values   (G, rows, 16) float32 of `projection`
+    moments  (G, GRADIENTS + rows, 16) float32
+    first    (N + 1,) and sums (P, SUMS) of the image's pairs; N at most 16 G
+    errors   (N,) float32, raised by each Gaussian's share of the error
+    """
+    groups, rows = values.shape[0], values.shape[1]
+    for task in numba.prange((groups + GROUPS_A_TASK - 1) // GROUPS_A_TASK):
+        total, basis = np.empty(16 * (SUMS + 1), np.float32), np.empty(16 * 16, np.float32)
+        gradient, correct = np.empty(16 * rows, np.float32), np.empty(32, np.float32)
+        p, m = pointer(values), pointer(moments)
+        for group in range(task * GROUPS_A_TASK, min(groups, (task + 1) * GROUPS_A_TASK)):
+            if _gather_sums(group, first, sums, total):
+                _step_group(
+                    p, np.int64(group) * rows * LANES, m, np.int64(group) * moments.shape[1] * LANES, lens, degree, h, pointer(total), pointer(basis),
+                    pointer(gradient), pointer(correct),
+                )  # fmt: skip
+                for lane in range(LANES):
+                    errors[group * LANES + lane] += total[16 * ERROR + lane]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def gradients(values, lens, degree, first, sums, out):  # type: ignore[no-untyped-def]
+    """What `step` goes along, for tests: out like values."""
+    rows = values.shape[1]
+    total, basis, gradient = np.empty(16 * (SUMS + 1), np.float32), np.empty(16 * 16, np.float32), np.empty(16 * rows, np.float32)
+    for group in range(values.shape[0]):
+        _gather_sums(group, first, sums, total)
+        at = np.int64(group) * rows * LANES
+        _geometry_gradients(pointer(values), at, lens, pointer(total), pointer(gradient))
+        _colour_gradients(pointer(values), at, lens, degree, pointer(total), pointer(basis), pointer(gradient))
+        for row in range(rows):
+            for lane in range(LANES):
+                out[group, row, lane] = gradient[16 * row + lane]

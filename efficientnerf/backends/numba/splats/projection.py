@@ -1,0 +1,229 @@
+"""Gaussians into images, sixteen at a time (numba): Zwicker et al. 2001, "EWA splatting", as 3DGS has it.
+
+A mean goes through the camera, lens and all; the covariance through the derivative of that map at the mean, and grows by LOW_PASS square pixels. Where 3DGS
+knows pinholes alone, the derivative here includes the lens: distorted pictures are rendered as they are. Beside the picture it is taken at the border of what
+`lens_of` allows.
+
+Values lie in groups of sixteen Gaussians: (G, rows, 16) float32, rows as named below, 3 K of them harmonics, coefficient by coefficient.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer, sigmoid
+from efficientnerf.backends.numba.splats.lanes import LANES, arctangent16, exp16
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max16, min16, select16, sqrt16, store16
+from efficientnerf.rendering import harmonics
+
+MEAN, SCALE, ROTATION, OPACITY, HARMONICS = 0, 3, 6, 10, 11  # rows of values: logarithms of scales, logit of the opacity
+X, Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, WIDTH, HEIGHT, DEPTH = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11  # of a projected Gaussian
+RECORD = 16  # numbers of one
+LOW_PASS = np.float32(0.3)
+LEAST_ALPHA, MOST_ALPHA = np.float32(1 / 255), np.float32(0.99)
+MOST_LOG_SCALE = np.float32(40)
+GROUPS_A_TASK = 64
+_NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+_C0, _C1 = np.float32(harmonics.C0), np.float32(harmonics.C1)
+_C2, _C3 = tuple(np.float32(c) for c in harmonics.C2), tuple(np.float32(c) for c in harmonics.C3)
+
+
+class Lens(NamedTuple):
+    """A camera as kernels take it.
+
+    turn          (9,) float32, rows of the rotation from the world to the camera
+    centre        (3,) float32
+    numbers       (16,) float32: fx fy cx cy; k1 k2 k3 k4 over k4 k5 k6 (of a fisheye k1..k4 over nothing); p1 p2; squared radius at which the lens folds
+                  back, on the undistorted plane; nearest depth; 0
+    limits        (4,) float32: least and greatest u, least and greatest v on the undistorted plane at which derivatives are taken
+    fisheye       whether the undistorted plane is that of angles
+    width, height of the picture
+    """
+
+    turn: np.ndarray
+    centre: np.ndarray
+    numbers: np.ndarray
+    limits: np.ndarray
+    fisheye: bool
+    width: int
+    height: int
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _plane(x, y, z, lens):  # type: ignore[no-untyped-def]
+    """Points of the camera on the undistorted plane (u, v), whether each can be seen there, and the derivative of (u, v), kept within the limits: three numbers
+    each."""
+    if lens.fisheye:
+        square = x * x + y * y
+        across, whole = sqrt16(max16(square, np.float32(1e-20))), square + z * z
+        angle = _TWO * arctangent16(across / max16(sqrt16(whole) + z, np.float32(1e-12)))
+        nx, ny, whole = x / across, y / across, max16(whole, np.float32(1e-20))
+        straight = across < np.float32(1e-5) * z  # angle / across is 1 / z there
+        per, along = select16(straight, _ONE / max16(z, np.float32(1e-12)), angle / across), z / whole
+        cross, back = nx * ny * (along - per), across / whole * np.float32(-1)
+        u_x, v_y = nx * nx * along + (_ONE - nx * nx) * per, ny * ny * along + (_ONE - ny * ny) * per
+        return x * per, y * per, whole > lens.numbers[13] * lens.numbers[13], u_x, cross, nx * back, cross, v_y, ny * back
+    ahead = z > lens.numbers[13]
+    per = _ONE / select16(ahead, z, _ONE)
+    u, v = x * per, y * per
+    u_near, v_near = min16(max16(u, lens.limits[0]), lens.limits[1]), min16(max16(v, lens.limits[2]), lens.limits[3])
+    zero = broadcast16(_NONE)
+    return u, v, ahead, per, zero, u_near * per * np.float32(-1), zero, per, v_near * per * np.float32(-1)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _distorted(u, v, lens):  # type: ignore[no-untyped-def]
+    """Points of the undistorted plane, distorted, and the derivative: x_u, x_v, y_u, y_v."""
+    n = lens.numbers
+    s = u * u + v * v
+    top = ((s * n[7] + n[6]) * s + n[5]) * s + n[4]
+    top_slope = ((s * (np.float32(4) * n[7]) + np.float32(3) * n[6]) * s + _TWO * n[5]) * s + n[4]
+    bottom = ((s * n[10] + n[9]) * s + n[8]) * s + _ONE
+    bottom_slope = (s * (np.float32(3) * n[10]) + _TWO * n[9]) * s + n[8]
+    radial = (top * s + _ONE) / bottom
+    slope = (top_slope - radial * bottom_slope) / bottom
+    p1, p2 = n[11], n[12]
+    x = u * radial + _TWO * p1 * u * v + p2 * (s + _TWO * u * u)
+    y = v * radial + _TWO * p2 * u * v + p1 * (s + _TWO * v * v)
+    cross = _TWO * u * v * slope + _TWO * p1 * u + _TWO * p2 * v
+    x_u = radial + _TWO * u * u * slope + _TWO * p1 * v + np.float32(6) * p2 * u
+    y_v = radial + _TWO * v * v * slope + np.float32(6) * p1 * v + _TWO * p2 * u
+    return x, y, x_u, cross, cross, y_v
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def rotation16(p, at):  # type: ignore[no-untyped-def]
+    """The unit quaternion of a group and its length, and the matrix by rows."""
+    at += 16 * ROTATION
+    w, x, y, z = load16(p, at), load16(p, at + 16), load16(p, at + 32), load16(p, at + 48)
+    length = sqrt16(max16(w * w + x * x + y * y + z * z, np.float32(1e-20)))
+    w, x, y, z = w / length, x / length, y / length, z / length
+    matrix = (
+        _ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y),
+        _TWO * (x * y + w * z), _ONE - _TWO * (x * x + z * z), _TWO * (y * z - w * x),
+        _TWO * (x * z - w * y), _TWO * (y * z + w * x), _ONE - _TWO * (x * x + y * y),
+    )  # fmt: skip
+    return (w, x, y, z), length, matrix
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def image16(p, at, lens):  # type: ignore[no-untyped-def]
+    """A group in the image: (x, y) pixels, depth, whether it can be seen; the derivative of (x, y) by the point of the world (2, 3); that times the rotation
+    (2, 3); the standard deviations; and the rotation."""
+    t, n = lens.turn, lens.numbers
+    a, b, c = load16(p, at) - lens.centre[0], load16(p, at + 16) - lens.centre[1], load16(p, at + 32) - lens.centre[2]
+    x, y, z = a * t[0] + b * t[1] + c * t[2], a * t[3] + b * t[4] + c * t[5], a * t[6] + b * t[7] + c * t[8]
+    u, v, seen, u_x, u_y, u_z, v_x, v_y, v_z = _plane(x, y, z, lens)
+    seen = seen & (u * u + v * v < n[14])
+    px, py, _a, _b, _c, _d = _distorted(u, v, lens)
+    at_u, at_v = (u, v) if lens.fisheye else (min16(max16(u, lens.limits[0]), lens.limits[1]), min16(max16(v, lens.limits[2]), lens.limits[3]))
+    _x, _y, x_u, x_v, y_u, y_v = _distorted(at_u, at_v, lens)
+    jx = (n[0] * (x_u * u_x + x_v * v_x), n[0] * (x_u * u_y + x_v * v_y), n[0] * (x_u * u_z + x_v * v_z))
+    jy = (n[1] * (y_u * u_x + y_v * v_x), n[1] * (y_u * u_y + y_v * v_y), n[1] * (y_u * u_z + y_v * v_z))
+    wx = (jx[0] * t[0] + jx[1] * t[3] + jx[2] * t[6], jx[0] * t[1] + jx[1] * t[4] + jx[2] * t[7], jx[0] * t[2] + jx[1] * t[5] + jx[2] * t[8])
+    wy = (jy[0] * t[0] + jy[1] * t[3] + jy[2] * t[6], jy[0] * t[1] + jy[1] * t[4] + jy[2] * t[7], jy[0] * t[2] + jy[1] * t[5] + jy[2] * t[8])
+    turned = rotation16(p, at)
+    r = turned[2]
+    nx = (wx[0] * r[0] + wx[1] * r[3] + wx[2] * r[6], wx[0] * r[1] + wx[1] * r[4] + wx[2] * r[7], wx[0] * r[2] + wx[1] * r[5] + wx[2] * r[8])
+    ny = (wy[0] * r[0] + wy[1] * r[3] + wy[2] * r[6], wy[0] * r[1] + wy[1] * r[4] + wy[2] * r[7], wy[0] * r[2] + wy[1] * r[5] + wy[2] * r[8])
+    low, high = -MOST_LOG_SCALE, MOST_LOG_SCALE
+    scales = (
+        exp16(min16(max16(load16(p, at + 16 * SCALE), low), high)), exp16(min16(max16(load16(p, at + 16 * (SCALE + 1)), low), high)),
+        exp16(min16(max16(load16(p, at + 16 * (SCALE + 2)), low), high)),
+    )  # fmt: skip
+    depth = sqrt16(x * x + y * y + z * z) if lens.fisheye else z
+    return px * n[0] + n[2], py * n[1] + n[3], depth, seen, wx, wy, nx, ny, scales, turned
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def conic16(nx, ny, scales):  # type: ignore[no-untyped-def]
+    """The covariance in the image (xx, xy, yy) with LOW_PASS, and its inverse."""
+    ax, ay = (nx[0] * scales[0], nx[1] * scales[1], nx[2] * scales[2]), (ny[0] * scales[0], ny[1] * scales[1], ny[2] * scales[2])
+    xx, yy = ax[0] * ax[0] + ax[1] * ax[1] + ax[2] * ax[2] + LOW_PASS, ay[0] * ay[0] + ay[1] * ay[1] + ay[2] * ay[2] + LOW_PASS
+    xy = ax[0] * ay[0] + ax[1] * ay[1] + ax[2] * ay[2]
+    # By differences of large products a needle's determinant would lose all its digits: LOW_PASS alone holds it above zero.
+    one, two, three = ax[0] * ay[1] - ax[1] * ay[0], ax[1] * ay[2] - ax[2] * ay[1], ax[2] * ay[0] - ax[0] * ay[2]
+    determinant = one * one + two * two + three * three + LOW_PASS * (xx + yy - LOW_PASS)
+    return ax, ay, (xx, xy, yy), (yy / determinant, xy * np.float32(-1) / determinant, xx / determinant)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def basis16(p, at, lens, degree, out):  # type: ignore[no-untyped-def]
+    """Harmonics of the view directions of a group, `out` (K, 16)."""
+    x, y, z = load16(p, at) - lens.centre[0], load16(p, at + 16) - lens.centre[1], load16(p, at + 32) - lens.centre[2]
+    length = sqrt16(max16(x * x + y * y + z * z, np.float32(1e-30)))
+    x, y, z = x / length, y / length, z / length
+    xx, yy, zz = x * x, y * y, z * z
+    store16(out, 0, broadcast16(_C0))
+    if degree > 0:
+        store16(out, 16, y * -_C1)
+        store16(out, 32, z * _C1)
+        store16(out, 48, x * -_C1)
+    if degree > 1:
+        store16(out, 64, x * y * _C2[0])
+        store16(out, 80, y * z * _C2[1])
+        store16(out, 96, (zz * _TWO - xx - yy) * _C2[2])
+        store16(out, 112, x * z * _C2[3])
+        store16(out, 128, (xx - yy) * _C2[4])
+    if degree > 2:
+        store16(out, 144, y * (xx * np.float32(3) - yy) * _C3[0])
+        store16(out, 160, x * y * z * _C3[1])
+        store16(out, 176, y * (zz * np.float32(4) - xx - yy) * _C3[2])
+        store16(out, 192, z * (zz * _TWO - xx * np.float32(3) - yy * np.float32(3)) * _C3[3])
+        store16(out, 208, x * (zz * np.float32(4) - xx - yy) * _C3[4])
+        store16(out, 224, z * (xx - yy) * _C3[5])
+        store16(out, 240, x * (xx - yy * np.float32(3)) * _C3[6])
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def colour16(p, at, degree, basis):  # type: ignore[no-untyped-def]
+    """1/2 + the sum of the harmonics of a group, three channels; not clipped."""
+    red, green, blue = broadcast16(_HALF), broadcast16(_HALF), broadcast16(_HALF)
+    for k in range((degree + 1) * (degree + 1)):
+        value, row = load16(basis, 16 * k), at + 16 * (HARMONICS + 3 * k)
+        red, green, blue = red + value * load16(p, row), green + value * load16(p, row + 16), blue + value * load16(p, row + 32)
+    return red, green, blue
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore[no-untyped-def]
+    """Records of a group into out[first : first + 16]; WIDTH is 0 for what is not in the image."""
+    x, y, depth, seen, _wx, _wy, nx, ny, scales, _turned = image16(p, at, lens)
+    _ax, _ay, covariance, conic = conic16(nx, ny, scales)
+    opacity = sigmoid(load16(p, at + 16 * OPACITY))
+    # ln o <= 8 (o^(1/8) - 1): beyond this many squared standard deviations alpha is below LEAST_ALPHA.
+    reach = np.float32(2 * 5.5412637) + np.float32(16) * (sqrt16(sqrt16(sqrt16(opacity))) - _ONE)
+    reach = max16(reach, _NONE)
+    wide, high = sqrt16(reach * covariance[0]), sqrt16(reach * covariance[2])
+    seen = seen & (opacity >= LEAST_ALPHA) & (x + wide > _NONE) & (y + high > _NONE)
+    seen = seen & (x - wide < np.float32(lens.width)) & (y - high < np.float32(lens.height))
+    basis16(p, at, lens, degree, basis)
+    red, green, blue = colour16(p, at, degree, basis)
+    store16(row, 16 * X, x)
+    store16(row, 16 * Y, y)
+    store16(row, 16 * CONIC_A, conic[0])
+    store16(row, 16 * CONIC_B, conic[1])
+    store16(row, 16 * CONIC_C, conic[2])
+    store16(row, 16 * ALPHA, opacity)
+    store16(row, 16 * RED, max16(red, _NONE))
+    store16(row, 16 * (RED + 1), max16(green, _NONE))
+    store16(row, 16 * (RED + 2), max16(blue, _NONE))
+    store16(row, 16 * WIDTH, select16(seen, wide, _NONE))
+    store16(row, 16 * HEIGHT, select16(seen, high, _NONE))
+    store16(row, 16 * DEPTH, depth)
+    for lane in range(LANES):
+        for n in range(12):
+            out[first + lane, n] = row[16 * n + lane]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def project(values, lens, degree, out):  # type: ignore[no-untyped-def]
+    """Records (16 G, RECORD) float32 of Gaussians (G, rows, 16), in the image of a lens."""
+    groups, rows = values.shape[0], values.shape[1]
+    for task in numba.prange((groups + GROUPS_A_TASK - 1) // GROUPS_A_TASK):
+        basis, row, p = np.empty(16 * 16, np.float32), np.empty(16 * RECORD, np.float32), pointer(values)
+        for group in range(task * GROUPS_A_TASK, min(groups, (task + 1) * GROUPS_A_TASK)):
+            _project_group(p, np.int64(group) * rows * LANES, lens, degree, pointer(basis), pointer(row), out, group * LANES)

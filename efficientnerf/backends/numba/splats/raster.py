@@ -1,0 +1,238 @@
+"""Images of projected Gaussians, and how an image's error changes with each of them (numba, all cores).
+
+From front to back, as 3DGS:
+
+    alpha_i = min(0.99, o_i exp(-q_i / 2)), none below 1/255        colour = sum_i T_i alpha_i c_i        T_(i+1) = T_i (1 - alpha_i)
+
+and a pixel ends before T would fall below 1e-4. Lanes are the sixteen pixels of a block, so that what is summed stays in registers from the first Gaussian
+to the last. The sums of a Gaussian over a tile's pixels are its pair's own: no two threads add to one number, and the result does not depend on their number.
+
+P pairs, N Gaussians, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.splats.lanes import LOG2_E, sums16
+from efficientnerf.backends.numba.splats.pairs import BLOCK, TILE, Pairs
+from efficientnerf.backends.numba.splats.projection import (
+    ALPHA,
+    CONIC_A,
+    CONIC_B,
+    CONIC_C,
+    LEAST_ALPHA,
+    MOST_ALPHA,
+    RECORD,
+    RED,
+    X,
+    Y,
+)
+from efficientnerf.backends.numba.tree.packets.lanes import bits_of, broadcast16, exp2_neg16, load16, mask_of, max16, min16, select16, store16
+from efficientnerf.backends.numba.tree_training.tasks import take_next
+
+SUMS = 16  # numbers of a pair
+ERROR = 9  # of them: the squared error where the Gaussian shows, times its weight
+LEAST_TRANSMITTANCE = np.float32(1e-4)
+_NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+
+
+class Picture(NamedTuple):
+    """What an image is compared with: pixels (H, W, 4) uint8, straight alpha, and mask (H, W) uint8, 0 where a pixel does not count.
+
+    over_all  whether it is compared over all backgrounds at once, as a picture with alpha; else over `background` (3,) float32, and alpha is not read
+    """
+
+    pixels: np.ndarray
+    mask: np.ndarray
+    over_all: bool
+    background: np.ndarray
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _exponent(p, at, x, y):  # type: ignore[no-untyped-def]
+    """A Gaussian's distances from pixels, and what it hides before it is capped."""
+    dx, dy = x - p[at + X], y - p[at + Y]
+    q = dx * (dx * p[at + CONIC_A] + dy * (_TWO * p[at + CONIC_B])) + dy * dy * p[at + CONIC_C]
+    return dx, dy, exp2_neg16(max16(q * (_HALF * LOG2_E), _NONE)) * p[at + ALPHA]
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):  # type: ignore[no-untyped-def]
+    """A block front to back: colour, transmittance and how many pairs were met, whose numbers go to `met`."""
+    red, green, blue, light = broadcast16(_NONE), broadcast16(_NONE), broadcast16(_NONE), broadcast16(_ONE)
+    count = 0
+    for pair in range(first, end):
+        if mask[pair] & bit:
+            at = np.int64(gaussian[pair]) * RECORD
+            _dx, _dy, strength = _exponent(p, at, x, y)
+            alpha = min16(strength, MOST_ALPHA)
+            left = light * (_ONE - alpha)
+            counts = open_ & (alpha >= LEAST_ALPHA)
+            ends = counts & (left < LEAST_TRANSMITTANCE)
+            counts = counts & ~ends
+            open_ = open_ & ~ends
+            if bits_of(counts) != 0:
+                weight = select16(counts, light * alpha, _NONE)
+                red, green, blue = red + weight * p[at + RED], green + weight * p[at + RED + 1], blue + weight * p[at + RED + 2]
+                light = select16(counts, left, light)
+                met[count] = pair
+                count += 1
+            if bits_of(open_) == 0:
+                break
+    store16(place, 0, red)
+    store16(place, 16, green)
+    store16(place, 32, blue)
+    store16(place, 48, light)
+    return count
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _pixels(left, top, width, height, xs, ys):  # type: ignore[no-untyped-def]
+    """Centres of the pixels of a block into `xs` and `ys`, and bits of those in the image."""
+    inside = 0
+    for lane in range(16):
+        column, row = left + lane % BLOCK, top + lane // BLOCK
+        xs[lane], ys[lane] = np.float32(column) + _HALF, np.float32(row) + _HALF
+        if column < width and row < height:
+            inside |= 1 << lane
+    return np.int64(inside)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, transmittance):  # type: ignore[no-untyped-def]
+    row, column = tile // pairs.columns, tile % pairs.columns
+    for block in range(16):
+        left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
+        if left < width and top < height:
+            open_ = mask_of(_pixels(left, top, width, height, xs, ys))
+            x, y = load16(pointer(xs), 0), load16(pointer(ys), 0)
+            _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, open_, met, pointer(place))
+            for lane in range(16):
+                i, j = top + lane // BLOCK, left + lane % BLOCK
+                if i < height and j < width:
+                    for channel in range(3):
+                        colour[i, j, channel] = place[16 * channel + lane]
+                    transmittance[i, j] = place[48 + lane]
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _render(begin, end, workers, task, records, pairs, longest, colour, transmittance):  # type: ignore[no-untyped-def]
+    for _ in numba.prange(workers):
+        met, place = np.empty(longest, np.int64), np.empty(64, np.float32)
+        xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
+        tile = begin + take_next(pointer(task))
+        while tile < end:
+            _render_tile(tile, pointer(records), pairs, colour.shape[1], colour.shape[0], met, place, xs, ys, colour, transmittance)
+            tile = begin + take_next(pointer(task))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _residual(left, top, place, picture, slopes):  # type: ignore[no-untyped-def]
+    """The squared error of a block, whose colours and transmittances are in `place`; half of its derivatives by them into the first 64 of `slopes`, and each
+    pixel's error into the last 16.
+
+    Over all backgrounds b from 0 to 1, d + t b has the mean square (d + t / 2)^2 + t^2 / 12: d a channel's difference, t that of the transmittances.
+    """
+    total = 0.0
+    height, width = picture.mask.shape
+    for lane in range(16):
+        i, j = top + lane // BLOCK, left + lane % BLOCK
+        by_light, error = _NONE, _NONE
+        counts = i < height and j < width and picture.mask[i, j] != 0
+        alpha = np.float32(picture.pixels[i, j, 3]) * np.float32(1 / 255) if counts and picture.over_all else _ONE
+        for channel in range(3):
+            slope = _NONE
+            if counts:
+                wanted = np.float32(picture.pixels[i, j, channel]) * np.float32(1 / 255) * alpha
+                if picture.over_all:
+                    more = place[48 + lane] - (_ONE - alpha)
+                    slope = place[16 * channel + lane] - wanted + _HALF * more
+                    by_light += _HALF * slope + more * np.float32(1 / 12)
+                    error += slope * slope + more * more * np.float32(1 / 12)
+                else:
+                    slope = place[16 * channel + lane] + place[48 + lane] * picture.background[channel] - wanted
+                    by_light += slope * picture.background[channel]
+                    error += slope * slope
+            slopes[16 * channel + lane] = slope
+        slopes[48 + lane], slopes[64 + lane] = by_light, error
+        total += float(error)
+    return total
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):  # type: ignore[no-untyped-def]
+    """Sums of the pairs that a block met, added to theirs: what the error changes by, with -q / 2 (v), with that times distances (v dx, v dy, v dx dx, v dx dy,
+    v dy dy) and with the colour; and the error where it shows."""
+    by_red, by_green, by_blue, error = load16(slopes, 0), load16(slopes, 16), load16(slopes, 32), load16(slopes, 64)
+    behind = load16(place, 0) * by_red + load16(place, 16) * by_green + load16(place, 32) * by_blue + load16(place, 48) * load16(slopes, 48)
+    light, open_ = broadcast16(_ONE), inside
+    for n in range(count):
+        pair = met[n]
+        at = np.int64(gaussian[pair]) * RECORD
+        dx, dy, strength = _exponent(p, at, x, y)
+        alpha = min16(strength, MOST_ALPHA)
+        rest = _ONE - alpha
+        left = light * rest
+        counts = open_ & (alpha >= LEAST_ALPHA)
+        ends = counts & (left < LEAST_TRANSMITTANCE)
+        counts = counts & ~ends
+        open_ = open_ & ~ends
+        weight = select16(counts, light * alpha, _NONE)
+        gain = by_red * p[at + RED] + by_green * p[at + RED + 1] + by_blue * p[at + RED + 2]
+        behind = behind - weight * gain
+        v = (light * gain - behind / rest) * alpha
+        v = select16(counts & (strength < MOST_ALPHA), v, _NONE)
+        light = select16(counts, left, light)
+        vx, vy = v * dx, v * dy
+        to = np.int64(slot[pair]) * SUMS
+        found = sums16(v, vx, vy, vx * dx, vx * dy, vy * dy, weight * by_red, weight * by_green, weight * by_blue, weight * error)
+        store16(sums, to, load16(sums, to) + found)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):  # type: ignore[no-untyped-def]
+    row, column, (height, width), total = tile // pairs.columns, tile % pairs.columns, picture.mask.shape, 0.0
+    for pair in range(pairs.begin[tile], pairs.begin[tile + 1]):
+        for n in range(SUMS):
+            sums[pairs.slot[pair], n] = _NONE
+    for block in range(16):
+        left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
+        if left < width and top < height:
+            inside = mask_of(_pixels(left, top, width, height, xs, ys))
+            x, y = load16(pointer(xs), 0), load16(pointer(ys), 0)
+            count = _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, inside, met, pointer(place))
+            total += _residual(left, top, place, picture, slopes)
+            _pull(p, met, count, pairs.gaussian, pairs.slot, x, y, inside, pointer(place), pointer(slopes), pointer(sums))
+    return total
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _fit(begin, end, workers, task, records, pairs, longest, picture, sums, errors):  # type: ignore[no-untyped-def]
+    for _ in numba.prange(workers):
+        met, place, slopes = np.empty(longest, np.int64), np.empty(64, np.float32), np.empty(80, np.float32)
+        xs, ys = np.empty(16, np.float32), np.empty(16, np.float32)
+        tile = begin + take_next(pointer(task))
+        while tile < end:
+            errors[tile] = _fit_tile(tile, pointer(records), pairs, picture, met, place, slopes, xs, ys, sums)
+            tile = begin + take_next(pointer(task))
+
+
+def _longest(pairs: Pairs) -> int:
+    return int(np.diff(pairs.begin).max(initial=1))
+
+
+def render_tiles(tiles: slice, records: np.ndarray, pairs: Pairs, colour: np.ndarray, transmittance: np.ndarray) -> None:
+    """Pixels of some tiles: colour (H, W, 3) and transmittance (H, W) float32."""
+    workers = min(numba.get_num_threads(), tiles.stop - tiles.start)
+    _render(tiles.start, tiles.stop, workers, np.zeros(1, np.int64), records, pairs, _longest(pairs), colour, transmittance)
+
+
+def fit_tiles(tiles: slice, records: np.ndarray, pairs: Pairs, picture: Picture, sums: np.ndarray, errors: np.ndarray) -> None:
+    """The squared error of each of some tiles in `errors` (T,) float64, and sums of half of its derivatives by their pairs in `sums` (P, SUMS) float32."""
+    workers = min(numba.get_num_threads(), tiles.stop - tiles.start)
+    _fit(tiles.start, tiles.stop, workers, np.zeros(1, np.int64), records, pairs, _longest(pairs), picture, sums, errors)

@@ -1,0 +1,64 @@
+"""From a tree and pictures to 3D Gaussians: its voxels merged, then fitted to the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from efficientnerf.splats.gaussians import Gaussians
+from efficientnerf.splats.merging import merged
+from efficientnerf.splats.refit import View, refitted
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+__all__ = ["Budget", "NothingToShow", "View", "gaussians_of_asset"]
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """count   Gaussians at most
+    degree  of their harmonics, 0 to 3; at most the asset's
+    steps   of the refit, each a whole picture; 0: the voxels merged, as they are
+    seed    of the order of the pictures
+    """
+
+    count: int = 200_000
+    degree: int = 2
+    steps: int = 300
+    seed: int = 0
+
+
+class NothingToShow(ValueError):
+    """No voxel shows in any picture."""
+
+
+def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, progress: Progress | None = None) -> Gaussians:
+    """Gaussians that show what the tree shows.
+
+    views     what they are fitted to, and whose cameras say which voxels show
+    progress  called with what is done, of how much, and what is being done
+
+    Raises NothingToShow, and ValueError without views.
+    """
+    if not views:
+        raise ValueError("Gaussians of an asset need pictures to be fitted to; there are none")
+
+    def said(done: int, text: str) -> None:
+        if progress is not None:
+            progress(done, budget.steps + 1, text)
+
+    said(0, "merging voxels")
+    gaussians = merged(tree, [view.camera for view in views], budget.count, budget.degree)
+    if not len(gaussians):
+        raise NothingToShow("no voxel of the asset shows in any picture: there is nothing that Gaussians could show")
+    said(1, "fitting Gaussians")
+    fitted = refitted(
+        gaussians, views, budget.steps, background=tree.background, seed=budget.seed, reached=lambda step, error: said(step + 1, "fitting Gaussians")
+    )
+    if not len(fitted):
+        raise NothingToShow("no Gaussian is left that shows in any picture")
+    return fitted

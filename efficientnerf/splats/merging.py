@@ -1,0 +1,303 @@
+"""Voxels that show, merged into Gaussians.
+
+Voxels lie in cells of 1, 2, 4, ... voxels a side. What is lost when the voxels of a cell become one is the sum, over the pixels that show them, of the squared
+differences of their colours and places from the mean. It never falls from a cell to the one around it: so the cells that lose at most some bound, each the
+largest of its place, are a partition, and the bound follows from how many Gaussians there may be.
+
+A Gaussian has the mean of its voxels, weighted by the pixels that show them, their covariance across the density's normal, and little depth along it. Its
+opacity follows from the optical thickness of the voxels, which it keeps. Colours are their mean, converted: an asset's are the sigmoid of a sum of harmonics,
+a Gaussian's the sum itself.
+
+N voxels, C cells or Gaussians, K harmonics.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.backends.pieces import pieces
+from efficientnerf.geometry.cameras import Camera, rays
+from efficientnerf.rendering import environment
+from efficientnerf.rendering.harmonics import C0, basis_numpy
+from efficientnerf.splats.gaussians import MAX_DEGREE, Gaussians, quaternions_from
+
+if TYPE_CHECKING:
+    from efficientnerf.asset.tree import NerfTree
+
+# docs/experiments/splats.md
+RAYS = 2**19  # of all views together that find out which voxels show
+LEAST_WEIGHT = 0.02  # of a voxel in the pixel that shows it most
+PLACE = 0.02  # difference of colour that a distance of one pixel between merged voxels is worth
+WIDEN = 1.5  # standard deviations of a cell's voxels across the normal, times this: neighbours have to overlap
+THIN = 0.3  # least depth along the normal, voxels
+DIRECTIONS = 32  # that a colour is converted at
+LEVELS = 9  # of cells
+SHELL_SHARE, SHELL_MOST, SHELL_DISTANCE = 0.05, 10_000, 30.0  # Gaussians for the environment; their distance in half diagonals of the outermost cascade
+DEEPEST = 0.2  # of its distance, that a Gaussian of normalised device coordinates reaches along the view axis
+AT_ONCE = 2**17  # voxels whose coefficients are decoded together
+VIEWS = 32  # that the size of voxels in pixels is taken from
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """The voxels that show, in Morton order within their cascade.
+
+    voxels   (N,) their numbers
+    keys     (N,) int64: cascade, then Morton code
+    centres  (N, 3) and sides (N,), the tree's frame
+    pixels   (N,) of the views, about, that show each
+    width    (N,) of each in pixels
+    """
+
+    voxels: np.ndarray
+    keys: np.ndarray
+    centres: np.ndarray
+    sides: np.ndarray
+    pixels: np.ndarray
+    width: np.ndarray
+
+
+def greatest_weights(tree: NerfTree, cameras: Sequence[Camera], count: int = RAYS) -> np.ndarray:
+    """(N,) the greatest contribution of each voxel to one of about `count` pixels, spread evenly over the pictures."""
+    from efficientnerf.backends.numba.tree import contributions
+    from efficientnerf.backends.numba.tree.walk import tree_grid
+
+    grid, found = tree_grid(tree), np.zeros((contributions.contribution_shares(), len(tree.density_values)), np.float32)
+    stride = max(1.0, np.sqrt(sum(camera.width * camera.height for camera in cameras) / count))
+    for number, camera in enumerate(cameras):
+        # Each picture's raster begins elsewhere, so that together they meet more voxels.
+        x, y = (np.arange((number * share) % 1 * stride, size, stride) for share, size in ((0.618, camera.width), (0.414, camera.height)))
+        pixels = np.stack(np.meshgrid(np.floor(x) + 0.5, np.floor(y) + 0.5), axis=-1).reshape(-1, 2)
+        for part in pieces(len(pixels), first=2048):
+            warped = tree.frame.rays(*rays(camera, pixels[part]))
+            start = np.ascontiguousarray((warped.origins - tree.bounds_min) / tree.voxel)
+            along = np.ascontiguousarray(warped.directions)
+            contributions.max_contributions(grid, start, along, tree.density_values, np.ones(len(start), np.float32), found)
+    return np.asarray(found.max(axis=0))
+
+
+def shown_voxels(tree: NerfTree, cameras: Sequence[Camera]) -> Shown:
+    """The voxels that the cameras see."""
+    from efficientnerf.asset.cascades import voxel_cascades, voxel_sides
+    from efficientnerf.asset.region import voxel_centres
+    from efficientnerf.asset.tree import voxel_coordinates
+
+    weight = greatest_weights(tree, cameras)
+    voxels = np.flatnonzero(weight > LEAST_WEIGHT)
+    keys = _spread_bits(voxel_coordinates(tree)[voxels].astype(np.int64)) | voxel_cascades(tree)[voxels].astype(np.int64) << 57
+    voxels = voxels[np.argsort(keys, kind="stable")]
+    centres, sides = voxel_centres(tree)[voxels], voxel_sides(tree)[voxels].astype(np.float64)
+    width = _pixel_widths(tree, cameras, centres, sides)
+    return Shown(voxels, np.sort(keys), centres, sides, np.maximum(weight[voxels] * width**2, 1e-9), width)
+
+
+def _spread_bits(at: np.ndarray) -> np.ndarray:
+    """(N,) Morton codes of coordinates (N, 3) below 2^19."""
+    code = np.zeros(len(at), np.int64)
+    for bit in range(19):
+        for axis in range(3):
+            code |= (at[:, axis] >> bit & 1) << (3 * bit + 2 - axis)
+    return code
+
+
+def _pixel_widths(tree: NerfTree, cameras: Sequence[Camera], centres: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """(N,) of voxels in pixels: the root mean square over views, wherever they look."""
+    chosen = [cameras[int(n)] for n in np.unique(np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round())]
+    square, side = np.zeros(len(centres)), sides
+    world = centres
+    if tree.ndc is not None:
+        world, side = tree.ndc.world(centres), sides * np.linalg.norm(_jacobians(tree, centres)[:, :, 0], axis=1)
+    for camera in chosen:
+        k = camera.intrinsics
+        square += k["fx"] * k["fy"] * side**2 / np.maximum(np.square(world - camera.centre).sum(axis=1), side**2)
+    return np.sqrt(square / len(chosen))
+
+
+def _jacobians(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) derivative of the world by the frame at points (N, 3) of the frame."""
+    if tree.ndc is None:
+        return np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    ndc, (a, b) = tree.ndc, tree.ndc.slopes
+    z = 2 * ndc.near / np.maximum(1 - points[:, 2], 1e-9)
+    local = np.zeros((len(points), 3, 3))
+    local[:, 0, 0], local[:, 1, 1] = z / a, z / b
+    local[:, :, 2] = np.stack([points[:, 0] / a, points[:, 1] / b, np.ones(len(points))], axis=-1) * (z * z / (2 * ndc.near))[:, None]
+    return np.asarray(np.einsum("ij,njk->nik", ndc.world_from_camera[:3, :3], local))
+
+
+def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
+    """(C + 1,) where the voxels of each cell begin, at most `most` cells.
+
+    colours  (N, 3) of the voxels, sRGB
+    """
+    at = shown.centres / shown.sides[:, None]
+    at = at - at.mean(axis=0)
+    # Sums over the voxels of a cell of w, w x and w |x|^2: of colours, and of places.
+    weights = [shown.pixels, shown.pixels * np.square(PLACE * shown.width)]
+    sums = [values * weight[:, None] for values, weight in zip((colours, at), weights, strict=True)]
+    squares = [np.square(values).sum(axis=1) * weight for values, weight in zip((colours, at), weights, strict=True)]
+    begin = np.arange(len(shown.keys))
+    losses, begins, parents = [np.zeros(len(begin))], [begin], []
+    for level in range(1, LEVELS):
+        keys = shown.keys[begin] >> (3 * level)
+        first = np.flatnonzero(np.concatenate([[True], np.diff(keys) != 0]))
+        parents.append(np.cumsum(np.concatenate([[0], np.diff(keys) != 0])))
+        begin = begin[first]
+        weights, squares = [np.add.reduceat(each, first) for each in weights], [np.add.reduceat(each, first) for each in squares]
+        sums = [np.add.reduceat(each, first, axis=0) for each in sums]
+        lost = sum(square - np.square(total).sum(axis=1) / weight for square, total, weight in zip(squares, sums, weights, strict=True))
+        # A cell holds those in it; rounding must not let it lose less than they do.
+        within = np.maximum.reduceat(losses[-1], first)
+        losses.append(np.maximum(lost, within))
+        begins.append(begin)
+
+    def chosen(bound: float) -> list[np.ndarray]:
+        """Which cells of each level lose at most `bound`, where the one around them loses more."""
+        alone = [losses[level + 1][parents[level]] > bound if level + 1 < LEVELS else np.ones(len(losses[level]), bool) for level in range(LEVELS)]
+        return [(losses[level] <= bound) & alone[level] for level in range(LEVELS)]
+
+    low, high = 0.0, float(losses[-1].max(initial=0)) + 1e-12
+    if sum(int(level.sum()) for level in chosen(low)) > most:
+        for _ in range(50):
+            middle = np.sqrt(max(low, 1e-18) * high)
+            low, high = (low, middle) if sum(int(level.sum()) for level in chosen(middle)) <= most else (middle, high)
+    else:
+        high = low
+    cells = chosen(high)
+    begin = np.sort(np.concatenate([begins[level][cells[level]] for level in range(LEVELS)]))
+    return np.concatenate([begin, [len(shown.keys)]])
+
+
+def merged(tree: NerfTree, cameras: Sequence[Camera], most: int, degree: int) -> Gaussians:
+    """At most `most` Gaussians for what the cameras see of a tree; none where they see nothing."""
+    shell = environment_shell(tree, most, degree)
+    shown = shown_voxels(tree, cameras)
+    if not len(shown.voxels):
+        return shell
+    parts = (shown.voxels[begin : begin + AT_ONCE] for begin in range(0, len(shown.voxels), AT_ONCE))
+    base = 1 / (1 + np.exp(-C0 * np.concatenate([tree.coefficients(part)[:, 0] for part in parts]).astype(np.float64)))
+    begin = cells_of(shown, base, most - len(shell))
+    gaussians = _gaussians_of_cells(tree, shown, begin, min(degree, tree.degree, MAX_DEGREE))
+    return joined(gaussians, shell)
+
+
+def _gaussians_of_cells(tree: NerfTree, shown: Shown, begin: np.ndarray, degree: int) -> Gaussians:
+    first = begin[:-1]
+    weight = np.add.reduceat(shown.pixels, first)
+    mean = np.add.reduceat(shown.centres * shown.pixels[:, None], first, axis=0) / weight[:, None]
+    side = np.maximum.reduceat(shown.sides, first)
+    off = shown.centres - np.repeat(mean, np.diff(begin), axis=0)
+    spread = np.empty((len(mean), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            spread[:, i, j] = spread[:, j, i] = np.add.reduceat(off[:, i] * off[:, j] * shown.pixels, first) / weight
+    spread += np.eye(3) * (side**2 / 12)[:, None, None]
+    axes, scales = flattened(spread, _normals(tree, mean), side)
+    thickness = np.add.reduceat(tree.density_values[shown.voxels] * shown.sides**3, first) / (2 * np.pi * scales[:, 0] * scales[:, 1])
+    opacities = np.clip(-np.expm1(-thickness), 0.02, 0.98)
+    if tree.ndc is not None:
+        mean, axes, scales = _in_the_world(tree, mean, axes, scales)
+    harmonics = np.empty((len(mean), (degree + 1) ** 2, 3), np.float32)
+    _convert(tree, shown, begin, weight, harmonics, degree)
+    parts = mean, scales, quaternions_from(axes), opacities, harmonics
+    return Gaussians(*(np.ascontiguousarray(part, np.float32) for part in parts))
+
+
+def _normals(tree: NerfTree, points: np.ndarray) -> np.ndarray:
+    """(C, 3) down the density's gradient, in the frame; zero where it is flat."""
+    from efficientnerf.backends.numba.tree import queries
+
+    return np.asarray(queries.normal_at(tree, points), np.float64)
+
+
+def flattened(spread: np.ndarray, normals: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Axes (C, 3, 3), columns, the last along the normal, and standard deviations (C, 3) of Gaussians that cover cells of such covariances (C, 3, 3).
+
+    normals  (C, 3) unit, or zero: then the axis that the voxels spread least along
+    side     (C,) of the voxels
+    """
+    own = np.linalg.eigh(spread).eigenvectors  # by ascending variance
+    normal = np.where((np.square(normals).sum(axis=1) > 0.5)[:, None], normals, own[:, :, 0])
+    # The widest direction across the normal: the covariance within that plane, as two numbers and an angle.
+    helper = np.where(np.abs(normal[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    first = np.cross(helper, normal)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
+
+    def along(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.asarray(np.einsum("ni,nij,nj->n", a, spread, b))
+
+    angle = 0.5 * np.arctan2(2 * along(first, second), along(first, first) - along(second, second))
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    first, second = cosine * first + sine * second, cosine * second - sine * first
+    across = [WIDEN * np.sqrt(np.maximum(along(axis, axis), 0)) for axis in (first, second)]
+    deep = np.maximum(np.sqrt(np.maximum(along(normal, normal) - side**2 / 12, 0)), THIN * side)
+    return np.stack([first, second, normal], axis=-1), np.stack([*across, deep], axis=-1)
+
+
+def _in_the_world(tree: NerfTree, mean: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gaussians of normalised device coordinates in the world: means, axes and standard deviations."""
+    assert tree.ndc is not None
+    root = np.einsum("nij,njk->nik", _jacobians(tree, mean), axes * scales[:, None, :])
+    variance, turned = np.linalg.eigh(np.einsum("nij,nkj->nik", root, root))
+    turned[:, :, 0] *= np.sign(np.linalg.det(turned))[:, None]
+    world = tree.ndc.world(mean)
+    far = np.linalg.norm(world - tree.ndc.world_from_camera[:3, 3], axis=1, keepdims=True)
+    return world, turned, np.minimum(np.sqrt(np.maximum(variance, (1e-6 * far) ** 2)), DEEPEST * far)
+
+
+def _convert(tree: NerfTree, shown: Shown, begin: np.ndarray, weight: np.ndarray, out: np.ndarray, degree: int) -> None:
+    """Mean colours of cells into `out` (C, K, 3), as Gaussians have them."""
+    directions = _directions(DIRECTIONS)
+    basis = basis_numpy(directions, tree.degree)
+    back = np.linalg.pinv(basis_numpy(directions, degree)).astype(np.float32)
+    for cells in pieces(len(begin) - 1, first=4096, most=2**15):
+        part = slice(begin[cells.start], begin[cells.stop])
+        mixed = tree.coefficients(shown.voxels[part]) * shown.pixels[part, None, None].astype(np.float32)
+        mixed = np.add.reduceat(mixed, begin[cells] - part.start, axis=0) / weight[cells, None, None].astype(np.float32)
+        out[cells] = 0
+        for n in range(len(directions)):  # not by BLAS, whose sums depend on its threads
+            raw = sum(np.float32(basis[n, k]) * mixed[:, k] for k in range(basis.shape[1]))
+            colour = 1 / (1 + np.exp(-np.asarray(raw))) - np.float32(0.5)
+            for k in range(out.shape[1]):
+                out[cells, k] += back[k, n] * colour
+
+
+def _directions(count: int) -> np.ndarray:
+    """(count, 3) unit, spread evenly: a Fibonacci lattice."""
+    n = np.arange(count) + 0.5
+    z, azimuth = 1 - 2 * n / count, np.pi * (1 + np.sqrt(5)) * n
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=-1)
+
+
+def environment_shell(tree: NerfTree, most: int, degree: int) -> Gaussians:
+    """Far Gaussians in the colours of a tree's environment map; none without one."""
+    from efficientnerf.asset.cascades import cascades_of
+
+    count = 0 if tree.environment is None else min(int(SHELL_SHARE * most), SHELL_MOST)
+    bounds = cascades_of(tree)[-1].bounds(tree.brick)
+    distance = SHELL_DISTANCE * np.linalg.norm(bounds[1] - bounds[0]) / 2
+    directions = _directions(count) if count else np.zeros((0, 3))
+    first = np.cross(np.where(np.abs(directions[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), directions)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    axes = np.stack([first, np.cross(directions, first), directions], axis=-1)
+    spacing = distance * np.sqrt(4 * np.pi / max(count, 1))
+    harmonics = np.zeros((count, (degree + 1) ** 2, 3))
+    if count and tree.environment is not None:
+        harmonics[:, 0] = (environment.lookup(tree.environment, directions) - 0.5) / C0
+    scales = np.tile([0.6 * spacing, 0.6 * spacing, 0.1 * spacing], (count, 1))
+    parts = bounds.mean(axis=0) + distance * directions, scales, quaternions_from(axes), np.full(count, 0.98), harmonics
+    return Gaussians(*(np.ascontiguousarray(part, np.float32) for part in parts))
+
+
+def joined(*sets: Gaussians) -> Gaussians:
+    """All Gaussians of some sets, in order; harmonics that a set lacks are zero."""
+    terms = max(each.harmonics.shape[1] for each in sets)
+    harmonics = [np.pad(each.harmonics, ((0, 0), (0, terms - each.harmonics.shape[1]), (0, 0))) for each in sets]
+    means, scales, rotations, opacities = (np.concatenate([getattr(each, name) for each in sets]) for name in ("means", "scales", "rotations", "opacities"))
+    return Gaussians(means, scales, rotations, opacities, np.concatenate(harmonics))

@@ -1,0 +1,116 @@
+"""Gaussians fitted to pictures: Adam on means, scales, rotations, opacities and harmonics.
+
+A step is a whole picture. What is minimised is the squared error; of a picture with alpha that over all backgrounds at once. The order of the pictures is
+drawn by (seed, round). The same pictures give the same bytes on any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from efficientnerf.backends.pieces import pieces
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.splats.gaussians import Gaussians
+from efficientnerf.splats.rendering import LANES, gaussians_from, lens_of, values_of
+
+if TYPE_CHECKING:
+    from efficientnerf.backends.numba.splats.fitting import Rates
+    from efficientnerf.backends.numba.splats.raster import Picture
+
+# docs/experiments/splats.md
+MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.02, 0.01, 0.01, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
+LAST_RATE = 0.1  # of the learning rates, at the last step
+MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
+LEAST_OPACITY = 0.005  # below which a Gaussian is left out in the end; 3DGS
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture that Gaussians are fitted to.
+
+    camera  in the asset's frame, of the picture's size
+    pixels  (H, W, 3) or (H, W, 4) uint8 sRGB, alpha straight
+    mask    (H, W) bool, pixels that count; None: all
+    """
+
+    camera: Camera
+    pixels: np.ndarray
+    mask: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height, self.camera.width)
+        if self.pixels.dtype != np.uint8 or self.pixels.ndim != 3 or self.pixels.shape[:2] != size or self.pixels.shape[2] not in (3, 4):
+            found = f"{self.camera.name}: pixels of shape {self.pixels.shape} and type {self.pixels.dtype}"
+            raise ValueError(f"{found}; expected {size} and 3 or 4 channels, uint8")
+        if self.mask is not None and (self.mask.shape != size or self.mask.dtype != bool):
+            raise ValueError(f"{self.camera.name}: a mask of shape {self.mask.shape} and type {self.mask.dtype}; expected {size} bool")
+
+
+def refitted(
+    gaussians: Gaussians, views: Sequence[View], steps: int, *, background: tuple[float, float, float] | None = None, seed: int = 0,
+    reached: Callable[[int, float], None] | None = None,
+) -> Gaussians:  # fmt: skip
+    """The Gaussians after so many steps, without those that no longer show.
+
+    background  sRGB colour behind pictures without alpha; None: these are opaque
+    reached     called after each step, with their number and the picture's mean squared error of a channel
+    """
+    from efficientnerf.backends.numba.splats import fitting, raster
+    from efficientnerf.backends.numba.splats.pairs import pairs_of
+    from efficientnerf.backends.numba.splats.projection import RECORD, project
+
+    values, degree = values_of(gaussians), gaussians.degree
+    moments = np.zeros((len(values), fitting.GRADIENTS + values.shape[1], LANES), np.float32)
+    records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
+    sums = np.zeros((0, raster.SUMS), np.float32)
+    order: list[int] = []
+    for number in range(steps):
+        if not order:
+            order = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 5, number])).permutation(len(views)).tolist()
+        view = views[order.pop()]
+        lens, picture = lens_of(view.camera), _picture(view, background)
+        project(values, lens, degree, records)
+        pairs = pairs_of(records, view.camera.width, view.camera.height)
+        if len(sums) < len(pairs.gaussian):
+            sums = np.zeros((len(pairs.gaussian) * 5 // 4, raster.SUMS), np.float32)
+        lost = np.zeros(len(pairs.begin) - 1)
+        for tiles in pieces(len(lost)):
+            raster.fit_tiles(tiles, records, pairs, picture, sums, lost)
+        fitting.step(values, moments, lens, degree, pairs.first, sums, _rates(number / max(steps - 1, 1)), errors)
+        if reached is not None:
+            reached(number + 1, float(lost.sum()) / max(3 * int(picture.mask.sum()), 1))
+    fitted = gaussians_from(values, len(gaussians))
+    return fitted.subset(fitted.opacities >= LEAST_OPACITY)
+
+
+def _picture(view: View, background: tuple[float, float, float] | None) -> Picture:
+    """As kernels take it."""
+    from efficientnerf.backends.numba.splats.raster import Picture
+
+    pixels = view.pixels
+    over_all = pixels.shape[2] == 4 or background is None
+    if pixels.shape[2] == 3:
+        pixels = np.concatenate([pixels, np.full((*pixels.shape[:2], 1), 255, np.uint8)], axis=2)
+    mask = np.ones(pixels.shape[:2], np.uint8) if view.mask is None else np.ascontiguousarray(view.mask).view(np.uint8)
+    return Picture(np.ascontiguousarray(pixels), mask, over_all, np.asarray(background or (0, 0, 0), np.float32))
+
+
+def _rates(done: float) -> Rates:
+    """The rates when so much, 0 to 1, of the steps is done."""
+    from efficientnerf.backends.numba.splats.fitting import Rates
+
+    fall = LAST_RATE**done
+    rates = np.asarray([MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS], np.float32) * np.float32(fall)
+    return Rates(
+        rates, np.float32(MOMENTUM), np.float32(DECAY), np.float32(EPSILON), _corrections(MOMENTUM), _corrections(DECAY), np.float32(-30), np.float32(20)
+    )  # fmt: skip
+
+
+def _corrections(decay: float) -> np.ndarray:
+    """1 / (1 - decay^n) for n = 1, 2, ... until it is 1."""
+    most = int(np.ceil(np.log(1e-8) / np.log(decay)))
+    return np.asarray(1 / (1 - decay ** np.arange(1, most + 1)), np.float32)

@@ -1,0 +1,205 @@
+"""From trees to Gaussians: what is merged, and that fitting brings it nearer to the pictures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.cascades import cascades_of
+from efficientnerf.asset.rendering import render as render_tree
+from efficientnerf.asset.tree import NerfTree, tree_from_voxels
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.ndc import Ndc
+from efficientnerf.rendering.harmonics import C0
+from efficientnerf.splats import merging
+from efficientnerf.splats.build import Budget, NothingToShow, View, gaussians_of_asset
+from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
+from efficientnerf.splats.refit import refitted
+from efficientnerf.splats.rendering import render
+from tests.efficientnerf.balls import pose
+from tests.efficientnerf.trees import random_cascades
+
+SIDE = 24
+
+
+def ball(side: int = 24, degree: int = 1) -> NerfTree:
+    """A ball of radius 0.8 in the middle of the world, red to the one side and green to the other, with a shell of voxels alone."""
+    voxel = 2 / side
+    indices = np.argwhere(np.ones((side,) * 3, bool))
+    at = (indices + 0.5) * voxel - 1
+    far = np.linalg.norm(at, axis=1)
+    near = np.abs(far - 0.75) < 1.5 * voxel
+    sh = np.zeros((int(near.sum()), (degree + 1) ** 2, 3), np.float32)
+    sh[:, 0] = np.where(at[near, :1] > 0, [2.0, -2, -2], [-2.0, 2, -2]) / C0
+    return tree_from_voxels((side // 4,) * 3, voxel, np.full(3, -1.0), indices[near], np.full(len(sh), 4 / voxel, np.float32), sh)
+
+
+def ring(count: int, side: int = SIDE, distance: float = 3.0) -> list[Camera]:
+    found = []
+    for n in range(count):
+        at = pose(2 * np.pi * n / count, 0.4)
+        at[:3, 3] *= distance / np.linalg.norm(at[:3, 3])
+        found.append(Camera(f"view {n}", side, side, "SIMPLE_PINHOLE", (1.4 * side, side / 2, side / 2), at))
+    return found
+
+
+def photographs(tree: NerfTree, cameras: list[Camera]) -> list[View]:
+    """Renders of the tree with straight alpha."""
+    views = []
+    for camera in cameras:
+        seen = render_tree(tree, camera, normals=False)
+        colour = seen.colour / np.maximum(seen.opacity[..., None], 1e-3)
+        views.append(View(camera, np.round(np.clip(np.concatenate([colour, seen.opacity[..., None]], axis=2), 0, 1) * 255).astype(np.uint8)))
+    return views
+
+
+def error(gaussians: Gaussians, views: list[View]) -> float:
+    """Mean squared error over white."""
+    total = 0.0
+    for view in views:
+        wanted = view.pixels / 255
+        total += np.square(render(gaussians, view.camera, (1, 1, 1)).colour - (wanted[..., :3] * wanted[..., 3:] + 1 - wanted[..., 3:])).mean()
+    return total / len(views)
+
+
+def test_gaussians_of_a_ball_lie_flat_on_it_in_its_colours_as_many_as_wanted() -> None:
+    tree = ball()
+    gaussians = merging.merged(tree, ring(6), 300, 1)
+    assert 200 < len(gaussians) <= 300
+    far = np.linalg.norm(gaussians.means, axis=1)
+    assert (np.abs(far - 0.78) < 0.1).mean() > 0.95
+    axes = rotation_matrices(gaussians.rotations)
+    thinnest = axes[np.arange(len(gaussians)), :, np.argmin(gaussians.scales, axis=1)]
+    along = np.abs((thinnest * gaussians.means).sum(axis=1) / far)
+    assert np.median(along) > 0.95
+    clear = np.abs(gaussians.means[:, 0]) > 0.15
+    colours = 0.5 + C0 * gaussians.harmonics[clear, 0]
+    wanted = np.where(gaussians.means[clear, :1] > 0, 1.0, -1.0) * [1, -1, 0] * 2
+    np.testing.assert_allclose(colours[:, :2], 1 / (1 + np.exp(-wanted[:, :2])), atol=0.02)
+
+
+def test_fitting_brings_gaussians_nearer_to_pictures_that_they_were_not_fitted_to() -> None:
+    tree, cameras = ball(16), ring(12)
+    views = photographs(tree, cameras)
+    seen, held_back = views[::2], views[1::2]
+    said: list[tuple[int, int, str]] = []
+    merely = gaussians_of_asset(tree, seen, Budget(count=250, degree=1, steps=0))
+    fitted = gaussians_of_asset(tree, seen, Budget(count=250, degree=1, steps=40), lambda done, total, text: said.append((done, total, text)))
+    assert error(fitted, seen) < 0.6 * error(merely, seen)
+    assert error(fitted, held_back) < 0.9 * error(merely, held_back)
+    assert [done for done, _, _ in said] == [0, 1, *range(2, 42)]
+    assert {total for _, total, _ in said} == {41}
+
+
+def test_what_no_picture_shows_is_no_part_of_it() -> None:
+    tree = ball()
+    away = [replace(camera, world_from_camera=camera.world_from_camera @ np.diag([1.0, -1, -1, 1])) for camera in ring(2)]
+    with pytest.raises(NothingToShow):
+        gaussians_of_asset(tree, photographs(tree, away), Budget(count=100))
+    one_side = merging.merged(tree, ring(8)[:1], 2000, 0)
+    towards = ring(8)[0].centre
+    assert (one_side.means @ towards > -0.3).mean() > 0.99
+    with pytest.raises(ValueError, match="pictures to be fitted to"):
+        gaussians_of_asset(tree, [], Budget())
+
+
+def test_colours_are_those_of_the_asset_from_all_directions() -> None:
+    rng, degree = np.random.default_rng(0), 2
+    tree = ball(degree=degree)
+    tree = tree.with_values(tree.density_values, rng.normal(size=tree.sh.shape).astype(np.float32) * [[[0.5]]] * np.float32(1))
+    shown = merging.shown_voxels(tree, ring(4))
+    begin = np.arange(len(shown.voxels) + 1)
+    out = np.empty((len(shown.voxels), 9, 3), np.float32)
+    merging._convert(tree, shown, begin, shown.pixels, out, degree)
+    from efficientnerf.rendering.harmonics import basis_numpy
+
+    directions = rng.normal(size=(200, 3))
+    basis = basis_numpy(directions / np.linalg.norm(directions, axis=1, keepdims=True), degree)
+    wanted = 1 / (1 + np.exp(-np.einsum("dk,nkc->ndc", basis, tree.sh[shown.voxels])))
+    off = 0.5 + np.einsum("dk,nkc->ndc", basis, out) - wanted
+    assert np.sqrt(np.square(off).mean()) < 0.02
+    assert np.abs(off).max() < 0.15
+
+
+def test_cells_that_lose_little_are_merged_before_those_that_lose_much() -> None:
+    tree = ball()
+    shown = merging.shown_voxels(tree, ring(6))
+    rng = np.random.default_rng(0)
+    rough = shown.centres[:, 0] > 0
+    colours = np.where(rough[:, None], rng.random((len(rough), 3)), 0.5)
+    counts = [len(merging.cells_of(shown, colours, most)) - 1 for most in (50, 400, 10**6)]
+    assert 25 < counts[0] <= 50
+    assert 350 < counts[1] <= 400
+    assert counts[2] == len(shown.voxels)
+    begin = merging.cells_of(shown, colours, 400)
+    assert (np.diff(begin) > 0).all()
+    assert begin[0] == 0
+    assert begin[-1] == len(rough)
+    on_rough = rough[begin[:-1]]
+    assert on_rough.sum() > 3 * (~on_rough).sum()
+
+
+def forward_facing() -> tuple[NerfTree, Camera]:
+    """A plane in front of a camera, red and black."""
+    at = np.eye(4)
+    ndc = Ndc(at, 30.0, 24.0, 24.0, 1.0)
+    size, brick = 32, 4
+    indices = np.argwhere(np.ones((size, size, 2), bool)) + np.array([0, 0, 22])
+    sh = np.zeros((len(indices), 1, 3), np.float32)
+    sh[:, 0, 0] = np.where((indices[:, 0] // 8 + indices[:, 1] // 8) % 2, 3, -3) / C0
+    voxel = 2 / size
+    tree = tree_from_voxels((size // brick,) * 3, voxel, np.full(3, -1.0), indices, np.full(len(indices), 5 / voxel, np.float32), sh, ndc=ndc)
+    return tree, Camera("front", 24, 24, "SIMPLE_PINHOLE", (30.0, 12.0, 12.0), at)
+
+
+def test_gaussians_of_normalised_device_coordinates_lie_in_the_world() -> None:
+    tree, camera = forward_facing()
+    moved = camera.world_from_camera.copy()
+    moved[:2, 3] = 0.2, 0.1
+    beside = replace(camera, world_from_camera=moved)
+    gaussians = merging.merged(tree, [camera, beside], 1100, 0)
+    assert tree.ndc is not None
+    depth = tree.ndc.world(np.array([[0.0, 0.0, 23 / 16 - 1]]))[0, 2]
+    assert np.abs(gaussians.means[:, 2] - depth).max() < 0.1 * depth
+    for view in (camera, beside):
+        wanted, found = render_tree(tree, view, background=(0, 0, 0)).colour, render(gaussians, view, (0, 0, 0))
+        off = np.abs(found.colour - wanted)[3:-3, 3:-3]  # neighbours of another colour mix into a pixel
+        assert np.median(off[..., 0]) < 0.07
+        assert off[..., 1:].max() < 0.02
+        assert found.opacity[3:-3, 3:-3].min() > 0.95
+
+
+def test_whole_scenes_have_their_cascades_and_a_shell_of_their_environment() -> None:
+    tree = random_cascades(count=2, degree=0)
+    bounds = cascades_of(tree)[0].bounds(tree.brick)
+    cameras = [replace(camera, world_from_camera=camera.world_from_camera + np.pad(bounds.mean(axis=0)[:, None], ((0, 1), (3, 0)))) for camera in ring(5)]
+    gaussians = merging.merged(tree, cameras, 1500, 1)
+    assert len(gaussians) <= 1500
+    inside = ((gaussians.means >= bounds[0]) & (gaussians.means <= bounds[1])).all(axis=1)
+    away = np.linalg.norm(gaussians.means - bounds.mean(axis=0), axis=1) > 10 * np.linalg.norm(bounds[1] - bounds[0])
+    assert inside.sum() > 50
+    assert (~inside & ~away).sum() > 50
+    assert away.sum() == 75
+    outward = Camera("out", 16, 16, "SIMPLE_PINHOLE", (20.0, 8.0, 8.0), cameras[0].world_from_camera @ np.diag([-1.0, 1, -1, 1]))
+    assert render(gaussians, outward).opacity.min() > 0.9
+
+
+def test_the_same_pictures_give_the_same_bytes_and_what_cannot_be_seen_stays() -> None:
+    tree, cameras = ball(16, 0), ring(3)
+    views = photographs(tree, cameras)
+    begun = merging.merged(tree, cameras, 150, 0)
+    behind = replace(begun.subset(np.arange(1)), means=np.array([[50, 50, 50]], np.float32))
+    begun = Gaussians(*(np.concatenate([getattr(begun, name), getattr(behind, name)]) for name in vars(begun)))
+    one, two = refitted(begun, views, 5), refitted(begun, views, 5)
+    assert one.means.tobytes() == two.means.tobytes()
+    assert one.harmonics.tobytes() == two.harmonics.tobytes()
+    assert (one.means[-1] == begun.means[-1]).all()
+    assert np.abs(one.means[:-1] - begun.means[: len(one) - 1]).max() > 0
+
+
+@pytest.mark.parametrize("pixels", [np.zeros((24, 24, 3)), np.zeros((24, 23, 3), np.uint8), np.zeros((24, 24), np.uint8)])
+def test_pictures_of_another_kind_are_refused(pixels: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        View(ring(1)[0], pixels)

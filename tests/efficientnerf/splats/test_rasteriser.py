@@ -1,0 +1,153 @@
+"""The rasteriser's kernels against plain torch: values and gradients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from efficientnerf.backends.numba.splats import fitting, raster
+from efficientnerf.backends.numba.splats.pairs import pairs_of
+from efficientnerf.backends.numba.splats.projection import RECORD, project
+from efficientnerf.geometry import cameras
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.splats.gaussians import Gaussians
+from efficientnerf.splats.reference import render_reference
+from efficientnerf.splats.rendering import gaussians_from, lens_of, render, values_of
+from tests.efficientnerf.balls import pose
+
+WIDTH, HEIGHT = 37, 27  # neither a multiple of a tile or block
+
+
+def some(count: int = 60, degree: int = 3, seed: int = 0, size: float = 0.2) -> Gaussians:
+    """Around the origin, some behind the camera, some thin, some opaque."""
+    rng = np.random.default_rng(seed)
+    rotations = rng.normal(size=(count, 4))
+    rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
+    means = rng.normal(size=(count, 3)) * 0.5
+    means[::17] *= 30
+    harmonics = rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.4
+    parts = means, size * np.exp(rng.normal(size=(count, 3)) - 1), rotations, rng.uniform(0.02, 0.999, count), harmonics
+    return Gaussians(*(part.astype(np.float32) for part in parts))
+
+
+def camera(model: str = "PINHOLE", extra: tuple[float, ...] = ()) -> Camera:
+    return Camera("view", WIDTH, HEIGHT, model, (33.0, 35.0, 18.0, 13.0, *extra), pose(0.7, 0.4))
+
+
+def tensors(gaussians: Gaussians) -> list[Tensor]:
+    logits = np.log(gaussians.opacities.astype(np.float64) / (1 - gaussians.opacities))
+    parts = gaussians.means, np.log(gaussians.scales.astype(np.float64)), gaussians.rotations, logits, gaussians.harmonics
+    return [torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in parts]
+
+
+@pytest.mark.parametrize(("degree", "size"), [(0, 0.05), (1, 0.2), (2, 1.0), (3, 0.2)])
+def test_images_are_those_of_the_plain_sums(degree: int, size: float) -> None:
+    gaussians = some(degree=degree, size=size)
+    image = render(gaussians, camera())
+    colour, light = render_reference(*tensors(gaussians), camera())
+    np.testing.assert_allclose(image.colour, colour.detach(), atol=2e-4)
+    np.testing.assert_allclose(image.opacity, 1 - light.detach(), atol=2e-4)
+    assert image.opacity.max() > 0.5
+
+
+def picture_of(seed: int, over_all: bool) -> raster.Picture:
+    rng = np.random.default_rng(seed)
+    mask = (rng.random((HEIGHT, WIDTH)) < 0.8).astype(np.uint8)
+    return raster.Picture(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8), mask, over_all, np.array([0.2, 0.5, 0.9], np.float32))
+
+
+def reference_loss(image: Tensor, light: Tensor, picture: raster.Picture) -> Tensor:
+    """Half of the squared error."""
+    pixels, mask = torch.tensor(picture.pixels / 255.0), torch.tensor(picture.mask != 0)
+    if not picture.over_all:
+        off = image + light[..., None] * torch.tensor(picture.background, dtype=image.dtype) - pixels[..., :3]
+        return 0.5 * (off.square().sum(-1) * mask).sum()
+    alpha = pixels[..., 3:]
+    more = light[..., None] - (1 - alpha)
+    off = image - pixels[..., :3] * alpha + 0.5 * more
+    return 0.5 * ((off.square() + more.square() / 12).sum(-1) * mask).sum()
+
+
+@pytest.mark.parametrize(("degree", "over_all"), [(2, True), (3, False)])
+def test_gradients_are_those_of_the_plain_sums(degree: int, over_all: bool) -> None:
+    gaussians, picture = some(count=53, degree=degree), picture_of(1, over_all)
+    values, lens = values_of(gaussians), lens_of(camera())
+    records = np.zeros((16 * len(values), RECORD), np.float32)
+    project(values, lens, degree, records)
+    pairs = pairs_of(records, WIDTH, HEIGHT)
+    sums, errors = np.full((len(pairs.gaussian), raster.SUMS), np.nan, np.float32), np.full(len(pairs.begin) - 1, np.nan)
+    raster.fit_tiles(slice(0, len(errors)), records, pairs, picture, sums, errors)
+    found = np.empty_like(values)
+    fitting.gradients(values, lens, degree, pairs.first, sums, found)
+    rows = found.transpose(0, 2, 1).reshape(-1, values.shape[1])[: len(gaussians)]
+
+    wanted = tensors(gaussians)
+    loss = reference_loss(*render_reference(*wanted, camera()), picture)
+    loss.backward()
+    assert 0.5 * errors.sum() == pytest.approx(loss.item(), rel=1e-5)
+    for name, part, leaf in zip(("means", "scales", "rotations", "logits", "harmonics"), np.split(rows, [3, 6, 10, 11], axis=1), wanted, strict=True):
+        gradient = leaf.grad.reshape(len(gaussians), -1).numpy()
+        np.testing.assert_allclose(part, gradient, rtol=2e-3, atol=2e-4 * np.abs(gradient).max(), err_msg=name)
+
+
+LENSES = [
+    ("OPENCV", (-0.2, 0.05, 0.01, -0.02)), ("FULL_OPENCV", (-0.2, 0.05, 0.01, -0.02, 0.02, 0.05, 0.01, 0.0)), ("OPENCV_FISHEYE", (-0.05, 0.02, 0.01, -0.01)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("model", "extra"), LENSES)
+def test_a_small_gaussian_lands_where_the_lens_sends_it_in_the_shape_of_its_points(model: str, extra: tuple[float, ...]) -> None:
+    lens, rng = camera(model, extra), np.random.default_rng(0)
+    one = some(count=1)
+    pixels = np.array([[9.0, 7.0], [30.0, 20.0], [18.3, 13.1]])
+    origins, directions = cameras.rays(lens, pixels)
+    means = (origins + 3 * directions).astype(np.float32)
+    scales = np.array([[0.3, 0.1, 0.02]], np.float32)
+    gaussians = replace(one.subset(np.zeros(3, int)), means=means, scales=np.repeat(scales, 3, axis=0))
+    records = np.zeros((16, RECORD), np.float32)
+    project(values_of(gaussians), lens_of(lens), 3, records)
+    np.testing.assert_allclose(records[:3, :2], pixels, atol=2e-3)
+    from efficientnerf.splats.gaussians import covariances
+
+    for n in range(3):
+        points = rng.multivariate_normal(np.zeros(3), covariances(gaussians)[n], 4000) * 1e-3 + means[n]
+        seen, _ = cameras.project(lens, points)
+        conic = np.array([[records[n, 2], records[n, 3]], [records[n, 3], records[n, 4]]])
+        np.testing.assert_allclose(np.linalg.inv(conic), np.cov(seen.T) * 1e6 + 0.3 * np.eye(2), rtol=0.1, atol=0.3)
+
+
+def test_what_lies_behind_the_camera_or_beside_the_picture_is_not_rendered() -> None:
+    view = camera()
+    there = np.stack([view.centre - view.forward, view.centre + 30 * view.up + view.forward, view.centre]).astype(np.float32)
+    gaussians = replace(some(count=3), means=there, scales=np.full((3, 3), 0.1, np.float32))
+    assert render(gaussians, view).opacity.max() == 0
+
+
+def test_tiles_rendered_in_pieces_are_the_whole_and_ties_keep_their_order() -> None:
+    gaussians = some(count=40)
+    twice = gaussians.subset(np.tile(np.arange(40), 2))
+    records = np.zeros((80, RECORD), np.float32)
+    project(values_of(twice), lens_of(camera()), 3, records)
+    pairs = pairs_of(records, WIDTH, HEIGHT)
+    depth = records[pairs.gaussian, 11]
+    for begin, end in zip(pairs.begin[:-1], pairs.begin[1:], strict=True):
+        key = list(zip(depth[begin:end].tolist(), pairs.gaussian[begin:end].tolist(), strict=True))
+        assert key == sorted(key)
+    assert sorted(pairs.slot.tolist()) == list(range(len(pairs.slot)))
+    colour, light = np.empty((HEIGHT, WIDTH, 3), np.float32), np.empty((HEIGHT, WIDTH), np.float32)
+    for tile in range(len(pairs.begin) - 1):
+        raster.render_tiles(slice(tile, tile + 1), records, pairs, colour, light)
+    whole = render(twice, camera())
+    assert (whole.colour == colour).all()
+    assert (whole.opacity == 1 - light).all()
+
+
+def test_groups_hold_what_was_put_in() -> None:
+    gaussians = some(count=21, degree=1)
+    back = gaussians_from(values_of(gaussians), 21)
+    for name in ("means", "scales", "rotations", "opacities", "harmonics"):
+        np.testing.assert_allclose(getattr(back, name), getattr(gaussians, name), rtol=1e-5, atol=1e-6)
