@@ -65,6 +65,12 @@ class PosesSettings:
         "What masks and alpha channels mean: outside of them is background, and the object alone is trained, on random colours (silhouette), or pixels outside"
         " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
     )
+    mask_from: Annotated[str, Meta(pattern="^(off|static|green|white|#[0-9a-fA-F]{6})$")] = setting(
+        "off",
+        "Background that silhouettes are made from where photographs have no masks: one that stands still while the object turns (static), a screen of one"
+        " colour (green, white, #rrggbb), or none (off).",
+        advanced=True,
+    )
     test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
     llff_factor: PositiveInt | Auto = setting(
         "auto", "Reduction factor n of the LLFF images to use (images_n); auto: the largest images there are.", advanced=True
@@ -161,6 +167,8 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
         capture = importers.IMPORTERS[name].read(job.source, settings)
         for sentence in capture.warnings:
             warn(sentence)
+        made = _made_masks(job, {photo.camera.name: photo.image for photo in capture.photos if photo.mask is None}, warn)
+        capture = replace(capture, photos=tuple(replace(photo, mask=made.get(photo.camera.name, photo.mask)) for photo in capture.photos))
     else:
         capture = _find_cameras(job, settings, warn)
     if settings.strict and capture.rejected:
@@ -180,7 +188,8 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     source = job.source
     assert source is not None
     found = with_frames(job, find_material(source, settings.allow_outside, warn), max(settings.max_image_size, settings.feature_image_size), warn)
-    paths, masks = found.paths, found.masks
+    paths = found.paths
+    masks = {**found.masks, **_made_masks(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     sizes = []
     for path in paths.values():
         job.safe_point()
@@ -203,10 +212,25 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
             warn=warn,
         )
 
-    kind = silhouettes_with_surroundings(paths, masks, settings.masks, job.safe_point)
+    kind = silhouettes_with_surroundings(paths, masks, _mask_choice(settings), job.safe_point)
     # Alpha channels leave pixels out where these are no silhouettes.
     capture = _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths)) if kind else find("cameras", masks)
     return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected})
+
+
+def _made_masks(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, Path]:
+    """Masks made for these photographs, by name, as `poses.mask_from` says."""
+    from stages.masking.made import made_masks
+
+    how = job.settings.mask_from
+    if how == "off" or not paths:
+        return {}
+    return made_masks(paths, how, job.work / "masks", safe_point=job.safe_point, progress=job.progress, warn=warn)
+
+
+def _mask_choice(settings: PosesSettings) -> str:
+    """What masks mean: those that are made from a background are silhouettes."""
+    return "silhouette" if settings.mask_from != "off" and settings.masks == "auto" else settings.masks
 
 
 def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None]) -> Capture:
@@ -249,7 +273,7 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
     from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
 
     renders = _may_be_renders(capture)
-    use = find_mask_use(capture, job.settings.masks, renders, small, job.safe_point)
+    use = find_mask_use(capture, _mask_choice(job.settings), renders, small, job.safe_point)
     for sentence in use.sentences:
         job.say(sentence)
     for sentence in doubts(use):

@@ -100,7 +100,7 @@ def test_silhouettes_of_one_object_bound_the_scene(how: str, write: Callable[...
     made, said, warned = run(write(how, tmp_path / "source", ball), tmp_path)
     assert made.background == WHITE
     assert made.space == "box"
-    assert not warned
+    assert [text for text in warned if "sparse points" not in text] == []  # the fixture has few of them
     assert any("are silhouettes: " in text for text in said)
     report = json.loads((tmp_path / "poses/report.json").read_text())
     assert {facts["use"] for facts in report["masks"].values()} == {"silhouette"}

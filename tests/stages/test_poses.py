@@ -202,6 +202,25 @@ def test_masks_by_dialect(tmp_path: Path) -> None:
     assert made.views[1].mask is None
 
 
+@pytest.mark.parametrize("masks", ["auto", "ignore"])
+def test_masks_are_made_from_a_green_screen(tmp_path: Path, masks: str) -> None:
+    """Of photographs that have none; as silhouettes, unless they are to be ignored."""
+    made = captures.cameras()
+    source = captures.nerfstudio(tmp_path / "nerfstudio", made)
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    for index, camera in enumerate(made):
+        inside = np.hypot(x - WIDTH / 2, y - HEIGHT / 2) < 6 + index % 2
+        captures.write_picture(source / "images" / camera.name, np.where(inside[..., None], captures.picture(index), np.uint8([60, 190, 80])))
+    plain, _ = run(source, tmp_path / "a")
+    assert plain.background is None
+    assert all(view.mask is None for view in plain.views)
+    keyed, _ = run(source, tmp_path / "b", mask_from="green", masks=masks)
+    assert keyed.background == (None if masks == "ignore" else (1.0, 1.0, 1.0))
+    assert all(view.mask is not None for view in keyed.views) == (masks == "ignore")
+    with pytest.raises(BadInput, match="--mask #800080: no photograph shows such a background"):
+        run(source, tmp_path / "c", mask_from="#800080")
+
+
 def test_masks_of_another_size(tmp_path: Path) -> None:
     source = captures.colmap_bin(tmp_path / "source")
     mask = np.zeros((2 * HEIGHT, 2 * WIDTH), np.uint8)

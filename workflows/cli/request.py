@@ -32,6 +32,7 @@ class Options:
     budget: str | None = None
     target_mib: float | None = None
     frames: int | None = None
+    mask_from: str | None = None
     device: str | None = None
     memory: str | None = None
     strict: bool = False
@@ -107,6 +108,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         settings.put_seed(seed)
     for name, value, origin in (
         ("format", options.format, f"--as {options.format}"),
+        ("mask_from", options.mask_from, f"--mask {options.mask_from}"),
         ("strict", options.strict or None, "--strict"),
         ("allow_outside", options.allow_outside or None, "--allow-outside"),
     ):

@@ -1,0 +1,106 @@
+"""Masks as files, for photographs that have none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import BadInput
+from stages.io.pictures import UnreadableImage
+
+STATIC = "static"
+MASK_SIDE = 2048  # px, longest side of the photographs that masks are made from
+Warn = Callable[..., Any]
+
+
+def made_masks(
+    paths: Mapping[str, Path], how: str, folder: Path, *, safe_point: Callable[[], None], progress: Callable[[int, int, str], None], warn: Warn
+) -> dict[str, Path]:
+    """Name -> mask, written to a folder, of the photographs in which what is not the object could be told.
+
+    paths  photograph by name
+    how    static, green, white or #rrggbb
+    Raises BadInput where no photograph has one.
+    """
+    names = sorted(paths)
+    make = _by_stillness(paths, names, safe_point) if how == STATIC else _by_key(how)
+    folder.mkdir(parents=True, exist_ok=True)
+    found, without = {}, []
+    for number, name in enumerate(names):
+        safe_point()
+        progress(number, len(names), "masks")
+        target = folder / f"{number:05d}.png"
+        try:
+            if make(paths[name], target):
+                found[name] = target
+            else:
+                without.append(name)
+        except UnreadableImage:
+            continue  # said where it is read
+    if not found:
+        raise BadInput(f"--mask {how}: no photograph shows such a background. Choose another, or leave --mask away.")
+    if without:
+        warn(f"--mask {how}: no such background in {len(without)} of {len(names)} photographs, as in {without[0]}: they get no mask", images=without)
+    return found
+
+
+def _by_key(how: str) -> Callable[[Path, Path], bool]:
+    from stages.masking.keying import key_of, keyed
+
+    key = key_of(how)
+
+    def make(photograph: Path, target: Path) -> bool:
+        photo = _read(photograph, MASK_SIDE)
+        mask = keyed(photo.rgb, key)
+        if mask is not None:
+            _write(mask, photo, target)
+        return mask is not None
+
+    return make
+
+
+def _by_stillness(paths: Mapping[str, Path], names: list[str], safe_point: Callable[[], None]) -> Callable[[Path, Path], bool]:
+    from stages.masking.static import SIDE, StillBackground, sharpened
+
+    small: dict[Path, np.ndarray] = {}
+    for name in names:
+        safe_point()
+        try:
+            small[paths[name]] = _read(paths[name], SIDE).rgb
+        except UnreadableImage:
+            continue
+    shapes = [each.shape for each in small.values()]
+    usual = max(dict.fromkeys(shapes), key=shapes.count, default=None)
+    still = StillBackground(np.stack([each for each in small.values() if each.shape == usual]) if usual else np.zeros((0, 1, 1, 3), np.uint8))
+
+    def make(photograph: Path, target: Path) -> bool:
+        photo = _read(photograph, MASK_SIDE)
+        if small[photograph].shape != usual:
+            return False
+        mask = still.mask(small[photograph])
+        if not mask.any():
+            return False
+        _write(sharpened(mask, photo.rgb), photo, target)
+        return True
+
+    return make
+
+
+def _read(path: Path, side: int) -> Any:
+    from stages.io.photo import read_photo
+
+    return read_photo(path, side)
+
+
+def _write(mask: np.ndarray, photo: Any, target: Path) -> None:
+    """At the photograph's own size."""
+    import cv2
+
+    from stages.io.png import write_png
+
+    if mask.shape != (photo.height, photo.width):
+        mask = cv2.resize(mask, (photo.width, photo.height), interpolation=cv2.INTER_LINEAR)
+    write_png(mask, target, durable=False)

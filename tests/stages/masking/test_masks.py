@@ -1,0 +1,156 @@
+"""Masks that are made: of screens of one colour, and of backgrounds that stand still."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.errors import BadInput
+from stages.io.png import read_png, write_png
+from stages.masking.keying import key_of, keyed, without_specks
+from stages.masking.made import made_masks
+from stages.masking.static import StillBackground
+
+H, W = 96, 128
+
+
+def disc(centre: tuple[float, float], radius: float) -> np.ndarray:
+    """(H, W) from 0 to 1, soft at its edge."""
+    y, x = np.mgrid[:H, :W] + 0.5
+    return np.clip(radius - np.hypot(x - centre[0], y - centre[1]) + 0.5, 0, 1)
+
+
+def photograph(behind: np.ndarray, cover: np.ndarray, seed: int, noise: float = 2.0) -> np.ndarray:
+    """A textured disc over what is behind (H, W, 3), with noise."""
+    rng = np.random.default_rng(seed)
+    texture = cv2.resize(rng.integers(20, 236, (24, 32, 3)).astype(np.uint8), (W, H), interpolation=cv2.INTER_CUBIC).astype(float)
+    texture[..., 1] = np.minimum(texture[..., 1], texture[..., [0, 2]].max(-1))  # nothing greener than it is red or blue
+    mixed = texture * cover[..., None] + behind * (1 - cover[..., None]) + rng.normal(0, noise, (H, W, 3))
+    return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
+
+
+def uneven(colour: tuple[float, float, float]) -> np.ndarray:
+    """A screen lit from the left."""
+    return np.asarray(colour) * np.linspace(1.1, 0.75, W)[None, :, None] * np.linspace(1, 0.9, H)[:, None, None]
+
+
+def overlap(mask: np.ndarray, cover: np.ndarray) -> float:
+    """Intersection over union."""
+    one, two = mask > 127, cover > 0.5
+    return float((one & two).sum() / (one | two).sum())
+
+
+@pytest.mark.parametrize(("name", "colour"), [("green", (60, 190, 80)), ("green", (30, 120, 50)), ("#3cbe50", (60, 190, 80)), ("#2060d0", (32, 96, 208))])
+def test_an_unevenly_lit_screen_is_told_from_what_stands_before_it(name: str, colour: tuple[int, int, int]) -> None:
+    cover = disc((70, 50), 30)
+    texture = photograph(uneven(colour), cover, 0)
+    if name == "#2060d0":  # the object is not blue
+        texture[cover > 0.99] = texture[cover > 0.99][:, [2, 1, 0]] * [1, 1, 0.3]
+    mask = keyed(texture, key_of(name))
+    assert mask is not None
+    assert overlap(mask, cover) > 0.96
+
+
+def test_a_hole_shows_a_green_screen_and_white_inside_an_object_stays() -> None:
+    ring = np.minimum(disc((64, 48), 36), 1 - disc((64, 48), 12))
+    through = keyed(photograph(uneven((60, 190, 80)), ring, 1), key_of("green"))
+    assert through is not None
+    assert overlap(through, ring) > 0.94  # its edges are as long as 40 % of its pixels
+    assert through[48, 64] == 0
+    before_white = photograph(np.full((H, W, 3), 235.0), disc((64, 48), 36), 2)
+    before_white[40:56, 56:72] = 235  # a white label on the object
+    whole = keyed(before_white, key_of("white"))
+    assert whole is not None
+    assert whole[48, 64] == 255
+    assert overlap(whole, disc((64, 48), 36)) > 0.95
+
+
+def test_a_shadow_on_a_coloured_screen_is_no_object() -> None:
+    cover = disc((70, 40), 24)
+    behind = uneven((60, 190, 80)) * (1 - 0.35 * disc((50, 70), 20))[..., None]
+    mask = keyed(photograph(behind, cover, 3), key_of("green"))
+    assert mask is not None
+    assert overlap(mask, cover) > 0.95
+
+
+@pytest.mark.parametrize("name", ["green", "white", "#ff00ff"])
+def test_what_has_no_such_screen_has_no_mask(name: str) -> None:
+    assert keyed(photograph(np.full((H, W, 3), (120.0, 90.0, 70.0)), disc((64, 48), 20), 4), key_of(name)) is None
+
+
+@pytest.mark.parametrize("name", ["", "red", "#12", "#gggggg", "0x112233"])
+def test_keys_are_names_or_colours(name: str) -> None:
+    with pytest.raises(ValueError, match=r"#rrggbb|hexadecimal|fromhex"):
+        key_of(name)
+
+
+def test_specks_and_pinholes_go() -> None:
+    mask = np.zeros((300, 300), np.uint8)
+    mask[50:250, 50:250] = 255
+    mask[100, 100] = 0
+    mask[10, 10] = 255
+    cleaned = without_specks(mask)
+    assert cleaned[100, 100] == 255
+    assert cleaned[10, 10] == 0
+    assert (cleaned[50:250, 50:250] == 255).all()
+
+
+def turned(number: int, count: int = 9) -> tuple[np.ndarray, np.ndarray]:
+    """What a camera on a stand sees of an object that turns: a disc whose texture changes and that moves a little; and where it is."""
+    wall = cv2.resize(np.random.default_rng(9).integers(40, 200, (12, 16, 3)).astype(np.uint8), (W, H), interpolation=cv2.INTER_CUBIC).astype(float)
+    cover = disc((64 + 4 * np.cos(6.28 * number / count), 50), 24)
+    return photograph(wall * (1 + 0.04 * np.sin(number)), cover, 20 + number), cover
+
+
+def test_a_background_that_stands_still_is_left_out() -> None:
+    pictures = [turned(number) for number in range(9)]
+    still = StillBackground(np.stack([picture for picture, _ in pictures]))
+    for picture, cover in pictures:
+        assert overlap(still.mask(picture), cover) > 0.85
+
+
+def test_a_background_that_moves_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    walls = [cv2.resize(rng.integers(0, 255, (12, 16, 3)).astype(np.uint8), (W, H)) for _ in range(8)]
+    with pytest.raises(BadInput, match="of the border is the same in most photographs"):
+        StillBackground(np.stack(walls))
+    with pytest.raises(BadInput, match="needs at least 5 photographs of one size; these are 2"):
+        StillBackground(np.stack(walls[:2]))
+
+
+def written(folder: Path, pictures: list[np.ndarray]) -> dict[str, Path]:
+    folder.mkdir()
+    for number, picture in enumerate(pictures):
+        write_png(picture, folder / f"{number}.png")
+    return {path.name: path for path in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("how", ["static", "green"])
+def test_masks_are_files_at_the_size_of_their_photographs(tmp_path: Path, how: str) -> None:
+    pairs = [turned(number) for number in range(6)]
+    if how == "green":
+        pairs = [(photograph(uneven((60, 190, 80)), cover, number), cover) for number, (_, cover) in enumerate(pairs)]
+    other = np.full((40, 90, 3), 128, np.uint8)  # of another size, and without a screen
+    paths = written(tmp_path / "photographs", [*(picture for picture, _ in pairs), other])
+    (tmp_path / "photographs" / "torn.png").write_bytes(b"\x89PNG torn")
+    told: list[str] = []
+    masks = made_masks(
+        {**paths, "torn.png": tmp_path / "photographs" / "torn.png"}, how, tmp_path / "masks",
+        safe_point=lambda: None, progress=lambda *_: None, warn=lambda text, **_: told.append(text),
+    )  # fmt: skip
+    assert sorted(masks) == sorted(paths)[:6]
+    for (_, cover), path in zip(pairs, masks.values(), strict=True):
+        mask = read_png(path)
+        assert mask.shape == (H, W)
+        assert overlap(mask, cover) > 0.85
+    assert len(told) == 1
+    assert told[0] == f"--mask {how}: no such background in 1 of 8 photographs, as in 6.png: they get no mask"
+
+
+def test_no_mask_at_all_is_refused(tmp_path: Path) -> None:
+    paths = written(tmp_path / "photographs", [turned(0)[0]])
+    with pytest.raises(BadInput, match="--mask white: no photograph shows such a background"):
+        made_masks(paths, "white", tmp_path / "masks", safe_point=lambda: None, progress=lambda *_: None, warn=lambda *_, **__: None)
