@@ -29,8 +29,9 @@ import numpy as np
 from pipeline.errors import PipelineError
 from pipeline.text import printable
 
-FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF")  # Pillow's names; a JPEG of several pictures (MPO) comes with JPEG
-LOSSY = ("JPEG", "MPO", "WEBP", "HEIF")  # without a clean zero
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "RAW")  # Pillow's names, and our own; a JPEG of several pictures (MPO) comes with JPEG
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are TIFFs of a thumbnail to other readers
+LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")  # without a clean zero
 MAX_SIDE = 65_535  # pixels
 MAX_PIXELS = 178_956_970  # of a picture, from its header, before anything is decoded; Pillow's own limit
 FEW_PIXELS = 32_000_000  # whatever the size of the file: memory stays within a few hundred MB
@@ -80,7 +81,9 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
     try:
         with _regular_file(path) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow remarks on damaged EXIF blocks, which do no harm here
-            with Image.open(file, formats=_possible(file, formats)) as image:
+            raw = path.suffix.lower() in RAW_SUFFIXES and "RAW" in formats
+            image: Any
+            with _raw(file) if raw else Image.open(file, formats=_possible(file, formats)) as image:
                 _check_size(*image.size, file.size)
                 yield image
     except (UnreadableImage, MemoryError, PipelineError):
@@ -124,22 +127,32 @@ def _check_size(width: int, height: int, size: int) -> None:
 
 
 def _possible(file: _Bounded, formats: Sequence[str]) -> tuple[str, ...]:
-    """The decoders that may try. HEIF's is asked only for files of its kind, so that others never load it."""
-    head = file.read(12)
+    """The decoders that may try. Those of HEIF and AVIF are asked only for files of their kind, so that others never load them."""
+    head = file.read(64)
     file.seek(0)
+    brands = head[8 : min(64, int.from_bytes(head[:4], "big"))]
+    if head[4:8] == b"ftyp" and (b"avif" in brands or b"avis" in brands) and "AVIF" in formats:
+        return ("AVIF",)
     if head[4:8] == b"ftyp" and "HEIF" in formats:
         import pillow_heif
 
         pillow_heif.register_heif_opener()
         return ("HEIF",)
-    return tuple(name for name in formats if name != "HEIF")
+    return tuple(name for name in formats if name not in ("HEIF", "AVIF", "RAW"))
+
+
+def _raw(file: _Bounded) -> Any:
+    """A camera's raw picture."""
+    from stages.io.raw import RawFile
+
+    return RawFile(file)
 
 
 def _reason(error: Exception) -> str:
     from PIL import Image, UnidentifiedImageError
 
     if isinstance(error, UnidentifiedImageError):
-        return "no picture in a format that is read (PNG, JPEG, WebP, TIFF, BMP, HEIF), or damaged at its start"
+        return "no picture in a format that is read (PNG, JPEG, WebP, TIFF, BMP, HEIF, AVIF, camera raw), or damaged at its start"
     if isinstance(error, Image.DecompressionBombError):
         return f"more than {MAX_PIXELS // 10**6} million pixels"
     if isinstance(error, OSError) and error.strerror:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.errors import BadInput
-from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in
+from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, one_of_each
 from stages.video.reading import KNOWN, SUFFIXES
 
 MASKS = "masks"
@@ -47,7 +47,7 @@ def photographs(source: Source) -> list[Path]:
     if not found:
         everything = source.walk()
         usable = [path for path in everything if not NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1])]
-        found = sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES) or sorted(filter(is_video, usable))
+        found = one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES)) or sorted(filter(is_video, usable))
         if not found:
             raise BadInput(_nothing(folder, everything))
     if len(found) > MAX_FRAMES:
@@ -90,7 +90,7 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
 
 
 def _nothing(folder: Path, everything: Sequence[Path]) -> str:
-    known = f"png, jpg, webp, tif, bmp, heic or avif; {KNOWN}"
+    known = f"png, jpg, webp, tif, bmp, heic, avif or camera raw; {KNOWN}"
     if not everything:
         return f"{folder}: the folder is empty. Expected at least {MIN_IMAGES} photographs or a video ({known}), or a posed data set."
     common = Counter(path.suffix.lower() or "(no extension)" for path in everything).most_common(3)

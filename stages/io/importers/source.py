@@ -20,8 +20,9 @@ from efficientnerf.settings import Auto
 from pipeline import files, run
 from pipeline.errors import BadInput
 from pipeline.text import printable
+from stages.io.pictures import RAW_SUFFIXES
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".hif")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".hif", ".avif", *RAW_SUFFIXES)
 MAX_FRAMES = 100_000
 MAX_FILES = 1_000_000  # entries of a source folder
 MAX_PATH = 4096  # characters of a listed name
@@ -228,7 +229,13 @@ def images_in(folder: Path) -> list[Path]:
     """The image files directly in a folder, sorted by name."""
     if not os.path.isdir(folder):
         return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file())
+    return one_of_each(sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()))
+
+
+def one_of_each(images: Sequence[Path]) -> list[Path]:
+    """Without a camera's raw pictures that lie beside the same as JPEG or the like."""
+    developed = {path.with_suffix("") for path in images if path.suffix.lower() not in RAW_SUFFIXES}
+    return [path for path in images if path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in developed]
 
 
 def missing_images_warning(where: str, total: int, kept: int, missing: Sequence[str], strict: bool, remedy: str) -> list[str]:

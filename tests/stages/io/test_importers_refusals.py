@@ -62,8 +62,8 @@ def test_an_empty_folder(tmp_path: Path) -> None:
 
 def test_no_images_of_a_known_type(tmp_path: Path) -> None:
     for index in range(3):
-        (tmp_path / f"{index}.cr3").write_bytes(b"x")
-    refusal(tmp_path, "no images of a known type", "3 .cr3", "Convert")
+        (tmp_path / f"{index}.psd").write_bytes(b"x")
+    refusal(tmp_path, "no images of a known type", "3 .psd", "Convert")
 
 
 @pytest.mark.parametrize("name", ["nerfstudio", "llff", "colmap"])

@@ -86,7 +86,7 @@ def test_other_formats_are_refused(tmp_path: Path, kind: str) -> None:
         pictures.read_header(path)
 
 
-@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF"])
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF"])
 def test_the_content_decides_and_not_the_suffix(tmp_path: Path, kind: str) -> None:
     import pillow_heif
 
@@ -293,7 +293,7 @@ def test_sizes_are_bounded_before_anything_is_decoded(tmp_path: Path, size: tupl
         working_images.write(masked, tmp_path / "out", "a.png", max_side=64)
 
 
-@pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF", "WEBP", "BMP", "HEIF"])
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF", "WEBP", "BMP", "HEIF", "AVIF"])
 def test_mutated_pictures_are_read_or_unreadable(tmp_path: Path, kind: str) -> None:
     import pillow_heif
 
