@@ -84,7 +84,8 @@ def opened(path: Path, formats: Sequence[str] = FORMATS) -> Iterator[Any]:
             raw = path.suffix.lower() in RAW_SUFFIXES and "RAW" in formats
             image: Any
             with _raw(file) if raw else Image.open(file, formats=_possible(file, formats)) as image:
-                _check_size(*image.size, file.size)
+                width, height = image.size
+                _check_size(width, height, file.size)
                 yield image
     except (UnreadableImage, MemoryError, PipelineError):
         raise
