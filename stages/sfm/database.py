@@ -107,6 +107,20 @@ def copy_rows(source: Path, target: Path, tables: Sequence[tuple[str, str]], key
             _insert(fresh, tables, rows)
 
 
+def copy_database(work: Path, place: Path) -> None:
+    """A copy of the database in another scratch folder, in the place of what is there."""
+    remove_database(place)
+    with contextlib.closing(sqlite3.connect(database_path(work))) as old, contextlib.closing(sqlite3.connect(database_path(place))) as fresh:
+        old.backup(fresh)
+
+
+def forget(work: Path, tables: Sequence[tuple[str, str]], keys: Sequence[int]) -> None:
+    """Remove the rows of these keys."""
+    with contextlib.closing(sqlite3.connect(database_path(work))) as connection, connection:
+        for table, column in tables:
+            connection.executemany(f"DELETE FROM {table} WHERE {column} = ?", [(key,) for key in keys])
+
+
 def record(work: Path, name: str, tables: Sequence[tuple[str, str]], keys: Sequence[int]) -> None:
     """Note that the rows of these keys are written: the next call copies them, and no others."""
     with contextlib.closing(sqlite3.connect(database_path(work))) as connection:

@@ -131,6 +131,12 @@ class Copy:
     remark: str
 
 
+def images_of(work: Path) -> Path:
+    """The folder of the copies: of a rung's own scratch folder that of the folder it lies in."""
+    here = work / "images"
+    return here if here.is_dir() else work.parent / "images"
+
+
 def _file(index: int) -> str:
     return f"{index:05d}.png"
 

@@ -1,18 +1,133 @@
-"""From features to verified matches of the pairs that are worth comparing."""
+"""From features to cameras, rung by rung: each is tried where those before it left photographs without a camera, and what it finds is kept where it is better.
+
+    1  the matches of the pairs that are worth comparing, and COLMAP's mapper
+    2  the mapper goes on from there with fewer matches to a photograph
+    3  photographs without a camera are matched again, with more of the others, and along the geometry of the first matches
+    4  more features are detected in them, of less contrast
+    5  the mapper begins anew from another pair, with smaller angles
+
+The rungs 3 and 4 work in a scratch folder of their own that is made anew: what a killed call has left there would change the rungs before.
+docs/experiments/sfm.md
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from stages.sfm import matches, pairs
-from stages.sfm.database import database_path, inlier_counts
+from pipeline.files import remove
+from stages.sfm import mapping, matches, pairs
+from stages.sfm.database import FEATURES, PAIRS, copy_database, database_path, forget, inlier_counts, pair_id_of
 from stages.sfm.images import Progress, SafePoint, WorkImage
 
 MAX_EXHAUSTIVE = 60  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
 OVERLAPPING = 30  # verified matches, from which two photographs are said to overlap
 FEW_NEIGHBOURS = 3  # photographs that one overlaps with; of fewer, more are looked for
 WIDER = 48  # photographs that are most like one, which it is compared with then
+ENOUGH = 0.9  # of the photographs with a camera, from which the costlier rungs are not tried; and
+AGREEING = 0.8  # of the verified matches, that agree with the cameras
+BETTER = 1.005  # times the score, from which a later rung is better than an earlier one
+MORE_FEATURES, LESS_CONTRAST = 2, 0.35
+
+
+@dataclass(frozen=True)
+class Found:
+    """
+    models  sub-models, largest first
+    work    the scratch folder whose database they are of
+    rungs   what was tried: its name, the number of photographs that had a camera then, and the share of matches that agreed
+    """
+
+    models: list[Any]
+    work: Path
+    rungs: list[dict[str, object]]
+
+
+class _Climb:
+    """The rungs so far, and the best of them: by the number of registered photographs times the share of the matches that agree."""
+
+    def __init__(self, work: Path, images: Sequence[WorkImage]) -> None:
+        self.images = images
+        self.found = Found([], work, [])
+        self._score = 0.0
+        self._agreement = 0.0
+
+    def tried(self, rung: str, work: Path, models: list[Any]) -> None:
+        agreement = mapping.match_agreement(work, self.images, models[0]) if models else 0.0
+        rungs = [*self.found.rungs, {"rung": rung, "registered": mapping.num_registered(models), "agreeing": round(agreement, 4)}]
+        score = mapping.num_registered(models) * agreement
+        better = score > BETTER * self._score
+        if better:
+            self._score, self._agreement = score, agreement
+        self.found = Found(models, work, rungs) if better else Found(self.found.models, self.found.work, rungs)
+
+    def missing(self) -> list[int]:
+        """The positions of the photographs without a camera."""
+        there = {image.name for image in self.found.models[0].images.values() if image.has_pose} if self.found.models else set()
+        return [position for position, image in enumerate(self.images) if image.file not in there]
+
+    def is_enough(self) -> bool:
+        return mapping.num_registered(self.found.models) >= ENOUGH * len(self.images) and self._agreement >= AGREEING
+
+
+def find_models(
+    work: Path, images: Sequence[WorkImage], how: str, *, features: int, seed: int, threads: int, progress: Progress, safe_point: SafePoint
+) -> Found:
+    """The best of what the rungs find, the features being detected.
+
+    how      pairs that are matched, as `match` takes it
+    threads  on which features are detected, and processes in which pairs are matched
+    """
+    quiet: dict[str, Any] = {"progress": progress, "safe_point": safe_point}
+    match(work, images, how, seed=seed, workers=threads, **quiet)
+    climb = _Climb(work, images)
+    climb.tried(how, work, mapping.sub_models(work, images, seed, mapping.DEFAULTS, **quiet))
+    if climb.missing() and climb.found.models:
+        climb.tried("fewer matches", work, mapping.continued(work, images, climb.found.models[0], seed, mapping.RELAXED, **quiet))
+    place = work / "rungs"
+    remove(place)
+    if climb.missing():
+        place.mkdir()
+        copy_database(work, place)
+        for rung, more in (("wider matching", False), ("more features", True)):
+            weak = climb.missing()
+            if not weak or (more and climb.is_enough()):
+                break
+            if more:
+                _detect_more(place, images, weak, features=features, threads=threads, **quiet)
+            _match_again(place, images, weak, rung, seed=seed, workers=threads, **quiet)
+            if climb.found.models:
+                models = mapping.continued(place, images, climb.found.models[0], seed, mapping.RELAXED, **quiet)
+            else:
+                models = mapping.sub_models(place, images, seed, mapping.RELAXED, **quiet)
+            climb.tried(rung, place, models)
+    for rung, options in (("another beginning", mapping.RELAXED), ("small angles", mapping.FORWARD)):
+        if not climb.is_enough():
+            climb.tried(rung, place, mapping.sub_models(place if place.is_dir() else work, images, seed, options, **quiet))
+    return climb.found
+
+
+def _detect_more(place: Path, images: Sequence[WorkImage], weak: Sequence[int], *, features: int, threads: int, **quiet: Any) -> None:
+    """More features in the place of those of some photographs, whose pairs are forgotten."""
+    count = len(images)
+    forget(place, FEATURES, [i + 1 for i in weak])
+    forget(place, PAIRS, [pair_id_of(a + 1, b + 1) for i in weak for j in range(count) if i != j for a, b in [pairs.ordered(i, j)]])
+    chosen = [images[i] for i in weak]
+    matches.extract_features(place, chosen, features=MORE_FEATURES * features, threads=threads, contrast=LESS_CONTRAST, **quiet)
+
+
+def _match_again(place: Path, images: Sequence[WorkImage], weak: Sequence[int], rung: str, *, seed: int, workers: int, **quiet: Any) -> None:
+    """Match some photographs with more of the others, or again with those that they do not overlap with for sure."""
+    near = neighbours(place, len(images))
+    if len(images) <= MAX_EXHAUSTIVE:
+        wanted = {pairs.ordered(i, j) for i in weak for j in range(len(images)) if i != j}
+    else:
+        wanted = pairs.wider_pairs(matches.likeness(place, seed, quiet["safe_point"]), weak, near, WIDER)
+    wanted = {(i, j) for i, j in wanted if j not in near[i]}
+    forget(place, PAIRS, [pair_id_of(i + 1, j + 1) for i, j in sorted(wanted)])
+    matches.match_pairs(place, images, wanted, seed=seed, workers=workers, name=f"{rung.split()[0]}_", guided=True, **quiet)
 
 
 def matching_for(count: int) -> str:

@@ -1,4 +1,4 @@
-"""Verified matches to cameras: COLMAP's incremental mapper, attempted with stricter options first, and a final robust bundle adjustment.
+"""Verified matches to cameras: COLMAP's incremental mapper, and a final robust bundle adjustment. `stages.sfm.ladder` says what is attempted when.
 
 See docs/experiments/sfm.md.
 """
@@ -15,45 +15,37 @@ from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.files import remove
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
 from stages.sfm.database import database_path, verified_pairs
-from stages.sfm.images import Progress, SafePoint, WorkImage
+from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 
 MIN_MODEL_SIZE = 3  # registered photographs
-
-# A later attempt is made only where photographs are not registered by the one before. The first has COLMAP's defaults: an initial pair with a
-# triangulation angle of 16 degrees and 100 inliers. The second is for little texture and little parallax. The third also keeps two-view tracks and points
-# with small triangulation angles, as of forward motion.
-_RELAXED = {"mapper": {"init_min_tri_angle": 4.0, "init_min_num_inliers": 40, "abs_pose_min_num_inliers": 15}}
-ATTEMPTS: tuple[Mapping[str, Mapping[str, object]], ...] = (
-    {},
-    _RELAXED,
-    {
-        "mapper": {**_RELAXED["mapper"], "init_max_forward_motion": 1.0, "filter_min_tri_angle": 0.5},
-        "triangulation": {"ignore_two_view_tracks": False, "min_angle": 0.5},
-    },
-)
-MIN_REGISTERED_RATIO = 0.9  # of the photographs; with more registered, the third attempt is not made
+# Options of attempts. COLMAP's defaults want an initial pair with a triangulation angle of 16 degrees and 100 inliers. RELAXED is for little texture and
+# little parallax. FORWARD also keeps two-view tracks and points with small triangulation angles, as of forward motion.
+Options = Mapping[str, Mapping[str, object]]
+DEFAULTS: Options = {}
+RELAXED: Options = {"mapper": {"init_min_tri_angle": 4.0, "init_min_num_inliers": 40, "abs_pose_min_num_inliers": 15}}
+FORWARD: Options = {
+    "mapper": {**RELAXED["mapper"], "init_max_forward_motion": 1.0, "filter_min_tri_angle": 0.5},
+    "triangulation": {"ignore_two_view_tracks": False, "min_angle": 0.5},
+}
 
 
-def best_models(work: Path, images: Sequence[WorkImage], seed: int, progress: Progress, safe_point: SafePoint) -> list[Any]:
-    """The sub-models of the best attempt, by the number of registered photographs times `match_agreement`, largest first."""
-    best: list[Any] = []
-    best_score = -1.0
-    for attempt, options_of_attempt in enumerate(ATTEMPTS):
-        if num_registered(best) >= (len(images) if attempt == 1 else MIN_REGISTERED_RATIO * len(images)):
-            break
-        models = _incremental_mapping(work, len(images), seed, options_of_attempt, progress, safe_point)
-        models = _with_exif_focal(work, images, seed, options_of_attempt, models, progress, safe_point)
-        score = num_registered(models) * match_agreement(work, images, models[0]) if models else 0.0
-        if score > best_score:
-            best, best_score = models, score
-    return best
+def sub_models(work: Path, images: Sequence[WorkImage], seed: int, options: Options, progress: Progress, safe_point: SafePoint) -> list[Any]:
+    """The sub-models that are found from the matches, largest first."""
+    models = _incremental_mapping(work, len(images), seed, options, progress, safe_point)
+    return _with_exif_focal(work, images, seed, options, models, progress, safe_point)
+
+
+def continued(work: Path, images: Sequence[WorkImage], model: Any, seed: int, options: Options, progress: Progress, safe_point: SafePoint) -> list[Any]:
+    """A model with more photographs registered, as far as the matches of `work` let them, and other sub-models; largest first."""
+    fixed = any(camera.focal_length == prior for camera, prior in _cameras_with_exif_focal(images, model))
+    return _incremental_mapping(work, len(images), seed, options, progress, safe_point, refine_camera=not fixed, start=model)
 
 
 def _with_exif_focal(
     work: Path,
     images: Sequence[WorkImage],
     seed: int,
-    options_of_attempt: Mapping[str, Mapping[str, object]],
+    options_of_attempt: Options,
     models: list[Any],
     progress: Progress,
     safe_point: SafePoint,
@@ -83,13 +75,17 @@ def _incremental_mapping(
     work: Path,
     count: int,
     seed: int,
-    options_of_attempt: Mapping[str, Mapping[str, object]],
+    options_of_attempt: Options,
     progress: Progress,
     safe_point: SafePoint,
     *,
     refine_camera: bool = True,
+    start: Any = None,
 ) -> list[Any]:
-    """All sub-models, by the number of registered photographs, then of points. On one thread: with two the results vary."""
+    """All sub-models, by the number of registered photographs, then of points. On one thread: with two the results vary.
+
+    start  a model to go on from
+    """
     with quiet_pycolmap() as pycolmap:
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = options.mapper.num_threads = 1
@@ -107,16 +103,27 @@ def _incremental_mapping(
             registered = min(registered + 1, count)
             progress(registered, count, "registering images")
 
-        output = work / "models"
-        remove(output)
-        output.mkdir()
+        output, begun = work / "models", work / "model_so_far"
+        for folder in (output, begun):
+            remove(folder)
+            folder.mkdir()
+        if start is not None:
+            start.write(begun)
+            registered = start.num_reg_images()
         pycolmap.set_random_seed(seed)
         safe_point()
         with every_image_read(pycolmap, work):  # for the colours of its points
             models = pycolmap.incremental_mapping(
-                database_path(work), work / "images", output, options, initial_image_pair_callback=one_more, next_image_callback=one_more
+                database_path(work),
+                images_of(work),
+                output,
+                options,
+                begun if start is not None else "",
+                initial_image_pair_callback=one_more,
+                next_image_callback=one_more,
             )
-        remove(output)
+        for folder in (output, begun):
+            remove(folder)
     safe_point()
     return [model for _, model in sorted(models.items(), key=lambda item: (-item[1].num_reg_images(), -item[1].num_points3D(), item[0]))]
 

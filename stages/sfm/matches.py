@@ -12,7 +12,7 @@ from stages.io.png import FAST, write_png
 from stages.sfm import pair_workers
 from stages.sfm.colmap import num_threads, quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, pair_id_of, record, verified_pairs
-from stages.sfm.images import Progress, SafePoint, WorkImage
+from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 from stages.sfm.pairs import Pair, in_blocks, likeness_of, ordered
 
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md
@@ -20,27 +20,38 @@ MAX_WORKERS = 8  # processes that match pairs
 PAIRS_A_WORKER = 96  # a process is not worth its start for fewer
 
 
-def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, threads: int | None = None, progress: Progress, safe_point: SafePoint) -> None:
+def extract_features(
+    work: Path,
+    images: Sequence[WorkImage],
+    *,
+    features: int,
+    threads: int | None = None,
+    contrast: float = 1.0,
+    progress: Progress,
+    safe_point: SafePoint,
+) -> None:
     """SIFT features of the images that have none yet, a few images at a time.
 
-    threads  None: as many as the process may use. An image's features do not depend on them
+    threads   None: as many as the process may use. An image's features do not depend on them
+    contrast  that a feature must have, of COLMAP's default
     """
-    threads = threads or num_threads()
+    threads, place = threads or num_threads(), images_of(work).parent
     with quiet_pycolmap() as pycolmap:
         with pycolmap.Database.open(database_path(work)) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
             known = {name for name, image_id in ids.items() if database.exists_descriptors(image_id)}
         reader = pycolmap.ImageReaderOptions()
-        if any((work / "masks").glob("*.png")):
+        if any((place / "masks").glob("*.png")):
             for image in images:  # COLMAP skips an image whose mask is missing
-                if not (work / "masks" / f"{image.file}.png").exists():
+                if not (place / "masks" / f"{image.file}.png").exists():
                     everything = np.full((image.work_height, image.work_width), 255, np.uint8)
-                    write_png(everything, work / "masks" / f"{image.file}.png", compress_level=FAST, durable=False)
-            reader.mask_path = work / "masks"
+                    write_png(everything, place / "masks" / f"{image.file}.png", compress_level=FAST, durable=False)
+            reader.mask_path = place / "masks"
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu = False
         options.num_threads = threads
         options.sift.max_num_features = features
+        options.sift.peak_threshold *= contrast
         done = len(known)
         progress(done, len(images), "detecting features")
         for octave in (-1, 0):
@@ -51,9 +62,9 @@ def extract_features(work: Path, images: Sequence[WorkImage], *, features: int, 
                 some = [image.file for image in todo[start : start + 2 * threads]]
                 for _ in range(2):
                     pycolmap.extract_features(
-                        database_path(work), work / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+                        database_path(work), place / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
                     )
-                    if not _check_readable(work, _without_features(pycolmap, work, ids, some)):
+                    if not _check_readable(place, _without_features(pycolmap, work, ids, some)):
                         break
                 record(work, f"features_{Path(some[0]).stem}", FEATURES, [ids[file] for file in some])
                 done += len(some)
@@ -66,11 +77,11 @@ def _without_features(pycolmap: Any, work: Path, ids: Mapping[str, int], files: 
         return [file for file in files if not database.exists_descriptors(ids[file])]
 
 
-def _check_readable(work: Path, files: Sequence[str]) -> bool:
+def _check_readable(place: Path, files: Sequence[str]) -> bool:
     """Whether there are any; raises the OSError that may have kept COLMAP from reading one, for it goes on without."""
     for file in files:
-        (work / "images" / file).read_bytes()
-        if (mask := work / "masks" / f"{file}.png").exists():
+        (place / "images" / file).read_bytes()
+        if (mask := place / "masks" / f"{file}.png").exists():
             mask.read_bytes()
     return bool(files)
 
@@ -87,12 +98,22 @@ def likeness(work: Path, seed: int, safe_point: SafePoint) -> np.ndarray:
 
 
 def match_pairs(
-    work: Path, images: Sequence[WorkImage], wanted: Iterable[Pair], *, seed: int, workers: int = 1, name: str = "", progress: Progress, safe_point: SafePoint
+    work: Path,
+    images: Sequence[WorkImage],
+    wanted: Iterable[Pair],
+    *,
+    seed: int,
+    workers: int = 1,
+    name: str = "",
+    guided: bool = False,
+    progress: Progress,
+    safe_point: SafePoint,
 ) -> None:
     """Matches and two-view geometries of those of the wanted pairs that have none yet, a block at a time.
 
     workers  processes that may be busy at the same time; a pair's matches do not depend on them
     name     of the notes, one for each call on the same photographs
+    guided   whether more matches are looked for along the geometry that the first ones fit, among less distinct ones
 
     A process compares on one thread: COLMAP's FAISS multiplies matrices by an OpenBLAS that is not thread-safe, which gave wrong matches in about one of
     sixty runs (docs/experiments/sfm.md). COLMAP verifies in another thread meanwhile, without BLAS.
@@ -119,11 +140,11 @@ def match_pairs(
 
     busy = min(workers, MAX_WORKERS, left // PAIRS_A_WORKER)
     if busy > 1:
-        pair_workers.match(work, blocks, seed=seed, workers=busy, more=more, safe_point=safe_point)
+        pair_workers.match(work, blocks, seed=seed, guided=guided, workers=busy, more=more, safe_point=safe_point)
         return
     names = {image_id: file for file, image_id in ids.items()}
     for note, block in blocks.items():
         safe_point()
-        pair_workers.match_block(database_path(work), work / "pairs.txt", block, names, seed)
+        pair_workers.match_block(database_path(work), work / "pairs.txt", block, names, seed, guided)
         record(work, note, PAIRS, [pair_id_of(*pair) for pair in block])
         more(len(block))

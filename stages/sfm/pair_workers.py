@@ -19,6 +19,7 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, copy_rows, database_path, pair_id_of, record
 from stages.sfm.images import SafePoint
 
+GUIDED_RATIO = 0.88  # of the distances of the two best; COLMAP's own is 0.8
 LOOK = 0.1  # seconds between two looks at the workers
 Block = Sequence[tuple[int, int]]  # of image ids, the smaller first
 
@@ -27,7 +28,7 @@ class _Stopped(Exception):
     """Another worker has failed, or the user has asked to stop."""
 
 
-def match(work: Path, blocks: Mapping[str, Block], *, seed: int, workers: int, more: Callable[[int], None], safe_point: SafePoint) -> None:
+def match(work: Path, blocks: Mapping[str, Block], *, seed: int, guided: bool, workers: int, more: Callable[[int], None], safe_point: SafePoint) -> None:
     """Match blocks of pairs, by the name of the note of each.
 
     more  is told of the number of pairs that are done
@@ -50,7 +51,7 @@ def match(work: Path, blocks: Mapping[str, Block], *, seed: int, workers: int, m
                 counts.append(len(blocks[name]))
 
         mine = names[number::workers]
-        arguments = {"work": str(work), "scratch": str(scratch), "seed": seed, "blocks": [list(map(list, blocks[name])) for name in mine]}
+        arguments = {"work": str(work), "scratch": str(scratch), "seed": seed, "guided": guided, "blocks": [list(map(list, blocks[name])) for name in mine]}
         try:
             process.run(arguments, task="pairs", progress=finished, safe_point=go_on, warn=lambda *_, **__: None)
         except _Stopped:
@@ -88,12 +89,12 @@ def match_for(arguments: Mapping[str, Any], *, progress: Callable[..., None], sa
     for position, block in enumerate(arguments["blocks"]):
         safe_point()
         _take_features(work, scratch, sorted({image for pair in block for image in pair}))
-        match_block(database_path(scratch), scratch / "pairs.txt", [(i, j) for i, j in block], names, arguments["seed"])
+        match_block(database_path(scratch), scratch / "pairs.txt", [(i, j) for i, j in block], names, arguments["seed"], arguments["guided"])
         progress(position)
     safe_point()
 
 
-def match_block(database: Path, listed: Path, block: Block, names: Mapping[int, str], seed: int) -> None:
+def match_block(database: Path, listed: Path, block: Block, names: Mapping[int, str], seed: int, guided: bool = False) -> None:
     """Match pairs of images on one thread.
 
     listed  scratch file
@@ -102,6 +103,9 @@ def match_block(database: Path, listed: Path, block: Block, names: Mapping[int, 
         matching = pycolmap.FeatureMatchingOptions()
         matching.use_gpu = False
         matching.num_threads = 1
+        if guided:
+            matching.guided_matching = True
+            matching.sift.max_ratio = GUIDED_RATIO
         geometry = pycolmap.TwoViewGeometryOptions()
         geometry.ransac.random_seed = seed
         pairing = pycolmap.ImportedPairingOptions()

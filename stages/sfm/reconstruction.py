@@ -151,13 +151,15 @@ def reconstruct(
     with _full_disk_named(work):
         open_database(work, images, warn)
         matches.extract_features(work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
-        ladder.match(work, images, matching, seed=seed, workers=threads or num_threads(), progress=progress, safe_point=safe_point)
-        models = mapping.best_models(work, images, seed, progress, safe_point)
-    rejected = [*unreadable, *_unregistered(work, images, models)]
+        found = ladder.find_models(
+            work, images, matching, features=features, seed=seed, threads=threads or num_threads(), progress=progress, safe_point=safe_point
+        )
+    models, place = found.models, found.work
+    rejected = [*unreadable, *_unregistered(place, images, models)]
     if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
-        raise BadInput(_failure(folder, work, images, models, rejected, matching))
-    facts = _facts_of_matching(work, images, models, matching)
-    capture = _capture(folder, work, images, mapping.bundle_adjusted(work, images, models[0], safe_point), masks, rejected, facts)
+        raise BadInput(_failure(folder, work, images, found, rejected, matching))
+    facts = _facts_of_matching(images, found, matching)
+    capture = _capture(folder, place, images, mapping.bundle_adjusted(place, images, models[0], safe_point), masks, rejected, facts)
     for sentence in capture.warnings:
         warn(sentence)
     return capture
@@ -243,12 +245,13 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
     return rejected
 
 
-def _facts_of_matching(work: Path, images: Sequence[WorkImage], models: Sequence[Any], how: str) -> dict[str, object]:
-    """How the photographs were matched, and the sizes of the parts that they fall into: by overlap, and of the sub-models."""
+def _facts_of_matching(images: Sequence[WorkImage], found: ladder.Found, how: str) -> dict[str, object]:
+    """How the photographs were matched, the sizes of the parts that they fall into, by overlap and of the sub-models, and what was tried."""
     return {
         "matching": how,
-        "components": [len(part) for part in ladder.components(ladder.neighbours(work, len(images)))],
-        "models": [int(model.num_reg_images()) for model in models],
+        "components": [len(part) for part in ladder.components(ladder.neighbours(found.work, len(images)))],
+        "models": [int(model.num_reg_images()) for model in found.models],
+        "rungs": found.rungs,
     }
 
 
@@ -258,17 +261,19 @@ def _overlaps(work: Path, images: Sequence[WorkImage]) -> tuple[tuple[str, str, 
     return tuple((images[i - 1].name, images[j - 1].name, count) for (i, j), count in counts.items() if count)
 
 
-def _failure(folder: Path, work: Path, images: Sequence[WorkImage], models: Sequence[Any], rejected: Sequence[tuple[str, str]], how: str) -> str:
+def _failure(
+    folder: Path, work: Path, images: Sequence[WorkImage], found: ladder.Found, rejected: Sequence[tuple[str, str]], how: str
+) -> str:
     hints = ["more photographs with at least 60 % overlap between neighbours, sharp, of a subject with texture"]
     if how == "sequential":
         hints.append("--set poses.matching=exhaustive if the names do not follow the path of the camera")
     hints.append("--set poses.max_features=8192")
     worst = dict(rejected)
     fewest = max(mapping.MIN_MODEL_SIZE, -(-len(images) // 2))
-    registered = mapping.num_registered(models)
+    registered = mapping.num_registered(found.models)
     what = f"cameras found for {registered} of {len(images)} photographs; at least {fewest} are needed."
     looks = look_at_all({image.name: work / "images" / image.file for image in images})
-    verdict = failed(what, "; ".join(hints), registered, rejected, looks, _facts_of_matching(work, images, models, how), _overlaps(work, images))
+    verdict = failed(what, "; ".join(hints), registered, rejected, looks, _facts_of_matching(images, found, how), _overlaps(found.work, images))
     write_json(work / VERDICT, {"source": str(folder), **verdict.document()})
     also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")
     return (

@@ -324,3 +324,14 @@ def test_real_photographs_with_colmap_cameras(tmp_path: Path) -> None:
     assert ((pixels >= 0) & (pixels <= (view.camera.width, view.camera.height))).all()
     assert view.near < np.quantile(depth, 0.01)
     assert np.quantile(depth, 0.99) < view.far
+
+
+def test_a_model_of_few_of_the_photographs_is_not_taken_without_a_word(tmp_path: Path) -> None:
+    source = captures.colmap_txt(tmp_path / "source")
+    _, warnings = run(source, tmp_path / "whole")
+    assert not [text for text in warnings if "--as photographs" in text]
+    captures.write_pictures(source / "images", [f"more_{k}.png" for k in range(10, 24)])
+    made, warnings = run(source, tmp_path / "part")
+    assert len(made.views) == 6
+    assert [text for text in warnings if "6 of the 20 photographs in the folder" in text and "--as photographs" in text]
+    assert json.loads((tmp_path / "part/poses/verdict.json").read_text())["grade"] == "poor"

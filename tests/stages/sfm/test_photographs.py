@@ -165,7 +165,7 @@ def test_an_image_that_colmap_cannot_read_is_not_left_out(resumed: tuple[Path, l
     last = work / "images" / images[-1].file
     last.rename(work / "hidden.png")
     with pytest.raises(StageFailed, match=r"poses: Could not read image \"?\w+.png"):
-        mapping.best_models(work, images, 0, **quiet)
+        mapping.sub_models(work, images, 0, mapping.DEFAULTS, **quiet)
     assert not list(work.glob("colmap_log*"))
     with pytest.raises(StageFailed, match=r"poses: .*could not be read by COLMAP"):
         open_database(work, images, lambda *a, **k: None)

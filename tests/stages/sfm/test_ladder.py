@@ -1,0 +1,155 @@
+"""Rungs of structure from motion: what is tried when, what is kept, and that a weak photograph gets its camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+
+from benchmarks.poses import aligned_errors, true_centres
+from pipeline.errors import BadInput
+from stages.sfm import ladder, mapping, matches, pairs
+from stages.sfm.images import WorkImage
+from stages.sfm.reconstruction import find_cameras
+
+ROOT = Path(__file__).resolve().parents[3]
+STILL_LIFE, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
+QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
+IMAGES = [WorkImage(f"{k}.jpg", f"{k:05d}.png", 64, 48, 64, 48, None, "a") for k in range(20)]
+
+
+class Rig:
+    """Stands for COLMAP: each rung registers as many photographs, with such a share of matches that agrees."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, outcomes: dict[str, tuple[int, float]]) -> None:
+        self.outcomes, self.tried, self.weak = outcomes, list[str](), list[list[int]]()
+        self._rung = "exhaustive"
+        monkeypatch.setattr(mapping, "sub_models", lambda work, images, seed, options, *a, **k: self.model(work, "begin", options))
+        monkeypatch.setattr(mapping, "continued", lambda work, images, model, seed, options, *a, **k: self.model(work, "continue", options))
+        monkeypatch.setattr(mapping, "match_agreement", lambda work, images, model: model.agreeing)
+        monkeypatch.setattr(ladder, "match", lambda *a, **k: None)
+        monkeypatch.setattr(ladder, "copy_database", lambda *a: None)
+        monkeypatch.setattr(ladder, "_detect_more", lambda place, images, weak, **k: self.weak.append(list(weak)))
+        monkeypatch.setattr(ladder, "_match_again", self.match_again)
+
+    def match_again(self, place: Path, images: Any, weak: list[int], rung: str, **_: Any) -> None:
+        self._rung = rung
+        self.weak.append(list(weak))
+
+    def model(self, work: Path, how: str, options: Any) -> list[Any]:
+        if work.name == "rungs" and how == "begin" and self._rung == "beyond":
+            name = "small angles" if options is mapping.FORWARD else "another beginning"
+        elif how == "continue" and work.name != "rungs":
+            name = "fewer matches"
+        elif how == "begin" and options is not mapping.DEFAULTS and self._rung in ("exhaustive", "more features"):
+            name = "small angles" if options is mapping.FORWARD else "another beginning"
+        else:
+            name = self._rung
+        self.tried.append(name)
+        count, agreeing = self.outcomes.get(name, (0, 0.0))
+        if not count:
+            return []
+        images = {k: SimpleNamespace(name=IMAGES[k].file, has_pose=True) for k in range(count)}
+        return [SimpleNamespace(images=images, num_reg_images=lambda: count, agreeing=agreeing, rung=name)]
+
+
+def climbed(rig: Rig, tmp_path: Path) -> ladder.Found:
+    return ladder.find_models(tmp_path, IMAGES, "exhaustive", features=100, seed=0, threads=1, **QUIET)
+
+
+def test_nothing_more_is_tried_where_every_photograph_has_a_camera(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.95)})
+    found = climbed(rig, tmp_path)
+    assert rig.tried == ["exhaustive"]
+    assert found.rungs == [{"rung": "exhaustive", "registered": 20, "agreeing": 0.95}]
+    assert found.work == tmp_path
+    assert not (tmp_path / "rungs").exists()
+
+
+def test_one_lost_photograph_is_worth_the_cheap_rungs_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (19, 0.95), "fewer matches": (19, 0.95), "wider matching": (19, 0.95)})
+    found = climbed(rig, tmp_path)
+    assert rig.tried == ["exhaustive", "fewer matches", "wider matching"]
+    assert rig.weak == [[19]]
+    assert found.models[0].rung == "exhaustive"  # of equals the first
+    assert found.work == tmp_path
+
+
+def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
+    found = climbed(rig, tmp_path)
+    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features"]
+    assert [rung["registered"] for rung in found.rungs] == [8, 9, 11, 19]
+    assert rig.weak == [list(range(9, 20)), list(range(11, 20)), list(range(11, 20))]
+    assert (found.models[0].rung, found.work) == ("more features", tmp_path / "rungs")
+
+
+def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (12, 0.95), "more features": (20, 0.4), "another beginning": (14, 0.9)})
+    found = climbed(rig, tmp_path)
+    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles"]
+    assert found.models[0].rung == "another beginning"
+
+
+def test_a_folded_scene_is_begun_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.5), "another beginning": (20, 0.97)})
+    found = climbed(rig, tmp_path)
+    assert rig.tried == ["exhaustive", "another beginning"]
+    assert found.models[0].rung == "another beginning"
+
+
+def test_nothing_at_all_is_no_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    found = climbed(Rig(monkeypatch, {}), tmp_path)
+    assert found.models == []
+    assert {rung["registered"] for rung in found.rungs} == {0}
+
+
+def test_a_weak_photograph_is_matched_with_all_but_those_it_overlaps_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: dict[str, Any] = {}
+    monkeypatch.setattr(ladder, "neighbours", lambda work, count: {i: {5} if i == 3 else {3} if i == 5 else set() for i in range(count)})
+    monkeypatch.setattr(ladder, "forget", lambda place, tables, keys: asked.update(forgotten=keys))
+    monkeypatch.setattr(matches, "match_pairs", lambda place, images, wanted, **k: asked.update(wanted=wanted, **k))
+    ladder._match_again(tmp_path, IMAGES, [3], "wider matching", seed=0, workers=2, **QUIET)
+    assert asked["wanted"] == {pairs.ordered(3, j) for j in range(20) if j not in (3, 5)}
+    assert len(asked["forgotten"]) == 18
+    assert asked["guided"]
+    assert asked["name"] == "wider_"
+
+
+def test_a_faint_photograph_gets_its_camera_by_more_features(tmp_path: Path) -> None:
+    """Of a sixth of the contrast, and blurred."""
+    truth = true_centres(TRUTH)
+    names = sorted(sorted((path.name for path in STILL_LIFE.glob("*.jpg")), key=lambda name: -truth[name][0])[:6])
+    if len(names) < 6:
+        pytest.skip("examples/still_life is not there")
+    for name in names:
+        with Image.open(STILL_LIFE / name) as image:
+            faint = np.asarray(image.filter(ImageFilter.GaussianBlur(1.0)), np.float32) * 0.15 + 85
+            (Image.fromarray(faint.astype(np.uint8)) if name == names[2] else image).save(tmp_path / name, quality=95)
+    capture = find_cameras(tmp_path, names, work=tmp_path / "work", max_side=360, warn=lambda *a, **k: None, **QUIET)
+    rungs = {rung["rung"]: rung["registered"] for rung in capture.facts["rungs"]}  # type: ignore[attr-defined]
+    assert rungs["exhaustive"] == rungs["wider matching"] == 5
+    assert rungs["more features"] == 6
+    errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))
+    assert len(errors) == 6
+    assert errors.max() < 0.02
+
+
+def test_what_was_tried_is_in_the_verdict_of_a_failure(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        coarse = Image.fromarray(rng.integers(0, 255, (24, 32, 3), np.uint8))
+        coarse.resize((160, 120), Image.Resampling.BICUBIC).save(tmp_path / f"{k}.png")
+    with pytest.raises(BadInput, match=r"verdict\.json"):
+        find_cameras(tmp_path, [f"{k}.png" for k in range(3)], work=tmp_path / "work", warn=lambda *a, **k: None, **QUIET)
+    from pipeline.files import read_json
+
+    said = read_json(tmp_path / "work/verdict.json")
+    assert said["grade"] == "failed"
+    assert [rung["rung"] for rung in said["rungs"]] == ["exhaustive", "wider matching", "more features", "another beginning", "small angles"]
+    assert set(said["images"]) == {"0.png", "1.png", "2.png"}
+    assert not said["images"]["0.png"]["registered"]
