@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Budget", "NothingToShow", "View", "gaussians_of_asset"]
 
+START = 0.8  # of the Gaussians that there may be, that voxels are merged into: the rest is added where the error is; docs/experiments/splats.md
+
 Progress = Callable[[int, int, str], None]
 
 
@@ -52,13 +54,15 @@ def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, pr
             progress(done, budget.steps + 1, text)
 
     said(0, "merging voxels")
-    gaussians = merged(tree, [view.camera for view in views], budget.count, budget.degree)
+    begun = int(START * budget.count) if budget.steps else budget.count
+    gaussians = merged(tree, [view.camera for view in views], begun, budget.degree)
     if not len(gaussians):
         raise NothingToShow("no voxel of the asset shows in any picture: there is nothing that Gaussians could show")
     said(1, "fitting Gaussians")
     fitted = refitted(
-        gaussians, views, budget.steps, background=tree.background, seed=budget.seed, reached=lambda step, error: said(step + 1, "fitting Gaussians")
-    )
+        gaussians, views, budget.steps, most=budget.count, background=tree.background, seed=budget.seed,
+        reached=lambda step, error: said(step + 1, "fitting Gaussians"),
+    )  # fmt: skip
     if not len(fitted):
         raise NothingToShow("no Gaussian is left that shows in any picture")
     return fitted

@@ -14,8 +14,8 @@ import numpy as np
 
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera
-from efficientnerf.splats.gaussians import Gaussians
-from efficientnerf.splats.rendering import LANES, gaussians_from, lens_of, values_of
+from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
+from efficientnerf.splats.rendering import LANES, gaussians_from, grouped, lens_of, ungrouped, values_of
 
 if TYPE_CHECKING:
     from efficientnerf.backends.numba.splats.fitting import Rates
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.02, 0.01, 0.01, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
-LEAST_OPACITY = 0.005  # below which a Gaussian is left out in the end; 3DGS
+LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS
+SPLIT_AT = (0.25, 0.5)  # of the steps: when Gaussians are divided where the error is, up to as many as there may be
+SPLIT_APART, SPLIT_SHARE = 0.5, 0.7  # of the longest standard deviation: how far the halves lie from the middle, and what is left of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +53,12 @@ class View:
 
 
 def refitted(
-    gaussians: Gaussians, views: Sequence[View], steps: int, *, background: tuple[float, float, float] | None = None, seed: int = 0,
+    gaussians: Gaussians, views: Sequence[View], steps: int, *, most: int = 0, background: tuple[float, float, float] | None = None, seed: int = 0,
     reached: Callable[[int, float], None] | None = None,
 ) -> Gaussians:  # fmt: skip
     """The Gaussians after so many steps, without those that no longer show.
 
+    most        Gaussians up to whose number some are divided on the way; 0: none is
     background  sRGB colour behind pictures without alpha; None: these are opaque
     reached     called after each step, with their number and the picture's mean squared error of a channel
     """
@@ -64,13 +67,17 @@ def refitted(
     from efficientnerf.backends.numba.splats.projection import RECORD, project
 
     values, degree = values_of(gaussians), gaussians.degree
+    count, sums = len(gaussians), np.zeros((0, raster.SUMS), np.float32)
     moments = np.zeros((len(values), fitting.GRADIENTS + values.shape[1], LANES), np.float32)
     records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
-    sums = np.zeros((0, raster.SUMS), np.float32)
+    splits = {int(share * steps) for share in SPLIT_AT} - {0} if most else set()
     order: list[int] = []
     for number in range(steps):
         if not order:
             order = np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 5, number])).permutation(len(views)).tolist()
+        if number in splits:
+            values, moments, count = _divided(values, moments, errors[:count], most)
+            records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
         view = views[order.pop()]
         lens, picture = lens_of(view.camera), _picture(view, background)
         project(values, lens, degree, records)
@@ -83,8 +90,35 @@ def refitted(
         fitting.step(values, moments, lens, degree, pairs.first, sums, _rates(number / max(steps - 1, 1)), errors)
         if reached is not None:
             reached(number + 1, float(lost.sum()) / max(3 * int(picture.mask.sum()), 1))
-    fitted = gaussians_from(values, len(gaussians))
+    fitted = gaussians_from(values, count)
     return fitted.subset(fitted.opacities >= LEAST_OPACITY)
+
+
+def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Values, moments and number of the Gaussians without those that hide nothing any more, and with those in two that had the greatest part in the errors (N,).
+
+    The halves lie along the longest axis, beside each other in memory, and begin without momentum.
+    """
+    from efficientnerf.backends.numba.splats.projection import OPACITY, ROTATION, SCALE
+
+    rows, state = ungrouped(values, len(errors)), ungrouped(moments, len(errors))
+    alive = rows[:, OPACITY] > np.log(LEAST_OPACITY / (1 - LEAST_OPACITY))
+    copies = alive.astype(np.int64)
+    worst = np.argsort(np.where(alive, -errors, 0), kind="stable")[: max(0, most - int(alive.sum()))]
+    copies[worst[alive[worst] & (errors[worst] > 0)]] = 2
+    index = np.repeat(np.arange(len(rows)), copies)
+    halves = copies[index] == 2
+    rows, state = rows[index], state[index]
+    state[halves] = 0
+    first = np.concatenate([[True], np.diff(index) > 0])[halves]
+    parts = rows[halves]
+    longest = np.argmax(parts[:, SCALE : SCALE + 3], axis=1)
+    here = np.arange(len(parts))
+    apart = SPLIT_APART * np.exp(parts[here, SCALE + longest]) * np.where(first, 1, -1)
+    parts[:, :3] += apart[:, None] * rotation_matrices(parts[:, ROTATION:OPACITY])[here, :, longest]
+    parts[here, SCALE + longest] += np.log(SPLIT_SHARE)
+    rows[halves] = parts
+    return grouped(rows), grouped(state, unseen=False), len(rows)
 
 
 def _picture(view: View, background: tuple[float, float, float] | None) -> Picture:

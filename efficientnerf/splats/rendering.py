@@ -81,17 +81,29 @@ def _limits(camera: Camera) -> np.ndarray:
 def values_of(gaussians: Gaussians) -> np.ndarray:
     """(G, 11 + 3 K, 16) float32, rows as `efficientnerf.backends.numba.splats.projection` names them; what fills the last group cannot be seen."""
     count = len(gaussians)
-    rows = np.zeros((-(-count // LANES) * LANES, 11 + 3 * gaussians.harmonics.shape[1]), np.float32)
-    rows[count:, 6], rows[count:, 10] = 1, -30
-    rows[:count, :3], rows[:count, 3:6], rows[:count, 6:10] = gaussians.means, np.log(gaussians.scales), gaussians.rotations
-    rows[:count, 10] = np.log(gaussians.opacities) - np.log1p(-gaussians.opacities)
-    rows[:count, 11:] = gaussians.harmonics.reshape(count, -1)
-    return np.ascontiguousarray(rows.reshape(-1, LANES, rows.shape[1]).transpose(0, 2, 1))
+    logits = np.log(gaussians.opacities) - np.log1p(-gaussians.opacities)
+    parts = gaussians.means, np.log(gaussians.scales), gaussians.rotations, logits[:, None], gaussians.harmonics.reshape(count, -1)
+    return grouped(np.concatenate(parts, axis=1))
+
+
+def grouped(rows: np.ndarray, unseen: bool = True) -> np.ndarray:
+    """Groups (G, width, 16) of rows (N, width) float32, the last filled with Gaussians that cannot be seen, or with zeros."""
+    count, width = rows.shape
+    out = np.zeros((-(-count // LANES) * LANES, width), np.float32)
+    out[:count] = rows
+    if unseen:
+        out[count:, 6], out[count:, 10] = 1, -30
+    return np.ascontiguousarray(out.reshape(-1, LANES, width).transpose(0, 2, 1))
+
+
+def ungrouped(groups: np.ndarray, count: int) -> np.ndarray:
+    """The first `count` rows of groups, see `grouped`."""
+    return np.ascontiguousarray(groups.transpose(0, 2, 1)).reshape(-1, groups.shape[1])[:count]
 
 
 def gaussians_from(values: np.ndarray, count: int) -> Gaussians:
     """The first `count` Gaussians of groups, see `values_of`."""
-    rows = values.transpose(0, 2, 1).reshape(-1, values.shape[1])[:count].astype(np.float64)
+    rows = ungrouped(values, count).astype(np.float64)
     rotations = rows[:, 6:10] / np.linalg.norm(rows[:, 6:10], axis=1, keepdims=True)
     opacities = np.clip(1 / (1 + np.exp(-rows[:, 10])), 1e-4, 1 - 1e-4)
     parts = rows[:, :3], np.exp(rows[:, 3:6]), rotations, opacities, rows[:, 11:].reshape(count, -1, 3)

@@ -13,11 +13,11 @@ from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.geometry.cameras import Camera
 from efficientnerf.geometry.ndc import Ndc
 from efficientnerf.rendering.harmonics import C0
-from efficientnerf.splats import merging
+from efficientnerf.splats import merging, refit
 from efficientnerf.splats.build import Budget, NothingToShow, View, gaussians_of_asset
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.refit import refitted
-from efficientnerf.splats.rendering import render
+from efficientnerf.splats.rendering import gaussians_from, render, ungrouped, values_of
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import random_cascades
 
@@ -203,3 +203,25 @@ def test_the_same_pictures_give_the_same_bytes_and_what_cannot_be_seen_stays() -
 def test_pictures_of_another_kind_are_refused(pixels: np.ndarray) -> None:
     with pytest.raises(ValueError, match="expected"):
         View(ring(1)[0], pixels)
+
+
+def test_gaussians_are_divided_where_the_error_was_and_those_that_hide_nothing_go() -> None:
+    begun = merging.merged(ball(16, 0), ring(3), 100, 0)
+    count = len(begun)
+    faint = np.where(np.arange(count) < 5, np.float32(0.003), begun.opacities)
+    begun = replace(begun, opacities=faint)
+    errors = np.zeros(count, np.float32)
+    errors[[2, 20, 30]] = 9, 2, 3
+    errors[40] = 1
+    moments = np.ones((len(values_of(begun)), 30, 16), np.float32)
+    values, state, found = refit._divided(values_of(begun), moments, errors, count - 5 + 2)
+    assert found == count - 5 + 2
+    after = gaussians_from(values, found)
+    halves = np.flatnonzero((ungrouped(state, found) == 0).all(axis=1))
+    assert halves.tolist() == [15, 16, 26, 27]
+    np.testing.assert_allclose(after.means[halves].reshape(2, 2, 3).mean(axis=1), begun.means[[20, 30]], atol=1e-6)
+    longest = begun.scales[[20, 30]].max(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(after.means[[15, 26]] - after.means[[16, 27]], axis=1), 2 * refit.SPLIT_APART * longest, rtol=1e-4)
+    np.testing.assert_allclose(after.scales.max(axis=1)[[15, 26]], np.maximum(refit.SPLIT_SHARE * longest, np.sort(begun.scales[[20, 30]], axis=1)[:, 1]), rtol=1e-4)
+    kept = np.setdiff1d(np.arange(5, count), [20, 30])
+    np.testing.assert_allclose(after.means[np.setdiff1d(np.arange(found), halves)], begun.means[kept], atol=1e-7)
