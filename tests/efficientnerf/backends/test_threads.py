@@ -18,10 +18,12 @@ import numpy as np
 
 from efficientnerf.asset.queries import colour_at, density_at, normal_at
 from efficientnerf.asset.rendering import render_rays
+from efficientnerf.splats.merging import merged
+from efficientnerf.splats.refit import View, refitted
 from efficientnerf.training.loop import state_of, train, trainer
 from tests.efficientnerf.balls import pixels, untrained
 from tests.efficientnerf.networks import passes, weights_of
-from tests.efficientnerf.trees import random_tree, rays_at
+from tests.efficientnerf.trees import looking, random_tree, rays_at
 
 print(numba.get_num_threads())
 t = trainer(untrained(contracted=True, iterations=5, occupancy_warmup_steps=2))
@@ -39,6 +41,9 @@ seen = render_rays(tree, *rays_at(tree, 3000))
 points = np.random.default_rng(0).uniform(tree.bounds_min, tree.bounds_max, (5000, 3))
 for values in (seen.colour, seen.opacity, seen.depth, seen.normal, density_at(tree, points), normal_at(tree, points), colour_at(tree, points, None)):
     print(hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest())
+view = View(looking(tree, 40), rng.integers(0, 256, (43, 40, 4), dtype=np.uint8))
+for values in vars(refitted(merged(tree, [view.camera], 300, 1), [view], 6, most=400)).values():
+    print(hashlib.sha256(values.tobytes()).hexdigest())
 """
 
 
