@@ -95,7 +95,7 @@ def refitted(
 
 
 def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Values, moments and number of the Gaussians without those that hide nothing any more, and with those in two that had the greatest part in the errors (N,).
+    """Values, moments and number of the Gaussians without those that hide nothing any more; those that had the greatest part in the errors (N,) are two.
 
     The halves lie along the longest axis, beside each other in memory, and begin without momentum.
     """

@@ -222,6 +222,7 @@ def test_gaussians_are_divided_where_the_error_was_and_those_that_hide_nothing_g
     np.testing.assert_allclose(after.means[halves].reshape(2, 2, 3).mean(axis=1), begun.means[[20, 30]], atol=1e-6)
     longest = begun.scales[[20, 30]].max(axis=1)
     np.testing.assert_allclose(np.linalg.norm(after.means[[15, 26]] - after.means[[16, 27]], axis=1), 2 * refit.SPLIT_APART * longest, rtol=1e-4)
-    np.testing.assert_allclose(after.scales.max(axis=1)[[15, 26]], np.maximum(refit.SPLIT_SHARE * longest, np.sort(begun.scales[[20, 30]], axis=1)[:, 1]), rtol=1e-4)
+    next_to = np.sort(begun.scales[[20, 30]], axis=1)[:, 1]
+    np.testing.assert_allclose(after.scales.max(axis=1)[[15, 26]], np.maximum(refit.SPLIT_SHARE * longest, next_to), rtol=1e-4)
     kept = np.setdiff1d(np.arange(5, count), [20, 30])
     np.testing.assert_allclose(after.means[np.setdiff1d(np.arange(found), halves)], begun.means[kept], atol=1e-7)
