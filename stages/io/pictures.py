@@ -215,6 +215,14 @@ def grey_of(image: Any) -> np.ndarray:
     return np.asarray(image.convert("L"))
 
 
+def integers_of(image: Any) -> np.ndarray:
+    """(H, W) int32 samples of an opened PNG of one channel, as they are stored; raises UnreadableImage for another kind of picture."""
+    if image.format != "PNG" or not (image.mode == "L" or image.mode.startswith("I")):
+        raise UnreadableImage(f"unreadable: {image.format} of mode {image.mode}; expected a PNG of one channel")
+    image.load()
+    return np.asarray(image, np.int32)
+
+
 def _refuse_unknown_samples(image: Any) -> None:
     """Raise UnreadableImage unless the samples are unsigned integers of up to 8, or of exactly 16 bits."""
     if image.format == "PNG":

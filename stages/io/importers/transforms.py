@@ -6,6 +6,7 @@ All state camera-to-world matrices with x right, y up, looking along -z, and are
     nerfstudio   intrinsics at the top or per frame, `mask_path` (black is left out), `train_filenames` etc., points in a PLY file
     instant-ngp  `aabb_scale`, `scale`, `offset`; masks `dynamic_mask_<image>.png` (white is left out); rolling-shutter pairs of matrices
 
+Depth that frames name (PNG; nerfstudio's `depth_file_path`, instant-ngp's `depth_path`) becomes sparse points where images agree on it.
 The capture's frame is that of the matrices; `applied_transform` is recorded only.
 """
 
@@ -23,6 +24,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
+from stages.io.importers.depth import DepthFile, depth_file, with_depth
 from stages.io.importers.frames import relocated
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, Found, ImportSettings, Source, missing_images_warning, moved_images_warnings
 from stages.io.importers.transforms_camera import lens_of, pose_of
@@ -37,6 +39,7 @@ _NERFSTUDIO_FACTS = ("camera_model", "applied_transform", "applied_scale", "ply_
 _NERFSTUDIO_KEYS = (*_NERFSTUDIO_FACTS, "orientation_override", "train_filenames", "val_filenames", "test_filenames")
 _NGP_FACTS = ("aabb_scale", "scale", "offset")
 _NGP_KEYS = (*_NGP_FACTS, "is_fisheye", "from_na", "n_extra_learnable_dims", "enable_depth_loading", "integer_depth_scale", "render_aabb")
+_MILLIMETRE = 0.001  # metres
 _NGP_SCALE = 0.33  # of instant-ngp, where the file states none
 
 
@@ -108,6 +111,9 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
         mask, _ = _mask(source, frame)
         if mask is not None:
             paths[mask] = None
+        depth = _depth(source, frame)
+        if depth is not None:
+            paths[depth.file] = None
     return list(paths)
 
 
@@ -132,7 +138,7 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
         warnings.append(f"transforms.json is not read: {where} state the same with their splits.")
     points, point_warnings = _points(source, document)
     order = {"train": 0, "val": 1, "test": 2, None: 3}
-    return Capture(
+    capture = Capture(
         kind=kind,
         photos=tuple(sorted(photos, key=lambda photo: (order[photo.split], photo.camera.name))),
         background=None,
@@ -145,6 +151,8 @@ def read(folder: Path, settings: ImportSettings, kind: str | None = None) -> Cap
         facts={key: _fact(document[key]) for key in (*_NERFSTUDIO_FACTS, *_NGP_FACTS) if key in document},
         rejected_files={name: file for name, _, file in unreadable},
     )
+    maps = {source.real(frame.image): _depth(source, frame) for frame in listing.frames}
+    return with_depth(capture, lambda photo: maps.get(photo.image))
 
 
 def _fact(value: Any, depth: int = 2) -> Any:
@@ -259,6 +267,18 @@ def _mask(source: Source, frame: _Frame) -> tuple[Path | None, str]:
         if os.path.isfile(beside):
             return source.check_inside(beside), "white"
     return None, "black"
+
+
+def _depth(source: Source, frame: _Frame) -> DepthFile | None:
+    """The depth of a frame: nerfstudio's in millimetres, instant-ngp's in units that the file states. Of poses that were scaled afterwards it is not used."""
+    if isinstance(frame.entry.get("depth_file_path"), str) and "applied_scale" not in frame.document:
+        listed, unit = frame.entry["depth_file_path"], _MILLIMETRE
+    elif isinstance(frame.entry.get("depth_path"), str):
+        listed, unit = frame.entry["depth_path"], finite(frame.document.get("integer_depth_scale")) or 0.0
+    else:
+        return None
+    path = source.find(listed, frame.file.parent, (".png",)).path if unit > 0 else None
+    return None if path is None or path == frame.image or path.suffix.lower() != ".png" else depth_file(source, path, unit)
 
 
 def _bounds(document: dict[str, Any], file: Path) -> np.ndarray | None:

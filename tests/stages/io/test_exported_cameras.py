@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from efficientnerf.geometry.cameras import opengl_from_pose, project
+from efficientnerf.geometry.cameras import Camera, opengl_from_pose, project, rays
 from pipeline.errors import BadInput
-from stages.io import importers
+from pipeline.stage import Job
+from stages import poses
+from stages.io import importers, scene
 from stages.io.capture import Capture
 from stages.io.importers.brown import MAX_ERROR, quotient_of_cubics
 from stages.io.importers.description import describe_source
+from stages.training.data import sparse_depth_of
 from tests.stages import captures, exports
 from tests.stages.captures import Settings
 from tests.stages.exports import EXPORTS, POINTS
@@ -384,3 +387,111 @@ def test_missing_images_are_named_and_too_few_are_refused(how: str, tmp_path: Pa
             assert any("1 of 6 listed images are missing" in warning for warning in read(folder).warnings)
     with pytest.raises(BadInput):
         read(folder)
+
+
+# --- depth
+
+
+def plane_depth(camera: Camera, width: int, height: int) -> np.ndarray:
+    """(h, w) depth of the plane z = 0 along the view axis."""
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    pixels = np.stack([x.ravel() * camera.width / width, y.ravel() * camera.height / height], -1)
+    origins, directions = rays(camera, pixels)
+    distance = -origins[:, 2] / directions[:, 2]
+    along = np.where(distance > 0, distance * (directions @ camera.forward), 0)
+    return np.where(along < 20, along, 0).reshape(height, width)
+
+
+def write_depth(path: Path, values: np.ndarray, unit: float = 0.001) -> None:
+    captures.write_picture(path, np.clip(np.rint(values / unit), 0, 65535).astype(np.uint16))
+
+
+def sharp(folder: Path) -> tuple[Path, list[Camera]]:
+    """Polycam's export whose depth maps show the plane z = 0, with as many pixels as the images."""
+    folder, _ = exports.polycam(folder)
+    made = [photo.camera for photo in read(folder).photos]
+    for index, camera in enumerate(made):
+        write_depth(folder / f"keyframes/depth/img_{index}.png", plane_depth(camera, 64, 48))
+    return folder, made
+
+
+def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path) -> None:
+    folder, made = sharp(tmp_path / "a")
+    capture = read(folder)
+    assert capture.points is not None
+    assert len(capture.points.xyz) > 500
+    assert np.abs(capture.points.xyz[:, 2]).max() < 0.01, "they lie on the plane"
+    assert min(map(len, capture.points.tracks)) >= 3
+    for point, track in list(zip(capture.points.xyz, capture.points.tracks, strict=True))[::97]:
+        for index in track:
+            pixel, distance = project(made[index], point[None])
+            assert distance[0] > 0
+            assert (pixel > 0).all()
+            assert (pixel < (32, 24)).all()
+    assert {folder / f"keyframes/depth/img_{index}.png" for index in range(6)} < set(importers.files(folder, Settings()))
+    again = read(folder)
+    assert again.points is not None
+    np.testing.assert_array_equal(again.points.xyz, capture.points.xyz)
+
+
+def test_depth_of_low_confidence_or_out_of_range_is_not_used(tmp_path: Path) -> None:
+    folder, made = sharp(tmp_path / "a")
+    for index in range(6):
+        sure = np.full((48, 64), 127, np.uint8)
+        sure[12:36, 16:48] = 255
+        captures.write_picture(folder / f"keyframes/confidence/img_{index}.png", sure)
+    capture = read(folder)
+    assert capture.points is not None
+    for index, camera in enumerate(made):
+        seen = [point for point, track in zip(capture.points.xyz, capture.points.tracks, strict=True) if index in track]
+        assert (np.abs(project(camera, np.array(seen))[0] - (16, 12)) < (8.1, 6.1)).all(), "in the middle, where the maps are sure"
+    for index, camera in enumerate(made):
+        write_depth(folder / f"keyframes/depth/img_{index}.png", np.where(plane_depth(camera, 64, 48) > 0, 5.5, 0))
+    assert read(folder).points is None
+
+
+def test_depth_that_no_other_image_confirms_is_left_out_with_a_word(tmp_path: Path) -> None:
+    folder, _ = sharp(tmp_path / "a")
+    random = np.random.default_rng(0)
+    for index in range(6):
+        write_depth(folder / f"keyframes/depth/img_{index}.png", np.full((48, 64), 0.2 + 0.6 * index))
+    (folder / "keyframes/depth/img_5.png").write_bytes(b"nothing")
+    captures.write_picture(folder / "keyframes/depth/img_4.png", random.integers(0, 255, (48, 64, 3), np.uint8))
+    capture = read(folder)
+    assert capture.points is None
+    assert capture.facts["depth_points"] == 0
+    assert any("confirm each other nowhere" in warning for warning in capture.warnings)
+    assert any("2 of 6 depth maps are not used" in warning for warning in capture.warnings)
+
+
+@pytest.mark.parametrize(("key", "unit", "more"), [("depth_file_path", 0.001, {}), ("depth_path", 0.0005, {"integer_depth_scale": 0.0005})])
+def test_depth_of_transforms(key: str, unit: float, more: dict[str, float], tmp_path: Path) -> None:
+    made = captures.cameras()
+    frames = captures.frames(made)
+    for index, camera in enumerate(made):
+        frames[index][key] = f"depth/img_{index}.png"
+        write_depth(tmp_path / f"depth/img_{index}.png", plane_depth(camera, 64, 48), unit)
+    captures.nerfstudio(tmp_path, frames=frames, **more)
+    capture = read(tmp_path)
+    assert capture.points is not None
+    assert np.abs(capture.points.xyz[:, 2]).max() < 0.01
+    assert capture.metric == (key == "depth_file_path")
+    assert tmp_path / "depth/img_3.png" in importers.files(tmp_path, Settings())
+    captures.nerfstudio(tmp_path, frames=frames, **more, applied_scale=0.5)
+    if key == "depth_file_path":
+        assert read(tmp_path).points is None, "depth in other units than the poses"
+
+
+def test_points_of_depth_supervise_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scene that the poses stage writes of a phone's capture has rays to them."""
+    folder, _ = sharp(tmp_path / "a")
+    monkeypatch.setattr("stages.io.importers.depth.MAX_POINTS", 200)
+    job = Job(settings=poses.PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=folder, stage="poses", report=lambda event: None)
+    poses.run(job)
+    made = scene.load(tmp_path / "poses")
+    assert made.metric
+    found = sparse_depth_of(tmp_path / "poses", made)
+    assert found is not None
+    ends = found.origins + found.directions * found.distance[:, None]
+    there = made.world_from_capture.inverse().points(ends)
+    assert np.abs(there[:, 2]).max() < 0.02

@@ -2,7 +2,7 @@
 
 Layout: the README of PolyCam/polyform. A file of keyframes/cameras or corrected_cameras is named as its image and holds fx fy cx cy width height and the rows
 t_00 ... t_23 of camera to world, with x right, y up, looking along -z; the world is ARKit's: y up, metres. Corrected cameras belong to corrected images, which
-are undistorted; the two kinds share no frame and are not mixed.
+are undistorted; the two kinds share no frame and are not mixed. depth/ holds the sensor's millimetres, confidence/ 0, 127 or 255.
 """
 
 from __future__ import annotations
@@ -17,11 +17,15 @@ from pipeline.errors import BadInput
 from stages.io.capture import Capture
 from stages.io.importers import frames, lenses
 from stages.io.importers.brown import brown_camera
+from stages.io.importers.depth import DepthFile, depth_file, with_depth
 from stages.io.importers.source import ImportSettings, Source, images_in
 from stages.io.json_file import finite, read_json, shown
 
 KEYFRAMES = "keyframes"
 LARGEST_CAMERA = 1 << 20  # bytes
+MILLIMETRE = 0.001  # metres
+HIGH = 255  # confidence; 127 is medium
+FARTHEST = 5.0  # metres, the range of the sensor
 _KINDS = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _AGAIN = "Export the raw data again."
 
@@ -35,7 +39,10 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The camera files, their images and masks."""
     source = Source(folder, settings.allow_outside)
     images, cameras = _kind(source)
-    return [*_cameras(source, cameras), *frames.files_of(source, _frames(source, images, cameras))]
+    found = frames.files_of(source, _frames(source, images, cameras))
+    maps = [_depth(source, path.stem) for path in found]
+    beside = [path for one in maps if one is not None for path in (one.file, one.confidence) if path is not None]
+    return [*_cameras(source, cameras), *found, *beside]
 
 
 def read(folder: Path, settings: ImportSettings) -> Capture:
@@ -47,7 +54,7 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
         warnings.append("keyframes/corrected_cameras is not there: the phone's own poses and images with some distortion are used. Process with loop closure.")
     posed = {path.stem for path in _cameras(source, cameras)}
     unposed = [source.name_of(path) for path in images_in(source.root / KEYFRAMES / images) if path.stem not in posed]
-    return frames.capture_of(
+    capture = frames.capture_of(
         source,
         _frames(source, images, cameras),
         settings,
@@ -59,6 +66,12 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
         metric=True,
         facts={"cameras": cameras},
     )
+    return with_depth(capture, lambda photo: _depth(source, photo.image.stem))
+
+
+def _depth(source: Source, stem: str) -> DepthFile | None:
+    place = source.root / KEYFRAMES
+    return depth_file(source, place / f"depth/{stem}.png", MILLIMETRE, place / f"confidence/{stem}.png", HIGH, FARTHEST)
 
 
 def _cameras(source: Source, name: str) -> list[Path]:
