@@ -1,0 +1,289 @@
+"""Bad captures made from a good one: each must end in cameras that are right, or in the right diagnosis.
+
+    python -m benchmarks.bad_captures --work FOLDER [--only blur,mirrored] [--out benchmarks/results]
+
+The photographs of examples/still_life, whose true cameras are known, are spoiled in a known way; `enerf check` forecasts, `enerf run --until poses` finds
+cameras, both as a user would. A row is right where the centres are within MOST_ERROR of the truth, or where the verdict or the error names one of the problems
+that the capture has. Writes bad_captures.json and .md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from benchmarks.poses import aligned_errors, true_centres
+from workflows.paper.document import hardware
+
+ROOT = Path(__file__).resolve().parents[1]
+GOOD, TRUTH = ROOT / "examples" / "still_life", ROOT / "tests" / "data" / "still_life_cameras.json"
+ENERF = (sys.executable, "-m", "workflows.cli.main")
+MOST_ERROR = 1.0  # % of the mean distance of the cameras from their middle, root mean square
+ENOUGH = 0.75  # share of the photographs that can be placed, from which a capture without a diagnosis counts
+Pictures = dict[str, np.ndarray]  # by name; BGR
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A way to spoil a capture.
+
+    make       the spoiled pictures, of the good ones
+    diagnoses  words of which the right diagnosis has one
+    placeable  pictures whose cameras can be found; all by default
+    names      name of the good photograph that each picture shows, where it is another
+    """
+
+    name: str
+    make: Callable[[Pictures], Pictures]
+    diagnoses: tuple[str, ...]
+    placeable: Callable[[list[str]], list[str]] = list
+    names: Callable[[str], str] = str
+
+
+def each(change: Callable[[np.ndarray, int], np.ndarray], *, every: int = 1) -> Callable[[Pictures], Pictures]:
+    """The same change to every n-th picture."""
+    return lambda good: {name: change(picture, n) if n % every == 0 else picture for n, (name, picture) in enumerate(good.items())}
+
+
+def motion_blur(picture: np.ndarray, n: int) -> np.ndarray:
+    length, angle = 13, 40.0 * n
+    kernel = np.zeros((length, length), np.float32)
+    kernel[length // 2] = 1 / length
+    turned = cv2.warpAffine(kernel, cv2.getRotationMatrix2D((length // 2, length // 2), angle, 1), (length, length))
+    return cv2.filter2D(picture, -1, turned / turned.sum())
+
+
+def brighter(factor: float) -> Callable[[np.ndarray, int], np.ndarray]:
+    """In linear light."""
+    return lambda picture, n: np.clip(255 * ((picture / 255.0) ** 2.2 * factor) ** (1 / 2.2), 0, 255).astype(np.uint8)
+
+
+def noisy(deviation: float) -> Callable[[np.ndarray, int], np.ndarray]:
+    return lambda picture, n: np.clip(picture + np.random.default_rng(n).normal(0, deviation, picture.shape), 0, 255).astype(np.uint8)
+
+
+def zoomed(picture: np.ndarray, n: int) -> np.ndarray:
+    h, w = picture.shape[:2]
+    share = (1.0, 0.8, 0.65)[n % 3]
+    dy, dx = round(h * (1 - share) / 2), round(w * (1 - share) / 2)
+    return cv2.resize(picture[dy : h - dy, dx : w - dx], (w, h), interpolation=cv2.INTER_CUBIC)
+
+
+def cropped(picture: np.ndarray, n: int) -> np.ndarray:
+    """Somewhere, so that the principal point is nowhere near the middle."""
+    h, w = picture.shape[:2]
+    y, x = (int(k) for k in np.random.default_rng(n).integers(0, (h // 4, w // 4)))
+    return picture[y : y + 3 * h // 4, x : x + 3 * w // 4]
+
+
+def shrunk(picture: np.ndarray, n: int) -> np.ndarray:
+    return cv2.resize(picture, (96, 72), interpolation=cv2.INTER_AREA)
+
+
+def compressed(picture: np.ndarray, n: int) -> np.ndarray:
+    return cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 6])[1], cv2.IMREAD_COLOR)
+
+
+def labelled(picture: np.ndarray, n: int) -> np.ndarray:
+    """A date and a frame that stay put, as cheap cameras burn in."""
+    out = picture.copy()
+    cv2.rectangle(out, (4, 4), (out.shape[1] - 5, out.shape[0] - 5), (255, 255, 255), 2)
+    cv2.putText(out, "2026-11-23 12:00 CAM 01 REC", (20, 340), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2)
+    return out
+
+
+def mixed(good: Pictures) -> Pictures:
+    """Half of the scene, and half of another: the same pictures upside down in other colours, which no match joins to the first."""
+    names = list(good)
+    return {name: cv2.flip(255 - good[name][..., ::-1], 0) if n % 2 else good[name] for n, name in enumerate(names)}
+
+
+def turned_only(good: Pictures) -> Pictures:
+    """What a camera sees that turns on the spot, within one picture enlarged."""
+    wide = cv2.resize(next(iter(good.values())), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    focal, out = 800.0, {}
+    inside = np.array([[focal, 0, wide.shape[1] / 2], [0, focal, wide.shape[0] / 2], [0, 0, 1]])
+    seen = np.array([[focal, 0, 240], [0, focal, 180], [0, 0, 1]])
+    for n in range(24):
+        turn = cv2.Rodrigues(np.array([0.08 * np.sin(n), 0.16 * np.cos(n / 2), 0.02 * n]))[0]
+        out[f"turn_{n:02d}.jpg"] = cv2.warpPerspective(wide, seen @ turn @ np.linalg.inv(inside), (480, 360))
+    return out
+
+
+def white_wall(good: Pictures) -> Pictures:
+    return {name: np.clip(np.random.default_rng(n).normal(228, 1.5, (360, 480, 3)), 0, 255).astype(np.uint8) for n, name in enumerate(good)}
+
+
+def before_a_wall(good: Pictures) -> Pictures:
+    """The scene's middle, which turns, before a wall that stands still."""
+    wall = cv2.resize(np.random.default_rng(3).integers(30, 220, (72, 96, 3)).astype(np.uint8), (480, 360), interpolation=cv2.INTER_CUBIC)
+    y, x = np.mgrid[:360, :480]
+    inside = np.clip(1.5 - np.hypot((x - 240) / 150, (y - 190) / 130), 0, 0.1)[..., None] * 10
+    return {name: np.round(picture * inside + wall * (1 - inside)).astype(np.uint8) for name, picture in good.items()}
+
+
+def shuffled(good: Pictures) -> Pictures:
+    order = np.random.default_rng(0).permutation(len(good))
+    names = list(good)
+    return {f"{k:03d}_{names[n]}": good[names[n]] for k, n in enumerate(order)}
+
+
+def upright_or_not(picture: np.ndarray, n: int) -> np.ndarray:
+    return np.rot90(picture, n % 4)
+
+
+def few(good: Pictures) -> Pictures:
+    return dict(list(good.items())[::9])
+
+
+APART = ("components", "groups", "not registered", "sub-models", "no camera")
+CAPTURES = (
+    Capture("as it is", dict, ()),
+    Capture("blur", each(lambda p, n: cv2.GaussianBlur(p, (0, 0), 4)), ("blurred", "blurry")),
+    Capture("motion blur of every second", each(motion_blur, every=2), ("blurred", "blurry")),
+    Capture("noise", each(noisy(45)), ("noise", "not registered", "few points", "reprojection error")),
+    Capture("dark", each(brighter(0.01)), ("dark", "clipped", "black")),
+    Capture("overexposed", each(brighter(14)), ("clipped", "white")),
+    Capture("exposure steps", each(brighter(0.25), every=2), ("exposure", "brighter or darker")),
+    Capture("two scenes mixed", mixed, APART),
+    Capture("one image thirty-six times", lambda good: dict.fromkeys(good, next(iter(good.values()))), ("duplicates", "same picture", "one place", "parallax")),
+    Capture("zoom changes", each(zoomed), ("zoom", "focal", "reprojection error")),
+    Capture("cropped", each(cropped), ("cropped", "focal", "sizes", "reprojection error", "not registered")),
+    Capture("tiny", each(shrunk), ("small", "smaller", "few points", "not registered")),
+    Capture("four photographs", few, ("few", "overlap")),
+    Capture("turned on the spot", turned_only, ("parallax", "one place")),
+    Capture("white wall", white_wall, ("texture", "features", "overlap")),
+    Capture("a wall that stands still", before_a_wall, ("stands still", "static", "turntable")),
+    Capture("mirrored, every second", each(lambda p, n: cv2.flip(p, 1), every=2), APART),
+    Capture("shuffled video", shuffled, (), names=lambda name: name[4:]),
+    Capture("turned by quarters", each(upright_or_not), ("orientation", "not registered", "sizes")),
+    Capture("hard compression", each(compressed), ("compress", "few points", "not registered", "reprojection error")),
+    Capture("a label burnt in", each(labelled), ("stands still", "static", "folded", "parallax")),
+    Capture("torn files", dict, ("cannot be used",), placeable=lambda names: names[6:]),
+)
+
+
+def write(capture: Capture, folder: Path) -> list[str]:
+    """The pictures of a capture as JPEGs; returns their names."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    good = {path.name: cv2.imread(str(path)) for path in sorted(GOOD.glob("*.jpg"))}
+    made = capture.make(good)
+    for n, (name, picture) in enumerate(made.items()):
+        cv2.imwrite(str(folder / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 92])
+        if capture.name == "torn files" and n < 6:
+            whole = (folder / name).read_bytes()
+            (folder / name).write_bytes([whole[: len(whole) // 3], b"", b"not a picture"][n % 3])
+    return sorted(made)
+
+
+@dataclass
+class Row:
+    capture: str
+    photographs: int
+    forecast: str = ""
+    exit_code: int = 0
+    grade: str = ""
+    registered: int = 0
+    centre_rms_percent: float | None = None
+    problems: list[str] = field(default_factory=list)
+    said: str = ""
+    seconds: float = 0.0
+    right: bool = False
+
+
+def measured(capture: Capture, work: Path) -> Row:
+    folder, run = work / "captures" / capture.name.replace(" ", "-"), work / "runs" / capture.name.replace(" ", "-")
+    names = write(capture, folder)
+    shutil.rmtree(run, ignore_errors=True)
+    row = Row(capture.name, len(names))
+    checked = subprocess.run([*ENERF, "check", str(folder), "--json"], capture_output=True, text=True, check=False, cwd=ROOT)
+    forecast = _last_json(checked.stdout)
+    row.forecast = str(forecast.get("grade") or forecast.get("message") or checked.returncode)
+    started = time.monotonic()
+    done = subprocess.run([*ENERF, "run", str(folder), "--out", str(run), "--until", "poses"], capture_output=True, text=True, check=False, cwd=ROOT)
+    row.seconds, row.exit_code = round(time.monotonic() - started, 1), done.returncode
+    row.said = (done.stdout + done.stderr)[-6000:]
+    verdicts = [run / "poses" / "verdict.json", *sorted((run / ".work").rglob("verdict.json"))]
+    diagnosis = ""
+    for verdict in [path for path in verdicts if path.exists()][:1]:
+        found = json.loads(verdict.read_text())
+        row.grade, row.registered, row.problems = found["grade"], found["registered"] or 0, [problem["what"] for problem in found["problems"]]
+        diagnosis = " ".join(f"{problem['what']} {problem['sentence']}" for problem in found["problems"]).lower()
+        row.centre_rms_percent = _error(run, capture) if done.returncode == 0 else None
+    placeable = len(capture.placeable(names))
+    placed = row.centre_rms_percent is not None and row.centre_rms_percent <= MOST_ERROR and row.registered >= ENOUGH * placeable
+    row.right = "Traceback" not in row.said and (placed or any(word in diagnosis for word in capture.diagnoses))
+    return row
+
+
+def _last_json(text: str) -> dict[str, Any]:
+    for line in reversed(text.splitlines()):
+        try:
+            found = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(found, dict):
+            return found
+    return {}
+
+
+def _error(run: Path, capture: Capture) -> float | None:
+    """Root mean square of the centres' distances from the truth, %; None where there are too few."""
+    truth = true_centres(TRUTH)
+    views = json.loads((run / "poses" / "scene.json").read_text())["views"]
+    pairs = [
+        (np.array(view["source_camera"]["world_from_camera"])[:3, 3], truth[capture.names(view["source_camera"]["name"])])
+        for view in views
+        if capture.names(view["source_camera"]["name"]) in truth
+    ]
+    if len(pairs) < 4:
+        return None
+    errors = aligned_errors(np.array([found for found, _ in pairs]), np.array([true for _, true in pairs]))
+    return round(100 * float(np.sqrt((errors**2).mean())), 3)
+
+
+def in_markdown(rows: list[Row]) -> str:
+    columns = ("capture", "photographs", "forecast", "grade", "registered", "centres, %", "problems", "exit code", "seconds", "right")
+    lines = ["# Bad captures", "", "| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    for row in rows:
+        error = "" if row.centre_rms_percent is None else f"{row.centre_rms_percent:.2f}"
+        parts = [row.capture, row.photographs, row.forecast, row.grade, row.registered, error, ", ".join(row.problems), row.exit_code, f"{row.seconds:.0f}"]
+        lines.append("| " + " | ".join(map(str, [*parts, "yes" if row.right else "**no**"])) + " |")
+    right = sum(row.right for row in rows)
+    lines += ["", f"{right} of {len(rows)} end in cameras within {MOST_ERROR:g} % of the truth or in the right diagnosis.", ""]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--only", default="", help="names, with commas between")
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results")
+    given = parser.parse_args()
+    wanted = {name.strip() for name in given.only.split(",") if name.strip()}
+    rows = []
+    for capture in CAPTURES:
+        if wanted and capture.name not in wanted:
+            continue
+        rows.append(measured(capture, given.work.resolve()))
+        print(f"{rows[-1].capture}: {rows[-1].grade or rows[-1].exit_code}, {'right' if rows[-1].right else 'WRONG'}", flush=True)
+    given.out.mkdir(parents=True, exist_ok=True)
+    document = {"machine": hardware("cpu"), "rows": [{key: value for key, value in vars(row).items() if key != "said"} for row in rows]}
+    (given.out / "bad_captures.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    (given.out / "bad_captures.md").write_text(in_markdown(rows), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
