@@ -29,6 +29,7 @@ _WRITTEN = ("", "-wal", "-shm", "-journal")  # files of a database
 _BLOBS = {"F": 72, "E": 72, "H": 72, "qvec": 32, "tvec": 24}  # bytes, where there are any
 MAX_IMAGES = 2147483647  # COLMAP's
 _MAX_KEYPOINTS = 2**20
+HOMOGRAPHIES = (4, 5, 6)  # of COLMAP's two-view geometries: planar, panoramic, either of them
 
 Row = dict[str, Any]
 
@@ -236,6 +237,13 @@ def inlier_counts(path: Path) -> dict[tuple[int, int], int]:
     """Verified matches of each pair of image ids that was compared, in order."""
     with contextlib.closing(sqlite3.connect(path)) as connection:
         return {image_ids_of_pair(row[0]): int(row[1]) for row in connection.execute("SELECT pair_id, rows FROM two_view_geometries ORDER BY pair_id")}
+
+
+def planar_share(path: Path) -> float | None:
+    """Share of the verified pairs whose matches one homography explains: of a camera that only turned, or of one plane; None without such pairs."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        kinds = [int(row[0]) for row in connection.execute("SELECT config FROM two_view_geometries WHERE rows > 0")]
+    return sum(kind in HOMOGRAPHIES for kind in kinds) / len(kinds) if kinds else None
 
 
 def pair_id_of(first: int, second: int) -> int:

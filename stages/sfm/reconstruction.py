@@ -25,13 +25,14 @@ from pipeline.files import write_json
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import ladder, mapping, matches, process
 from stages.sfm.colmap import num_threads, quiet_pycolmap
-from stages.sfm.database import database_path, inlier_counts, open_database, remove_database
+from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
 from stages.sfm.images import Masks, WorkImage, prepare_images
 from stages.verdict.looks import look_at_all
-from stages.verdict.verdict import failed, triangulation_angle
+from stages.verdict.verdict import WITHOUT_TEXTURE, failed, triangulation_angle
 
 WAIT = 0.05  # seconds between two looks at a lock
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
+FEW_FEATURES = 50  # of a photograph, below which nothing can be told by it
 MAX_NAMES = 8  # photographs that an error lists by name
 
 
@@ -235,8 +236,8 @@ def _unregistered(work: Path, images: Sequence[WorkImage], models: Sequence[Any]
         inliers = best.get(ids[image.file], 0)
         if other is not None:
             reason = f"belongs to another sub-model, of {len(other)} photographs, which shares too few points with the rest"
-        elif features[image.file] < 50:
-            reason = f"only {features[image.file]} features detected: blurred, dark or without texture"
+        elif features[image.file] < FEW_FEATURES:
+            reason = f"only {features[image.file]} features detected: {WITHOUT_TEXTURE}"
         elif inliers < 15:
             reason = "overlaps no other photograph well enough"
         else:
@@ -252,6 +253,7 @@ def _facts_of_matching(images: Sequence[WorkImage], found: ladder.Found, how: st
         "components": [len(part) for part in ladder.components(ladder.neighbours(found.work, len(images)))],
         "models": [int(model.num_reg_images()) for model in found.models],
         "rungs": found.rungs,
+        "planar_pairs": planar_share(database_path(found.work)),
     }
 
 

@@ -25,6 +25,9 @@ FEW = 12  # views all round a subject
 FEW_POINTS = 60  # sparse points of a photograph, below which its pose is doubtful
 SHARE = 0.1  # of the photographs, from which a problem of single ones is one of the capture
 LARGE_ERROR = 2.0  # px at LONGEST
+MOST_PLANAR = 0.8  # share of the pairs
+SMALL_ANGLE = 4.0  # degrees of parallax
+WITHOUT_TEXTURE = "blurred, dark or without texture"
 LONGEST = 1600  # px that reprojection errors are stated at
 MORE_PHOTOGRAPHS = "Take more photographs between those that do not fit together, with at least 60 % overlap between neighbours."
 
@@ -92,11 +95,12 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
         "triangulation_angle": angle if angle is None else round(angle, 2),
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "points_per_image": None if counts is None else float(np.median(counts)),
-        **{key: capture.facts[key] for key in ("matching", "components", "models", "pairs_agreeing", "rungs") if key in capture.facts},
+        **{key: capture.facts[key] for key in ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs") if key in capture.facts},
         "sharpness": round(float(np.median([each.sharpness for each in looks.values()])), 3) if looks else None,
     }
     problems = [
         *_of_registration(capture, len(names), total, in_folder),
+        *_of_matches(capture, flat=angle is None or angle < SMALL_ANGLE),
         *_of_geometry(capture, angle, counts),
         *of_looks(looks),
     ]
@@ -116,7 +120,7 @@ def failed(
 ) -> Verdict:
     """The verdict on photographs that no cameras were found of."""
     capture = Capture(kind="photographs", photos=(), background=None, rejected=tuple(rejected), facts=facts, overlaps=overlaps)
-    others = [*_of_parts(capture), *of_looks(looks)]
+    others = [*_of_matches(capture, flat=True), *_of_parts(capture), *of_looks(looks)]
     problems = (Problem("failed", "failed", sentence, remedy, tuple(name for name, _ in rejected)), *others)
     return Verdict("failed", problems, {"photographs": len(looks), "registered": registered, **facts}, _rows(capture, looks, None))
 
@@ -141,6 +145,21 @@ def _of_registration(capture: Capture, registered: int, total: int, in_folder: i
     return found
 
 
+def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
+    """Why photographs that were matched have no cameras, or doubtful ones. flat: no depth was found, or hardly any."""
+    found = []
+    bare = tuple(name for name, reason in capture.rejected if WITHOUT_TEXTURE in reason)
+    if len(bare) > SHARE * (len(capture.photos) + len(capture.rejected)):
+        sentence = f"{len(bare)} photographs show hardly a feature; they are {WITHOUT_TEXTURE}: {abbreviated(list(bare))}."
+        remedy = "Photograph a subject with texture in good light; put a patterned cloth or newspaper under a plain one."
+        found.append(Problem("without texture", "poor", sentence, remedy, bare))
+    planar = capture.facts.get("planar_pairs")
+    if flat and isinstance(planar, float) and planar > MOST_PLANAR:
+        sentence = f"In {planar:.0%} of the pairs one homography explains all matches: the camera only turned on the spot, or all is one flat thing."
+        found.append(Problem("one place", "poor", sentence, "Move round the subject between photographs; turning the camera alone shows no depth."))
+    return found
+
+
 def _of_parts(capture: Capture) -> list[Problem]:
     components, models = (capture.facts.get(key) for key in ("components", "models"))
     parts = [count for count in components if count >= MIN_IMAGES] if isinstance(components, list) else []
@@ -160,7 +179,7 @@ def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | Non
     if isinstance(agreeing, float) and agreeing < 0.8:
         sentence = f"Only {agreeing:.0%} of the matches agree with the cameras: repeated structure may have folded the scene."
         found.append(Problem("folded", "poor", sentence, "Look at cameras.png. Photographs with more of the surroundings tell repeated parts apart."))
-    if angle is not None and angle < 4.0:
+    if angle is not None and angle < SMALL_ANGLE:
         sentence = f"The photographs were taken from almost one place (parallax {angle:.1f} degrees): depth will be poor."
         found.append(Problem("parallax", "poor" if angle < 2.0 else "usable", sentence, "Move sideways between photographs, not only turn."))
     if capture.reprojection_error is not None and capture.photos:

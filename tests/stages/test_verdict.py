@@ -14,7 +14,7 @@ from efficientnerf.geometry.cameras import Camera
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.verdict import looks, pictures
 from stages.verdict.looks import Look, look
-from stages.verdict.verdict import GRADES, verdict_on
+from stages.verdict.verdict import GRADES, Verdict, failed, verdict_on
 
 RNG = np.random.default_rng(0)
 PICTURE = cv2.resize(RNG.integers(40, 216, (120, 160), np.uint8), (640, 480), interpolation=cv2.INTER_LANCZOS4)
@@ -154,6 +154,24 @@ def test_lost_photographs_have_the_registered_ones_that_they_failed_against() ->
     found = verdict_on(made, {})
     assert found.images["lost0.jpg"]["nearest"] == [{"image": "01.jpg", "matches": 19}, {"image": "00.jpg", "matches": 12}]
     assert found.images["lost1.jpg"]["nearest"] == []
+
+
+BARE = tuple((f"bare{k}.jpg", "only 3 features detected: blurred, dark or without texture") for k in range(4))
+
+
+def test_cameras_that_only_turned_and_photographs_without_texture_are_named() -> None:
+    def words(found: Verdict) -> list[str]:
+        return [problem.what for problem in found.problems]
+
+    flat = {"planar_pairs": 0.95}
+    assert "one place" in words(failed("none.", "try.", 0, LOST, {}, flat, ()))
+    assert "one place" in words(verdict_on(capture(radius=0.05, facts=flat), sharp(NAMES)))
+    assert words(verdict_on(capture(facts=flat), sharp(NAMES))) == []  # a wall seen from all sides has depth all the same
+    assert "one place" not in words(failed("none.", "try.", 0, LOST, {}, {"planar_pairs": 0.3}, ()))
+    bare = failed("none.", "try.", 0, BARE, {}, {}, ())
+    assert "without texture" in words(bare)
+    assert bare.problems[1].images == tuple(name for name, _ in BARE)
+    assert "without texture" not in words(verdict_on(capture(rejected=BARE[:1]), sharp(NAMES)))
 
 
 def test_problems_are_in_order_and_the_worst_is_the_grade() -> None:
