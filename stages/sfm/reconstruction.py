@@ -280,7 +280,7 @@ def _failure(
     also = " ".join(problem.sentence for problem in verdict.problems[1:] if problem.grade != "good")
     return (
         f"{folder}: {what} Not registered: {_abbreviated(list(worst))} ({next(iter(worst.values()), 'no model')}).{also and ' '}{also}"
-        f"\nTry {'; '.join(hints)}. Of each photograph: {work / VERDICT}"
+        f" Try {'; '.join(hints)}. Of each photograph: {work / VERDICT}"
     )
 
 
