@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-STAGES = ("poses", "train", "bake", "mesh", "evaluate", "turntable", "points")
+STAGES = ("poses", "train", "bake", "mesh", "splats", "evaluate", "turntable", "points")
 QUICK = (
     "poses.test_every=50", "train.iterations=150", "train.preview_every=off", "bake.refine_steps=4", "bake.visibility_rays=60000", "bake.max_mib=8",
     "bake.samples_per_voxel=1", "evaluate.field_views=1", "evaluate.field_background_rays=10000", "turntable.frames=2",

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-LATER = ("bake", "mesh", "evaluate", "turntable", "points")
+LATER = ("bake", "mesh", "splats", "evaluate", "turntable", "points")
 OWN = (".lock", ".work", ".cache")  # a lock belongs to the file, not to its name
 
 

@@ -134,6 +134,16 @@ class PointsOutputs(Outputs):
     ply = Name("points.ply")  # the capture's frame
 
 
+class SplatsOutputs(Outputs):
+    """The asset as 3D Gaussians; of a run that makes none the report alone."""
+
+    stage = "splats"
+    ply = Name("splats.ply")  # as 3DGS writes it, the capture's frame
+    spz = Name("splats.spz")  # the same, small, y up
+    preview = Name("preview.png")  # beside the asset
+    report = Name("report.json")  # how many, bytes, seconds
+
+
 @dataclass(frozen=True)
 class TrainInputs:
     poses: PosesOutputs
@@ -146,8 +156,16 @@ class BakeInputs:
 
 
 @dataclass(frozen=True)
+class SplatsInputs:
+    bake: BakeOutputs
+    train: TrainOutputs
+    poses: PosesOutputs
+
+
+@dataclass(frozen=True)
 class EvaluateInputs:
     mesh: MeshOutputs
+    splats: SplatsOutputs
     bake: BakeOutputs
     train: TrainOutputs
     poses: PosesOutputs

@@ -1,7 +1,8 @@
-"""The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field, the baked asset and the mesh on the test views, and what parts the first two.
+"""The evaluate stage: PSNR, SSIM and optionally LPIPS of the trained field, the baked asset, the mesh and the 3D Gaussians on the test views, and what parts
+the first two.
 
-    metrics.json       "network" (the field), "asset" and "mesh": means over the views; "gap", "holes", "floaters": the asset against the network; "views": the
-                       metrics of each (stages.evaluation.summary, stages.evaluation.comparison, stages.evaluation.mesh)
+    metrics.json       "network" (the field), "asset", "mesh" and, where there are Gaussians, "splats": means over the views; "gap", "holes", "floaters": the
+                       asset against the network; "views": the metrics of each (stages.evaluation.summary, .comparison, .mesh, .splats)
     contact_sheet.png  ground truth, field and asset, with their errors
     strip_*.png        photograph, network, asset and mesh at full size: the worst, the median and the best view
     captured_path.mp4  the asset along the captured cameras
@@ -35,13 +36,15 @@ from stages.compiling import compiling_kernels
 from stages.evaluation.asset import EvaluatedAsset, evaluated
 from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES, evaluate_view
 from stages.evaluation.findings import findings
+from stages.evaluation.lpips_weights import load_lpips
 from stages.evaluation.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
+from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
+from stages.evaluation.splats import EvaluatedSplats, load_splats
 from stages.evaluation.strips import STRIP_RAYS, strip_views, write_strips
 from stages.evaluation.summary import in_words, quality, summary
 from stages.evaluation.video import write_captured_path
 from stages.evaluation.views import constant_background, evaluation_views, evenly_spaced, stride_for
 from stages.io.scene import View
-from stages.lpips_weights import load_lpips
 from stages.scratch import note, noted, once
 
 if TYPE_CHECKING:
@@ -97,7 +100,7 @@ def run(job: Job) -> None:
     tree = format.load(inputs.bake.asset).to(job.device)
     _refuse_large_views(tree, inputs, job)
     region = read_json(inputs.mesh.report).get("region", "foreground")
-    evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region))
+    evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree))
 
 
 def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> None:
@@ -116,12 +119,13 @@ def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> Non
     refuse_what_does_not_fit(job, need, "Lower poses.max_image_size or bake.max_mib.")
 
 
-def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job, mesh: EvaluatedMesh) -> None:
+def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job, mesh: EvaluatedMesh, splats: EvaluatedSplats | None = None) -> None:
     """Write metrics, pictures and video. Metrics and thumbnails of each view are kept in job.work, so that a kill costs at most one view.
 
     tree        the asset's
     load_field  returns a FieldRenderer; called only where one is needed
     mesh        made of the asset
+    splats      the same
     """
     from stages.io.refined_cameras import load_scene
 
@@ -143,18 +147,20 @@ def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], jo
         job.safe_point()
         job.progress(k, len(views), f"view {view.name}")
         done, with_field = job.work / f"view_{k:05d}.json", k in drawn
-        check = partial(_check, job.work, k, view, with_field=with_field, composited=composited, perceptual=[*perceptual])
+        check = partial(_check, job.work, k, view, with_field=with_field, composited=composited, perceptual=[*perceptual], splats=splats is not None)
         measured = noted(done, dict[str, Measured], warn, check)
         if measured is None:
             field = load_field() if with_field or not surrounded else None
             measured, images = evaluate_view(
-                asset, mesh, field, scene, view, job, with_field=with_field, stride=stride if with_field or rest is None else rest, perceptual=perceptual
-            )
+                asset, mesh, field, scene, view, job, with_field=with_field, stride=stride if with_field or rest is None else rest, perceptual=perceptual,
+                splats=splats,
+            )  # fmt: skip
             note(done, measured, _save_thumbnails(images, job.work, k) if with_field else ())
         figures.append(measured)
     job.progress(len(views), len(views))
     strips = write_strips(asset, mesh, load_field, scene, views, strip_views(figures), job, warn) if settings.strips == "on" else []
-    metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips, mesh=mesh.facts)
+    metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips, mesh=mesh.facts,
+                      splats=None if splats is None else splats.facts)  # fmt: skip
     write_json(EvaluateOutputs(job.out).metrics, metrics)
     _write_sheet(metrics, drawn, job)
     frames = given(settings.captured_path_frames)
@@ -174,7 +180,8 @@ def _field_stride(views: Sequence[View], scale: float | None) -> int:
 
 
 def _check(
-    folder: Path, k: int, view: View, measured: Mapping[str, Any], outputs: Collection[str], *, with_field: bool, composited: bool, perceptual: Sequence[str]
+    folder: Path, k: int, view: View, measured: Mapping[str, Any], outputs: Collection[str], *, with_field: bool, composited: bool, perceptual: Sequence[str],
+    splats: bool,
 ) -> None:
     """Raises where these are not the metrics of the k-th view as `evaluate_view` returns them, or a thumbnail is missing or can't be read.
 
@@ -190,6 +197,8 @@ def _check(
         raise ValueError("no metrics of the field")
     if not {*FIGURES} <= measured["mesh"].keys():
         raise ValueError("no metrics of the mesh")
+    if splats and not {*SPLATS_FIGURES} <= measured["splats"].keys():
+        raise ValueError("no metrics of the Gaussians")
     if not all(isinstance(measured[name], int | float | None) for name in ("holes", "floaters")):
         raise ValueError("no metrics of the asset against the field")
     if with_field and composited and not {*QUALITY} <= measured["asset_with_network_background"].keys():
@@ -228,4 +237,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=4, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)
+STAGE = Stage(name="evaluate", version=5, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)

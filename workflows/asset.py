@@ -27,7 +27,8 @@ NAMES = (
     "train",  # poses -> field, density voxels
     "bake",  # train, poses -> asset.nerftree
     "mesh",  # bake, train, poses -> PLY, GLB, OBJ
-    "evaluate",  # mesh, bake, train, poses -> PSNR and SSIM of the network, of the asset and of the mesh
+    "splats",  # bake, train, poses -> 3D Gaussians as PLY and SPZ, where splats.make is on
+    "evaluate",  # mesh, splats, bake, train, poses -> PSNR and SSIM of the network, of the asset, of the mesh and of the Gaussians
     "turntable",  # bake -> frames, video, EXR
     "points",  # bake -> PLY
 )

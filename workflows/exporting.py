@@ -1,4 +1,5 @@
-"""What `enerf export` does: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras."""
+"""What `enerf export` does: a surface as files, taken from the run's stage `mesh` where that has made the same; volumes and cameras. 3D Gaussians:
+`workflows.exporting_splats`."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import BadInput, UsageError
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, VOLUME_EXPORTERS, Format
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS, Format
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +36,7 @@ class Export:
     what       a run or an asset
     files      to write, by extension; those that are there only if `force`
     as_points  points instead of a mesh
+    as_splats  3D Gaussians instead of a mesh
     region, crop  of the asset; None: as the settings say
     texture    of the mesh; None: what the settings say, where a file keeps it or, of a run, takes colours of vertices from it
     normal_map  beside the texture; None: as the settings say, where a file keeps it
@@ -45,6 +47,7 @@ class Export:
     what: Path
     files: tuple[Path, ...]
     as_points: bool = False
+    as_splats: bool = False
     region: str | None = None
     crop: Box | None = None
     force: bool = False
@@ -55,7 +58,12 @@ class Export:
 
     @property
     def formats(self) -> dict[str, Format]:
-        return {**(POINT_EXPORTERS if self.as_points else MESH_EXPORTERS), **VOLUME_EXPORTERS}
+        return {**self.table, **VOLUME_EXPORTERS}
+
+    @property
+    def table(self) -> dict[str, Format]:
+        """Of what is made of the asset beside volumes."""
+        return SPLAT_EXPORTERS if self.as_splats else POINT_EXPORTERS if self.as_points else MESH_EXPORTERS
 
     def format(self, path: Path) -> Format:
         return self.formats[path.suffix.lower()]
@@ -75,8 +83,12 @@ class Export:
     @property
     def surfaces(self) -> list[Path]:
         """The files that hold the surface."""
-        others = {*self.cameras, *self.viewers, *self.volumes}
-        return [path for path in self.files if path not in others]
+        return [] if self.as_splats else [path for path in self.files if path.suffix.lower() in self.table]
+
+    @property
+    def splats(self) -> list[Path]:
+        """The files that hold 3D Gaussians."""
+        return [path for path in self.files if path.suffix.lower() in self.table] if self.as_splats else []
 
     @property
     def keeps_textures(self) -> bool:
@@ -112,10 +124,12 @@ def check(export: Export) -> None:
     """Raise UsageError for what cannot be written, before anything is done."""
     from workflows.destination import check_files
 
+    if export.as_points and export.as_splats:
+        raise UsageError("--points and --splats: one of the two at a time, for .ply is either.")
     known = [*export.formats, CAMERAS, VIEWER]
     for path in export.files:
         if path.suffix.lower() not in known:
-            kind = "points" if export.as_points else "a mesh or a volume"
+            kind = "points" if export.as_points else "3D Gaussians" if export.as_splats else "a mesh or a volume"
             raise UsageError(f"{path}: the extension {path.suffix!r} names no format for {kind}; expected one of {', '.join(known)}.")
     if (export.picture != "png" and not export.keeps_textures) or (export.texture not in (None, "off") and not (export.is_coloured and not export.as_points)):
         raise UsageError("None of the files keeps a texture (enerf export --list). Give a .glb, .obj, .usdz or .usdc, or leave out --texture and --jpeg.")
@@ -337,8 +351,8 @@ _OTHERS = (
 def formats() -> list[dict[str, Any]]:
     """All formats with what they keep and lose, the command that writes them, the extra that they need, and who opens them."""
     rows: list[dict[str, Any]] = []
-    for kind, table in (("mesh", MESH_EXPORTERS), ("points", POINT_EXPORTERS), ("volume", VOLUME_EXPORTERS)):
-        command = "enerf export --points" if kind == "points" else "enerf export"
+    for kind, table in (("mesh", MESH_EXPORTERS), ("points", POINT_EXPORTERS), ("splats", SPLAT_EXPORTERS), ("volume", VOLUME_EXPORTERS)):
+        command = f"enerf export --{kind}" if kind in ("points", "splats") else "enerf export"
         for each in table.values():
             facts = {"keeps": each.keeps, "loses": each.loses, "extra": each.extra, "opened_by": each.opened_by}
             rows.append({"extension": each.extension, "of": kind, "command": command, **facts})

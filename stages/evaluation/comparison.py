@@ -21,6 +21,7 @@ from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.evaluation.asset import EvaluatedAsset, over_field, render_asset
 from stages.evaluation.mesh import MAX_PSNR, EvaluatedMesh, mesh_image, mesh_metrics
+from stages.evaluation.splats import EvaluatedSplats, splats_image, splats_metrics
 from stages.evaluation.views import GroundTruth, constant_background, ground_truth, subsample, subsample_camera, upsample
 from stages.io.scene import Scene, View
 
@@ -36,7 +37,7 @@ SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 def evaluate_view(
     asset: EvaluatedAsset, mesh: EvaluatedMesh, field: Any, scene: Scene, view: View, job: Job, *, with_field: bool, stride: int,
-    perceptual: Mapping[str, Lpips] | None = None,
+    perceptual: Mapping[str, Lpips] | None = None, splats: EvaluatedSplats | None = None,
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The metrics of one view, and its images for the contact sheet: ground truth, field and its error if it is measured, asset and its error.
 
@@ -64,6 +65,8 @@ def evaluate_view(
         metrics["asset"]["background_scale"] = 1.0 / stride
     drawn, plain, covered = mesh_image(mesh, asset, scene, view, seen, stride)
     metrics["mesh"] = mesh_metrics(clipped(drawn, job, f"{view.name}: the mesh"), clipped(plain, job, f"{view.name}: the mesh"), covered, image, truth)
+    if splats is not None:
+        metrics["splats"] = splats_metrics(clipped(splats_image(splats, asset, scene, view), job, f"{view.name}: the Gaussians"), truth)
     if with_field and seen is not None:
         small = truth.subsampled(stride)
         render = clipped(seen.colour, job, f"{view.name}: the field")

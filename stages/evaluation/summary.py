@@ -4,6 +4,7 @@ network, asset  means over their views of PSNR (in decibels, as published), SSIM
 asset.on_network_views         those of the views that the network was rendered for
 asset_with_network_background  cascade 0 of a whole scene's asset between what the field shows before and behind its box; null for other assets
 mesh            means over the views of what `stages.evaluation.mesh` measures, and how many faces and texels the mesh has
+splats          the same of the 3D Gaussians (`stages.evaluation.splats`); null where there are none
 gap, holes, floaters           means over the views that the network was rendered for (`stages.evaluation.comparison`)
 strips          the views whose pictures stand beside, with the figures of these
 views           the metrics of each view
@@ -17,13 +18,14 @@ from typing import Any
 
 from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES
 from stages.evaluation.mesh import FIGURES
+from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
 
 FORMAT = 1
 
 
 def summary(
     figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, mesh: Mapping[str, Any], perceptual: Sequence[str] = (),
-    strips: Sequence[dict[str, Any]] = (),
+    strips: Sequence[dict[str, Any]] = (), splats: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The document of metrics.json.
 
@@ -31,6 +33,7 @@ def summary(
     stride      of the network's renders
     background  stride of the surroundings that the field renders for the other views; None: no view has such
     mesh        facts about the mesh
+    splats      facts about the Gaussians, if there are any
     perceptual  names of LPIPS metrics
     """
     drawn = [view for view in figures if view["network"] is not None]
@@ -47,6 +50,7 @@ def summary(
         "network": network,
         "asset": asset,
         "mesh": {**means([view["mesh"] for view in figures], FIGURES), **mesh, "views": len(figures), "scale": 1.0},
+        "splats": None if splats is None else {**means([view["splats"] for view in figures], SPLATS_FIGURES), **splats, "views": len(figures), "scale": 1.0},
         "asset_with_network_background": {**means(composited), "views": len(composited), "background_scale": 1.0 / stride} if composited else None,
         "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
         **means(drawn, ("holes", "floaters")),
@@ -72,7 +76,7 @@ def quality(found: Mapping[str, Any]) -> str:
 
 def in_words(metrics: Mapping[str, Any]) -> str:
     """The means in one line."""
-    parts = [f"{name} {quality(metrics[name])}" for name in ("network", "asset", "mesh")]
+    parts = [f"{name} {quality(metrics[name])}" for name in ("network", "asset", "mesh", "splats") if metrics[name] is not None]
     if metrics["gap"]["psnr"] is not None:
         parts.append(f"gap {metrics['gap']['psnr']:+.2f} dB")
     for name in ("holes", "floaters"):

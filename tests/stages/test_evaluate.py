@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from PIL import Image
 from efficientnerf.evaluation.metrics import psnr, ssim
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.errors import Interrupted
+from stages.evaluation.splats import EvaluatedSplats
 from stages.evaluation.views import evenly_spaced, stride_for, subsample, subsample_camera, upsample
 from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
@@ -43,6 +45,19 @@ def test_a_perfect_asset_is_as_good_as_eight_bits_allow(tmp_path: Path) -> None:
     assert metrics["asset"]["views"] == metrics["network"]["views"] == 3
     assert sorted(path.name for path in job.out.iterdir()) == ["contact_sheet.png", "metrics.json"]
     assert field.calls == [(f"v{k}.png", WIDTH, HEIGHT) for k in (1, 3, 5)]
+
+
+def test_gaussians_that_look_like_the_asset_have_its_figures(tmp_path: Path) -> None:
+    """Over the same background; and where a first attempt had none, its views are measured again."""
+    poses = make_scene(tmp_path / "poses", "tt")
+    splats = EvaluatedSplats(lambda camera, background: TREE.render(camera, background=background).colour, {"gaussians": 7})
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job_in(tmp_path, poses, out="none"))
+    assert json.loads((tmp_path / "none/metrics.json").read_text())["splats"] is None
+    job = job_in(tmp_path, poses)
+    measure(TREE, lambda: BallField(TREE, background=WHITE), job, splats)
+    metrics = figures_of(job)
+    assert metrics["splats"] == {"psnr": metrics["asset"]["psnr"], "ssim": metrics["asset"]["ssim"], "gaussians": 7, "views": 2, "scale": 1.0}
+    assert [view["splats"]["psnr"] for view in metrics["views"]] == [view["asset"]["psnr"] for view in metrics["views"]]
 
 
 def test_figures_are_those_of_the_metrics(tmp_path: Path) -> None:

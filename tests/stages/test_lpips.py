@@ -11,10 +11,10 @@ import torch
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
 from stages.evaluation.comparison import GAP, lpips_metrics
+from stages.evaluation.lpips_weights import BACKBONES, load_lpips
 from stages.evaluation.mesh import FIGURES
 from stages.evaluation.summary import summary
 from stages.evaluation.views import GroundTruth
-from stages.lpips_weights import BACKBONES, load_lpips
 
 
 @pytest.fixture(autouse=True)

@@ -23,7 +23,7 @@ def test_a_table_of_a_run_and_of_one_that_fails(tmp_path: Path, capsys: pytest.C
     assert good["ok"]
     assert good["gap"]["psnr"] == metrics["gap"]["psnr"]
     assert (good["holes"], good["floaters"]) == (metrics["holes"], metrics["floaters"])
-    assert set(good["seconds"]) == {"poses", "train", "bake", "evaluate", "turntable", "mesh", "points"}
+    assert set(good["seconds"]) == {"poses", "train", "bake", "evaluate", "turntable", "mesh", "splats", "points"}
     assert good["asset_bytes"] == (tmp_path / "runs/source/bake/asset.nerftree").stat().st_size
     assert good["frames_per_second"] > 0
     assert not bad["ok"]

@@ -22,14 +22,15 @@ EXR = ("off", "first", "all")  # of turntable.exr, which a test compares
 Crop = tuple[float, float, float, float, float, float] | None
 
 
-@click.command(short_help="Write meshes, points, volumes, a viewer or cameras in other formats.")
+@click.command(short_help="Write meshes, points, splats, volumes, a viewer or cameras.")
 @click.argument("what", metavar="RUN|ASSET", required=False, type=folder_type)
 @click.argument("more", metavar="[FILE]...", nargs=-1, type=folder_type)
 @click.option("--to", "first", metavar="FILE", type=folder_type, help="File to write; more may follow. The extension selects the format.")
 @click.option("--list", "as_list", is_flag=True, help="All formats: what they keep and lose, what they need, who opens them.")
 @click.option("--points", "as_points", is_flag=True, help="Points instead of a mesh.")
+@click.option("--splats", "as_splats", is_flag=True, help="3D Gaussians instead of a mesh.")
 @click.option(
-    "--region", type=click.Choice(REGIONS), help="The subject (foreground) or the whole scene (all); by default mesh.region or points.region: foreground."
+    "--region", type=click.Choice(REGIONS), help="The subject (foreground) or the whole scene (all); by default that of the stage: foreground, of splats all."
 )
 @crop_option
 @click.option("--faces", metavar="20k|100k|500k|N", help="Most faces of the mesh, in place of mesh.max_faces.")
@@ -53,14 +54,15 @@ def export(
     what: Path | None, first: Path | None, more: tuple[Path, ...], as_list: bool, sets: tuple[str, ...], memory: str | None, as_json: bool, quiet: bool,
     **given: Any,
 ) -> None:
-    """Write the surface of RUN or ASSET as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl, with --points as .ply, .xyz, .las or .laz; its voxels
-    as a volume (.vdb); all of it as a page for browsers (.html); or the cameras of RUN as .json (nerfstudio).
+    """Write the surface of RUN or ASSET as .glb, .obj, .usdz, .usdc (with a texture), .ply or .stl, with --points as .ply, .xyz, .las or .laz; with
+    --splats 3D Gaussians as .ply, .spz or .glb; its voxels as a volume (.vdb); all of it as a page for browsers (.html); or the cameras of RUN as .json
+    (nerfstudio).
 
-    Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. What the run's stage mesh has made with
-    the same settings is taken from there. Settings of the stages mesh and points apply: '--set mesh.max_faces=...'.
+    Each file appears whole or not at all; an existing one is replaced with --force only, a file of a run never. What the run's stages mesh and splats
+    have made with the same settings is taken from there. Settings of the stages mesh, points and splats apply: '--set mesh.max_faces=...'.
     """
     from pipeline.errors import UsageError
-    from workflows import exporting
+    from workflows import exporting, exporting_splats
     from workflows.cli.output import closing, listing, write_json
 
     if as_list:
@@ -82,6 +84,7 @@ def export(
         settings = _settings_for(what, (*sets, *options), _surface_stages())
         written += exporting.export_viewers(asked)
         written += exporting.export_volumes(asked, settings)
+        written += exporting_splats.export_splats(asked, settings, _progress("export", show))
         written += exporting.export_surface(asked, settings, _progress("export", show))
     if as_json:
         write_json({"event": "summary", "ok": True, "written": written, "exit_code": 0})
@@ -92,9 +95,9 @@ def export(
 
 
 def _surface_stages() -> dict[str, type]:
-    from stages import mesh, points
+    from stages import mesh, points, splats
 
-    return {"mesh": mesh.MeshSettings, "points": points.PointsSettings}
+    return {"mesh": mesh.MeshSettings, "points": points.PointsSettings, "splats": splats.SplatsSettings}
 
 
 def _settings_for(what: Path, sets: tuple[str, ...], types: dict[str, type]) -> Settings:

@@ -73,6 +73,7 @@ class Metrics(msgspec.Struct):
     network: NetworkQuality | None = None
     asset: Quality | None = None
     mesh: MeshQuality | None = None
+    splats: Quality | None = None
     asset_with_network_background: Quality | None = None
     gap: Quality | None = None
     holes: float | None = None

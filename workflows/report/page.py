@@ -18,7 +18,7 @@ import jinja2
 from markupsafe import Markup
 
 from pipeline.text import printable
-from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, TrainOutputs, TurntableOutputs
+from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.output import plain
 from workflows.cli.progress import duration, size
 from workflows.report import documents
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 NAME = "report.html"
 RUN = Path()  # names are relative to the page
 POSES, TRAIN, BAKE, EVALUATE = PosesOutputs.of_run(RUN), TrainOutputs.of_run(RUN), BakeOutputs.of_run(RUN), EvaluateOutputs.of_run(RUN)
-TURNTABLE, MESH, POINTS = TurntableOutputs.of_run(RUN), MeshOutputs.of_run(RUN), PointsOutputs.of_run(RUN)
+TURNTABLE, MESH, POINTS, SPLATS = TurntableOutputs.of_run(RUN), MeshOutputs.of_run(RUN), PointsOutputs.of_run(RUN), SplatsOutputs.of_run(RUN)
 VIEWER = RUN / "viewer.html"
 DOWNLOADS = (
     (BAKE.asset, "the baked asset"),
@@ -45,6 +45,8 @@ DOWNLOADS = (
     (MESH.texture, "its texture"),
     (MESH.ply, "mesh with colours of its vertices, the capture's frame"),
     (POINTS.ply, "point cloud"),
+    (SPLATS.ply, "3D Gaussians, the capture's frame"),
+    (SPLATS.spz, "3D Gaussians in few bytes, y up"),
     (POSES.scene, "cameras and splits"),
     (EVALUATE.captured_path, "the asset along the captured cameras, H.264"),
     (EVALUATE.metrics, "all figures"),
@@ -120,11 +122,13 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
         evaluate=EVALUATE,
         turntable=TURNTABLE,
         mesh=MESH,
+        splats=SPLATS,
         viewer=VIEWER,
         files=[{"name": name, "what": what, "size": size(count)} for name, what in DOWNLOADS if (count := _size(folder / name)) is not None],
         views=_views(found),
         asset_report=_facts(folder, BAKE.report, damaged),
         mesh_report=_facts(folder, MESH.report, damaged),
+        splats_report=_facts(folder, SPLATS.report, damaged),
         mesh_seconds=_facts(folder, MESH.timings, damaged),
         previews=_previews(folder, TRAIN.previews),
         asset_previews=_previews(folder, BAKE.previews),
@@ -224,7 +228,7 @@ def _means(found: Metrics | None) -> list[tuple[str, ...]]:
     on_mesh = [None if mesh is None else Quality(psnr) for psnr in ((mesh.psnr_covered, mesh.asset_psnr_covered) if mesh is not None else (None, None))]
     rows = (("network", found.network, ""), ("asset", found.asset, ""), ("mesh, unlit, before the asset's surroundings", mesh, ""),
             ("mesh in the colours of its vertices", vertices, ""), ("mesh, on the pixels that it covers", on_mesh[0], ""),
-            ("asset, on the same pixels", on_mesh[1], ""), ("asset minus network, on the same pixels", found.gap, "+"),
+            ("asset, on the same pixels", on_mesh[1], ""), ("3D Gaussians", found.splats, ""), ("asset minus network, on the same pixels", found.gap, "+"),
             ("asset's innermost box before the network's surroundings", found.asset_with_network_background, ""))  # fmt: skip
     return [
         (name, *_figures(quality, sign), "" if quality.psnr_colour_fitted is None else f"{quality.psnr_colour_fitted:{sign}.2f}")

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from pipeline.runner import Outcome
-from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, TrainOutputs, TurntableOutputs
+from stages.artifacts import BakeOutputs, EvaluateOutputs, MeshOutputs, PointsOutputs, PosesOutputs, SplatsOutputs, TrainOutputs, TurntableOutputs
 from workflows.cli.progress import duration, size
 from workflows.report import documents
 from workflows.report.documents import Metrics
@@ -31,12 +31,14 @@ ARTIFACTS = {
     "mesh_obj": MeshOutputs.of_run(RUN).obj,
     "mesh_ply": MeshOutputs.of_run(RUN).ply,
     "points": PointsOutputs.of_run(RUN).ply,
+    "splats_ply": SplatsOutputs.of_run(RUN).ply,
+    "splats_spz": SplatsOutputs.of_run(RUN).spz,
     "report": RUN / "report.html",
     "viewer": RUN / "viewer.html",
 }
 TITLES = {
     "asset": "asset", "captured_path": "video", "strip_worst": "strip", "turntable": "turntable", "mesh_glb": "mesh", "mesh_obj": "mesh", "mesh_ply": "mesh",
-    "points": "points", "report": "report", "viewer": "viewer",
+    "points": "points", "splats_ply": "splats", "splats_spz": "splats", "report": "report", "viewer": "viewer",
 }  # fmt: skip
 
 
@@ -93,7 +95,7 @@ def quality_in_words(found: Metrics | None) -> str | None:
     if found is None:
         return None
     parts = []
-    for name, part in (("network", found.network), ("asset", found.asset), ("mesh", found.mesh)):
+    for name, part in (("network", found.network), ("asset", found.asset), ("mesh", found.mesh), ("splats", found.splats)):
         if part is not None and part.psnr is not None and part.ssim is not None:
             parts.append(f"{name} {part.psnr:.2f} dB PSNR, {part.ssim:.3f} SSIM")
     count = len(found.views)

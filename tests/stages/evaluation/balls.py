@@ -16,6 +16,7 @@ from efficientnerf.surface.mesh import Mesh
 from pipeline.stage import Job
 from stages.evaluate import EvaluateSettings, evaluate
 from stages.evaluation.mesh import evaluated_mesh
+from stages.evaluation.splats import EvaluatedSplats
 from stages.figures.plots import to_uint8
 from stages.framing.camera_paths import pose_on_sphere
 from stages.io.exporters.frames import frame_from_rendering
@@ -74,8 +75,8 @@ def job_in(folder: Path, poses: Path, chosen: EvaluateSettings | None = None, ou
     return Job(settings=chosen or settings(), out=folder / out, work=folder / "work", inputs={"poses": poses, "train": folder / "no refined cameras"}, **more)
 
 
-def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, **more: Any) -> None:
-    evaluate(tree.evaluated(**more), tree, load_field, job, BALL_MESH)
+def measure(tree: BallTree, load_field: Callable[[], Any], job: Job, splats: EvaluatedSplats | None = None, **more: Any) -> None:
+    evaluate(tree.evaluated(**more), tree, load_field, job, BALL_MESH, splats)
 
 
 def figures_of(job: Job) -> dict[str, Any]:

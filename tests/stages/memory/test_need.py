@@ -14,7 +14,7 @@ from PIL import Image
 from pipeline.errors import UsageError
 from pipeline.executors.memory import Limit
 from pipeline.stage import Job
-from stages import bake, evaluate, mesh, points, train, turntable
+from stages import bake, evaluate, mesh, points, splats, train, turntable
 from stages.artifacts import BakeOutputs, TrainOutputs
 from stages.bake import BakeSettings
 from stages.evaluate import EvaluateSettings
@@ -26,6 +26,7 @@ from stages.mesh import MeshSettings
 from stages.points import PointsSettings
 from stages.poses import PosesSettings
 from stages.poses import run as run_poses
+from stages.splats import SplatsSettings
 from stages.turntable import TurntableSettings
 from tests.efficientnerf.balls import settings
 from tests.stages.balls import job, poses
@@ -42,7 +43,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     train.run(job(folder / "train", settings(**QUICK), poses=scene))
     inputs = {"poses": scene, "train": folder / "train/out"}
     bake.run(job(folder / "bake", BakeSettings(resolution=16, samples_per_voxel=1, refine_steps=1, weight_threshold=0.0), **inputs))
-    return {**inputs, "bake": folder / "bake/out", "mesh": folder / "none"}  # refused before a mesh is looked at
+    return {**inputs, "bake": folder / "bake/out", "mesh": folder / "none", "splats": folder / "none"}  # refused before a mesh is looked at
 
 
 def limited(made: Job, size: int, events: list[dict[str, Any]] | None = None) -> Job:
@@ -114,6 +115,7 @@ def test_training_that_does_not_fit_is_refused_before_it_begins(made: dict[str, 
         (turntable, TurntableSettings(width=8192, height=8192), "turntable.width"),
         (points, PointsSettings(num_points=10**9), "points.num_points"),
         (mesh, MeshSettings(), "bake.max_mib"),
+        (splats, SplatsSettings(make="on", count=5_000_000), "splats.count (5000000)"),
         (evaluate, EvaluateSettings(), "poses.max_image_size"),
     ],
 )

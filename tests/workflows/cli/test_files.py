@@ -22,7 +22,8 @@ from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import UsageError
 from stages.framing.camera_paths import pose_on_sphere
 from stages.framing.captured import captured_metadata
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, VOLUME_EXPORTERS
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS, VOLUME_EXPORTERS
+from stages.io.exporters.splats.ply import read_splats
 from stages.mesh import MeshSettings
 from stages.turntable import TurntableSettings
 from tests.workflows.command import Result
@@ -112,7 +113,8 @@ def test_an_obj_replaces_none_of_its_three_files_without_force(enerf: Enerf, bal
 def test_the_list_names_every_format(enerf: Enerf) -> None:
     lines = enerf("export", "--list").out.splitlines()
     rows = enerf("export", "--list", "--json").objects[-1]["formats"]
-    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *VOLUME_EXPORTERS, ".json", ".html", ".png", ".exr", ".mp4", ".nerftree"}
+    others = {".json", ".html", ".png", ".exr", ".mp4", ".nerftree"}
+    assert {row["extension"] for row in rows} == {*MESH_EXPORTERS, *POINT_EXPORTERS, *SPLAT_EXPORTERS, *VOLUME_EXPORTERS, *others}
     assert all(row["keeps"] and row["loses"] and row["opened_by"] for row in rows)
     assert sum("pip install 'efficientnerf[usd]'" in line for line in lines) == 2
     assert sum("pip install 'efficientnerf[las]'" in line for line in lines) == 2
@@ -158,6 +160,21 @@ def test_a_volume_of_what_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path
     assert enerf("export", scene, "--to", tmp_path / "few.vdb", "--memory", "100m").code == 2
 
 
+def test_splats_of_what_is_asked_for(enerf: Enerf, scene: Path, tmp_path: Path) -> None:
+    """All with its surroundings, unless a region says otherwise; in the capture's frame, where the red ball has a radius of 1.2."""
+    few = ["--set", "splats.count=400", "--set", "splats.iterations=2", "--set", "splats.sh_degree=0"]
+    result = enerf("export", scene, "--splats", "--to", *(tmp_path / f"all{each}" for each in SPLAT_EXPORTERS), *few, "--json")
+    assert result.code == 0, result.err
+    written = result.objects[-1]["written"]
+    assert [entry["bytes"] for entry in written] == [(tmp_path / f"all{each}").stat().st_size for each in SPLAT_EXPORTERS]
+    assert enerf("export", scene, "--splats", "--to", tmp_path / "subject.ply", "--region", "foreground", *few).code == 0
+    everything, subject = (np.abs(read_splats(tmp_path / f"{name}.ply").means).max() for name in ("all", "subject"))
+    assert everything > 3.5
+    assert subject < 1.6
+    assert written[0]["Gaussians"] == len(read_splats(tmp_path / "all.ply")) <= 400
+    assert enerf("export", scene, "--splats", "--to", tmp_path / "all.spz", *few).code == 2, "it is there"
+
+
 def test_every_frame_has_its_passes_where_asked_for(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
     result = enerf("render", ball, "--out", tmp_path, "--frames", 2, "--width", 16, "--height", 16, "--exr", "all")
     assert result.code == 0, result.err
@@ -173,6 +190,11 @@ def test_every_frame_has_its_passes_where_asked_for(enerf: Enerf, ball: Path, tm
     [
         (["--to", "ball.fbx"], 2, ".ply, .glb, .obj, .usdz, .usdc, .stl, .vdb"),
         (["--to", "ball.obj", "--points"], 2, ".ply, .xyz, .las, .laz, .vdb"),
+        (["--to", "ball.obj", "--splats"], 2, ".ply, .spz, .glb, .vdb"),
+        (["--to", "ball.ply", "--splats", "--points"], 2, "one of the two at a time"),
+        (["--to", "ball.glb", "--splats", "--texture", "asset"], 2, "None of the files keeps a texture"),
+        (["--to", "ball.ply", "--splats", "--set", "splats.sh_degree=4"], 2, "splats.sh_degree"),
+        (["--to", "ball.ply", "--splats", "--memory", "100m"], 2, "Lower splats.count (200000)"),
         (["--to", "no/where/ball.ply"], 2, "does not exist"),
         (["--to", "cameras.json"], 2, "has no cameras"),
         (["--to", "ball.ply", "--set", "mesh.max_facs=3"], 2, "Nearest: mesh.max_faces."),

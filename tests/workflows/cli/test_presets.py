@@ -17,7 +17,7 @@ TYPES = {stage.name: stage.settings for stage in asset.STAGES}
 
 def test_the_workflow_is_in_order() -> None:
     names = [stage.name for stage in asset.STAGES]
-    assert names == ["poses", "train", "bake", "mesh", "evaluate", "turntable", "points"]
+    assert names == ["poses", "train", "bake", "mesh", "splats", "evaluate", "turntable", "points"]
     for place, stage in enumerate(asset.STAGES):
         assert set(stage.needs) <= set(names[:place])
 

@@ -223,7 +223,7 @@ def test_a_stage_that_is_replaced_meanwhile_is_read_again(toys: Path, enerf: Ene
         calls.append(1)
         if len(calls) == 1:
             (run.path / "points").rename(tmp_path / "old")
-        if len(calls) == 3:
+        if len(calls) == 4:
             (tmp_path / "old").rename(run.path / "points")
         return known(*arguments)
 
@@ -231,7 +231,7 @@ def test_a_stage_that_is_replaced_meanwhile_is_read_again(toys: Path, enerf: Ene
     path = module.write_report(run, TOYS)
     assert "<td>points</td><td>fresh</td>" in path.read_text(encoding="utf-8")
     assert "points/points.ply" in path.read_text(encoding="utf-8")
-    assert len(calls) == 6
+    assert len(calls) == 8
 
 
 def test_what_vanishes_while_the_page_is_made_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

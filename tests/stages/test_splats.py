@@ -1,0 +1,139 @@
+"""The stage `splats` on a real asset file that holds a ball, before its photographs and without them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.format import load, save
+from efficientnerf.asset.tree import tree_from_voxels
+from efficientnerf.splats.rendering import render
+from pipeline.errors import StageFailed
+from pipeline.stage import Job
+from stages import splats
+from stages.artifacts import SplatsOutputs
+from stages.evaluation.splats import load_splats
+from stages.framing.captured import captured_metadata
+from stages.io.exporters.splats.ply import read_splats
+from stages.io.exporters.writing import source_frame
+from stages.io.png import read_png
+from stages.io.scene import load as load_scene
+from stages.splats import SplatsSettings, gaussians_of
+from stages.splatting.pictures import LONGER_SIDE, photographs, render_cameras, renders
+from tests.efficientnerf.balls import BOUNDS, CENTRE, RADIUS
+from tests.stages.balls import ORBIT, SIMILARITY, poses
+
+QUICK = SplatsSettings(make="on", count=800, sh_degree=1, iterations=6)
+
+
+def bake(folder: Path) -> Path:
+    """A folder with the asset: the ball that `tests.stages.balls.poses` photographs, on white."""
+    voxel = 2 / 24
+    index = np.argwhere(np.ones((24, 24, 24), bool))
+    away = BOUNDS[0] + (index + 0.5) * voxel - CENTRE
+    distance = np.linalg.norm(away, axis=1) - RADIUS
+    kept = distance < voxel
+    colour = np.clip(0.5 + 0.6 * away[kept], 0.05, 0.95)
+    sh = np.log(colour / (1 - colour))[:, None] / 0.28209479
+    metadata = {
+        "world_from_capture": {"scale": SIMILARITY.scale, "rotation": SIMILARITY.rotation.tolist(), "translation": SIMILARITY.translation.tolist()},
+        "orbit": asdict(ORBIT),
+        "background": [1.0, 1.0, 1.0],
+    }
+    density = 100 * np.clip(0.5 - distance[kept] / voxel, 0, 1)
+    folder.mkdir()
+    save(tree_from_voxels((6, 6, 6), voxel, BOUNDS[0], index[kept], density, sh.astype(np.float32), metadata=metadata), folder / "asset.nerftree")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("ball")
+    return {"bake": bake(folder / "bake"), "poses": poses(folder / "poses"), "train": folder / "train"}
+
+
+@pytest.fixture(scope="module")
+def made(inputs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> SplatsOutputs:
+    folder = tmp_path_factory.mktemp("splats")
+    splats.run(Job(settings=QUICK, inputs=inputs, out=folder / "out", work=folder / "work"))
+    return SplatsOutputs(folder / "out")
+
+
+def test_the_files_hold_the_ball_in_the_capture_s_frame(made: SplatsOutputs, inputs: dict[str, Path]) -> None:
+    tree = load(inputs["bake"] / "asset.nerftree")
+    found, frame = read_splats(made.ply), source_frame(tree.metadata)
+    assert 100 < len(found) <= 800
+    assert found.degree <= 1
+    distance = np.linalg.norm(frame.world_from_capture.points(found.means) - CENTRE, axis=1)
+    assert np.median(distance) == pytest.approx(RADIUS, abs=0.08)
+    report = json.loads(made.report.read_text())
+    assert report == {"gaussians": len(found), "made": True, "sh_degree": found.degree, "region": "all",
+                      "ply_bytes": made.ply.stat().st_size, "spz_bytes": made.spz.stat().st_size}  # fmt: skip
+    assert made.spz.stat().st_size < 0.4 * made.ply.stat().st_size
+    assert read_png(made.preview).shape == (splats.PREVIEW[1], 2 * splats.PREVIEW[0], 3)
+
+
+def test_they_look_like_the_asset_to_those_who_evaluate_them(made: SplatsOutputs, inputs: dict[str, Path]) -> None:
+    from efficientnerf.asset.rendering import render as render_tree
+
+    tree = load(inputs["bake"] / "asset.nerftree")
+    measured = load_splats(made, tree)
+    assert measured is not None
+    assert measured.facts["gaussians"] == len(read_splats(made.ply))
+    camera = load_scene(inputs["poses"]).views[0].camera
+    white = (1.0, 1.0, 1.0)
+    error = measured.draw(camera, white) - render_tree(tree, camera, background=white, normals=False).colour
+    assert -10 * np.log10(np.square(error).mean()) > 18
+
+
+def test_none_are_made_where_none_are_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
+    splats.run(Job(settings=SplatsSettings(), inputs=dict.fromkeys(inputs, tmp_path), out=tmp_path / "out", work=tmp_path / "work"))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["report.json"]
+    assert load_splats(SplatsOutputs(tmp_path / "out"), load(inputs["bake"] / "asset.nerftree")) is None
+
+
+def test_the_same_pictures_give_the_same_bytes_and_others_do_not(made: SplatsOutputs, inputs: dict[str, Path], tmp_path: Path) -> None:
+    for name, settings in (("again", QUICK), ("own", replace(QUICK, pictures="asset"))):
+        splats.run(Job(settings=settings, inputs=inputs, out=tmp_path / name, work=tmp_path / "work"))
+    assert (tmp_path / "again/splats.ply").read_bytes() == made.ply.read_bytes()
+    assert (tmp_path / "own/splats.ply").read_bytes() != made.ply.read_bytes()
+
+
+def test_photographs_keep_the_alpha_of_an_object_and_are_masked_by_it_elsewhere(inputs: dict[str, Path]) -> None:
+    scene = load_scene(inputs["poses"])
+    some = photographs(inputs["poses"], scene)
+    assert [view.camera.name for view in some] == [view.camera.name for view in scene.views if view.split == "train"]
+    assert some[0].pixels.shape == (16, 16, 4)
+    assert some[0].mask is None
+    around = photographs(inputs["poses"], replace(scene, background=None))
+    assert around[0].pixels.shape == (16, 16, 3)
+    np.testing.assert_array_equal(around[0].mask, some[0].pixels[..., 3] >= 128)
+
+
+def test_an_asset_alone_is_fitted_to_its_own_renders(inputs: dict[str, Path]) -> None:
+    """From the cameras that it keeps, or a turntable's; transparent where it is."""
+    tree = load(inputs["bake"] / "asset.nerftree")
+    assert render_cameras(tree)[0].width == LONGER_SIDE
+    cameras = [view.camera for view in load_scene(inputs["poses"]).views]
+    kept = tree.with_metadata(captured_path=captured_metadata(cameras))
+    assert [camera.width for camera in render_cameras(kept)] == [cameras[0].width] * len(cameras)
+    reached: list[tuple[int, int]] = []
+    pictures = renders(kept, render_cameras(kept)[:2], lambda done, total, text: reached.append((done, total)))
+    assert reached == [(1, 2), (2, 2)]
+    assert pictures[0].pixels[0, 0, 3] == 0
+    assert pictures[0].pixels[8, 8, 3] == 255
+    found = gaussians_of(kept, replace(QUICK, iterations=2), lambda *_: None)
+    assert render(found, cameras[0]).opacity[8, 8] > 0.5
+
+
+def test_an_asset_that_shows_nothing_names_the_remedy(inputs: dict[str, Path], tmp_path: Path) -> None:
+    tree = load(inputs["bake"] / "asset.nerftree")
+    (tmp_path / "bake").mkdir()
+    save(tree.with_values(np.zeros_like(tree.density_values), tree.sh), tmp_path / "bake/asset.nerftree")
+    job = Job(settings=QUICK, inputs={**inputs, "bake": tmp_path / "bake"}, out=tmp_path / "out", work=tmp_path / "work")
+    with pytest.raises(StageFailed, match="Train longer"):
+        splats.run(job)

@@ -1,0 +1,73 @@
+"""3D Gaussians of a run or an asset as files: those of the run's stage `splats` where it has made the same, else made here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from workflows.exporting import Export, Progress, Written
+
+if TYPE_CHECKING:
+    from efficientnerf.splats.gaussians import Gaussians
+    from stages.io.exporters.writing import SourceFrame
+    from stages.splats import SplatsSettings
+    from workflows.cli.resolve import Settings
+
+
+def export_splats(export: Export, settings: Settings, progress: Progress) -> list[Written]:
+    """The asset as 3D Gaussians. `settings` holds those of the stage splats."""
+    from workflows.destination import writing
+
+    if not export.splats:
+        return []
+    wanted = replace(settings.resolved()["splats"], make="on")
+    wanted = replace(wanted, region=export.region or (wanted.region if export.crop is None else "all"))
+    gaussians, frame = (None if export.crop is not None else _made_by_the_stage(export.what, wanted)) or _made(export, wanted, progress)
+    written: list[Written] = []
+    for path in export.splats:
+        with writing(path, force=export.force):
+            export.format(path)(gaussians, path, frame)
+        written.append({"path": str(path.absolute()), "Gaussians": len(gaussians), "bytes": path.stat().st_size})
+    return written
+
+
+def _made(export: Export, wanted: SplatsSettings, progress: Progress) -> tuple[Gaussians, SourceFrame]:
+    """In the capture's frame."""
+    from stages.artifacts import PosesOutputs, TrainOutputs
+    from stages.framing.restriction import restricted
+    from stages.io.exporters.splats.frames import in_capture
+    from stages.io.exporters.writing import source_frame
+    from stages.memory.need import refuse_more_than
+    from stages.splats import gaussians_of, needed
+    from workflows.cli.target import load_asset
+
+    tree = restricted(load_asset(export.what), wanted.region, export.crop)
+    frame = source_frame(tree.metadata)
+    captured = None
+    if export.has_photographs and export.crop is None:
+        captured = PosesOutputs.of_run(export.what).folder, TrainOutputs.of_run(export.what).folder
+    refuse_more_than(export.limit, str(export.what), needed(tree, wanted, captured), f"Lower splats.count ({wanted.count}).")
+    return in_capture(gaussians_of(tree, wanted, progress, captured), frame), frame
+
+
+def _made_by_the_stage(what: Path, wanted: SplatsSettings) -> tuple[Gaussians, SourceFrame] | None:
+    """The Gaussians that the run's stage `splats` has made, if those are what is wanted."""
+    from efficientnerf.asset.format import describe
+    from pipeline.decide import decide
+    from pipeline.stage import settings_from
+    from stages.artifacts import BakeOutputs, SplatsOutputs
+    from stages.io.exporters.splats.ply import read_splats
+    from stages.io.exporters.writing import source_frame
+    from stages.splats import STAGE, SplatsSettings
+    from workflows.cli.target import is_run, open_run
+
+    if not is_run(what):
+        return None
+    decision = decide(STAGE, open_run(what))
+    if not decision.fresh or decision.manifest is None:
+        return None
+    made: Any = settings_from(SplatsSettings, decision.manifest.request.settings, where=STAGE.name)
+    if made != wanted:
+        return None
+    return read_splats(SplatsOutputs.of_run(what).ply), source_frame(describe(BakeOutputs.of_run(what).asset))
