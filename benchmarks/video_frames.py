@@ -1,6 +1,6 @@
 """Frames chosen of a video against every n-th: a hand-held clip is rendered from a run's asset, with motion blur where the hand shakes.
 
-    python -m benchmarks.video_frames RUN OUT [--frames 300] [--chosen 40] [--longest 560] [--no-cameras]
+    python -m benchmarks.video_frames RUN OUT [--seconds 10] [--fps 12] [--chosen 40] [--longest 400] [--no-cameras]
 
 OUT gets clip.mp4, truth.json (pose and true blur of each frame) and result.json: blur and sharpness of both choices, the share of frames whose cameras were
 found, and how far the centres are from the true ones.
@@ -32,10 +32,9 @@ from stages.sfm.reconstruction import find_cameras
 from stages.video import choice
 from stages.video.frames import Reader, frames_of, look
 
-FPS = 30
-SHUTTER = 0.6  # of the time between two frames: 1/50 s
+SHUTTER = 0.02  # seconds
 STEP = 1.5  # px between two of the pictures that a blurred frame is the mean of
-MOST = 12  # of these
+MOST = 8  # of these
 SHAKES = ((0.08, 0.13), (0.22, 0.3), (0.45, 0.5), (0.62, 0.72), (0.86, 0.9))  # shares of the clip in which the hand shakes
 SHAKE, SHAKE_HZ = 0.02, 3.5  # radians, a second
 STANDS = ((0.32, 0.4), (0.74, 0.8))  # and in which it stands
@@ -68,15 +67,15 @@ def camera_at(cameras: list[Camera], time: float, seconds: float) -> Camera:
     return replace(one, world_from_camera=pose)
 
 
-def rendered(run: Path, frames: int, longest: int, truth: list[dict[str, Any]]) -> Iterator[np.ndarray]:
+def rendered(run: Path, frames: int, fps: int, longest: int, truth: list[dict[str, Any]]) -> Iterator[np.ndarray]:
     """The frames; what is known of each goes into `truth`."""
     tree = format.load(BakeOutputs.of_run(run).asset)
     captured = scene.load(PosesOutputs.of_run(run).folder)
     cameras = captured_cameras([view.camera for view in captured.views], DENSE, longest)
-    seconds = frames / FPS
+    seconds = frames / fps
     middle = np.median([camera.centre + camera.forward * np.linalg.norm(camera.centre) for camera in cameras], axis=0)[None]
     for index in range(frames):
-        opens, closes = index / frames, (index + SHUTTER) / frames
+        opens, closes = index / frames, index / frames + SHUTTER / seconds
         ends = [project(camera_at(cameras, time, seconds), middle)[0][0] for time in (opens, (opens + closes) / 2, closes)]
         blur = float(np.linalg.norm(ends[1] - ends[0]) + np.linalg.norm(ends[2] - ends[1]))
         count = int(np.clip(np.ceil(blur / STEP), 1, MOST))
@@ -124,16 +123,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--fps", type=int, default=12)
     parser.add_argument("--chosen", type=int, default=40)
-    parser.add_argument("--longest", type=int, default=560)
+    parser.add_argument("--longest", type=int, default=400)
     parser.add_argument("--no-cameras", action="store_true")
     arguments = parser.parse_args()
-    clip = arguments.out / "clip.mp4"
+    clip, frames = arguments.out / "clip.mp4", round(arguments.seconds * arguments.fps)
     if not clip.exists():
         arguments.out.mkdir(parents=True, exist_ok=True)
         truth: list[dict[str, Any]] = []
-        write_mp4(rendered(arguments.run, arguments.frames, arguments.longest, truth), clip, fps=FPS, crf=20)
+        write_mp4(rendered(arguments.run, frames, arguments.fps, arguments.longest, truth), clip, fps=arguments.fps, crf=20)
         (arguments.out / "truth.json").write_text(json.dumps(truth))
     truth = json.loads((arguments.out / "truth.json").read_text())
     reader = Reader(1, arguments.out / "work", lambda *values: None, lambda: None, print)

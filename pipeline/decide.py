@@ -158,21 +158,22 @@ def _request(stage: Stage, run: Run, recorded: Manifest | None, hashes: Hashes) 
 
 
 def _source(stage: Stage, run: Run, settings: Any, former: dict[str, str] | None, hashes: Hashes) -> tuple[dict[str, str], str | None]:
-    """Digests of the source's files by path relative to it, and a note. Raises BadInput if the source cannot be used."""
-    source = run.source
-    if source is None or _is_gone(source):
-        what = "the run names no source" if source is None else f"{source} is not there, or empty"
+    """Digests of the files of the source by path relative to it, of several by name and path, and a note. Raises BadInput if one cannot be used."""
+    gone = next((source for source in run.sources.values() if _is_gone(source)), None)
+    if run.source is None or gone is not None:
+        what = "the run names no source" if gone is None else f"{gone} is not there, or empty"
         if former is not None:
             return former, f"{what}; {stage.name} stays as it was made"
         raise BadInput(f"{stage.name} needs the source: {what}. Name it: {run.how_to_resume(with_source=True)}")
-    base = source if source.is_dir() else source.parent
     prefix, digests = f"source of {stage.name}:", {}
-    try:
-        for path in _source_files(stage, source, settings):
-            name = Path(os.path.relpath(path, base)).as_posix()
-            digests[name] = hashes.digest(f"{prefix}{name}", path) if path.is_file() else ABSENT
-    except (OSError, ValueError) as error:
-        raise BadInput(f"{source}: cannot be read ({printable(error, 300)})") from error
+    for called, source in run.sources.items():
+        base = source if source.is_dir() else source.parent
+        try:
+            for path in _source_files(stage, source, settings):
+                name = Path(called, os.path.relpath(path, base)).as_posix()
+                digests[name] = hashes.digest(f"{prefix}{name}", path) if path.is_file() else ABSENT
+        except (OSError, ValueError) as error:
+            raise BadInput(f"{source}: cannot be read ({printable(error, 300)})") from error
     hashes.forget(prefix, {prefix + name for name in digests})
     return dict(sorted(digests.items())), None
 

@@ -1,12 +1,12 @@
 """The run folder: its source and settings, and its layout.
 
-    RUN/run.json     {"format": "enerf-run", "version": 1, "source", "settings", "preset", "seed", "device", "memory", "created"}
+    RUN/run.json     {"format": "enerf-run", "version": 1, "source", "also", "settings", "preset", "seed", "device", "memory", "created"}
     RUN/<stage>/     an artifact (artifact.py)
     RUN/.work/       what is being written
     RUN/.cache/      digests of files that have not changed since they were hashed; may be deleted at any time
     RUN/.lock        held while the run is written (lock.py)
 
-Nothing in it but the source is an absolute path: a run may be moved or copied.
+Nothing in it but the sources is an absolute path: a run may be moved or copied.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,15 +28,19 @@ from pipeline.executors.memory import MOST
 from pipeline.failures import cannot_write, failed
 from pipeline.links import CACHE, HOLDER, LOCK, RUN, refuse_links
 from pipeline.lock import Holder, holder_of, lock
+from pipeline.text import printable
 
 NAME = RUN
 FORMAT = "enerf-run"
 VERSION = 1
-_CHANGEABLE = ("source", "settings", "preset", "seed", "device", "memory")
+MOST_SOURCES = 100
+_CHANGEABLE = ("source", "also", "settings", "preset", "seed", "device", "memory")
 _ABANDONED = 24 * 3600.0  # seconds after which nobody is writing to a temporary file any more, such as that of a report
 # The fields of a run.json that anybody may have written. Settings are checked by the stages that have them.
+_Path = Annotated[str, msgspec.Meta(max_length=4096)]
 _FIELDS: dict[str, Any] = {
-    "source": Annotated[str, msgspec.Meta(max_length=4096)] | None,
+    "source": _Path | None,
+    "also": Annotated[list[_Path], msgspec.Meta(max_length=MOST_SOURCES)],
     "settings": dict[str, dict[str, Any]],
     "preset": Annotated[str, msgspec.Meta(max_length=200)] | None,
     "seed": Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None,
@@ -75,6 +79,7 @@ class Run:
 
     path         absolute
     source       absolute, or None
+    also         further sources, absolute: of one scene, together with the first
     settings     stage -> the resolved values of its settings, plain JSON
     memory       bytes that stages may take; None: what the machine has
     resume_text  how to go on with the run, for messages
@@ -87,6 +92,7 @@ class Run:
     seed: int | None = None
     device: str | None = None
     memory: int | None = None
+    also: tuple[Path, ...] = ()
     created: float = field(default_factory=time.time)
     resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)
     _holds: int = field(default=0, init=False, repr=False, compare=False)
@@ -94,6 +100,7 @@ class Run:
     def __post_init__(self) -> None:
         self.path = _absolute(self.path)
         self.source = None if self.source is None else _absolute(self.source)
+        self.also = tuple(_absolute(path) for path in self.also)
 
     @classmethod
     def create(cls, path: Path, source: Path | None = None, settings: dict[str, dict[str, Any]] | None = None, **more: Any) -> Run:
@@ -131,7 +138,7 @@ class Run:
         return cls(path, **_recorded(path), resume_text=resume_text)
 
     def update(self, **changes: Any) -> None:
-        """Change source, settings (all of them), preset, seed, device or memory, and write run.json if that makes a difference.
+        """Change source, further sources, settings (all of them), preset, seed, device or memory, and write run.json if that makes a difference.
 
         What is not changed is as another process may have left it. What is read first, and changed for that, is read in `locked`.
         """
@@ -149,6 +156,11 @@ class Run:
             except BaseException:
                 self._set(former)
                 raise
+
+    @property
+    def sources(self) -> dict[str, Path]:
+        """All sources by name, none where there is none; see `named`."""
+        return {} if self.source is None else named([self.source, *self.also])
 
     def folder(self, stage: str) -> Path:
         return self.path / stage
@@ -204,6 +216,7 @@ class Run:
             "format": FORMAT,
             "version": VERSION,
             "source": None if self.source is None else str(self.source),
+            **({"also": [str(path) for path in self.also]} if self.also else {}),
             "settings": self.settings,
             "preset": self.preset,
             "seed": self.seed,
@@ -222,6 +235,20 @@ class Run:
             files.write_atomically(self.path / NAME, files.pretty_json(self.plain()))
         except OSError as error:
             raise cannot_write(self.path, error) from None
+
+
+def named(sources: Sequence[Path]) -> dict[str, Path]:
+    """Sources by the name that what they hold goes by: "" for one alone; else that of the folder or file, with a number where another has it."""
+    if len(sources) == 1:
+        return {"": sources[0]}
+    found: dict[str, Path] = {}
+    for path in sources:
+        plain = printable(path.name or "source")
+        name, again = plain, 2
+        while name in found:
+            name, again = f"{plain} ({again})", again + 1
+        found[name] = path
+    return found
 
 
 def _make_folder(path: Path) -> None:
@@ -262,14 +289,15 @@ def _recorded(run: Path) -> dict[str, Any]:
         raise _damaged(path, "version", version)
     fields = {name: _field(path, name, value) for name in _FIELDS}
     source = fields["source"]
-    return {**fields, "source": None if source is None else Path(source)}
+    return {**fields, "source": None if source is None else Path(source), "also": tuple(map(Path, fields["also"]))}
 
 
 def _field(path: Path, name: str, value: dict[str, Any]) -> Any:
-    found = value.get(name, {"settings": {}, "created": 0.0}.get(name))
+    found = value.get(name, {"settings": {}, "also": [], "created": 0.0}.get(name))
     try:
         checked = msgspec.convert(found, _FIELDS[name])
-        if name == "source" and checked is not None and ("\0" in checked or not os.path.isabs(os.fsencode(checked))):
+        paths = checked if name == "also" else [checked] if name == "source" and checked is not None else []
+        if any("\0" in path or not os.path.isabs(os.fsencode(path)) for path in paths):
             raise ValueError
     except (ValueError, OverflowError):  # a path that no file system can name is a ValueError, too
         raise _damaged(path, name, found) from None

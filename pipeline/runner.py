@@ -161,6 +161,7 @@ class _Runner:
             settings=settings_from(stage.settings, self.run.settings.get(stage.name, {}), where=stage.name),
             inputs={need: self.run.folder(need) for need in stage.needs},
             source=self.run.source if stage.reads_source else None,
+            also=self.run.also if stage.reads_source else (),
             out=place.out,
             work=place.scratch,
             device=self.device,

@@ -8,7 +8,7 @@ import math
 import time
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +18,7 @@ import msgspec
 from pipeline.errors import Interrupted, UnknownSetting, UsageError
 from pipeline.executors.memory import Limit
 from pipeline.links import is_stage_name
+from pipeline.run import named
 from pipeline.text import printable
 
 T = TypeVar("T")
@@ -63,6 +64,7 @@ class Job:
     settings  an instance of the stage's settings
     inputs    need -> the folder of its artifact, to be read only
     source    the user's source for a stage with reads_source, else None
+    sources   all of them by name, where there are several; see `pipeline.run.named`
     out       an empty folder; what is in it when the stage returns is the artifact
     work      scratch of this very request that survives a kill: checkpoints. Removed once the artifact is published
     device    "cpu" or "cuda"; not part of the request
@@ -79,6 +81,7 @@ class Job:
         work: Path,
         inputs: Mapping[str, Path] | None = None,
         source: Path | None = None,
+        also: Sequence[Path] = (),
         device: str = "cpu",
         memory: Limit | None = None,
         stage: str = "",
@@ -88,6 +91,7 @@ class Job:
         self.settings = settings
         self.inputs = {need: Path(folder) for need, folder in (inputs or {}).items()}
         self.source = None if source is None else Path(source)
+        self.sources = {} if source is None else named([Path(source), *map(Path, also)])
         self.out = Path(out)
         self.work = Path(work)
         self.device = device

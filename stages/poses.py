@@ -153,13 +153,13 @@ def run(job: Job) -> None:
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
 
-STAGE = Stage(name="poses", version=4, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
+STAGE = Stage(name="poses", version=5, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
     assert job.source is not None
-    possible = importers.candidates(job.source, settings.allow_outside) if settings.format == "auto" else [settings.format]
+    possible = _formats(job, settings)
     name = possible[0]
     if len(possible) > 1 and possible[1:] != ["photographs"]:
         warn(f"{job.source} is read as {name}; it could also be {', '.join(possible[1:])}. Choose with --as.")
@@ -177,6 +177,17 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     return capture
 
 
+def _formats(job: Job, settings: PosesSettings) -> list[str]:
+    """What the source can be read as, the one to choose first; of several sources photographs alone. Raises BadInput."""
+    found: list[str] = []
+    for path in job.sources.values():
+        found = importers.candidates(path, settings.allow_outside) if settings.format == "auto" else [settings.format]
+        if len(job.sources) > 1 and found[0] != "photographs":
+            remedy = "Give it alone, or --as photographs, to find all cameras anew."
+            raise BadInput(f"{path}: is read as {found[0]}; of several sources photographs and videos alone can be put together. {remedy}")
+    return found
+
+
 def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     from stages.io.material import find_material, with_frames
     from stages.io.pictures import UnreadableImage, read_header
@@ -187,7 +198,7 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
     source = job.source
     assert source is not None
-    found = with_frames(job, find_material(source, settings.allow_outside, warn), max(settings.max_image_size, settings.feature_image_size), warn)
+    found = with_frames(job, find_material(job.sources, settings.allow_outside, warn), max(settings.max_image_size, settings.feature_image_size), warn)
     paths = found.paths
     masks = {**found.masks, **_made_masks(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     sizes = []

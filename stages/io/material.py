@@ -32,8 +32,19 @@ class Material:
     videos: dict[str, Path] = field(default_factory=dict)
 
 
-def find_material(path: Path, allow_outside: bool, warn: Warn) -> Material:
-    """What a folder or a video holds; nothing is decoded. Raises BadInput."""
+def find_material(sources: Mapping[str, Path], allow_outside: bool, warn: Warn) -> Material:
+    """What folders and videos hold, each by its source's name and its own; nothing is decoded. Raises BadInput."""
+    found = Material()
+    for called, path in sources.items():
+        one = _material_of(path, allow_outside, warn)
+        before = f"{called}/" if called else ""
+        found.paths |= {f"{before}{name}": file for name, file in one.paths.items()}
+        found.masks |= {f"{before}{name}": file for name, file in one.masks.items()}
+        found.videos |= {called if path == file else f"{before}{name}": file for name, file in one.videos.items()} if called else one.videos
+    return found
+
+
+def _material_of(path: Path, allow_outside: bool, warn: Warn) -> Material:
     found = Material()
     if not path.is_dir():
         found.videos[path.name] = path

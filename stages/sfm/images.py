@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated
 
 import msgspec
@@ -19,7 +19,7 @@ from stages.io.pictures import UnreadableImage
 from stages.io.png import FAST, read_png, write_png
 from stages.scratch import note, noted, once, opened
 
-LAYOUT = 3  # of the work folder; raise it when what is written there changes meaning
+LAYOUT = 4  # of the work folder; raise it when what is written there changes meaning
 
 Side = Annotated[int, msgspec.Meta(ge=1, le=2**20)]  # pixels
 Progress = Callable[..., None]
@@ -37,7 +37,7 @@ class WorkImage:
     width, height   of the photograph after EXIF rotation, pixels
     work_width, work_height  of the copy
     focal           pixels of the photograph, from its EXIF data, or None
-    camera_key      photographs with equal keys share a COLMAP camera: same size, maker and focal length
+    camera_key      photographs with equal keys share a COLMAP camera: same size, maker and focal length; without either same folder
     """
 
     name: str
@@ -163,7 +163,9 @@ def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, work: 
         write_png(np.where(mask, np.uint8(255), np.uint8(0)), outputs[1], compress_level=FAST, durable=False)
     height, width = photo.rgb.shape[:2]
     focal = None if photo.focal is None else float(photo.focal)
-    key = f"{photo.width}x{photo.height} {photo.maker} {focal if focal is None else round(focal, 1)}"
+    # Nothing tells the cameras of photographs without EXIF data apart but the folder, or of several sources the source, that they are in.
+    maker = photo.maker if photo.maker or focal else PurePosixPath(name).parts[0] if "/" in name else ""
+    key = f"{photo.width}x{photo.height} {maker} {focal if focal is None else round(focal, 1)}"
     return Copy(WorkImage(name, _file(index), photo.width, photo.height, width, height, focal, key), remark), outputs
 
 

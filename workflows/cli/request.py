@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeline.artifact import listed
 from pipeline.errors import BadInput, UsageError
 from pipeline.executors.memory import Limit, limit_for, parse_size, size_text
-from pipeline.run import NAME, Run
+from pipeline.run import MOST_SOURCES, NAME, Run
 from workflows.asset import Workflow
 from workflows.budget import share_budget
 from workflows.cli.device import has_cuda
@@ -24,6 +24,7 @@ class Options:
     """The options of the command line; None or empty where not given."""
 
     source: Path | None = None
+    also: tuple[Path, ...] = ()
     format: str | None = None
     preset: str | None = None
     config: Path | None = None
@@ -65,12 +66,13 @@ class Plan:
         The settings that the options change are those that run.json holds under the lock, whatever it held before.
         """
         if self.new:
-            facts = {"preset": self.run.preset, "seed": self.run.seed, "device": self.run.device, "memory": self.run.memory, "resume_text": resume_command}
+            facts = {name: getattr(self.run, name) for name in ("preset", "seed", "device", "memory", "also")}
+            facts["resume_text"] = resume_command
             Run.create(self.run.path, self.run.source, self.run.settings, **facts)
         run = open_run(self.run.path)
         with run.locked():
             now = self.again().run
-            run.update(source=now.source, settings=now.settings, preset=now.preset, seed=now.seed, device=now.device, memory=now.memory)
+            run.update(source=now.source, also=now.also, settings=now.settings, preset=now.preset, seed=now.seed, device=now.device, memory=now.memory)
             yield run
 
 
@@ -110,43 +112,42 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         ("format", options.format, f"--as {options.format}"),
         ("mask_from", options.mask_from, f"--mask {options.mask_from}"),
         ("strict", options.strict or None, "--strict"),
+        ("frames", options.frames, f"--frames {options.frames}"),
         ("allow_outside", options.allow_outside or None, "--allow-outside"),
     ):
         if value is not None:
             settings.put("poses", name, [value], origin)
+    sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
     if options.budget is not None:
-        parts = share_budget(seconds_of(options.budget), _format(settings, _source(options.source, standing)))
+        parts = share_budget(seconds_of(options.budget), _format(settings, sources))
         for stage, seconds in parts.items():
             settings.put(stage, "time_budget", [seconds], f"--budget {options.budget}")
     if options.target_mib is not None:
         settings.put("bake", "max_mib", [options.target_mib], f"--target-mib {options.target_mib:g}")
-    if options.frames is not None:
-        settings.put("poses", "frames", [options.frames], f"--frames {options.frames}")
     memory, limit = _memory(options.memory, standing, warnings)
     run = Run(
         path,
-        _source(options.source, standing),
+        sources[0] if sources else None,
         table_of(settings.resolved()),
         preset=preset or (standing.preset if standing else None),
         seed=seed if seed is not None else (standing.seed if standing else None),
         device=device or (standing.device if standing else None) or "auto",
-        memory=memory,
-        resume_text=resume_command,
-    )
+        memory=memory, also=sources[1:], resume_text=resume_command,
+    )  # fmt: skip
     return Plan(run, standing is None, run.device or "auto", limit, warnings, lambda: plan_run(path, workflow, options))
 
 
-def _format(settings: Settings, source: Path | None) -> str | None:
-    """The format that a source will be read as; None where it cannot be, which the stage poses reports."""
+def _format(settings: Settings, sources: Sequence[Path]) -> str | None:
+    """The format that sources will be read as; None where they cannot be, which the stage poses reports."""
     from stages.io.importers import detect
 
     stated = settings.resolved()["poses"]
     if stated.format != "auto":
         return str(stated.format)
-    if source is None:
-        return None
+    if len(sources) != 1:
+        return "photographs" if sources else None
     try:
-        return detect(source, stated.allow_outside)
+        return detect(sources[0], stated.allow_outside)
     except (BadInput, OSError):
         return None
 
@@ -165,13 +166,29 @@ def _standing(path: Path) -> Run | None:
     return open_run(path) if os.path.lexists(path / NAME) else None
 
 
-def _source(given: Path | None, standing: Run | None) -> Path | None:
-    """The source to record. It cannot change once poses have been made of it, unless it no longer exists."""
+def _sources(given: Sequence[Path], standing: Run | None) -> tuple[Path, ...]:
+    """The sources to record. They cannot change once poses have been made of them, unless they no longer exist."""
+    recorded = tuple(standing.sources.values()) if standing is not None else ()
+    if not given:
+        return recorded
+    for path in given:
+        _check_source(path)
+    sources = tuple(Path(os.path.abspath(path)) for path in given)
+    real = [os.path.realpath(path) for path in sources]
+    if len(set(real)) < len(real) or len(real) > MOST_SOURCES:
+        raise UsageError(f"{listed([str(path) for path in given])}: a source was given twice, or more than {MOST_SOURCES}. Give each once.")
+    unchanged = not recorded or real == [os.path.realpath(path) for path in recorded]
+    if standing is not None and not unchanged and standing.folder("poses").exists() and all(path.exists() for path in recorded):
+        was, now = (listed([str(path) for path in paths]) for paths in (recorded, sources))
+        remedy = f"Give a new folder for another source, or go on: {standing.how_to_resume()}"
+        raise UsageError(f"{standing.path}: was made from {was}, not from {now}. {remedy}")
+    return sources
+
+
+def _check_source(given: Path) -> None:
+    """BadInput for what is no source at all."""
     from stages.video.reading import KNOWN, SUFFIXES
 
-    recorded = standing.source if standing is not None else None
-    if given is None:
-        return recorded
     if not given.exists():
         raise BadInput(f"{given}: no such file or folder. Give the folder of the photographs or of the data set, or a video.")
     if not given.is_dir() and given.suffix.lower() not in SUFFIXES:
@@ -179,9 +196,3 @@ def _source(given: Path | None, standing: Run | None) -> Path | None:
         raise BadInput(f"{given}: is a file; expected {kinds}. Give {given.absolute().parent}")
     if given.is_dir() and not os.listdir(given):
         raise BadInput(f"{given}: the folder is empty; expected photographs or a data set.")
-    source = Path(os.path.abspath(given))
-    unchanged = recorded is None or os.path.realpath(source) == os.path.realpath(recorded)
-    if standing is not None and not unchanged and standing.folder("poses").exists() and recorded is not None and recorded.exists():
-        remedy = f"Give a new folder for another source, or go on: {standing.how_to_resume()}"
-        raise UsageError(f"{standing.path}: was made from {recorded}, not from {source}. {remedy}")
-    return source

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Run all stages on photographs or a data set, or resume a run.")
-@click.argument("source", required=False, type=folder_type)
+@click.argument("sources", nargs=-1, type=folder_type, metavar="[SOURCE]...")
 @click.option("--out", "run_folder", required=True, type=folder_type, metavar="RUN", help="The folder of the run.")
 @click.option("--as", "format_name", metavar="FORMAT", help="Format of SOURCE; by default it is detected. See poses.format in 'enerf presets poses'.")
 @click.option("--preset", metavar="NAME",
@@ -41,15 +41,16 @@ if TYPE_CHECKING:
 @json_option
 @quiet_option
 @common_options
-def run(run_folder: Path, until: str | None, start: str | None, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+def run(sources: tuple[Path, ...], run_folder: Path, until: str | None, start: str | None, dry_run: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Turn SOURCE into a baked asset, turntable, mesh and points under RUN, or resume RUN.
 
-    SOURCE is a folder of photographs, a video, or the folder of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Without it, RUN is
-    resumed with the settings that it recorded; options change them. Stages that are up to date are skipped.
+    SOURCE is a folder of photographs, a video, or the folder of a Blender, nerfstudio, instant-ngp, LLFF or COLMAP data set. Several folders and
+    videos of one scene may be given at once. Without any, RUN is resumed with the settings that it recorded; options change them. Stages that are
+    up to date are skipped.
     """
     from workflows.cli.request import Options, plan_run
 
-    options["format"] = options.pop("format_name")
+    options |= {"format": options.pop("format_name"), "source": sources[0] if sources else None, "also": sources[1:]}
     plan = plan_run(run_folder, workflow(), Options(**options))
     _work(plan, as_json=as_json, quiet=quiet, until=until, start=start, dry_run=dry_run)
 

@@ -61,7 +61,8 @@ def status(run_folder: Path, as_json: bool) -> None:
     if as_json:
         write_json(found, indent=1)
         return
-    listing(f"{run.path}  from {run.source}  preset {run.preset}" if run.preset else f"{run.path}  from {run.source}")
+    sources = ", ".join(map(str, run.sources.values())) or None
+    listing(f"{run.path}  from {sources}  preset {run.preset}" if run.preset else f"{run.path}  from {sources}")
     for entry in found["stages"]:
         seconds = "" if entry["seconds"] is None else duration(entry["seconds"])
         count = "" if entry["bytes"] is None else size(entry["bytes"])

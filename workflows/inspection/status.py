@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
     """A run, who is writing it, and its stages."""
     holder = run.holder()
-    facts = {"run": str(run.path), "source": run.source, "preset": run.preset, "seed": run.seed, "device": run.device}
+    facts = {"run": str(run.path), "source": run.source, "also": run.also, "preset": run.preset, "seed": run.seed, "device": run.device}
     return {**facts, "verdict": _verdict(run), "written_by": None if holder is None else holder.text(), "stages": [_stage(each) for each in decisions]}
 
 

@@ -108,7 +108,7 @@ def page(run: Run, decisions: Sequence[Decision]) -> str:
     made = [each.manifest for each in decisions if each.manifest is not None]
     return environment.get_template(TEMPLATE).render(
         name=folder.name,
-        source=run.source,
+        source=", ".join(map(str, run.sources.values())) or None,
         preset=run.preset,
         quality=quality_in_words(found),
         against=against_network(found),

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import BadInput, Interrupted
+from pipeline.run import named
 from pipeline.stage import Job
 from stages import poses
 from stages.io.capture import Capture
@@ -20,6 +21,7 @@ from stages.io.material import find_material, with_frames
 from stages.io.photo import read_photo
 from stages.poses import PosesSettings
 from stages.sfm import reconstruction
+from stages.sfm.images import prepare_images
 from stages.video.frames import Chosen, Reader, frames_of
 from tests.stages import captures, clips
 
@@ -52,7 +54,7 @@ def contents(found: Chosen) -> dict[str, bytes]:
 def record_of(source: Path, out: Path, **settings: Any) -> tuple[dict[str, Path], dict[str, Any], list[str]]:
     """Names and files, frames.json, warnings."""
     job, warnings = job_for(source, out, **settings)
-    found = with_frames(job, find_material(source, False, job.warn), 1000, job.warn)
+    found = with_frames(job, find_material({"": source}, False, job.warn), 1000, job.warn)
     return found.paths, json.loads((out / "poses" / "frames.json").read_text()), warnings
 
 
@@ -134,7 +136,7 @@ def test_a_damaged_clip_is_bad_input_that_names_it(tmp_path: Path) -> None:
 def test_photographs_come_before_the_videos_beside_them(tmp_path: Path) -> None:
     clip(tmp_path, "IMG_0.mov")
     captures.write_pictures(tmp_path, ["IMG_0.png", "IMG_1.png", "IMG_2.png"])
-    found = find_material(tmp_path, False, lambda text: None)
+    found = find_material({"": tmp_path}, False, lambda text: None)
     assert list(found.paths) == ["IMG_0.png", "IMG_1.png", "IMG_2.png"]
     assert not found.videos
 
@@ -161,3 +163,29 @@ def test_cameras_are_found_for_the_chosen_frames(tmp_path: Path, monkeypatch: py
     assert 3 <= len(seen) <= 5
     assert all(path.is_file() for path in seen.values())
     assert capture.rejected_files == dict([next(iter(seen.items()))])
+
+
+def test_what_several_sources_hold_is_kept_apart(tmp_path: Path) -> None:
+    captures.write_pictures(tmp_path / "a" / "photos", ["1.png", "2.png", "3.png"])
+    captures.write_pictures(tmp_path / "b" / "photos", ["1.png", "2.png", "3.png"])
+    captures.write_picture(tmp_path / "b" / "photos" / "masks" / "2.png", captures.picture())
+    sources = named([tmp_path / "a" / "photos", tmp_path / "b" / "photos", clip(tmp_path / "c"), clip(tmp_path / "d" / "clips", "x.mov").parent])
+    found = find_material(sources, False, lambda text: None)
+    assert list(found.paths) == [f"{name}/{number}.png" for name in ("photos", "photos (2)") for number in (1, 2, 3)]
+    assert found.masks == {"photos (2)/2.png": tmp_path / "b" / "photos" / "masks" / "2.png"}
+    assert found.videos == {"clip.mp4": tmp_path / "c" / "clip.mp4", "clips/x.mov": tmp_path / "d" / "clips" / "x.mov"}
+
+
+def test_photographs_without_exif_share_a_camera_within_their_source(tmp_path: Path) -> None:
+    captures.write_pictures(tmp_path / "a", ["1.png", "2.png"])
+    captures.write_pictures(tmp_path / "b", ["1.png"])
+    exif = Image.Exif()
+    exif[271] = "Maker"
+    for folder in ("a", "b"):
+        Image.fromarray(captures.picture()).save(tmp_path / folder / "9.jpg", exif=exif)
+    paths = find_material(named([tmp_path / "a", tmp_path / "b"]), False, lambda text: None).paths
+    quiet: dict[str, Any] = {"progress": lambda *values: None, "safe_point": lambda: None, "warn": lambda text: None}
+    images, _ = prepare_images(tmp_path, list(paths), paths=paths, max_side=100, features=300, seed=0, masks={}, work=tmp_path / "work", **quiet)
+    keys = {image.name: image.camera_key for image in images}
+    assert keys["a/1.png"] == keys["a/2.png"] != keys["b/1.png"]
+    assert keys["a/9.jpg"] == keys["b/9.jpg"] not in (keys["a/1.png"], keys["b/1.png"])

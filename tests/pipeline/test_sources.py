@@ -1,0 +1,73 @@
+"""Several sources of one run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipeline.decide import decide
+from pipeline.errors import CorruptArtifact
+from pipeline.run import NAME, Run, named
+from pipeline.runner import run_stages
+from pipeline.stage import Job
+from tests.pipeline.toy import LIST, STAGES, make_run, make_source
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """With sources a/photos, b/photos and c."""
+    one = make_run(tmp_path / "a")
+    one.update(also=(make_source(tmp_path / "b" / "photos"), make_source(tmp_path / "c")))
+    return one
+
+
+def test_names_are_those_of_folders_kept_apart() -> None:
+    assert named([Path("/x/photos")]) == {"": Path("/x/photos")}
+    paths = [Path("/x/photos"), Path("/y/photos"), Path("/y/clip.mp4"), Path("/photos (2)")]
+    assert named(paths) == dict(zip(("photos", "photos (2)", "clip.mp4", "photos (2) (2)"), paths, strict=True))
+
+
+def test_sources_are_recorded(run: Run, tmp_path: Path) -> None:
+    again = Run.open(run.path)
+    assert list(again.sources) == ["photos", "photos (2)", "c"]
+    assert again.sources == run.sources
+    run.update(also=())
+    assert "also" not in json.loads((run.path / NAME).read_text())  # as runs of one source always were
+    assert Run.open(run.path).sources == {"": tmp_path / "a" / "photos"}
+
+
+@pytest.mark.parametrize("also", ["x", [1], ["relative"], ["/nul\0"], ["/x"] * 101])
+def test_a_damaged_record_is_refused(run: Run, also: object) -> None:
+    document = json.loads((run.path / NAME).read_text())
+    (run.path / NAME).write_text(json.dumps(document | {"also": also}))
+    with pytest.raises(CorruptArtifact, match="also is"):
+        Run.open(run.path)
+
+
+def test_files_of_each_source_are_part_of_the_request(run: Run) -> None:
+    run_stages(run, STAGES, until="list")
+    made = decide(LIST, run)
+    assert made.fresh
+    assert made.request is not None
+    assert sorted(made.request.source or {}) == sorted(f"{name}/{index}.jpg" for name in ("photos", "photos (2)", "c") for index in range(3))
+    (run.also[1] / "1.jpg").write_bytes(b"other")
+    assert decide(LIST, run).reason == "inputs changed: 1 source file (1 changed: c/1.jpg)"
+    run.update(also=run.also[:1])
+    assert not decide(LIST, run).fresh
+
+
+def test_one_that_is_gone_leaves_the_artifact_as_it_is(run: Run) -> None:
+    run_stages(run, STAGES, until="list")
+    shutil.rmtree(run.also[0])
+    found = decide(LIST, run)
+    assert found.fresh
+    assert str(run.also[0]) in (found.note or "")
+
+
+def test_a_job_sees_them_by_name(run: Run, tmp_path: Path) -> None:
+    assert run.source is not None
+    assert Job(settings=None, out=tmp_path / "out", work=tmp_path / "work", source=run.source, also=run.also).sources == run.sources
+    assert Job(settings=None, out=tmp_path / "out", work=tmp_path / "work").sources == {}

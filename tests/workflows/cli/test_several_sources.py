@@ -1,0 +1,33 @@
+"""`enerf run` with several folders and videos."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.stages import captures, clips
+from tests.workflows.command import Enerf
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> list[Path]:
+    captures.write_pictures(tmp_path / "photos", ["1.png", "2.png", "3.png"])
+    return [clips.write_clip(tmp_path / "clip.mp4", clips.pan(4)), tmp_path / "photos"]
+
+
+def test_all_are_taken_and_recorded(enerf: Enerf, sources: list[Path], tmp_path: Path) -> None:
+    result = enerf("run", *sources, "--out", tmp_path / "run", "--until", "poses", "--dry-run", "--frames", "20")
+    assert (result.code, "poses" in result.out + result.err) == (0, True)
+
+
+def test_what_does_not_fit_together_is_refused(enerf: Enerf, sources: list[Path], tmp_path: Path) -> None:
+    twice = enerf("run", *sources, tmp_path / "photos" / "..", tmp_path / "photos", "--out", tmp_path / "run")
+    assert (twice.code, "given twice" in twice.err) == (2, True)
+    posed = captures.nerfstudio(tmp_path / "posed")
+    result = enerf("run", sources[1], posed, "--out", tmp_path / "run", "--until", "poses")
+    assert (result.code, "is read as nerfstudio; of several sources photographs and videos alone" in result.err) == (2, True)
+    about = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (about["source"], about["also"]) == (str(sources[1]), [str(posed)])
+    assert enerf("run", sources[1], "--out", tmp_path / "other", "--frames", "1", "--dry-run").code == 2
