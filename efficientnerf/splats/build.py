@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from efficientnerf.splats.gaussians import Gaussians
+from efficientnerf.splats.gaussians import MAX_DEGREE, Gaussians
 from efficientnerf.splats.merging import merged
 from efficientnerf.splats.refit import View, refitted
 
@@ -33,6 +33,10 @@ class Budget:
     steps: int = 300
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if self.count < 1 or self.steps < 0 or not 0 <= self.degree <= MAX_DEGREE:
+            raise ValueError(f"{self}: expected at least one Gaussian, harmonics of degree 0 to {MAX_DEGREE}, and no less than 0 steps")
+
 
 class NothingToShow(ValueError):
     """No voxel shows in any picture."""
@@ -54,7 +58,7 @@ def gaussians_of_asset(tree: NerfTree, views: Sequence[View], budget: Budget, pr
             progress(done, budget.steps + 1, text)
 
     said(0, "merging voxels")
-    begun = int(START * budget.count) if budget.steps else budget.count
+    begun = max(1, int(START * budget.count)) if budget.steps else budget.count
     gaussians = merged(tree, [view.camera for view in views], begun, budget.degree)
     if not len(gaussians):
         raise NothingToShow("no voxel of the asset shows in any picture: there is nothing that Gaussians could show")

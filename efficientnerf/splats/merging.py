@@ -31,11 +31,12 @@ if TYPE_CHECKING:
 # docs/experiments/splats.md
 RAYS = 2**19  # of all views together that find out which voxels show
 LEAST_WEIGHT = 0.02  # of a voxel in the pixel that shows it most
-PLACE = 0.02  # difference of colour that a distance of one pixel between merged voxels is worth
-WIDEN = 1.5  # standard deviations of a cell's voxels across the normal, times this: neighbours have to overlap
+PLACE = 0.05  # difference of colour that a distance of one pixel between merged voxels is worth
+WIDEN = 1.8  # standard deviations of a cell's voxels across the normal, times this: neighbours have to overlap
+THICKER = 3.0  # optical thickness of a Gaussian over that of its voxels: between means there is less, and light leaks
 THIN = 0.3  # least depth along the normal, voxels
 DIRECTIONS = 32  # that a colour is converted at
-LEVELS = 9  # of cells
+LEVELS = (*range(0, 57, 3), 62)  # of cells: bits of the keys that they leave out, of the last all
 SHELL_SHARE, SHELL_MOST, SHELL_DISTANCE = 0.05, 10_000, 30.0  # Gaussians for the environment; their distance in half diagonals of the outermost cascade
 DEEPEST = 0.2  # of its distance, that a Gaussian of normalised device coordinates reaches along the view axis
 AT_ONCE = 2**17  # voxels whose coefficients are decoded together
@@ -130,7 +131,7 @@ def _jacobians(tree: NerfTree, points: np.ndarray) -> np.ndarray:
 
 
 def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
-    """(C + 1,) where the voxels of each cell begin, at most `most` cells.
+    """(C + 1,) where the voxels of each cell begin, at most `most` cells, and one at least.
 
     colours  (N, 3) of the voxels, sRGB
     """
@@ -142,8 +143,8 @@ def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
     squares = [np.square(values).sum(axis=1) * weight for values, weight in zip((colours, at), weights, strict=True)]
     begin = np.arange(len(shown.keys))
     losses, begins, parents = [np.zeros(len(begin))], [begin], []
-    for level in range(1, LEVELS):
-        keys = shown.keys[begin] >> (3 * level)
+    for level in LEVELS[1:]:
+        keys = shown.keys[begin] >> level
         first = np.flatnonzero(np.concatenate([[True], np.diff(keys) != 0]))
         parents.append(np.cumsum(np.concatenate([[0], np.diff(keys) != 0])))
         begin = begin[first]
@@ -157,8 +158,8 @@ def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
 
     def chosen(bound: float) -> list[np.ndarray]:
         """Which cells of each level lose at most `bound`, where the one around them loses more."""
-        alone = [losses[level + 1][parents[level]] > bound if level + 1 < LEVELS else np.ones(len(losses[level]), bool) for level in range(LEVELS)]
-        return [(losses[level] <= bound) & alone[level] for level in range(LEVELS)]
+        alone = [around[parent] > bound for around, parent in zip(losses[1:], parents, strict=True)]
+        return [(lost <= bound) & most_of_all for lost, most_of_all in zip(losses, [*alone, np.ones(1, bool)], strict=True)]
 
     low, high = 0.0, float(losses[-1].max(initial=0)) + 1e-12
     if sum(int(level.sum()) for level in chosen(low)) > most:
@@ -168,7 +169,7 @@ def cells_of(shown: Shown, colours: np.ndarray, most: int) -> np.ndarray:
     else:
         high = low
     cells = chosen(high)
-    begin = np.sort(np.concatenate([begins[level][cells[level]] for level in range(LEVELS)]))
+    begin = np.sort(np.concatenate([of_level[kept] for of_level, kept in zip(begins, cells, strict=True)]))
     return np.concatenate([begin, [len(shown.keys)]])
 
 
@@ -197,7 +198,7 @@ def _gaussians_of_cells(tree: NerfTree, shown: Shown, begin: np.ndarray, degree:
             spread[:, i, j] = spread[:, j, i] = np.add.reduceat(off[:, i] * off[:, j] * shown.pixels, first) / weight
     spread += np.eye(3) * (side**2 / 12)[:, None, None]
     axes, scales = flattened(spread, _normals(tree, mean), side)
-    thickness = np.add.reduceat(tree.density_values[shown.voxels] * shown.sides**3, first) / (2 * np.pi * scales[:, 0] * scales[:, 1])
+    thickness = THICKER * np.add.reduceat(tree.density_values[shown.voxels] * shown.sides**3, first) / (2 * np.pi * scales[:, 0] * scales[:, 1])
     opacities = np.clip(-np.expm1(-thickness), 0.02, 0.98)
     if tree.ndc is not None:
         mean, axes, scales = _in_the_world(tree, mean, axes, scales)

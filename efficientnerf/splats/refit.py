@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from efficientnerf.backends.numba.splats.raster import Picture
 
 # docs/experiments/splats.md
-MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.02, 0.01, 0.01, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
+MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
 LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS

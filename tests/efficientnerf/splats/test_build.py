@@ -129,10 +129,11 @@ def test_cells_that_lose_little_are_merged_before_those_that_lose_much() -> None
     rng = np.random.default_rng(0)
     rough = shown.centres[:, 0] > 0
     colours = np.where(rough[:, None], rng.random((len(rough), 3)), 0.5)
-    counts = [len(merging.cells_of(shown, colours, most)) - 1 for most in (50, 400, 10**6)]
+    counts = [len(merging.cells_of(shown, colours, most)) - 1 for most in (50, 400, 10**6, 1, 5)]
     assert 25 < counts[0] <= 50
     assert 350 < counts[1] <= 400
-    assert counts[2] == len(shown.voxels)
+    assert counts[2:4] == [len(shown.voxels), 1]
+    assert 1 <= counts[4] <= 5
     begin = merging.cells_of(shown, colours, 400)
     assert (np.diff(begin) > 0).all()
     assert begin[0] == 0
@@ -197,6 +198,12 @@ def test_the_same_pictures_give_the_same_bytes_and_what_cannot_be_seen_stays() -
     assert one.harmonics.tobytes() == two.harmonics.tobytes()
     assert (one.means[-1] == begun.means[-1]).all()
     assert np.abs(one.means[:-1] - begun.means[: len(one) - 1]).max() > 0
+
+
+@pytest.mark.parametrize("wrong", [{"count": 0}, {"steps": -1}, {"degree": 4}, {"degree": -1}])
+def test_budgets_that_make_no_sense_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="expected at least one Gaussian"):
+        Budget(**wrong)
 
 
 @pytest.mark.parametrize("pixels", [np.zeros((24, 24, 3)), np.zeros((24, 23, 3), np.uint8), np.zeros((24, 24), np.uint8)])
