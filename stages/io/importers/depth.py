@@ -7,6 +7,7 @@ other maps confirm it. Their number is bounded, whatever the number of maps. C p
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,14 +15,19 @@ from pathlib import Path
 import numpy as np
 
 from efficientnerf.geometry.cameras import Camera, project, rays
+from pipeline.errors import BadInput
+from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers.source import Source
+from stages.io.importers.texts import read_bytes
 from stages.io.photo import same_aspect
 from stages.io.pictures import UnreadableImage, integers_of, opened, read_header
 
 MAX_POINTS = 20_000
 MAX_LOOKUPS = 4_000_000  # points times maps that they are looked up in
 MAX_MAPS = 1000  # that are used, evenly over the photos
+MAX_EXR = 4096  # pixels a side
+LARGEST_EXR = 64 << 20  # bytes
 MAX_SIDE = 512  # pixels of a map; larger ones are thinned
 MIN_TRACK = 3  # photos that agree; fewer and training does not use the point
 AGREEMENT = 0.03, 0.01  # of depths: a share, and metres
@@ -32,7 +38,7 @@ EDGE = 0.05  # share by which a sample may differ from its neighbours in the map
 class DepthFile:
     """The depth of a photo along its view axis.
 
-    file        PNG of one channel, without links; 0: unknown
+    file        PNG of one channel or OpenEXR, without links; 0, or what is not finite: unknown
     unit        units of the capture's frame to one
     confidence  PNG of one channel of the same size, or None
     trusted     the least confidence that is used
@@ -67,7 +73,7 @@ def with_depth(capture: Capture, depth_of: Callable[[Photo], DepthFile | None]) 
     for index, found in known[::every]:
         try:
             maps[index] = read_depth(found, capture.photos[index])
-        except UnreadableImage as error:
+        except (UnreadableImage, BadInput) as error:
             unreadable.append(f"{found.file.name}: {error}")
     points = depth_points([photo.camera for photo in capture.photos], maps)
     warnings = [*capture.warnings]
@@ -83,8 +89,11 @@ def read_depth(found: DepthFile, photo: Photo) -> np.ndarray:
     """(h, w) float32 depth in units of the capture, 0 where it is unknown or not to be trusted, thinned to `MAX_SIDE`. Raises UnreadableImage."""
     if read_header(photo.image).orientation != 1:
         raise UnreadableImage("its photograph is rotated by EXIF, and the map is not")
-    with opened(found.file, ("PNG",)) as image:
-        stored = integers_of(image)
+    if found.file.suffix.lower() == ".exr":
+        stored = _exr(found.file)
+    else:
+        with opened(found.file, ("PNG",)) as image:
+            stored = integers_of(image)
     height, width = stored.shape
     if not same_aspect((photo.camera.width, photo.camera.height), (width, height)):
         raise UnreadableImage(f"{width}x{height} pixels, of another aspect than its photograph")
@@ -98,6 +107,26 @@ def read_depth(found: DepthFile, photo: Photo) -> np.ndarray:
         depth[sure < found.trusted] = 0
     step = -(-max(width, height) // MAX_SIDE)
     return depth[step // 2 :: step, step // 2 :: step] if step > 1 and min(width, height) > step else depth
+
+
+def _exr(path: Path) -> np.ndarray:
+    """(H, W) float32, the one channel of an OpenEXR file, or its R, Y or Z. Raises UnreadableImage."""
+    import OpenEXR
+
+    data = read_bytes(path, LARGEST_EXR)
+    try:
+        low, high = OpenEXR.File(io.BytesIO(data), header_only=True, num_threads=0).header()["dataWindow"]
+        width, height = (int(end) - int(begin) + 1 for begin, end in zip(low, high, strict=True))
+        if not (0 < width <= MAX_EXR and 0 < height <= MAX_EXR):
+            raise UnreadableImage(f"{width}x{height} pixels; at most {MAX_EXR} a side are read")
+        channels = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0).channels()
+        name = next((name for name in ("R", "Y", "Z") if name in channels), next(iter(channels)))
+        pixels = np.asarray(channels[name].pixels)
+    except (RuntimeError, ValueError, TypeError, KeyError, StopIteration) as error:
+        raise UnreadableImage(f"unreadable: no OpenEXR file, or damaged ({printable(error, 80)})") from error
+    if pixels.shape != (height, width) or pixels.dtype.kind not in "fiu":
+        raise UnreadableImage("unreadable: no channel of as many pixels as the file has")
+    return pixels
 
 
 def depth_points(cameras: Sequence[Camera], maps: dict[int, np.ndarray]) -> SparsePoints | None:

@@ -482,6 +482,27 @@ def test_depth_of_transforms(key: str, unit: float, more: dict[str, float], tmp_
         assert read(tmp_path).points is None, "depth in other units than the poses"
 
 
+def test_record3ds_depth(tmp_path: Path) -> None:
+    openexr = pytest.importorskip("OpenEXR")
+    folder, _ = exports.record3d(tmp_path / "a")
+    place = folder / "EXR_RGBD/depth"
+    place.mkdir()
+    for photo in read(folder).photos:
+        values = np.ascontiguousarray(plane_depth(photo.camera, 64, 48), np.float32)
+        values[:5] = np.nan
+        header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+        openexr.File(header, {"R": values}).write(str(place / f"{photo.image.stem}.exr"))
+    capture = read(folder)
+    assert capture.points is not None
+    assert np.abs(capture.points.xyz[:, 2]).max() < 0.01
+    assert place / "3.exr" in importers.files(folder, Settings())
+    (place / "3.exr").write_bytes(b"nothing")
+    found = read(folder)
+    assert found.points is not None
+    assert all(3 not in track for track in found.points.tracks)
+    assert any("1 of 6 depth maps are not used, e.g. 3.exr: unreadable" in warning for warning in found.warnings)
+
+
 def test_points_of_depth_supervise_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The scene that the poses stage writes of a phone's capture has rays to them."""
     folder, _ = sharp(tmp_path / "a")

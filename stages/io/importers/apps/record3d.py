@@ -1,7 +1,8 @@
 """Record3D's export "EXR + JPG": rgb/<number>.jpg, depth/, metadata.json, directly in the folder or in EXR_RGBD/.
 
 Layout: record3d.app's manual and the reader of nerfstudio (record3d_utils). metadata.json holds w, h, K (column by column), for each frame the pose [qx qy qz
-qw tx ty tz], camera to world with x right, y up, looking along -z, and in newer versions the lens as [fx fy cx cy]. The world is ARKit's: y up, metres.
+qw tx ty tz], camera to world with x right, y up, looking along -z, and in newer versions the lens as [fx fy cx cy]. The world is
+ARKit's: y up, metres. depth/<number>.exr holds metres.
 """
 
 from __future__ import annotations
@@ -17,10 +18,12 @@ from pipeline.errors import BadInput
 from stages.io.capture import Capture
 from stages.io.importers import frames
 from stages.io.importers.brown import brown_camera
+from stages.io.importers.depth import DepthFile, depth_file, with_depth
 from stages.io.importers.source import ImportSettings, Source, images_in
 from stages.io.json_file import finite, read_json, shown
 
 PLACES = (".", "EXR_RGBD")
+FARTHEST = 5.0  # metres, the range of the sensor
 METADATA, IMAGES = "metadata.json", "rgb"
 _AGAIN = "Export from Record3D again, as EXR + JPG."
 
@@ -33,7 +36,9 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
     """The metadata, the images and their masks."""
     source = Source(folder, settings.allow_outside)
     place, listed, _ = _read(source)
-    return [place / METADATA, *frames.files_of(source, listed)]
+    found = frames.files_of(source, listed)
+    maps = [_depth(source, place, path.stem) for path in found]
+    return [place / METADATA, *found, *(one.file for one in maps if one is not None)]
 
 
 def read(folder: Path, settings: ImportSettings) -> Capture:
@@ -42,7 +47,13 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     place, listed, unposed = _read(source)
     where = source.name_of(place / METADATA)
     rejected = [(name, "without a pose") for name in unposed]
-    return frames.capture_of(source, listed, settings, kind="record3d", where=where, rejected=rejected, up=np.array([0.0, 1.0, 0.0]), metric=True)
+    up = np.array([0.0, 1.0, 0.0])
+    capture = frames.capture_of(source, listed, settings, kind="record3d", where=where, rejected=rejected, up=up, metric=True)
+    return with_depth(capture, lambda photo: _depth(source, place, photo.image.stem))
+
+
+def _depth(source: Source, place: Path, stem: str) -> DepthFile | None:
+    return depth_file(source, place / f"depth/{stem}.exr", 1.0, farthest=FARTHEST)
 
 
 def _place(source: Source) -> Path | None:
