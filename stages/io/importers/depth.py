@@ -30,6 +30,7 @@ MAX_EXR = 4096  # pixels a side
 LARGEST_EXR = 64 << 20  # bytes
 MAX_SIDE = 512  # pixels of a map; larger ones are thinned
 MIN_TRACK = 3  # photos that agree; fewer and training does not use the point
+MAX_TRACK = 16  # photos that a point is registered in: neighbours in a video see it alike
 AGREEMENT = 0.03, 0.01  # of depths: a share, and metres
 EDGE = 0.05  # share by which a sample may differ from its neighbours in the map
 
@@ -150,11 +151,17 @@ def depth_points(cameras: Sequence[Camera], maps: dict[int, np.ndarray]) -> Spar
         kept = np.flatnonzero(seen.sum(1) >= MIN_TRACK)
         order = np.fromiter(maps, np.int64)
         found.append(xyz[kept])
-        tracks += [tuple(sorted(order[seen[point]].tolist())) for point in kept]
+        tracks += [_thinned(sorted(order[seen[point]].tolist())) for point in kept]
     if not tracks:
         return None
     xyz = np.concatenate(found)
     return SparsePoints(xyz, np.full((len(xyz), 3), 128, np.uint8), np.full(len(xyz), np.nan), tuple(tracks))
+
+
+def _thinned(track: list[int]) -> tuple[int, ...]:
+    """`MAX_TRACK` of the photos at most, evenly over all of them."""
+    count = min(len(track), MAX_TRACK)
+    return tuple(track[place * len(track) // count] for place in range(count))
 
 
 def _smooth(depth: np.ndarray) -> np.ndarray:

@@ -415,7 +415,7 @@ def sharp(folder: Path) -> tuple[Path, list[Camera]]:
     return folder, made
 
 
-def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path) -> None:
+def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, made = sharp(tmp_path / "a")
     capture = read(folder)
     assert capture.points is not None
@@ -429,9 +429,12 @@ def test_polycams_depth_becomes_points_that_images_agree_on(tmp_path: Path) -> N
             assert (pixel > 0).all()
             assert (pixel < (32, 24)).all()
     assert {folder / f"keyframes/depth/img_{index}.png" for index in range(6)} < set(importers.files(folder, Settings()))
+    monkeypatch.setattr("stages.io.importers.depth.MAX_TRACK", 3)
     again = read(folder)
     assert again.points is not None
     np.testing.assert_array_equal(again.points.xyz, capture.points.xyz)
+    assert {len(track) for track in again.points.tracks} == {3}
+    assert all(set(few) <= set(many) for few, many in zip(again.points.tracks, capture.points.tracks, strict=True))
 
 
 def test_depth_of_low_confidence_or_out_of_range_is_not_used(tmp_path: Path) -> None:
