@@ -1,7 +1,7 @@
 """Gaussians fitted to pictures: Adam on means, scales, rotations, opacities and harmonics.
 
-A step is a whole picture. What is minimised is the squared error; of a picture with alpha that over all backgrounds at once. The order of the pictures is
-drawn by (seed, round). The same pictures give the same bytes on any number of threads.
+A step is a picture; of a large one rows that together have about PIXELS. What is minimised is the squared error, of a picture with alpha that over all
+backgrounds at once. The order of the pictures and the rows are drawn by (seed, step). The same pictures give the same bytes on any number of threads.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from efficientnerf.backends.pieces import pieces
-from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.cameras import Camera, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.rendering import LANES, gaussians_from, grouped, lens_of, ungrouped, values_of
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # docs/experiments/splats.md
 MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS = 0.1, 0.06, 0.02, 0.05, 0.02, 0.004  # learning rates of `fitting.Rates`
+PIXELS = 2**18  # of a step
 LAST_RATE = 0.1  # of the learning rates, at the last step
 MOMENTUM, DECAY, EPSILON = 0.9, 0.99, 1e-6
 LEAST_OPACITY = 0.005  # below which a Gaussian is left out; 3DGS
@@ -78,8 +79,9 @@ def refitted(
         if number in splits:
             values, moments, count = _divided(values, moments, errors[:count], most)
             records, errors = np.zeros((LANES * len(values), RECORD), np.float32), np.zeros(LANES * len(values), np.float32)
-        view = views[order.pop()]
-        lens, picture = lens_of(view.camera), _picture(view, background)
+        whole = views[order.pop()]
+        view = _band(whole, np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, 6, number])))
+        lens, picture = lens_of(view.camera, whole.camera), _picture(view, background)
         project(values, lens, degree, records)
         pairs = pairs_of(records, view.camera.width, view.camera.height)
         if len(sums) < len(pairs.gaussian):
@@ -119,6 +121,16 @@ def _divided(values: np.ndarray, moments: np.ndarray, errors: np.ndarray, most: 
     parts[here, SCALE + longest] += np.log(SPLIT_SHARE)
     rows[halves] = parts
     return grouped(rows), grouped(state, unseen=False), len(rows)
+
+
+def _band(view: View, rng: np.random.Generator) -> View:
+    """The view, or rows of it that have about PIXELS: those around a row that is drawn."""
+    height = max(LANES, round(PIXELS / view.camera.width / LANES) * LANES)
+    if height >= view.camera.height:
+        return view
+    begin = int(np.clip(rng.integers(view.camera.height) - height // 2, 0, view.camera.height - height))
+    rows = slice(begin, begin + height)
+    return View(rows_of(view.camera, rows.start, rows.stop), view.pixels[rows], None if view.mask is None else view.mask[rows])
 
 
 def _picture(view: View, background: tuple[float, float, float] | None) -> Picture:

@@ -49,8 +49,8 @@ def render_values(values: np.ndarray, degree: int, camera: Camera, background: t
     return SplatImage(colour, 1 - light)
 
 
-def lens_of(camera: Camera) -> Lens:
-    """The camera as kernels take it."""
+def lens_of(camera: Camera, whole: Camera | None = None) -> Lens:
+    """The camera as kernels take it; of a part of a picture with the limits of the whole."""
     from efficientnerf.backends.numba.splats.projection import Lens
 
     k, fisheye = camera.intrinsics, camera.model == "OPENCV_FISHEYE"
@@ -59,7 +59,7 @@ def lens_of(camera: Camera) -> Lens:
     turn = camera.world_from_camera[:3, :3]
     reach = min(fold_radius(camera), 1e9)
     numbers = np.asarray([*lens, NEAR, reach**2, 0.0], np.float32)
-    limits = np.zeros(4) if fisheye else _limits(camera)
+    limits = np.zeros(4) if fisheye else _limits(whole or camera)
     return Lens(
         np.ascontiguousarray(turn.T.reshape(9), np.float32), camera.centre.astype(np.float32), numbers, limits.astype(np.float32), fisheye, camera.width,
         camera.height,

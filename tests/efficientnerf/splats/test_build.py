@@ -17,7 +17,7 @@ from efficientnerf.splats import merging, refit
 from efficientnerf.splats.build import Budget, NothingToShow, View, gaussians_of_asset
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
 from efficientnerf.splats.refit import refitted
-from efficientnerf.splats.rendering import gaussians_from, render, ungrouped, values_of
+from efficientnerf.splats.rendering import gaussians_from, lens_of, render, ungrouped, values_of
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import random_cascades
 
@@ -198,6 +198,26 @@ def test_the_same_pictures_give_the_same_bytes_and_what_cannot_be_seen_stays() -
     assert one.harmonics.tobytes() == two.harmonics.tobytes()
     assert (one.means[-1] == begun.means[-1]).all()
     assert np.abs(one.means[:-1] - begun.means[: len(one) - 1]).max() > 0
+
+
+def test_large_pictures_are_taken_in_bands_that_show_what_the_whole_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    view = photographs(ball(16, 0), ring(1, 50))[0]
+    view = replace(view, mask=np.arange(2500).reshape(50, 50) % 3 > 0)
+    assert refit._band(view, np.random.default_rng(0)) is view
+    monkeypatch.setattr(refit, "PIXELS", 50 * 16)
+    gaussians, met = merging.merged(ball(16, 0), [view.camera], 200, 0), np.zeros(50, int)
+    whole = render(gaussians, view.camera)
+    for seed in range(40):
+        band = refit._band(view, np.random.default_rng(seed))
+        assert band.pixels.shape == (16, 50, 4)
+        begin = round(view.camera.params[2] - band.camera.params[2])
+        assert (band.pixels == view.pixels[begin : begin + 16]).all()
+        assert band.mask is not None
+        assert (band.mask == view.mask[begin : begin + 16]).all()
+        assert (lens_of(band.camera, view.camera).limits == lens_of(view.camera).limits).all()
+        np.testing.assert_allclose(render(gaussians, band.camera).colour, whole.colour[begin : begin + 16], atol=0.02)
+        met[begin : begin + 16] += 1
+    assert met.min() > 0
 
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"steps": -1}, {"degree": 4}, {"degree": -1}])
