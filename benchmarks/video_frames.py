@@ -34,9 +34,9 @@ from stages.video.frames import Reader, frames_of, look
 
 SHUTTER = 0.02  # seconds
 STEP = 1.5  # px between two of the pictures that a blurred frame is the mean of
-MOST = 8  # of these
+MOST = 12  # of these
 SHAKES = ((0.08, 0.13), (0.22, 0.3), (0.45, 0.5), (0.62, 0.72), (0.86, 0.9))  # shares of the clip in which the hand shakes
-SHAKE, SHAKE_HZ = 0.02, 3.5  # radians, a second
+SHAKE, SHAKE_HZ = 0.045, 3.5  # radians, a second
 STANDS = ((0.32, 0.4), (0.74, 0.8))  # and in which it stands
 DENSE = 1500
 

@@ -10,6 +10,8 @@ import numpy as np
 ALIKE = 0.004  # of the picture's diagonal: frames between which less has moved are alike
 APART = 0.4  # of a window: motion between two that are chosen, at least where
 AS_SHARP = 0.9  # a frame so far from the one before has this share of the sharpness of one that is nearer
+DISCOUNT = 3  # power of a frame's sharpness over the median round it, by which its motion counts less: a hand that shakes moves much, and for nothing
+AROUND = 15  # frames on each side that this median is of
 BLURRED = 0.7  # of the median sharpness of the chosen round it
 NEIGHBOURS = 8  # chosen frames on each side that this median is of
 CHOSEN, LESS_SHARP, SAME, BLUR = "chosen", "less sharp than a frame near it", "like a chosen one", "blurred"
@@ -24,10 +26,9 @@ def choose(motion: np.ndarray, sharpness: np.ndarray, count: int) -> list[str]:
 
     Time does not count: a camera that stands gives one frame, and frames may come at any rate. Of equally sharp frames the first is chosen.
     """
-    total = float(motion[-1] - motion[0]) if len(motion) else 0.0
-    windows = max(1, min(count, 1 + int(total / ALIKE)))
-    width = total / windows
-    chosen = _sharpest(motion, sharpness, windows, width)
+    useful = _discounted(motion, sharpness)
+    windows = max(1, min(count, 1 + int(useful[-1] / ALIKE)))
+    chosen = _sharpest(motion, useful, sharpness, windows)
     blurred = _blurred(sharpness, chosen)
     kept = np.array([frame for frame in chosen if frame not in blurred], int)
     verdicts = []
@@ -41,18 +42,26 @@ def choose(motion: np.ndarray, sharpness: np.ndarray, count: int) -> list[str]:
     return verdicts
 
 
-def _sharpest(motion: np.ndarray, sharpness: np.ndarray, windows: int, width: float) -> list[int]:
-    """The sharpest frame of each window that is not like the one before, nor needlessly near to it."""
-    window = np.minimum((motion - motion[:1]) / max(width, 1e-12), windows - 1).astype(int)
+def _discounted(motion: np.ndarray, sharpness: np.ndarray) -> np.ndarray:
+    """(F,) motion from the first frame on, that from and to blurred frames counted less."""
+    usual = np.array([np.median(sharpness[max(0, frame - AROUND) : frame + AROUND + 1]) for frame in range(len(motion))])
+    counts = np.clip(sharpness / np.maximum(usual, 1e-9), 0.0, 1.0) ** DISCOUNT
+    return np.concatenate([[0.0], np.cumsum(np.diff(motion) * np.minimum(counts[1:], counts[:-1]))])
+
+
+def _sharpest(motion: np.ndarray, useful: np.ndarray, sharpness: np.ndarray, windows: int) -> list[int]:
+    """The sharpest frame of each window of equal `useful` motion that is not like the one before, nor needlessly near to it."""
+    width = useful[-1] / windows
+    window = np.minimum(useful / max(width, 1e-12), windows - 1).astype(int)
     chosen: list[int] = []
     bounds = np.searchsorted(window, np.arange(windows + 1))
     for begin, end in pairwise(bounds):
-        before = motion[chosen[-1]] if chosen else -np.inf
+        before, reached = (motion[chosen[-1]], useful[chosen[-1]]) if chosen else (-np.inf, -np.inf)
         frames = begin + np.flatnonzero(motion[begin:end] >= before + ALIKE)
         if not len(frames):
             continue
         best = frames[np.argmax(sharpness[frames])]
-        frames = frames[(motion[frames] >= before + APART * width) & (sharpness[frames] >= AS_SHARP * sharpness[best])]
+        frames = frames[(useful[frames] >= reached + APART * width) & (sharpness[frames] >= AS_SHARP * sharpness[best])]
         chosen.append(int(frames[np.argmax(sharpness[frames])] if len(frames) else best))
     return chosen
 
