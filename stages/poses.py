@@ -80,6 +80,12 @@ class PosesSettings:
     )
     strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
     allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
+    lens: Literal["auto", "perspective", "equirectangular"] = setting(
+        "auto",
+        "What photographs and videos show: what a lens projects (perspective), or 360 degrees (equirectangular), which are cut into views of pinhole cameras;"
+        " auto: 360 degrees where a photograph is twice as wide as high and says so (XMP).",
+        advanced=True,
+    )
     matching: Literal["auto", "exhaustive", "retrieval", "sequential"] = setting(
         "auto",
         "Which photographs are matched: all pairs (exhaustive), each with those that look most like it (retrieval), or with those that follow (sequential);"
@@ -189,7 +195,7 @@ def _formats(job: Job, settings: PosesSettings) -> list[str]:
 
 
 def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
-    from stages.io.material import find_material, with_frames
+    from stages.io.material import photographs_of
     from stages.io.pictures import UnreadableImage, read_header
     from stages.memory.poses import feature_threads
     from stages.sfm.background import silhouettes_with_surroundings
@@ -198,7 +204,7 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
 
     source = job.source
     assert source is not None
-    found = with_frames(job, find_material(job.sources, settings.allow_outside, warn), max(settings.max_image_size, settings.feature_image_size), warn)
+    found = photographs_of(job, warn)
     paths = found.paths
     masks = {**found.masks, **_made_masks(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
     sizes = []

@@ -14,6 +14,7 @@ from stages.artifacts import PosesOutputs
 from stages.io.importers import one_line_errors
 from stages.io.importers.photographs import is_video, masks_of, photographs
 from stages.io.importers.source import MIN_IMAGES, Source
+from stages.io.pictures import MAX_SIDE
 
 Warn = Callable[[str], object]
 
@@ -30,6 +31,15 @@ class Material:
     paths: dict[str, Path] = field(default_factory=dict)
     masks: dict[str, Path] = field(default_factory=dict)
     videos: dict[str, Path] = field(default_factory=dict)
+
+
+def photographs_of(job: Job, warn: Warn) -> Material:
+    """The photographs of the job's sources, with frames of videos and views of panoramas among them. Raises BadInput."""
+    settings = job.settings
+    longest = max(settings.max_image_size, settings.feature_image_size)
+    round_about = settings.lens == "equirectangular"
+    found = with_frames(job, find_material(job.sources, settings.allow_outside, warn), MAX_SIDE if round_about else longest, warn)
+    return with_views(job, found, longest, warn)
 
 
 def find_material(sources: Mapping[str, Path], allow_outside: bool, warn: Warn) -> Material:
@@ -92,6 +102,37 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
         )
     _write_record(job, chosen.record, chosen.paths)
     return Material(found.paths | chosen.paths, found.masks)
+
+
+def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material:
+    """The material with views of its panoramas in their place. Raises BadInput.
+
+    max_side  longest side of the views, pixels
+    """
+    from stages.io.pictures import UnreadableImage, read_header
+    from stages.video.panorama import VIEWS, is_panorama, views_of
+
+    if job.settings.lens == "perspective":
+        return found
+    panoramas: dict[str, Path] = {}
+    for name, path in found.paths.items():
+        job.safe_point()
+        if job.settings.lens == "auto" and is_panorama(path):
+            panoramas[name] = path
+        elif job.settings.lens == "equirectangular":
+            with contextlib.suppress(UnreadableImage):  # said where it is read
+                width, height = read_header(path).size
+                if width != 2 * height:
+                    raise BadInput(f"{name}: {width}x{height} pixels; a picture of 360 degrees is twice as wide as high. Without --lens it is a photograph.")
+            panoramas[name] = path
+    if not panoramas:
+        return found
+    if masked := panoramas.keys() & found.masks.keys():
+        warn(f"{len(masked)} masks of 360-degree pictures are not used.")
+    job.say(f"{len(panoramas)} 360-degree pictures are cut into {VIEWS} views each")
+    views = views_of(panoramas, max_side=max_side, work=job.work / "panoramas", safe_point=job.safe_point, progress=job.progress, warn=warn)
+    left = {name: path for name, path in found.paths.items() if name not in panoramas}
+    return Material(left | views, {name: mask for name, mask in found.masks.items() if name not in panoramas})
 
 
 def _write_record(job: Job, record: list[dict[str, object]], paths: Mapping[str, Path]) -> None:

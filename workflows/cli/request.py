@@ -33,6 +33,7 @@ class Options:
     budget: str | None = None
     target_mib: float | None = None
     frames: int | None = None
+    lens: str | None = None
     mask_from: str | None = None
     device: str | None = None
     memory: str | None = None
@@ -104,8 +105,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     settings.put_table(config.table, f"--config {options.config}")
     for text in options.sets:
         settings.put_option(text)
-    if seed is None and standing is not None and options.preset is not None:
-        seed = standing.seed
+    seed = standing.seed if seed is None and standing is not None and options.preset is not None else seed
     if seed is not None:
         settings.put_seed(seed)
     for name, value, origin in (
@@ -113,6 +113,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         ("mask_from", options.mask_from, f"--mask {options.mask_from}"),
         ("strict", options.strict or None, "--strict"),
         ("frames", options.frames, f"--frames {options.frames}"),
+        ("lens", options.lens, f"--lens {options.lens}"),
         ("allow_outside", options.allow_outside or None, "--allow-outside"),
     ):
         if value is not None:

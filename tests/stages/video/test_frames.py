@@ -17,7 +17,7 @@ from pipeline.stage import Job
 from stages import poses
 from stages.io.capture import Capture
 from stages.io.importers import candidates, files
-from stages.io.material import find_material, with_frames
+from stages.io.material import find_material, photographs_of, with_frames
 from stages.io.photo import read_photo
 from stages.poses import PosesSettings
 from stages.sfm import reconstruction
@@ -189,3 +189,18 @@ def test_photographs_without_exif_share_a_camera_within_their_source(tmp_path: P
     keys = {image.name: image.camera_key for image in images}
     assert keys["a/1.png"] == keys["a/2.png"] != keys["b/1.png"]
     assert keys["a/9.jpg"] == keys["b/9.jpg"] not in (keys["a/1.png"], keys["b/1.png"])
+
+
+def test_panoramas_become_views_and_photographs_beside_them_stay(tmp_path: Path) -> None:
+    about = b'<x:xmpmeta GPano:ProjectionType="equirectangular"/>'
+    captures.write_picture(tmp_path / "source" / "360.jpg", captures.picture(width=64, height=32), xmp=about)
+    captures.write_picture(tmp_path / "source" / "plain.jpg", captures.picture(width=64, height=32))
+    views = [f"360.jpg/{degrees:03d}.png" for degrees in range(0, 360, 45)]
+    for lens, expected in (("auto", ["plain.jpg", *views]), ("perspective", ["360.jpg", "plain.jpg"])):
+        job, _ = job_for(tmp_path / "source", tmp_path / lens, lens=lens)
+        assert list(photographs_of(job, job.warn).paths) == expected
+    job, _ = job_for(tmp_path / "source", tmp_path / "all", lens="equirectangular")
+    assert len(photographs_of(job, job.warn).paths) == 16
+    captures.write_picture(tmp_path / "source" / "x.jpg", captures.picture())
+    with pytest.raises(BadInput, match=r"x\.jpg: 32x24 pixels; .* twice as wide as high"):
+        photographs_of(job, job.warn)

@@ -1,0 +1,96 @@
+"""Panoramas and the views that are cut from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.errors import Interrupted
+from stages.io.photo import read_photo
+from stages.video.panorama import VIEWS, cut, directions, is_panorama, view_side, views_of
+from tests.stages import captures
+
+GPANO = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+
+
+def colours(direction: np.ndarray) -> np.ndarray:
+    """A smooth picture of all directions (..., 3): its colours are the direction."""
+    unit = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    return (127.5 + 120 * unit).astype(np.float32)
+
+
+def panorama(height: int = 128) -> np.ndarray:
+    """(H, 2 H, 3) uint8: the middle looks along z, columns go to the right."""
+    longitude = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
+    latitude = ((np.arange(height) + 0.5) / height - 0.5) * np.pi
+    lon, lat = np.meshgrid(longitude, latitude)
+    return colours(np.stack([np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)], -1)).round().astype(np.uint8)
+
+
+def write(path: Path, **options: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(panorama()).save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("view", range(VIEWS))
+def test_a_view_shows_what_lies_in_its_directions(view: int) -> None:
+    side = 48
+    found, expected = cut(panorama(), side, view), colours(directions(side, view))
+    assert np.abs(found - expected).max() <= 2.5  # through the seam at the back, too
+    middle = directions(side, view).mean(axis=(0, 1))
+    np.testing.assert_allclose(np.degrees(np.arctan2(middle[0], middle[2])) % 360, 360 * view / VIEWS, atol=1e-9)
+
+
+def test_views_have_the_resolution_of_the_panorama_in_their_middle() -> None:
+    for width in (256, 5760):
+        side = view_side(width, 10_000)
+        assert np.degrees(np.arctan(2 / side)) == pytest.approx(360 / width, rel=0.03)
+    assert view_side(5760, 800) == 800
+
+
+def test_panoramas_are_recognised_by_shape_and_what_they_say(tmp_path: Path) -> None:
+    assert is_panorama(write(tmp_path / "a.jpg", xmp=GPANO))
+    assert is_panorama(write(tmp_path / "a.webp", xmp=GPANO))
+    assert not is_panorama(write(tmp_path / "b.jpg"))
+    captures.write_picture(tmp_path / "c.jpg", captures.picture(), xmp=GPANO)
+    (tmp_path / "d.jpg").write_bytes(b"no picture")
+    assert not is_panorama(tmp_path / "c.jpg")
+    assert not is_panorama(tmp_path / "d.jpg")
+
+
+def test_views_are_written_with_their_focal_length_and_again_after_a_kill(tmp_path: Path) -> None:
+    pictures = {name: write(tmp_path / name) for name in ("a.png", "b/a.png")}
+    quiet: dict[str, Any] = {"progress": lambda *values: None, "warn": lambda text: None, "max_side": 1000}
+    whole = views_of(pictures, work=tmp_path / "whole", safe_point=lambda: None, **quiet)
+    assert [name for name in whole if name.startswith("a.png/")] == [f"a.png/{degrees:03d}.png" for degrees in range(0, 360, 45)]
+    assert len(whole) == 2 * VIEWS
+    for path in whole.values():
+        photo = read_photo(path, 1000)
+        assert photo.focal == pytest.approx(photo.width / 2)
+        assert photo.width == photo.height == view_side(256, 1000)
+        assert photo.maker == "panorama"
+    points = iter(range(100))
+
+    def stop() -> None:
+        if next(points) == VIEWS + 3:
+            raise Interrupted(2)
+
+    with pytest.raises(Interrupted):
+        views_of(pictures, work=tmp_path / "killed", safe_point=stop, **quiet)
+    again = views_of(pictures, work=tmp_path / "killed", safe_point=lambda: None, **quiet)
+    assert {name: path.read_bytes() for name, path in again.items()} == {name: path.read_bytes() for name, path in whole.items()}
+
+
+def test_a_panorama_that_cannot_be_read_is_left_out_with_a_word(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"no picture")
+    warnings: list[str] = []
+    found = views_of(
+        {"a.png": tmp_path / "a.png"}, max_side=99, work=tmp_path / "work", safe_point=lambda: None, progress=lambda *values: None, warn=warnings.append
+    )
+    assert not found
+    assert "a.png: unreadable" in warnings[0]
