@@ -70,7 +70,12 @@ class BakeSettings:
     visibility_rays: Annotated[int, Meta(ge=1000)] = setting(
         1_000_000, "Training pixels that the field is rendered for, to find the visible voxels.", advanced=True
     )
-    weight_threshold: Fraction = setting(1e-3, "A voxel is kept where its weight in some pixel exceeds this.", advanced=True)
+    weight_threshold: Fraction = setting(
+        1e-3,
+        "A voxel is kept where its weight in some pixel exceeds this; in forward-facing scenes those that 4 or more training images have in view are baked"
+        " where it exceeds 30 times this.",
+        advanced=True,
+    )
     max_mib: Annotated[float, Meta(gt=0.0)] | Auto = setting(
         "auto",
         "Largest size of the asset: resolution auto follows from it, and voxels of least weight are dropped to keep to it; auto: 38;"

@@ -13,11 +13,14 @@ import numpy as np
 
 from pipeline.stage import Job
 from stages.baking.holes import find_holes, voxels_of_holes
+from stages.baking.voxels import FEW_VIEWS_RATIO, seen_by_few
 
 if TYPE_CHECKING:
     from efficientnerf.asset.field_samples import FieldSamples
     from efficientnerf.asset.refinement.state import RefinementState
     from efficientnerf.asset.refinement.targets import Targets
+    from efficientnerf.asset.tree import NerfTree
+    from stages.io.scene import Scene
 
 # Training rays per voxel that are rendered to see which voxels show, at least bake.visibility_rays; in normalised device coordinates, where no ray
 # misses and each meets many voxels, fewer. docs/experiments/refinement.md
@@ -47,10 +50,10 @@ class Pruned:
 
 
 def prune(
-    job: Job, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None, baked: np.ndarray | None
+    job: Job, s: Scene, state: RefinementState, targets: Targets, most: int, samples: FieldSamples | None, baked: np.ndarray | None
 ) -> tuple[RefinementState, Pruned]:
     """Only the voxels that contribute more than bake.weight_threshold to a pixel, and of these at most `most`, those that contribute most. Of a whole scene,
-    voxels without which a ray would end in a hole stay.
+    voxels without which a ray would end in a hole stay. In normalised device coordinates the contributions of voxels that few images have in view count more.
 
     baked  (N,) densities before the first step, of a whole scene
     """
@@ -59,6 +62,8 @@ def prune(
 
     state.to_host()
     greatest = greatest_weights(job, state, targets)
+    if state.tree.ndc is not None:
+        greatest[of_few_views(job, s, state.tree)] *= FEW_VIEWS_RATIO
     keep = heaviest(job, greatest, most)
     if not keep.any():
         return state, Pruned()
@@ -102,6 +107,16 @@ def greatest_weights(job: Job, state: RefinementState, targets: Targets) -> np.n
         job.safe_point()
 
     return fit.max_weights(state.tree, targets, count, job.settings.seed, progress)
+
+
+def of_few_views(job: Job, s: Scene, tree: NerfTree) -> np.ndarray:
+    """Numbers of the voxels of the coarse cells that few training images have in view, in normalised device coordinates."""
+    assert tree.ndc is not None
+    cells = np.argwhere(tree.brick_index >= 0)
+    few = seen_by_few(job, s, tree.ndc, (cells + 0.5) * (tree.voxel * tree.brick) + tree.bounds_min)
+    rows = tree.voxel_index[tree.brick_index[tuple(cells[few].T)]]
+    found: np.ndarray = rows[rows >= 0]
+    return found
 
 
 def heaviest(job: Job, greatest: np.ndarray, most: int) -> np.ndarray:

@@ -61,6 +61,7 @@ class Refinement:
     """
 
     job: Job
+    scene: Scene
     targets: Targets
     room: Room
     stopwatch: Stopwatch
@@ -174,7 +175,7 @@ class Refinement:
         point, splits = self.point, count_splits(self.point.schedule.phases[: self.point.phase])
         baked = None if self.baked is None else self.baked.density_values[checkpoint.ancestors(self.baked, point.state.tree, splits)]
         most = most_children(self.room(splits + 1)) // 8 if split else self.room(splits)
-        point.state, point.pruned = pruning.prune(self.job, point.state, self.targets, most, self.samples, baked)
+        point.state, point.pruned = pruning.prune(self.job, self.scene, point.state, self.targets, most, self.samples, baked)
         if split:
             point.state = splitting.split(point.state, np.ones(len(point.state.density), bool))
             self.job.say(f"voxels are split: {len(point.state.density):,} with {max(point.state.tree.resolution)} along the longest side")
@@ -219,7 +220,7 @@ def refined(
     if point.state.step == 0:
         log.begin(point.state, phases[0].name, before)
     del tree  # the state has values of its own
-    made = Refinement(job, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, per_ray, samples, baked)
+    made = Refinement(job, s, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, per_ray, samples, baked)
     tree = made.run()
     report |= {"steps": point.state.step, "schedule": point.schedule.state(), "time_budget": settings.time_budget}
     report["psnr_before"], report["psnr_after"] = (round(psnr_of(error), 3) for error in (before, fit.error(tree, targets, sample, settings.seed)))

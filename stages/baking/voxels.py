@@ -5,6 +5,7 @@ N voxels.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from stages.scratch import unusable
 
 if TYPE_CHECKING:
     from efficientnerf.asset.bake import Visibility
+    from efficientnerf.geometry.ndc import Ndc
     from efficientnerf.geometry.spaces import Space
     from efficientnerf.training.pixels import Pixels
     from stages.bake import BakeSettings
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 
 MAX_OVERSHOOT = 2  # voxels baked over voxels that fit into the asset, at most: of which the refinement keeps the heaviest
 OVERSHOOT = 1.7  # the same where the resolution is chosen: few of the dilated voxels show. docs/experiments/bake-resolution.md
+# In normalised device coordinates a voxel that fewer training images have in view counts so many times as much: what shows there at the borders of other views
+# is faint in the field. docs/experiments/bake-resolution.md
+WELL_SEEN_VIEWS, FEW_VIEWS_RATIO = 4, 30.0
 
 
 def voxel_space(job: Job, m: Any) -> Space:
@@ -59,6 +64,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     if (given(settings.resolution) or given(m.settings.discretise)) is not None:
         shape, voxel = bake.grid_of(bounds, baked_resolution(choice.resolution, splits), brick)
         visibility = _visibility(job, m, pixels, shape, voxel, np.asarray(bounds[0], np.float64), space)
+        visibility = by_views(job, s, visibility, shape, voxel, space)
         return choice, visibility, _heaviest_voxels(job, visibility, shape, MAX_OVERSHOOT * room(choice.resolution))
 
     top_shape, top_voxel = bake.grid_of(bounds, finest.resolution, brick)
@@ -74,6 +80,7 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
             coarse = visibility
             if resolution != finest.resolution:
                 coarse = bake.coarsened(visibility, top_shape, top_voxel, shape, voxel, brick, settings.weight_threshold)
+            coarse = by_views(job, s, coarse, shape, voxel, space)
             last = resolution, coarse, bake.chosen_voxels(coarse, shape, brick, settings.weight_threshold, settings.dilate)
         return last
 
@@ -84,6 +91,28 @@ def choose_voxels(job: Job, m: Any, s: Scene, pixels: Pixels, space: Space, mib:
     if len(indices) > most:
         indices = _heaviest_voxels(job, coarse, bake.grid_of(bounds, baked, brick)[0], most)
     return choice, coarse, indices
+
+
+def by_views(job: Job, s: Scene, visibility: Visibility, shape: tuple[int, int, int], voxel: float, space: Space) -> Visibility:
+    """The visibility in normalised device coordinates with smaller weights where many training images have voxels in view; that of other spaces as it is.
+
+    What the field shows faintly behind and before its surfaces the refinement drops: the room is worth more in finer voxels.
+    """
+    if space.ndc is None:
+        return visibility
+    brick = job.settings.brick_size
+    cells = np.stack(np.unravel_index(visibility.cells, shape), axis=-1)
+    few = seen_by_few(job, s, space.ndc, (cells + 0.5) * (voxel * brick) + np.asarray(space.bounds[0], np.float64))
+    return replace(visibility, greatest=visibility.greatest * np.where(few, 1, 1 / FEW_VIEWS_RATIO).astype(np.float32)[:, None])
+
+
+def seen_by_few(job: Job, s: Scene, ndc: Ndc, points: np.ndarray) -> np.ndarray:
+    """(N,) bool: which points (N, 3) in normalised device coordinates fewer than WELL_SEEN_VIEWS training images have in view, by pixels that are kept."""
+    from stages.framing.view_coverage import count_views, kept_pixels
+    from stages.io import scene
+
+    views = scene.views_of(s, "train")
+    return count_views(ndc.world(points), [view.camera for view in views], kept_pixels(job.inputs["poses"], views)) < WELL_SEEN_VIEWS
 
 
 def finest_choice(settings: BakeSettings, m: Any, s: Scene) -> Choice:

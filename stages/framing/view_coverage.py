@@ -72,6 +72,17 @@ def has_min_views(points: np.ndarray, cameras: Sequence[Camera], min_views: int,
     return (count >= needed) | (needed < 2)
 
 
+def count_views(points: np.ndarray, cameras: Sequence[Camera], masks: Masks | None = None) -> np.ndarray:
+    """(N,) int32: how many cameras have points (N, 3) of the world in view.
+
+    masks  a camera counts only where its mask keeps the pixel
+    """
+    count = np.zeros(len(points), np.int32)
+    for n, camera in enumerate(cameras):
+        count += shows(points, camera, None if masks is None else masks[n])
+    return count
+
+
 def cells_without_view(space: Space, cameras: Sequence[Camera], side: int, masks: Masks) -> np.ndarray:
     """(D, D, D) bool of the density voxels of any space, D = `side`: those in blocks of which no view shows any point by a pixel that is kept.
 
