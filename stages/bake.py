@@ -255,7 +255,7 @@ def _targets(s: Scene, pixels: Pixels, plan: Plan) -> Targets:
 
 STAGE = Stage(
     name="bake",
-    version=14,
+    version=15,
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,
