@@ -133,4 +133,4 @@ def run(job: Job) -> None:
     job.say(f"{len(gaussians)} Gaussians in {time.monotonic() - started:.0f} s", gaussians=len(gaussians))
 
 
-STAGE = Stage(name="splats", version=1, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)
+STAGE = Stage(name="splats", version=2, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)

@@ -101,7 +101,7 @@ READERS: dict[str, Callable[[Path, SourceFrame], Gaussians]] = {
     ".glb": lambda path, frame: from_y_up(read_glb_splats(path)[1], frame),
 }
 # What a format keeps: places, the logarithms of scales, opacities, first harmonics, those above.
-FINE, CODED = (1e-6, 1e-6, 1e-6, 1e-6, 2e-6), (2.0**-12, 1 / 32 + 1e-3, 0.5 / 255 + 1e-3, 0.5 / 255 / 0.15 + 1e-3, 0.13)
+FINE, CODED = (1e-6, 1e-6, 1e-6, 1e-6, 2e-6), (2.0**-12, 1 / 32 + 1e-3, 0.5 / 255 + 1e-3, 0.5 / 255 / 0.15 + 1e-3, 4 / 128)
 
 
 def differs_by(found: Gaussians, expected: Gaussians) -> tuple[float, ...]:
@@ -150,7 +150,7 @@ def test_spz_codes_are_niantic_s(tmp_path: Path) -> None:
     assert set(raw[16 + 6 * 13 : 16 + 6 * 16]) == {0}
     above = np.frombuffer(raw[-6 * 24 :], np.uint8).reshape(6, 8, 3)
     assert set(above[:, :3].ravel()) == {255}
-    assert set(above[:, 3:].ravel()) == {128}, "-0.05 is nearest to 0 of sixteenths"
+    assert set(above[:, 3:].ravel()) == {124}, "-0.05 is -6 of 128, and that as near to -4 as to -8"
 
 
 @pytest.mark.parametrize(("size", "at"), [(1.0, 0.0), (1e-3, 0.0), (500.0, 0.0), (1.0, 1e5), (1e-4, 7e6)])

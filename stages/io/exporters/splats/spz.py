@@ -6,7 +6,7 @@
     colours    3 times 8 bits: 0.5 + 0.15 f_dc
     scales     3 times 8 bits: their logarithms in sixteenths, from -10
     rotations  32 bits: which of x y z w is the largest, and 10 bits for each other one
-    harmonics  8 bits for each coefficient above f_dc, in 128ths from -1 to 1, rounded to eighths of 128 for degree 1 and to sixteenths above
+    harmonics  8 bits for each coefficient above f_dc, in 128ths from -1 to 1; rounded to multiples of BUCKETS, so that they compress
 
 https://github.com/nianticlabs/spz
 """
@@ -32,8 +32,8 @@ BITS = 12  # fractional bits of places that other writers have; here there are a
 STEPS = 4  # of places, in the thickness of the thinnest Gaussians but a twentieth
 COLOUR = 0.15
 SCALE_STEPS, SMALLEST_SCALE = 16, -10
-BUCKETS = (8, 16)  # of 256: what harmonics of degree 1, and those above, are rounded to; as Niantic's writer does
-LEVEL = 9  # of the compression
+BUCKETS = (2, 4)  # of 256: what harmonics of degree 1, and those above, are rounded to; Niantic's writer has 8 and 16. docs/experiments/splat-formats.md
+LEVEL = 6  # of the compression
 _GZIP = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x02\xff"  # no time, no name, no system: the same Gaussians give the same bytes
 
 
