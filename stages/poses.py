@@ -22,6 +22,7 @@ from pipeline.errors import BadInput
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
+from stages.cores import count_cores, in_order
 from stages.io import importers
 from stages.io.capture import Capture, Photo, Silhouettes, SparsePoints
 from stages.io.importers.source import MIN_IMAGES, abbreviated
@@ -316,6 +317,7 @@ def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[
     """Write the working images. Returns the capture without the images that cannot be decoded, and what was written for the others."""
     from stages.io import working_images
     from stages.io.pictures import UnreadableImage
+    from stages.memory.poses import reading_threads
 
     relative = working_images.image_paths([photo.camera for photo in capture.photos])
     how: dict[str, Any] = {"max_side": job.settings.max_image_size, "silhouettes": capture.silhouettes, "may_be_empty": _may_be_renders(capture)}
@@ -323,15 +325,22 @@ def _write_images(job: Job, capture: Capture, warn: Any) -> tuple[Capture, list[
     written = []
     failed: list[tuple[str, str]] = []
     remarks: list[str] = []
-    for index, photo in enumerate(capture.photos):
-        job.safe_point()
-        job.progress(index, len(capture.photos), "preparing images")
+
+    def write(index: int) -> working_images.Written | UnreadableImage:
         try:
-            written.append(working_images.write(photo, job.out, relative[index], **how))
-            remarks += written[-1].warnings
-            kept.append(index)
+            return working_images.write(capture.photos[index], job.out, relative[index], **how)
         except UnreadableImage as error:
-            failed.append((photo.camera.name, str(error)))
+            return error
+
+    threads = reading_threads(job, [(photo.camera.width, photo.camera.height) for photo in capture.photos], count_cores())
+    for index, found in enumerate(in_order(write, range(len(capture.photos)), threads, job.safe_point)):
+        job.progress(index, len(capture.photos), "preparing images")
+        if isinstance(found, UnreadableImage):
+            failed.append((capture.photos[index].camera.name, str(found)))
+        else:
+            written.append(found)
+            remarks += found.warnings
+            kept.append(index)
     job.progress(len(capture.photos), len(capture.photos), "preparing images")
     if failed:
         sentence = f"{len(failed)} of {len(capture.photos)} images cannot be used: {abbreviated([f'{name} {reason}' for name, reason in failed])}."

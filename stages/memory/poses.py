@@ -37,7 +37,7 @@ def features_needed(sizes: Sequence[tuple[int, int]], max_side: int, features: i
     workers = min(threads, MAX_WORKERS)
     matching = workers * (COLMAP + 4 * BLOCK_SIZE * DESCRIPTOR * features) if workers > 1 and len(sizes) > 2 * BLOCK_SIZE else 0
     return Need({
-        "a photograph, or features on each thread": max(decoded["a photograph"], SIFT * most * threads, matching),
+        "a photograph, or features, on each thread": max(decoded["a photograph"] * threads, SIFT * most * threads, matching),
         "descriptors": DESCRIPTOR * features * len(sizes),
         "libraries": decoded["libraries"] + COLMAP,
     })  # fmt: skip
@@ -52,6 +52,15 @@ def refuse_large_videos(job: Job, sizes: Sequence[tuple[int, int]]) -> None:
     """UsageError where the frames of a video do not fit into memory while it is decoded."""
     most = max((width * height for width, height in sizes), default=0)
     refuse_what_does_not_fit(job, Need({"frames of a video": FRAME * most, "libraries": IMAGING}), "Export the video at a lower resolution.")
+
+
+def reading_threads(job: Job, sizes: Sequence[tuple[int, int]], threads: int) -> int:
+    """On how many of the threads photographs of these sizes are read: as many as fit into memory."""
+    if job.memory is None:
+        return threads
+    now, needed = available_now(), decoding_needed(sizes).terms
+    room = (job.memory.bytes if now is None else min(job.memory.bytes, now)) - needed["libraries"]
+    return int(min(threads, max(1, room // max(1, needed["a photograph"]))))
 
 
 def feature_threads(job: Job, sizes: Sequence[tuple[int, int]], max_side: int, features: int, threads: int) -> int:

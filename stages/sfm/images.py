@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from pipeline.files import open_plain, remove, write_atomically
+from stages.cores import in_order
 from stages.io.photo import DecodedPhoto, read_mask_file, read_photo
 from stages.io.pictures import UnreadableImage
 from stages.io.png import FAST, read_png, write_png
@@ -68,6 +69,7 @@ def prepare_images(
     seed: int,
     masks: Masks,
     paths: Mapping[str, Path] | None = None,
+    threads: int = 1,
     work: Path,
     progress: Progress,
     safe_point: SafePoint,
@@ -77,32 +79,31 @@ def prepare_images(
 
     masks    of some or all names; None: the photograph as a whole, whatever its alpha channel says
     paths    of some or all names: the file that is read, where it is not the name below the folder
+    threads  on which photographs are read
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 
     What an earlier, killed call with the same photographs and settings left in `work` is kept, anything else there is removed.
     """
     paths = {name: folder / name for name in names} | dict(paths or {})
     request = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "photographs": _digests(paths, masks, safe_point)}
-    text = json.dumps(request, indent=1, sort_keys=True)
-    record = work / "request.json"
-    parts = work / "images", work / "masks"
-    work.mkdir(parents=True, exist_ok=True)
-    if not _holds(record, text.encode()) or any(part.is_symlink() or not part.is_dir() for part in parts):
-        for entry in list(work.iterdir()):
-            remove(entry)
-        for part in parts:
-            part.mkdir()
-        write_atomically(record, text.encode(), durable=False)
+    _begin(work, json.dumps(request, indent=1, sort_keys=True).encode())
+    ordered, warn_once = sorted(paths), once(warn)
+    known: list[Copy | None] = []
+    for index, name in enumerate(ordered):
+        safe_point()
+        known.append(noted(_note_of(index, work), Copy, warn_once, partial(_check, name, index, max_side, work)))
+    fresh = in_order(
+        lambda index: _copy(ordered[index], paths[ordered[index]], index, max_side, masks, work),
+        [index for index, copied in enumerate(known) if copied is None],
+        threads,
+        safe_point,
+    )
     images: list[WorkImage] = []
     rejected: list[tuple[str, str]] = []
-    warn_once = once(warn)
-    for index, name in enumerate(sorted(paths)):
-        safe_point()
-        record = work / f"copy_{index:05d}.json"
-        copied = noted(record, Copy, warn_once, partial(_check, name, index, max_side, work))
+    for index, (name, copied) in enumerate(zip(ordered, known, strict=True)):
         if copied is None:
-            copied, outputs = _copy(name, paths[name], index, max_side, masks, work)
-            note(record, msgspec.to_builtins(copied), outputs)
+            copied, outputs = next(fresh)
+            note(_note_of(index, work), msgspec.to_builtins(copied), outputs)
         if copied.image is None:
             rejected.append((name, copied.remark))
             warn(f"{name}: {copied.remark}; left out.")
@@ -112,6 +113,22 @@ def prepare_images(
             images.append(copied.image)
         progress(index + 1, len(paths), "reading photographs")
     return images, rejected
+
+
+def _begin(work: Path, request: bytes) -> None:
+    """Empty the work folder, unless it is of this very request."""
+    record, parts = work / "request.json", (work / "images", work / "masks")
+    work.mkdir(parents=True, exist_ok=True)
+    if not _holds(record, request) or any(part.is_symlink() or not part.is_dir() for part in parts):
+        for entry in list(work.iterdir()):
+            remove(entry)
+        for part in parts:
+            part.mkdir()
+        write_atomically(record, request, durable=False)
+
+
+def _note_of(index: int, work: Path) -> Path:
+    return work / f"copy_{index:05d}.json"
 
 
 def _digests(paths: Mapping[str, Path], masks: Masks, safe_point: SafePoint) -> list[list[str | None]]:

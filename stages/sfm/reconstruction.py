@@ -137,6 +137,7 @@ def reconstruct(
         seed=seed,
         masks=masks,
         paths=_paths(folder, names),
+        threads=threads or num_threads(),
         work=work,
         progress=progress,
         safe_point=safe_point,

@@ -446,3 +446,20 @@ def test_an_error_of_a_worker_is_one_of_the_stage(resumed: tuple[Path, list[Work
 
 def test_threads_are_those_allowed() -> None:
     assert 1 <= num_threads() <= (os.cpu_count() or 1)
+
+
+def test_photographs_are_read_the_same_on_any_number_of_threads(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(7):
+        Image.fromarray(rng.integers(0, 255, (30 + k, 44, 3), np.uint8)).save(tmp_path / f"{k}.png")
+    (tmp_path / "3.png").write_bytes(b"no picture")
+    quiet: dict[str, Any] = {"max_side": 40, "features": 9, "seed": 0, "masks": {}, "progress": lambda *a: None, "safe_point": lambda: None}
+    found = {}
+    for threads in (1, 3):
+        said: list[str] = []
+        made = prepare_images(tmp_path, [f"{k}.png" for k in range(7)], work=tmp_path / f"w{threads}", threads=threads, warn=said.append, **quiet)
+        files = {path.name: path.read_bytes() for path in sorted((tmp_path / f"w{threads}").rglob("*")) if path.is_file()}
+        found[threads] = (made, said, files)
+    assert found[1] == found[3]
+    assert [name for name, _ in found[1][0][1]] == ["3.png"]
+    assert len(found[1][0][0]) == 6
