@@ -13,7 +13,7 @@ from stages.sfm import pair_workers
 from stages.sfm.colmap import num_threads, quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, pair_id_of, record, verified_pairs
 from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
-from stages.sfm.pairs import Pair, in_blocks, likeness_of, ordered
+from stages.sfm.pairs import Pair, aggregated, in_blocks, likeness_of, ordered
 
 UPSAMPLE_BELOW = 1000  # pixels, longest side: of smaller images features are detected at twice the size; docs/experiments/sfm.md
 MAX_WORKERS = 8  # processes that match pairs
@@ -92,7 +92,8 @@ def likeness(work: Path, seed: int, safe_point: SafePoint) -> np.ndarray:
         descriptors = []
         for image in sorted(database.read_all_images(), key=lambda image: image.name):
             safe_point()
-            descriptors.append(np.asarray(database.read_descriptors(image.image_id).data, np.uint8).reshape(-1, 128))
+            every = np.asarray(database.read_descriptors(image.image_id).data, np.uint8).reshape(-1, 128)
+            descriptors.append(aggregated(every).copy())  # not a view of all
     safe_point()
     return likeness_of(descriptors, seed)
 

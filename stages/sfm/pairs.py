@@ -99,10 +99,15 @@ def likeness_of(descriptors: Sequence[np.ndarray], seed: int) -> np.ndarray:
 
     descriptors  of each image, (N, 128) uint8
     """
-    some = [image[:: max(1, -(-len(image) // AGGREGATED))] for image in descriptors]
+    some = [aggregated(image) for image in descriptors]
     words = visual_words(some, seed)
     vectors = np.stack([vlad(image, words) for image in some]) if some else np.zeros((0, 0))
     return vectors @ vectors.T
+
+
+def aggregated(descriptors: np.ndarray) -> np.ndarray:
+    """The rows that an image's vector is made of: all, or an even choice."""
+    return descriptors[:: max(1, -(-len(descriptors) // AGGREGATED))]
 
 
 def visual_words(descriptors: Sequence[np.ndarray], seed: int) -> np.ndarray:
