@@ -11,18 +11,19 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import add_scaled4, advanced, load4, pack4, sigmoid, store4
 from efficientnerf.backends.numba.tree.march import MIN_COLOUR_WEIGHT, PACKED_EARLY_STOP, exp2_neg
-from efficientnerf.backends.numba.tree.packets.halves import mix_pairs
+from efficientnerf.backends.numba.tree.packets.halves import mix_pairs16
 from efficientnerf.backends.numba.tree.packets.lanes import (
     bits_of,
     broadcast16,
     channels16,
-    copy4,
     exp2_neg16,
     floor16,
+    gather_fours16,
     load16,
     lowest_bit,
     mask_of,
     popcount16,
+    prefetch_groups,
     select16,
     store16,
     store_channels16,
@@ -36,15 +37,12 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     CACHED_BITS,
     COLOURS,
     DISTANCE,
-    FAR_ROWS,
     GAIN,
     GREEN,
     HALF_DISTANCE,
     HAS_BASIS,
     INTERPOLATED,
     LOOKUPS,
-    NEAR_ROWS,
-    OWNER,
     PENDING_WEIGHT,
     RED,
     ROW,
@@ -52,12 +50,9 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     SH_X,
     SH_Y,
     SH_Z,
+    TOTAL,
     TRANSMITTANCE,
-    VOXEL,
     WEIGHT,
-    X,
-    Y,
-    Z,
 )
 from efficientnerf.backends.numba.tree.view_colours import sh_basis, sh_colour
 
@@ -66,31 +61,37 @@ _LEAST = np.float32(1e-30)  # weight of stored voxels below which a sample has n
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
-def _fetch_rows(lane, grid, ints):  # type: ignore[no-untyped-def]
-    """The four rows around a ray's sample."""
-    first = 2 * np.int64(ints[ROW + lane])
-    copy4(ints, NEAR_ROWS + 4 * lane, grid.rows, first)
-    copy4(ints, FAR_ROWS + 4 * lane, grid.rows, first + 2 * (grid.brick + 2))
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
 def _weigh(n, first, mask, edge, bit, fz, gz, floats, ints):  # type: ignore[no-untyped-def]
     """The first voxel of row n, and weights of it and of the next; returns their sum.
 
     bit  of the first voxel in the mask; voxels that are not stored have no weight, and what lies in their place is any voxel beside them
     """
-    store16(ints, VOXEL + 16 * n, first + popcount16(mask & ((bit << 1) - 1)) - 1)
+    store16(ints, 16 * n, first + popcount16(mask & ((bit << 1) - 1)) - 1)
     here, next_ = select16((mask & bit) != 0, edge * gz, _NONE), select16((mask & (bit << 1)) != 0, edge * fz, _NONE)
     store_pairs16(floats, WEIGHT + 32 * n, here, next_)
     return here + next_
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _mix_view_colours(lane, colours, floats, ints):  # type: ignore[no-untyped-def]
-    """Weighted density, red, green and blue of a ray's sample."""
-    a, b = np.int64(ints[VOXEL + lane]), np.int64(ints[VOXEL + 16 + lane])
-    c, d = np.int64(ints[VOXEL + 32 + lane]), np.int64(ints[VOXEL + 48 + lane])
-    store4(floats, SAMPLE + 4 * lane, mix_pairs(floats, WEIGHT + 2 * lane, 32, colours, 4 * a, 4 * b, 4 * c, 4 * d))
+@numba.njit(cache=True, error_model="numpy")
+def locate(x, y, z, distance, owner, grid, colours, ints, batch, voxels):  # type: ignore[no-untyped-def]
+    """Which voxels are around a sample of each of sixteen rays, and their weights, into a batch; asks for their colours, which `blend` needs later.
+
+    x, y, z  in the block of the brick `owner`
+    batch    float32, see `layout`, and voxels int32
+    """
+    i, j, k = floor16(x), floor16(y), floor16(z)
+    side = grid.brick + 2
+    store16(ints, ROW, (owner * (side * side) + to_int16(i * np.float32(side) + j)) * 2)
+    first, mask, next_first, next_mask = gather_fours16(grid.rows, ints, ROW)
+    far_first, far_mask, last_first, last_mask = gather_fours16(advanced(grid.rows, 2 * side), ints, ROW)
+    fx, fy, fz = x - i, y - j, z - k
+    gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
+    bit = broadcast16(np.int32(1)) << to_int16(k)
+    weight = _weigh(0, first, mask, gx * gy, bit, fz, gz, batch, voxels) + _weigh(1, next_first, next_mask, gx * fy, bit, fz, gz, batch, voxels)
+    far = _weigh(2, far_first, far_mask, fx * gy, bit, fz, gz, batch, voxels) + _weigh(3, last_first, last_mask, fx * fy, bit, fz, gz, batch, voxels)
+    store16(batch, TOTAL, weight + far)
+    store16(batch, DISTANCE, distance)
+    prefetch_groups(colours, voxels)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -123,11 +124,11 @@ def _colours_along(voxel, entry, grid, view, floats):  # type: ignore[no-untyped
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _mix_cached(lane, grid, view, floats, ints):  # type: ignore[no-untyped-def]
+def _mix_cached(lane, grid, view, floats, ints, batch, voxels):  # type: ignore[no-untyped-def]
     """`_mix_view_colours` by the harmonics of voxels along the rays: those that rays which are neighbours share are summed once for all of them."""
     total = pack4(_NONE, _NONE, _NONE, _NONE)
     for n in range(8):
-        weight, voxel = floats[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)], np.int64(ints[VOXEL + 16 * (n >> 1) + lane]) + (n & 1)
+        weight, voxel = batch[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)], np.int64(voxels[16 * (n >> 1) + lane]) + (n & 1)
         if weight != 0:
             entry = (voxel * 0x9E3779B1 & 0xFFFFFFFF) >> 32 - CACHED_BITS
             if ints[CACHE + entry] != voxel:
@@ -138,13 +139,13 @@ def _mix_cached(lane, grid, view, floats, ints):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _mix_harmonics(lane, grid, view, floats, ints):  # type: ignore[no-untyped-def]
+def _mix_harmonics(lane, grid, view, floats, batch, voxels):  # type: ignore[no-untyped-def]
     """The same for rays that share nothing, and the weight of the colour; none is looked up until that is MIN_COLOUR_WEIGHT."""
     sigma = red = green = blue = _NONE
     for n in range(8):
-        weight = floats[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)]
+        weight = batch[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)]
         if weight != 0:
-            sigma += weight * grid.density[np.int64(ints[VOXEL + 16 * (n >> 1) + lane]) + (n & 1)]
+            sigma += weight * grid.density[np.int64(voxels[16 * (n >> 1) + lane]) + (n & 1)]
     sigma *= view.density_scale
     before = floats[TRANSMITTANCE + lane]
     gain = floats[PENDING_WEIGHT + lane] + before - before * exp2_neg(sigma)
@@ -153,60 +154,57 @@ def _mix_harmonics(lane, grid, view, floats, ints):  # type: ignore[no-untyped-d
         floats[PENDING_WEIGHT + lane], floats[GAIN + lane] = _NONE, gain
         floats[LOOKUPS + lane] += _ONE
         for n in range(8):
-            weight = floats[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)]
+            weight = batch[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)]
             if weight != 0:
-                r, g, b = sh_colour(np.int64(grid.voxel_of[np.int64(ints[VOXEL + 16 * (n >> 1) + lane]) + (n & 1)]), grid, advanced(floats, BASIS), lane, 16)
+                r, g, b = sh_colour(np.int64(grid.voxel_of[np.int64(voxels[16 * (n >> 1) + lane]) + (n & 1)]), grid, advanced(floats, BASIS), lane, 16)
                 red, green, blue = red + weight * r, green + weight * g, blue + weight * b
     store4(floats, SAMPLE + 4 * lane, pack4(sigma, red, green, blue))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _half_distance(lane, view, floats):  # type: ignore[no-untyped-def]
-    """Distance at which the transmittance falls to one half, within a ray's sample."""
-    within = np.log2(2 * floats[TRANSMITTANCE + lane]) / floats[SAMPLE + 4 * lane] - _HALF
-    floats[HALF_DISTANCE + lane] = floats[DISTANCE + lane] + within * np.float32(view.step)
+def _half_distances(lanes, sigma, view, floats, batch):  # type: ignore[no-untyped-def]
+    """Distances at which the transmittance of some rays, given as bits, falls to one half, within their samples."""
+    store16(floats, SAMPLE, sigma)
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        within = np.log2(2 * floats[TRANSMITTANCE + lane]) / floats[SAMPLE + lane] - _HALF
+        floats[HALF_DISTANCE + lane] = batch[DISTANCE + lane] + within * np.float32(view.step)
+        lanes &= lanes - 1
 
 
 @numba.njit(cache=True, error_model="numpy")
-def composite(ready, near, shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped-def]
+def _mix_near(near, shared, grid, view, floats, ints, batch, voxels):  # type: ignore[no-untyped-def]
+    """Weighted densities and colours of some rays' samples, given as bits, by harmonics, into SAMPLE."""
+    _evaluate_basis(view, floats, ints)
+    while near != 0:
+        if shared:
+            _mix_cached(lowest_bit(near), grid, view, floats, ints, batch, voxels)
+        else:
+            _mix_harmonics(lowest_bit(near), grid, view, floats, batch, voxels)
+        near &= near - 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def blend(ready, near, shared, grid, view, colours, floats, ints, batch, voxels):  # type: ignore[no-untyped-def]
     """Composites the samples of some rays, given as bits, those of `near` by harmonics; returns which rays end, their transmittance being spent.
 
-    shared  whether rays beside each other are neighbours, which share voxels
+    shared         whether rays beside each other are neighbours, which share voxels
+    batch, voxels  what `locate` left
     """
-    x, y, z = load16(floats, X), load16(floats, Y), load16(floats, Z)
-    i, j, k = floor16(x), floor16(y), floor16(z)
-    side = grid.brick + 2
-    store16(ints, ROW, load16(ints, OWNER) * (side * side) + to_int16(i * np.float32(side) + j))
-    left = ready
-    while left != 0:
-        _fetch_rows(lowest_bit(left), grid, ints)
-        left &= left - 1
-    fx, fy, fz = x - i, y - j, z - k
-    gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
-    bit = broadcast16(np.int32(1)) << to_int16(k)
-    first, mask, next_first, next_mask = channels16(ints, NEAR_ROWS)
-    weight = _weigh(0, first, mask, gx * gy, bit, fz, gz, floats, ints) + _weigh(1, next_first, next_mask, gx * fy, bit, fz, gz, floats, ints)
-    first, mask, next_first, next_mask = channels16(ints, FAR_ROWS)
-    weight = weight + (_weigh(2, first, mask, fx * gy, bit, fz, gz, floats, ints) + _weigh(3, next_first, next_mask, fx * fy, bit, fz, gz, floats, ints))
-    left = ready & ~near
-    while left != 0:
-        _mix_view_colours(lowest_bit(left), colours, floats, ints)
-        left &= left - 1
+    sigma = red = green = blue = broadcast16(_NONE)
+    if ready & ~near != 0:
+        sigma, red, green, blue = mix_pairs16(advanced(batch, WEIGHT), voxels, colours)
+    alone = broadcast16(_NONE) > _NONE
     if near != 0:
-        _evaluate_basis(view, floats, ints)
-    left, alone = near, near
-    while left != 0:
-        if shared:
-            _mix_cached(lowest_bit(left), grid, view, floats, ints)
-        else:
-            _mix_harmonics(lowest_bit(left), grid, view, floats, ints)
-        left &= left - 1
-    if shared:
-        alone = np.int64(0)
-    sigma, red, green, blue = channels16(floats, SAMPLE)
-    some, before = mask_of(ready), load16(floats, TRANSMITTANCE)
+        _mix_near(near, shared, grid, view, floats, ints, batch, voxels)
+        some, sums = mask_of(near), channels16(floats, SAMPLE)
+        sigma, red = select16(some, sums[0], sigma), select16(some, sums[1], red)
+        green, blue = select16(some, sums[2], green), select16(some, sums[3], blue)
+        if not shared:
+            alone = some
+    some, before, weight = mask_of(ready), load16(floats, TRANSMITTANCE), load16(batch, TOTAL)
     after = before * exp2_neg16(select16(some, sigma, _NONE))
-    gain = select16(mask_of(alone), load16(floats, GAIN), before - after)
+    gain = select16(alone, load16(floats, GAIN), before - after)
     # A lane without a sample gains nothing, whatever an earlier one left in it.
     share = _ONE / select16(weight > _LEAST, weight, broadcast16(_ONE))
     store16(floats, RED, load16(floats, RED) + gain * sigmoid(red * share))
@@ -214,10 +212,9 @@ def composite(ready, near, shared, grid, view, colours, floats, ints):  # type: 
     store16(floats, BLUE, load16(floats, BLUE) + gain * sigmoid(blue * share))
     used = select16(some, broadcast16(_ONE), _NONE)
     store16(floats, INTERPOLATED, load16(floats, INTERPOLATED) + used)
-    store16(floats, LOOKUPS, load16(floats, LOOKUPS) + select16(mask_of(alone), _NONE, used))
-    left = bits_of((after <= _HALF) & (before > _HALF))
-    while left != 0:
-        _half_distance(lowest_bit(left), view, floats)
-        left &= left - 1
+    store16(floats, LOOKUPS, load16(floats, LOOKUPS) + select16(alone, _NONE, used))
+    halved = bits_of((after <= _HALF) & (before > _HALF))
+    if halved != 0:
+        _half_distances(halved, sigma, view, floats, batch)
     store16(floats, TRANSMITTANCE, after)
     return bits_of(after < np.float32(PACKED_EARLY_STOP))

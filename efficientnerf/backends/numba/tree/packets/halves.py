@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from efficientnerf.backends.numba.simd import float32x4, multiply_add
+from efficientnerf.backends.numba.simd import float32x4, float32x16, multiply_add
 
 GREATEST = 65504.0  # of half floats that are finite
 _I16, _I32, _I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
@@ -72,24 +72,47 @@ def store_halves4(typing_context: Any, address: Any, index: Any, value: Any) -> 
     return types.void(types.CPointer(types.uint16), types.int64, float32x4), codegen
 
 
+def _shuffled(builder: Any, left: Any, right: Any, lanes: list[int]) -> Any:
+    return builder.shuffle_vector(left, right, ir.Constant(_vector(_I32, len(lanes)), lanes))
+
+
+def _mix_two(builder: Any, weights: Any, voxels: Any, values: Any, lane: int) -> Any:
+    """Weighted sums of the pairs of rays `lane` and `lane + 1`: of the first voxels and of the second of one, then of the other, four numbers each."""
+
+    def load(address: Any, at: Any, kind: Any, align: int) -> Any:
+        return builder.load(builder.bitcast(builder.gep(address, [at]), kind.as_pointer()), align=align)
+
+    sums: list[Any] = [None, None]
+    for n in range(4):
+        four = load(weights, ir.Constant(_I64, 32 * n + 2 * lane), _vector(ir.FloatType(), 4), 4)
+        weight = _shuffled(builder, four, four, [m // 4 for m in range(16)])
+        pairs = []
+        for m in range(2):
+            voxel = builder.sext(builder.load(builder.gep(voxels, [ir.Constant(_I64, 16 * n + lane + m)])), _I64)
+            pairs.append(load(values, builder.shl(voxel, ir.Constant(_I64, 2)), _vector(_I16, 8), 2))
+        value, total = _widen(builder, _shuffled(builder, *pairs, list(range(16)))), sums[n % 2]
+        sums[n % 2] = builder.fmul(weight, value) if total is None else multiply_add(builder, weight, value, total)
+    return builder.fadd(*sums)
+
+
 @intrinsic
-def mix_pairs(typing_context: Any, weights: Any, at: Any, stride: Any, values: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Weighted sum of eight groups of four half floats: those at q[a], q[b], q[c] and q[d], and the one after each, by two weights each, at p[at],
-    p[at + stride] and so on."""
+def mix_pairs16(typing_context: Any, weights: Any, voxels: Any, values: Any) -> Any:
+    """Weighted sums of eight groups of four half floats for each of sixteen rays: of the first numbers of the groups, of the second and so on, as four vectors.
+
+    weights  (4, 16, 2) float32: of four pairs of neighbouring groups
+    voxels   (4, 16) int32: which group is the first of each pair
+    values   groups of four uint16; all those that `voxels` says must exist
+    """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pair, eight = _vector(ir.FloatType(), 2), _vector(_I16, 8)
-        sums: list[Any] = [None, None]
-        for n, index in enumerate(args[4:]):
-            place = builder.add(args[1], builder.mul(args[2], ir.Constant(_I64, n)))
-            two = builder.load(builder.bitcast(builder.gep(args[0], [place]), pair.as_pointer()), align=4)
-            weight = builder.shuffle_vector(two, two, ir.Constant(_vector(_I32, 8), [0, 0, 0, 0, 1, 1, 1, 1]))
-            value = _widen(builder, builder.load(builder.bitcast(builder.gep(args[3], [index]), eight.as_pointer()), align=2))
-            total = sums[n % 2]
-            sums[n % 2] = builder.fmul(weight, value) if total is None else multiply_add(builder, weight, value, total)
-        both = builder.fadd(*sums)
-        halves = [builder.shuffle_vector(both, both, ir.Constant(_vector(_I32, 4), list(range(n, n + 4)))) for n in (0, 4)]
-        return builder.fadd(*halves)
+        fours = []
+        for lane in range(0, 16, 4):
+            one, other = (_mix_two(builder, *args, lane + m) for m in (0, 2))
+            low, high = (_shuffled(builder, one, other, [8 * (m // 4) + m % 4 + at for m in range(16)]) for at in (0, 4))
+            fours.append(builder.fadd(low, high))
+        halves = [_shuffled(builder, *fours[n : n + 2], list(range(32))) for n in (0, 2)]
+        whole = _shuffled(builder, *halves, list(range(64)))
+        return context.make_tuple(builder, signature.return_type, [_shuffled(builder, whole, whole, list(range(n, 64, 4))) for n in range(4)])
 
-    index = types.int64
-    return float32x4(types.CPointer(types.float32), index, index, types.CPointer(types.uint16), index, index, index, index), codegen
+    result = types.UniTuple(float32x16, 4)
+    return result(types.CPointer(types.float32), types.CPointer(types.int32), types.CPointer(types.uint16)), codegen

@@ -216,15 +216,19 @@ def store16(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
     return types.void(address, types.int64, value), codegen
 
 
+def _prefetch(builder: Any, address: Any) -> None:
+    place = builder.bitcast(address, ir.IntType(8).as_pointer())
+    kind = ir.FunctionType(ir.VoidType(), [place.type, _I32, _I32, _I32])
+    to_read, into_all_caches, of_data = (ir.Constant(_I32, n) for n in (0, 3, 1))
+    builder.call(builder.module.declare_intrinsic("llvm.prefetch.p0", (), kind), [place, to_read, into_all_caches, of_data])
+
+
 @intrinsic
 def prefetch(typing_context: Any, address: Any, index: Any) -> Any:
     """Asks for the cache line of p[index], and does not wait for it."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        place = builder.bitcast(builder.gep(args[0], [args[1]]), ir.IntType(8).as_pointer())
-        kind = ir.FunctionType(ir.VoidType(), [place.type, _I32, _I32, _I32])
-        to_read, into_all_caches, of_data = (ir.Constant(_I32, n) for n in (0, 3, 1))
-        builder.call(builder.module.declare_intrinsic("llvm.prefetch.p0", (), kind), [place, to_read, into_all_caches, of_data])
+        _prefetch(builder, builder.gep(args[0], [args[1]]))
         return context.get_dummy_value()
 
     return types.void(address, types.int64), codegen
@@ -271,16 +275,35 @@ def channels16(typing_context: Any, address: Any, index: Any) -> Any:
 
 
 @intrinsic
-def copy4(typing_context: Any, target: Any, at: Any, source: Any, index: Any) -> Any:
-    """p[at : at + 4] = q[index : index + 4] for pointers to int32."""
-    kind = ir.VectorType(_I32, 4)
+def gather_fours16(typing_context: Any, address: Any, places: Any, at: Any) -> Any:
+    """Four int32 from p[q[at]] on, from p[q[at + 1]] on, and so on for sixteen: the first of each, the second, the third and the fourth, as four vectors."""
+    four = ir.VectorType(_I32, 4)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = builder.load(builder.bitcast(builder.gep(args[2], [args[3]]), kind.as_pointer()), align=4)
-        builder.store(value, builder.bitcast(builder.gep(args[0], [args[1]]), kind.as_pointer()), align=4)
+        parts = []
+        for n in range(LANES):
+            place = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(_I64, n))]))
+            parts.append(builder.load(builder.bitcast(builder.gep(args[0], [builder.sext(place, _I64)]), four.as_pointer()), align=4))
+        while len(parts) > 1:
+            order = ir.Constant(ir.VectorType(_I32, 2 * parts[0].type.count), list(range(2 * parts[0].type.count)))
+            parts = [builder.shuffle_vector(left, right, order) for left, right in zip(parts[::2], parts[1::2], strict=True)]
+        lanes = [ir.Constant(ir.VectorType(_I32, LANES), list(range(n, 4 * LANES, 4))) for n in range(4)]
+        return context.make_tuple(builder, signature.return_type, [builder.shuffle_vector(parts[0], parts[0], each) for each in lanes])
+
+    return types.UniTuple(int32x16, 4)(types.CPointer(types.int32), types.CPointer(types.int32), types.int64), codegen
+
+
+@intrinsic
+def prefetch_groups(typing_context: Any, address: Any, places: Any) -> Any:
+    """`prefetch` of the groups of four that 64 int32 say."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        for n in range(64):
+            place = builder.sext(builder.load(builder.gep(args[1], [ir.Constant(_I64, n)])), _I64)
+            _prefetch(builder, builder.gep(args[0], [builder.shl(place, ir.Constant(_I64, 2))]))
         return context.get_dummy_value()
 
-    return types.void(types.CPointer(types.int32), types.int64, types.CPointer(types.int32), types.int64), codegen
+    return types.void(address, types.CPointer(types.int32)), codegen
 
 
 @intrinsic

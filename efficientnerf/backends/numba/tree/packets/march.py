@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import popcount
+from efficientnerf.backends.numba.simd import advanced, popcount
 from efficientnerf.backends.numba.tree.march import PARALLEL, SKIP_MARGIN
-from efficientnerf.backends.numba.tree.packets.composite import composite
+from efficientnerf.backends.numba.tree.packets.composite import blend, locate
 from efficientnerf.backends.numba.tree.packets.lanes import (
     abs16,
     bits_of,
@@ -36,7 +36,10 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     ALONG_X,
     ALONG_Y,
     ALONG_Z,
-    DISTANCE,
+    BATCH_FLOATS,
+    BATCH_VOXELS,
+    BATCHES,
+    BATCHES_OF_VOXELS,
     ENTRY_X,
     ENTRY_Y,
     ENTRY_Z,
@@ -45,9 +48,6 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     OWNER,
     TESTED,
     VISITED,
-    X,
-    Y,
-    Z,
 )
 
 _HALF, _ONE, _NONE, _FAR = np.float32(0.5), np.float32(1), np.float32(0), np.float32(1e30)
@@ -117,6 +117,8 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
     until, owner, visited, tested = k, broadcast16(np.int32(0)), broadcast16(_NONE), broadcast16(_NONE)
     bx = by = bz = px = py = pz = distance = broadcast16(_NONE)
     going, ready, close = bits_of(k < last), np.int64(0), np.int64(0)
+    pending, near, at = np.int64(0), np.int64(0), 0  # the batch before, whose colours have been asked for; which of them are near the camera
+    batches, voxels = advanced(floats, BATCHES), advanced(ints, BATCHES_OF_VOXELS)
     while going != 0:
         lanes = mask_of(going)
         enters = lanes & (k >= until)
@@ -161,12 +163,17 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
             ready |= bits_of(found)
         going = bits_of(k < last) & ~ready & going
         if ready != 0 and popcount(ready) >= popcount(going):
-            store16(floats, X, px)
-            store16(floats, Y, py)
-            store16(floats, Z, pz)
-            store16(floats, DISTANCE, distance)
-            store16(ints, OWNER, owner)
-            ended = composite(ready, ready & close, shared, grid, view, colours, floats, ints)
-            going, ready = going | (ready & ~ended & bits_of(k < last)), np.int64(0)
+            ended = np.int64(0)
+            locate(px, py, pz, distance, owner, grid, colours, ints, advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at))
+            at = 1 - at
+            if pending != 0:
+                batch, of_batch = advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at)
+                ended = blend(pending, pending & near, shared, grid, view, colours, floats, ints, batch, of_batch)
+            pending, near = ready & ~ended, close
+            going, ready = (going | (ready & bits_of(k < last))) & ~ended, np.int64(0)
+    if pending != 0:
+        at = 1 - at
+        batch, of_batch = advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at)
+        blend(pending, pending & near, shared, grid, view, colours, floats, ints, batch, of_batch)
     store16(floats, VISITED, load16(floats, VISITED) + visited)
     store16(floats, TESTED, load16(floats, TESTED) + tested)
