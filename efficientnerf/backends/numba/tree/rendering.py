@@ -39,10 +39,14 @@ def _allocate(height: int, width: int, *, normals: bool) -> tuple[np.ndarray, np
 
 
 class ViewColours(NamedTuple):
-    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`."""
+    """Colours of a tree's voxels for a view, see `compute_view_colours`, between two rows (N + 2, 4) uint16, and where they may be used, see `View`.
+
+    view  all that the colours depend on beside the tree; empty for none
+    """
 
     views: Views
     colours: np.ndarray
+    view: bytes
 
 
 def _cone(camera: Camera) -> np.ndarray:
@@ -55,30 +59,32 @@ def _cone(camera: Camera) -> np.ndarray:
 
 
 def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray = EVERYWHERE) -> ViewColours:
-    """Of all cascades, as far as the cone reaches; the direction is that of cascade 0."""
-    colours, packed = _colour_buffer(tree), packed_of(tree)
-    views = _views(tree, view_direction, _near_distance(tree, view_direction))
-    for cascade, bricks in enumerate(bricks_of(tree)):
-        for first, end in brick_ranges(*bricks, tree.brick):
-            direction, scale = views.direction[cascade], views.density_scale[cascade]
-            compute_view_colours(first, end, cascade, packed, tree.brick, direction, cone, scale, tree.degree, colours[1:])
-    return ViewColours(views, colours)
+    """Of all cascades, as far as the cone reaches; the direction is that of cascade 0. Those of the image before, if it was of the same view."""
+    views, view = _views(tree, view_direction, _near_distance(tree, view_direction)), view_direction.tobytes() + cone.tobytes()
+    colours, before = _colour_buffer(tree)
+    if view != before:
+        packed = packed_of(tree)
+        for cascade, bricks in enumerate(bricks_of(tree)):
+            for first, end in brick_ranges(*bricks, tree.brick):
+                direction, scale = views.direction[cascade], views.density_scale[cascade]
+                compute_view_colours(first, end, cascade, packed, tree.brick, direction, cone, scale, tree.degree, colours[1:])
+    return ViewColours(views, colours, view)
 
 
-def _colour_buffer(tree: NerfTree) -> np.ndarray:
-    """An array for view colours: that of an earlier image if none uses it."""
+def _colour_buffer(tree: NerfTree) -> tuple[np.ndarray, bytes]:
+    """An array for view colours, and which view they are of: that of an earlier image if none uses it."""
     kept = tree.derived.setdefault("view_colours", [])
     try:
         return kept.pop()
     except IndexError:
-        return np.zeros((len(tree.density_values) + 2, 4), np.uint16)  # finite, for what is not computed may be read and weighed by zero
+        return np.zeros((len(tree.density_values) + 2, 4), np.uint16), b""  # finite, for what is not computed may be read and weighed by zero
 
 
 def _keep_buffer(tree: NerfTree, colours: ViewColours) -> None:
     """Leaves the array of view colours, which nothing refers to any more, to the next image."""
     kept = tree.derived.setdefault("view_colours", [])
     if not kept and len(colours.colours) == len(tree.density_values) + 2:
-        kept.append(colours.colours)
+        kept.append((colours.colours, colours.view))
 
 
 def _views(tree: NerfTree, view_direction: np.ndarray, min_distance: np.ndarray) -> Views:
@@ -160,8 +166,10 @@ def render_rays(
     if len(origins):
         shared = eye is not None and _any_far(tree, view_direction)
         never = np.full(len(packed_of(tree).grids), np.inf)
-        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((2, 4), np.uint16))
+        colours = _view_colours(tree, view_direction) if shared else ViewColours(_views(tree, view_direction, never), np.zeros((2, 4), np.uint16), b"")
         _render(tree, batch, colours, np.zeros(3, np.float32), (1, TILE * TILE) if rows == 1 else (TILE, TILE), out)
+        if shared:
+            _keep_buffer(tree, colours)
     colour, opacity, depth, normal = out
     return colour.reshape(-1, 3), opacity.reshape(-1), depth.reshape(-1), normal.reshape(-1, 3)
 

@@ -25,11 +25,12 @@ from efficientnerf.backends.numba.simd import (
     unpack4,
 )
 from efficientnerf.backends.numba.tree.packets.halves import store_halves4
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, sqrt16
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, prefetch, sqrt16
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
 from efficientnerf.rendering import harmonics
 
 BRICKS_PER_TASK = 256
+AHEAD = 3
 
 _ONE = np.float32(1)
 _C0 = np.float32(harmonics.C0)
@@ -186,11 +187,20 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
+def _add_entries(count, entries, total, code, grid, basis, lane):  # type: ignore[no-untyped-def]
+    for k in range(count):
+        total = add_scaled4(total, basis[16 * k + 16 + lane], load4(grid.palette, 4 * (k * entries + np.int64(grid.codes[code + k]))))
+    return total
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _palette_colour(n, density, grid, basis, lane):  # type: ignore[no-untyped-def]
     """Density, red, green and blue of stored voxel n by its codes; `basis` (K, 16) is of sixteen directions, that of `lane` its own."""
     table, base, code, y = grid.base_table, 3 * n, n * grid.groups, basis[lane]
     r, g, b = table[3 * np.int64(grid.base[base])], table[3 * np.int64(grid.base[base + 1]) + 1], table[3 * np.int64(grid.base[base + 2]) + 2]
     total = pack4(density, y * r, y * g, y * b)
+    if grid.terms == 9 and grid.groups == 8 and grid.entries == 256:
+        return _add_entries(8, 256, total, code, grid, basis, lane)
     for k in range(grid.terms - 1):
         e = k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])
         total = add_scaled4(total, basis[16 * k + 16 + lane], load4(grid.palette, 4 * e))
@@ -224,6 +234,19 @@ def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
     return count
 
 
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _prefetch_voxels(owner, grid, out):  # type: ignore[no-untyped-def]
+    brick = grid.brick
+    side = brick + 2
+    for i in range(brick):
+        at = 2 * ((owner * side + i + 1) * side + 1)
+        for j in range(brick):
+            first = grid.rows[at + 2 * j]
+            prefetch(grid.density, first)
+            prefetch(grid.voxel_of, first)
+            prefetch(out, 4 * first)
+
+
 @numba.njit(cache=True, error_model="numpy")
 def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type: ignore[no-untyped-def]
     """Densities and colours of a brick's voxels into their rows of out (N, 4), half floats; directions and harmonics are those of sixteen neighbours at once.
@@ -245,7 +268,7 @@ def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type
             dz = load16(steps, 2 * padded + 16 * group) + np.float32(z)
             inverse = broadcast16(_ONE) / sqrt16(dx * dx + dy * dy + dz * dz)
             sh_basis(dx * inverse, dy * inverse, dz * inverse, view.degree, basis)
-        voxel, lane, density = np.int64(index[first + local]), local & 15, grid.density[p] * view.density_scale
+        voxel, lane, density = np.int64(grid.voxel_of[p]), local & 15, grid.density[p] * view.density_scale
         if grid.coded:
             store_halves4(out, 4 * p, _palette_colour(voxel, density, grid, basis, lane))
         else:
@@ -285,5 +308,7 @@ def compute_view_colours(first, end, cascade, packed, brick, direction, cone, de
             a, e, c = grid.cells[3 * owner] * brick + half, grid.cells[3 * owner + 1] * brick + half, grid.cells[3 * owner + 2] * brick + half
             x, y, z = view_direction(a, e, c, view.direction)
             along = x * cone[0] + y * cone[1] + z * cone[2]
+            if owner + AHEAD < end:
+                _prefetch_voxels(owner + AHEAD, grid, pointer(out))
             if np.sqrt(max(x * x + y * y + z * z - along * along, 0.0)) * cone[3] - along * cone[4] <= reach:
                 _brick_colours(owner, grid, view, pointer(steps), pointer(stored[0]), pointer(stored[1]), pointer(basis), pointer(out))
