@@ -55,6 +55,38 @@ def test_codes_are_found_across_bricks_of_any_size(brick: int) -> None:
     np.testing.assert_allclose(render_rays(tree, origins, directions).colour, colour, atol=1e-3)
 
 
+@pytest.mark.parametrize("brick", [2, 4])
+def test_rows_of_two_numbers_render_like_those_of_one(brick: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = random_tree(brick, shape=(5, 4, 6), brick=brick, degree=2, share=0.6, sigma=100.0)
+    camera = camera_of(tree)
+    narrow = render(tree, camera)
+    monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_BITS", 0)
+    other = replace(tree)
+    wide = render(other, camera)
+    assert packed_of(other).rows.shape[1] == 2 * packed_of(tree).rows.shape[1]
+    assert wide.opacity.max() > 0.5
+    for name in FIELDS:
+        assert np.array_equal(getattr(wide, name), getattr(narrow, name)), name
+
+
+def test_bands_of_an_ndc_image_share_the_colours_of_the_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are summed once for a view, and again for another."""
+    from efficientnerf.backends.numba.tree import rendering
+
+    tree, camera, calls, whole = wall(voxels=24), camera_at(0.1, 0.0, 0.0), [], rendering.compute_view_colours
+    monkeypatch.setattr(rendering, "VOXELS_PER_SLOPE_NDC", -100.0)
+    monkeypatch.setattr(rendering, "compute_view_colours", lambda *given: calls.append(len(calls)) or whole(*given))
+    usual, banded = render(tree, camera), render(tree, camera, rays_per_band=8 * camera.width)
+    assert len(calls) == 1
+    moved = camera_at(0.12, 0.0, 0.0)
+    again, fresh = render(tree, moved), render(replace(tree), moved)
+    assert len(calls) == 3
+    assert not np.array_equal(again.colour, usual.colour)
+    for name in FIELDS:
+        assert np.array_equal(getattr(usual, name), getattr(banded, name)), name
+        assert np.array_equal(getattr(again, name), getattr(fresh, name)), name
+
+
 def far_camera(tree: NerfTree, voxels: float) -> Camera:
     """A camera that many voxels away whose image the tree fills."""
     at = pose(0.7, 0.4, voxels * tree.voxel)

@@ -14,8 +14,9 @@ from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcoun
 from efficientnerf.backends.numba.tree import march
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.packets import halves, lanes
-from efficientnerf.backends.numba.tree.packets.halves import mix_pairs, store_halves4
-from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, sh_basis
+from efficientnerf.backends.numba.tree.packets.halves import mix_pairs16, store_halves4
+from efficientnerf.backends.numba.tree.packets.rows import row_at
+from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, packed_pointers, sh_basis
 from efficientnerf.rendering.harmonics import basis_numpy
 from tests.efficientnerf.trees import in_codes, random_tree
 
@@ -81,32 +82,31 @@ def test_four_points_are_interpolated_over_the_stored_corners() -> None:
 
 
 @numba.njit
-def pair_of(row, k, rows):  # type: ignore[no-untyped-def]
-    """Of voxels k and k + 1 of a row, numbered over all bricks: the first that is stored, and which are: bit 0, bit 1."""
-    mask = np.int64(rows[2 * row + 1])
-    return rows[2 * row] + popcount(mask & ((np.int64(1) << k) - 1)), mask >> k & 3
-
-
-@numba.njit
-def pairs(rows, side):  # type: ignore[no-untyped-def]
-    """(B, side, side, side - 1, 2): of each two neighbours along z the first that is stored, and which are."""
-    out = np.empty((len(rows), side, side, side - 1, 2), np.int64)
-    for row in range(len(rows) * side * side):
+def pairs(packed, brick):  # type: ignore[no-untyped-def]
+    """(B, side, side, side - 1, 2): of each two neighbours along z the first that is stored, and which are: bit 0, bit 1."""
+    side, grid = brick + 2, packed_pointers(packed, brick, 0)
+    out = np.empty((len(packed.rows), side, side, side - 1, 2), np.int64)
+    for row in range(len(packed.rows) * side * side):
+        first, mask = row_at(row, grid)
         for k in range(side - 1):
-            out[row // (side * side), row // side % side, row % side, k] = pair_of(row, k, pointer(rows))
+            out[row // (side * side), row // side % side, row % side, k] = first + popcount(mask & ((np.int64(1) << k) - 1)), mask >> k & 3
     return out
 
 
+@pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("brick", [1, 2, 3, 4, 5])
-def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int) -> None:
+def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int, wide: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if wide:
+        monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_BITS", 0)
     tree = random_tree(brick, brick=brick, degree=2, share=0.5)
     packed, side = packed_of(tree), brick + 2
+    assert packed.rows.shape == (len(tree.voxel_index), (2 if wide else 1) * side**2)
     count = len(tree.density_values)
     assert np.array_equal(np.sort(packed.voxel_of[:-1]), np.arange(count))
     assert np.array_equal(packed.density[:-1], tree.density_values[packed.voxel_of[:-1]])
     assert packed.density[-1] == 0
     cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
-    found = pairs(packed.rows, side)
+    found = pairs(packed, brick)
     for table, live, place in zip(found, packed.has_density, packed.cells, strict=True):
         at = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1) + place * brick  # of the voxel after the one that is meant
         local = (at - 1) % brick @ [brick**2, brick, 1]
@@ -152,8 +152,9 @@ def half_kernels():  # type: ignore[no-untyped-def]
             store_halves4(pointer(out), n, pack4(values[n], values[n + 1], values[n + 2], values[n + 3]))
 
     @numba.njit(error_model="numpy")
-    def mixed(weights, bits, at):  # type: ignore[no-untyped-def]
-        return unpack4(mix_pairs(pointer(weights), 0, 2, pointer(bits), at[0], at[1], at[2], at[3]))
+    def mixed(weights, bits, at, out):  # type: ignore[no-untyped-def]
+        for n, channel in enumerate(mix_pairs16(pointer(weights), pointer(at), pointer(bits))):
+            lanes.store16(pointer(out), 16 * n, channel)
 
     return rounded, mixed
 
@@ -174,11 +175,12 @@ def test_half_floats_are_numpys(converts: bool, monkeypatch: pytest.MonkeyPatch)
     rounded(values, bits)
     expected = np.clip(np.where(np.isnan(values), -halves.GREATEST, values), -halves.GREATEST, halves.GREATEST).astype(np.float16)
     assert np.array_equal(bits, expected.view(np.uint16))
-    weights, at = rng.random((4, 2)).astype(np.float32), 4 * rng.integers(0, len(bits) // 4 - 1, (300, 4))
-    for four in at:
-        eight = np.stack([expected[n : n + 8].reshape(2, 4) for n in four]).astype(np.float64)
-        exact = np.einsum("nr,nrc->c", weights, eight)
-        np.testing.assert_allclose(mixed(weights, bits, four), exact, rtol=1e-6, atol=1e-6 * np.abs(eight).max())
+    weights, groups, out = rng.random((4, 16, 2)).astype(np.float32), expected.reshape(-1, 4).astype(np.float64), np.zeros((4, 16), np.float32)
+    for at in rng.integers(0, len(bits) // 4 - 1, (20, 4, 16)).astype(np.int32):
+        mixed(weights, bits, at, out)
+        eight = np.stack([groups[at], groups[at + 1]], axis=2)
+        exact = np.einsum("nlr,nlrc->cl", weights, eight)
+        assert (np.abs(out - exact) <= 1e-6 * (np.abs(exact) + np.abs(eight).max(axis=(0, 2, 3)))).all()
 
 
 @numba.njit(error_model="numpy")

@@ -27,9 +27,13 @@ _HALF, _ONE, _NONE = np.float32(0.5), np.float32(1), np.float32(0)
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _row_density(row, k, fz, gz, grid):  # type: ignore[no-untyped-def]
     """Density between voxels k and k + 1 of rows, numbered over all bricks."""
-    mask = gather16(grid.rows, row * 2 + 1)
+    if grid.narrow:
+        mask = gather16(grid.rows, row)
+        begin = mask >> (grid.brick + 2)
+    else:
+        begin, mask = gather16(grid.rows, row * 2), gather16(grid.rows, row * 2 + 1)
     pair = (mask >> k) & 3
-    first = select16(pair == 0, grid.voxels, gather16(grid.rows, row * 2) + popcount16(mask & ((1 << k) - 1)))
+    first = select16(pair == 0, grid.voxels, begin + popcount16(mask & ((1 << k) - 1)))
     low = gather16(grid.density, first) * select16(pair == 2, fz, gz)
     return low + select16(pair == 3, gather16(grid.density, select16(pair == 3, first + 1, first)) * fz, _NONE)
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 SLOPE_VOXELS = 2**16  # voxels that `colour_slope` is estimated from
 FEWEST_PAIRS = 64  # of neighbours, for what they share to be estimated
 COLUMN_CELLS_PER_CALL = 2**22  # cells that one call of the kernel that orders voxels goes through
+MOST_BITS = 2**32  # numbers of a row's word
 VOXELS_PER_CALL = 2**23  # of bricks that one call of a kernel goes through, so that signals are answered between
 
 
@@ -34,12 +35,11 @@ class Packed(NamedTuple):
     leap          (C,) uint8: as `NerfTree.leap`, but bricks without density in or around them count as empty, and so do those in the box of the cascade before
     has_density   (B, W) int64 bit masks: bit n % 64 of word n // 64 is set where any of the eight voxels has density that begin at voxel
                   (i - 1, j - 1, k - 1) of the brick; n = (i (b + 2) + j) (b + 2) + k
-    rows          (B, (b + 2)^2, 2) int32: the first voxel, in the packed order, and the mask of the stored ones of the rows along z of a brick and of the layer
-                  around it
+    rows          (B, (b + 2)^2) int32: the first voxel, in the packed order, and the mask of the stored ones of the rows along z of a brick and of the layer
+                  around it, in the lowest b + 2 bits; (B, 2 (b + 2)^2), the voxel and then the mask, where the voxels are too many for the other bits
     voxel_of      (N + 1,) int32: which stored voxel is n-th in the packed order; the last is none
     cells         (B, 3) int32: the coarse cell of a brick
     brick_index   (C,) int32: those of the cascades
-    voxel_index   the tree's own; the harmonics likewise
     density       (N + 1,) float32, in the packed order; the last, of what is not stored, is 0
     sh            (N, K, 3) float32: the tree's own
     base, base_table, codes  as in PaletteHarmonics: the tree's own
@@ -57,7 +57,6 @@ class Packed(NamedTuple):
     voxel_of: np.ndarray
     cells: np.ndarray
     brick_index: np.ndarray
-    voxel_index: np.ndarray
     density: np.ndarray
     sh: np.ndarray
     base: np.ndarray
@@ -208,7 +207,8 @@ def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if max(2 * bricks * (tree.brick + 2) ** 2, count, sum(cascade.brick_index.size for cascade in cascades_of(tree))) >= 2**31:
         raise ValueError(f"{bricks} bricks of {tree.brick} voxels along a side: more than the CPU's kernels can number")
     begin, stored = np.empty((bricks, tree.brick**2), np.int32), np.empty((bricks, tree.brick**2), np.int32)
-    rows, voxel_of, voxel = np.empty((bricks, (tree.brick + 2) ** 2, 2), np.int32), np.full(count + 1, -1, np.int32), 0
+    words = 1 if count <= MOST_BITS >> tree.brick + 2 else 2
+    rows, voxel_of, voxel = np.empty((bricks, words * (tree.brick + 2) ** 2), np.int32), np.full(count + 1, -1, np.int32), 0
     for cascade, ends in zip(cascades_of(tree), bricks_of(tree), strict=True):
         columns, each = cascade.shape[0] * cascade.shape[1], max(1, COLUMN_CELLS_PER_CALL // max(1, cascade.shape[2]))
         for first in range(0, columns, each):
@@ -245,5 +245,5 @@ def pack(tree: NerfTree) -> Packed:
     density[:-1] = tree.density_values[voxel_of[:-1]]
     slopes = [_colour_slope(tree, *ends) for ends in bricks]
     joined = (leap[0], brick_index[0]) if len(leap) == 1 else (np.concatenate(leap), np.concatenate(brick_index))
-    own = np.ascontiguousarray(joined[1]), tree.voxel_index, density
+    own = np.ascontiguousarray(joined[1]), density
     return Packed(*_places(tree), joined[0], has_density, rows, voxel_of, cells, *own, *coded, np.array(slopes))

@@ -27,10 +27,11 @@ from efficientnerf.backends.numba.simd import (
 from efficientnerf.backends.numba.tree.packets.halves import store_halves4
 from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, prefetch, sqrt16
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
+from efficientnerf.backends.numba.tree.packets.rows import row_at
 from efficientnerf.rendering import harmonics
 
 BRICKS_PER_TASK = 256
-AHEAD = 3
+AHEAD = 3  # bricks whose voxels are asked for before they are needed: docs/experiments/renderer.md
 
 _ONE = np.float32(1)
 _C0 = np.float32(harmonics.C0)
@@ -75,7 +76,7 @@ class Views(NamedTuple):
 
 class PackedPointers(NamedTuple):
     """One cascade of a `Packed`, with its arrays as pointers, and its sizes: cells along each axis, mask words of a block, stored voxels of all
-    cascades, harmonics, code groups and palette entries; `coded` is whether there are codes.
+    cascades, harmonics, code groups and palette entries; `coded` is whether there are codes, `narrow` whether a row is one number.
 
     ratio  of its voxels' side to that of cascade 0
     shift  x, y, z: a point of cascade 0 is here at p / ratio + shift, voxel coordinates
@@ -93,11 +94,11 @@ class PackedPointers(NamedTuple):
     has_density: Any
     mask_words: int
     rows: Any
+    narrow: bool
     voxels: int
     voxel_of: Any
     cells: Any
     brick_index: Any
-    voxel_index: Any
     density: Any
     terms: int
     coded: bool
@@ -119,9 +120,10 @@ def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
     return PackedPointers(
         brick, grids[cascade, 0], grids[cascade, 1], grids[cascade, 2], places[cascade, 0], places[cascade, 1], places[cascade, 2], places[cascade, 3],
         advanced(pointer(packed.leap), first), pointer(packed.has_density.view(np.int32)), packed.has_density.shape[1], pointer(packed.rows),
-        len(packed.voxel_of) - 1, pointer(packed.voxel_of), pointer(packed.cells), advanced(pointer(packed.brick_index), first), pointer(packed.voxel_index),
-        pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh), pointer(packed.base), pointer(packed.base_table),
-        pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1], pointer(packed.code_columns),
+        packed.rows.shape[1] == (brick + 2) * (brick + 2), len(packed.voxel_of) - 1, pointer(packed.voxel_of), pointer(packed.cells),
+        advanced(pointer(packed.brick_index), first), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh),
+        pointer(packed.base), pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1],
+        pointer(packed.code_columns),
     )  # fmt: skip
 
 
@@ -188,6 +190,7 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _add_entries(count, entries, total, code, grid, basis, lane):  # type: ignore[no-untyped-def]
+    """The sum over `count` harmonics, each with a code of its own, of palettes of so many entries: constants, by which the loop is unrolled."""
     for k in range(count):
         total = add_scaled4(total, basis[16 * k + 16 + lane], load4(grid.palette, 4 * (k * entries + np.int64(grid.codes[code + k]))))
     return total
@@ -224,10 +227,8 @@ def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
     side, mask = brick + 2, (np.int64(1) << grid.brick) - 1
     for i in range(brick):
         for j in range(brick):
-            at, local = 2 * ((owner * side + i + 1) * side + j + 1), (i * brick + j) * brick
-            bits = np.int64(grid.rows[at + 1])
-            first = grid.rows[at] + (bits & 1)
-            bits = bits >> 1 & mask
+            first, bits = row_at((owner * side + i + 1) * side + j + 1, grid)
+            local, first, bits = (i * brick + j) * brick, first + (bits & 1), bits >> 1 & mask
             for k in range(brick):
                 stored[count], place[count] = local + k, first
                 count, first = count + (bits >> k & 1), first + (bits >> k & 1)
@@ -236,12 +237,12 @@ def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _prefetch_voxels(owner, grid, out):  # type: ignore[no-untyped-def]
+    """Asks for what is read and written of a brick's voxels in the packed order, where rows lie too far apart for the processor to see what comes next."""
     brick = grid.brick
     side = brick + 2
     for i in range(brick):
-        at = 2 * ((owner * side + i + 1) * side + 1)
         for j in range(brick):
-            first = grid.rows[at + 2 * j]
+            first, _ = row_at((owner * side + i + 1) * side + j + 1, grid)
             prefetch(grid.density, first)
             prefetch(grid.voxel_of, first)
             prefetch(out, 4 * first)
@@ -255,9 +256,9 @@ def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type
     stored  (b^3,) int64, scratch, and place likewise
     basis   (K, 16) float32, scratch
     """
-    brick, cells, index = grid.brick, grid.cells, grid.voxel_index
+    brick, cells = grid.brick, grid.cells
     cube = brick * brick * brick
-    first, padded, group = owner * cube, (cube + 15) // 16 * 16, np.int64(-1)
+    padded, group = (cube + 15) // 16 * 16, np.int64(-1)
     count = _stored_voxels(owner, grid, stored, place)
     x, y, z = view_direction(cells[3 * owner] * brick + 0.5, cells[3 * owner + 1] * brick + 0.5, cells[3 * owner + 2] * brick + 0.5, view.direction)
     for n in range(count):

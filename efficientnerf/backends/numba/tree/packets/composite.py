@@ -1,4 +1,4 @@
-"""Compositing of one sample of each of sixteen rays (numba).
+"""Compositing of one sample of each of sixteen rays (numba), in two steps: `locate` and `blend`.
 
 The eight voxels around a sample are read two by two, see `rows`; weights, transmittances and colours are computed for all rays at once. Where the camera is far
 away, voxels have the colours of the view; near it their harmonics are summed along each ray.
@@ -19,6 +19,7 @@ from efficientnerf.backends.numba.tree.packets.lanes import (
     exp2_neg16,
     floor16,
     gather_fours16,
+    gather_pairs16,
     load16,
     lowest_bit,
     mask_of,
@@ -81,9 +82,16 @@ def locate(x, y, z, distance, owner, grid, colours, ints, batch, voxels):  # typ
     """
     i, j, k = floor16(x), floor16(y), floor16(z)
     side = grid.brick + 2
-    store16(ints, ROW, (owner * (side * side) + to_int16(i * np.float32(side) + j)) * 2)
-    first, mask, next_first, next_mask = gather_fours16(grid.rows, ints, ROW)
-    far_first, far_mask, last_first, last_mask = gather_fours16(advanced(grid.rows, 2 * side), ints, ROW)
+    row = owner * (side * side) + to_int16(i * np.float32(side) + j)
+    if grid.narrow:
+        store16(ints, ROW, row)
+        mask, next_mask = gather_pairs16(grid.rows, ints, ROW)
+        far_mask, last_mask = gather_pairs16(advanced(grid.rows, side), ints, ROW)
+        first, next_first, far_first, last_first = mask >> side, next_mask >> side, far_mask >> side, last_mask >> side
+    else:
+        store16(ints, ROW, row * 2)
+        first, mask, next_first, next_mask = gather_fours16(grid.rows, ints, ROW)
+        far_first, far_mask, last_first, last_mask = gather_fours16(advanced(grid.rows, 2 * side), ints, ROW)
     fx, fy, fz = x - i, y - j, z - k
     gx, gy, gz = _ONE - fx, _ONE - fy, _ONE - fz
     bit = broadcast16(np.int32(1)) << to_int16(k)

@@ -90,7 +90,7 @@ def _mix_two(builder: Any, weights: Any, voxels: Any, values: Any, lane: int) ->
         for m in range(2):
             voxel = builder.sext(builder.load(builder.gep(voxels, [ir.Constant(_I64, 16 * n + lane + m)])), _I64)
             pairs.append(load(values, builder.shl(voxel, ir.Constant(_I64, 2)), _vector(_I16, 8), 2))
-        value, total = _widen(builder, _shuffled(builder, *pairs, list(range(16)))), sums[n % 2]
+        value, total = _widen(builder, _shuffled(builder, pairs[0], pairs[1], list(range(16)))), sums[n % 2]
         sums[n % 2] = builder.fmul(weight, value) if total is None else multiply_add(builder, weight, value, total)
     return builder.fadd(*sums)
 
@@ -107,11 +107,11 @@ def mix_pairs16(typing_context: Any, weights: Any, voxels: Any, values: Any) -> 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         fours = []
         for lane in range(0, 16, 4):
-            one, other = (_mix_two(builder, *args, lane + m) for m in (0, 2))
+            one, other = (_mix_two(builder, args[0], args[1], args[2], lane + m) for m in (0, 2))
             low, high = (_shuffled(builder, one, other, [8 * (m // 4) + m % 4 + at for m in range(16)]) for at in (0, 4))
             fours.append(builder.fadd(low, high))
-        halves = [_shuffled(builder, *fours[n : n + 2], list(range(32))) for n in (0, 2)]
-        whole = _shuffled(builder, *halves, list(range(64)))
+        low, high = (_shuffled(builder, fours[n], fours[n + 1], list(range(32))) for n in (0, 2))
+        whole = _shuffled(builder, low, high, list(range(64)))
         return context.make_tuple(builder, signature.return_type, [_shuffled(builder, whole, whole, list(range(n, 64, 4))) for n in range(4)])
 
     result = types.UniTuple(float32x16, 4)

@@ -274,28 +274,35 @@ def channels16(typing_context: Any, address: Any, index: Any) -> Any:
     return types.UniTuple(vector, 4)(address, types.int64), codegen
 
 
-@intrinsic
-def gather_fours16(typing_context: Any, address: Any, places: Any, at: Any) -> Any:
-    """Four int32 from p[q[at]] on, from p[q[at + 1]] on, and so on for sixteen: the first of each, the second, the third and the fourth, as four vectors."""
-    four = ir.VectorType(_I32, 4)
+def _gather_groups(size: int) -> Any:
+    """An intrinsic: groups of so many int32 from p[q[at]] on, from p[q[at + 1]] on, and so on for sixteen; the first of each, the second, ... as vectors."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        parts = []
-        for n in range(LANES):
-            place = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(_I64, n))]))
-            parts.append(builder.load(builder.bitcast(builder.gep(args[0], [builder.sext(place, _I64)]), four.as_pointer()), align=4))
-        while len(parts) > 1:
-            order = ir.Constant(ir.VectorType(_I32, 2 * parts[0].type.count), list(range(2 * parts[0].type.count)))
-            parts = [builder.shuffle_vector(left, right, order) for left, right in zip(parts[::2], parts[1::2], strict=True)]
-        lanes = [ir.Constant(ir.VectorType(_I32, LANES), list(range(n, 4 * LANES, 4))) for n in range(4)]
-        return context.make_tuple(builder, signature.return_type, [builder.shuffle_vector(parts[0], parts[0], each) for each in lanes])
+    @intrinsic
+    def gather(typing_context: Any, address: Any, places: Any, at: Any) -> Any:
+        group = ir.VectorType(_I32, size)
 
-    return types.UniTuple(int32x16, 4)(types.CPointer(types.int32), types.CPointer(types.int32), types.int64), codegen
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            parts = []
+            for n in range(LANES):
+                place = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(_I64, n))]))
+                parts.append(builder.load(builder.bitcast(builder.gep(args[0], [builder.sext(place, _I64)]), group.as_pointer()), align=4))
+            while len(parts) > 1:
+                order = ir.Constant(ir.VectorType(_I32, 2 * parts[0].type.count), list(range(2 * parts[0].type.count)))
+                parts = [builder.shuffle_vector(left, right, order) for left, right in zip(parts[::2], parts[1::2], strict=True)]
+            lanes = [ir.Constant(ir.VectorType(_I32, LANES), list(range(n, size * LANES, size))) for n in range(size)]
+            return context.make_tuple(builder, signature.return_type, [builder.shuffle_vector(parts[0], parts[0], each) for each in lanes])
+
+        return types.UniTuple(int32x16, size)(types.CPointer(types.int32), types.CPointer(types.int32), types.int64), codegen
+
+    return gather
+
+
+gather_pairs16, gather_fours16 = _gather_groups(2), _gather_groups(4)
 
 
 @intrinsic
 def prefetch_groups(typing_context: Any, address: Any, places: Any) -> Any:
-    """`prefetch` of the groups of four that 64 int32 say."""
+    """`prefetch` of p[4 n] for each n of 64 int32."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         for n in range(64):

@@ -1,10 +1,10 @@
 """Where the numbers of sixteen rays lie in the scratch of a thread: sixteen of each, one a ray.
 
-Floats: where a ray's part in a cascade begins, its direction, the first sample and the one after the last; what it met, see below; of the sample that is to be
-composited the place in its block and the distance; weights of its eight voxels, (4, 16, 2), two of each row; what comes out of them, (16, 4); the direction
-that harmonics are evaluated along, and their values, (K, 16); colours of some voxels along each ray, (CACHED, 16, 4). Integers: of that sample the brick, and
-its first row; that row and the one after it as `rows` has them, (16, 4), and the two beside them; the first voxel of each row, (4, 16); whether the harmonics
-are evaluated; which voxels those are, -1 for none.
+Floats: where a ray's part in a cascade begins, its direction, the first sample and the one after the last; what it met, see below; the place where it lost half
+of its light; what comes out of the voxels around a sample, (16, 4); the direction that harmonics are evaluated along, and their values, (K, 16); colours of
+some voxels along each ray, (CACHED, 16, 4); two batches of a sample of each ray: the distance, the sum of the weights of the voxels that are stored, and the
+weights, (4, 16, 2), two of each row. Integers: the brick that a ray is in, and its sample's first row; whether the harmonics are evaluated; which voxels have
+those colours, -1 for none; of each batch the first voxel of each row, (4, 16).
 
 State: transmittance; colour; distance at which the transmittance fell to one half; weight of samples near the camera without a colour yet, and that of the next
 colour; counts of coarse cells visited, of samples tested, of samples interpolated and of colours looked up; depth and normal.

@@ -1,7 +1,8 @@
 """Marching of sixteen rays, one a lane, through a cascade of a packed, interpolated tree (numba).
 
-Each ray goes on to its next sample of which one of the eight voxels has density; when half of them are at one, or have none left, these are composited
-together. Were all waited for, the gaps between surfaces that rays cross would be crossed one after the other: docs/experiments/renderer.md
+Each ray goes on to its next sample of which one of the eight voxels has density; when half of them are at one, or have none left, the voxels around these are
+looked up together. Were all waited for, the gaps between surfaces that rays cross would be crossed one after the other. They are composited when the next are
+looked up, for their colours take so long to come from memory; so rays go one sample beyond their end. docs/experiments/renderer.md
 
 All rays sample at t = t_enter + (k + 1/2) step, whatever is skipped and whatever the other lanes do: neither changes any value.
 """
@@ -84,7 +85,7 @@ def _near(a, e, c, grid, view):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _prefetch_rows(lanes, grid, ints):  # type: ignore[no-untyped-def]
     """Asks for the tables of rows of the bricks in OWNER, before the first sample there needs them: docs/experiments/renderer.md"""
-    size, before = 2 * (grid.brick + 2) * (grid.brick + 2), np.int64(-1)
+    size, before = (grid.brick + 2) * (grid.brick + 2) * (1 if grid.narrow else 2), np.int64(-1)
     while lanes != 0:
         owner = np.int64(ints[OWNER + lowest_bit(lanes)])
         if owner != before:

@@ -2,7 +2,8 @@
 
 A packed tree's voxels are ordered column of bricks by column, within it row by row, and along z: what a row of any brick stores, with one voxel of the bricks
 before and behind it, is contiguous. Each brick has a table of its rows and of those beside it, (b + 2)^2: the first voxel of a row, and which of its b + 2 are
-stored. So two neighbours along z are found by a mask and a count of bits, and read together, whatever bricks they lie in.
+stored. So two neighbours along z are found by a mask and a count of bits, and read together, whatever bricks they lie in. Both are in one int32, the mask in
+its lowest b + 2 bits, where the voxels are not too many for that.
 
 B bricks, N stored voxels; b = brick.
 """
@@ -67,8 +68,9 @@ def _row(before, here, after, row, last, begin, stored):  # type: ignore[no-unty
 
 @numba.njit(cache=True, error_model="numpy")
 def fill_rows(first, end, cells, brick, brick_index, begin, stored, rows):  # type: ignore[no-untyped-def]
-    """Tables of bricks first <= B < end of a cascade, into rows (B, (b + 2)^2, 2) int32: first voxel and mask."""
+    """Tables of bricks first <= B < end of a cascade, into `rows`, see `Packed`."""
     side = brick + 2
+    narrow = rows.shape[1] == side * side
     for owner in range(first, end):
         for p in range(3):
             for q in range(3):
@@ -80,4 +82,18 @@ def fill_rows(first, end, cells, brick, brick_index, begin, stored, rows):  # ty
                     for j in range(j0, j1):
                         row = (i - 1 - (p - 1) * brick) * brick + j - 1 - (q - 1) * brick
                         voxel, mask = _row(before, here, after, row, brick - 1, begin, stored)
-                        rows[owner, i * side + j, 0], rows[owner, i * side + j, 1] = voxel, mask
+                        at = i * side + j
+                        if narrow:
+                            rows[owner, at] = np.int32(voxel << side | mask)
+                        else:
+                            rows[owner, 2 * at], rows[owner, 2 * at + 1] = voxel, mask
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def row_at(n, grid):  # type: ignore[no-untyped-def]
+    """First voxel and mask of a row, numbered over all bricks."""
+    side = grid.brick + 2
+    if grid.narrow:
+        word = np.int64(grid.rows[n]) & 0xFFFFFFFF
+        return word >> side, word & ((np.int64(1) << side) - 1)
+    return np.int64(grid.rows[2 * n]), np.int64(grid.rows[2 * n + 1])
