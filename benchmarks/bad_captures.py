@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from benchmarks.poses import aligned_errors, true_centres
+from stages.io.pictures import opened, rgb_and_alpha
 from workflows.paper.document import hardware
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,6 +43,7 @@ class Capture:
     diagnoses  words of which the right diagnosis has one
     placeable  pictures whose cameras can be found; all by default
     names      name of the good photograph that each picture shows, where it is another
+    quality     of the JPEGs
     """
 
     name: str
@@ -49,6 +51,7 @@ class Capture:
     diagnoses: tuple[str, ...]
     placeable: Callable[[list[str]], list[str]] = list
     names: Callable[[str], str] = str
+    quality: int = 92
 
 
 def each(change: Callable[[np.ndarray, int], np.ndarray], *, every: int = 1) -> Callable[[Pictures], Pictures]:
@@ -89,10 +92,6 @@ def cropped(picture: np.ndarray, n: int) -> np.ndarray:
 
 def shrunk(picture: np.ndarray, n: int) -> np.ndarray:
     return cv2.resize(picture, (96, 72), interpolation=cv2.INTER_AREA)
-
-
-def compressed(picture: np.ndarray, n: int) -> np.ndarray:
-    return cv2.imdecode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 6])[1], cv2.IMREAD_COLOR)
 
 
 def labelled(picture: np.ndarray, n: int) -> np.ndarray:
@@ -168,7 +167,7 @@ CAPTURES = (
     Capture("mirrored, every second", each(lambda p, n: cv2.flip(p, 1), every=2), APART),
     Capture("shuffled video", shuffled, (), names=lambda name: name[4:]),
     Capture("turned by quarters", each(upright_or_not), ("orientation", "not registered", "sizes")),
-    Capture("hard compression", each(compressed), ("compress", "few points", "not registered", "reprojection error")),
+    Capture("hard compression", dict, ("compress", "few points", "not registered", "reprojection error"), quality=6),
     Capture("a label burnt in", each(labelled), ("stands still", "static", "folded", "parallax")),
     Capture("torn files", dict, ("cannot be used",), placeable=lambda names: names[6:]),
 )
@@ -178,10 +177,13 @@ def write(capture: Capture, folder: Path) -> list[str]:
     """The pictures of a capture as JPEGs; returns their names."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    good = {path.name: cv2.imread(str(path)) for path in sorted(GOOD.glob("*.jpg"))}
+    good = {}
+    for path in sorted(GOOD.glob("*.jpg")):
+        with opened(path) as image:
+            good[path.name] = np.ascontiguousarray(rgb_and_alpha(image)[0][..., ::-1])
     made = capture.make(good)
     for n, (name, picture) in enumerate(made.items()):
-        cv2.imwrite(str(folder / name), picture, [cv2.IMWRITE_JPEG_QUALITY, 92])
+        cv2.imwrite(str(folder / name), picture, [cv2.IMWRITE_JPEG_QUALITY, capture.quality])
         if capture.name == "torn files" and n < 6:
             whole = (folder / name).read_bytes()
             (folder / name).write_bytes([whole[: len(whole) // 3], b"", b"not a picture"][n % 3])
