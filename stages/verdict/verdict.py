@@ -70,6 +70,8 @@ class Verdict:
     def summary(self) -> str:
         """A sentence."""
         of, registered = self.figures.get("photographs"), self.figures.get("registered")
+        if registered is None:  # before cameras are looked for
+            return f"Photographs: {self.grade}; {of} of them, {len(self.problems) or 'no'} problem{'' if len(self.problems) == 1 else 's'}."
         words = [f"{registered} of {of} photographs have a camera"]
         if self.figures.get("reprojection_error") is not None:
             words.append(f"reprojection error {self.figures['reprojection_error']:.2f} px")

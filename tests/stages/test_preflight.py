@@ -13,6 +13,7 @@ from pipeline.errors import BadInput
 from stages.poses import PosesSettings
 from stages.verdict import preflight
 from stages.verdict.preflight import Small, check, overlap_of
+from stages.verdict.verdict import Problem, Verdict
 from tests.stages import captures
 
 SIZE = 240, 180
@@ -148,3 +149,8 @@ def test_of_many_photographs_an_even_choice_is_looked_at(tmp_path: Path, monkeyp
     found = check(write(tmp_path / "a", along(0, 14, step=5.0)), PosesSettings(), 2)
     assert (found.figures["photographs"], found.figures["looked_at"]) == (14, 5)
     assert sorted(found.images) == ["00.png", "03.png", "06.png", "09.png", "12.png"]
+
+
+def test_its_summary_speaks_of_photographs_not_of_cameras() -> None:
+    assert Verdict("good", (), {"photographs": 36}).summary() == "Photographs: good; 36 of them, no problems."
+    assert Verdict("usable", (Problem("small", "usable", "Small.", "Larger."),), {"photographs": 5}).summary() == "Photographs: usable; 5 of them, 1 problem."
