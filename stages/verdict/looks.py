@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from stages.io.photo import apply_exif_orientation
-from stages.io.pictures import UnreadableImage, opened, orientation_of
+from stages.io.pictures import UnreadableImage, opened, orientation_of, rgb_and_alpha
 
 SIDE = 640  # px, longest side that photographs are looked at with; docs/experiments/sfm.md
 NOISE = 0.8  # px, standard deviation of a blur that takes noise away
 COARSE = 8  # px between pixels that differ in a blurred photograph, too
 SMALL = (24, 16)  # px, of the picture that others are compared with
+OPAQUE, PAPER = 128, 128  # alpha from which a pixel counts; level of the others
 CLIPPED = (4, 250)  # levels that nothing is told by
 BLURRED = 0.15  # sharpness below which a photograph is blurred, whatever the others are
 LESS_SHARP = 0.77  # share of the capture's median, below which it is blurred among sharp ones
@@ -42,18 +43,22 @@ class Look:
 
 def look_at(path: Path) -> Look:
     """Raises UnreadableImage."""
+    return look(grey_of(path))
+
+
+def grey_of(path: Path) -> np.ndarray:
+    """(H, W) uint8 of a photograph as it is meant to be seen, of a longest side of SIDE or more where it has that; what is transparent is grey. Raises
+    UnreadableImage."""
+    import cv2
+
     with opened(path) as image:
         image.draft("RGB", (SIDE, SIDE))
         orientation = orientation_of(image)
-        if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
-            from PIL import Image
-
-            paper = Image.new("RGBA", image.size, (128, 128, 128, 255))
-            paper.alpha_composite(image.convert("RGBA"))
-            grey = np.asarray(paper.convert("L"))
-        else:
-            grey = np.asarray(image.convert("L"))
-    return look(np.ascontiguousarray(apply_exif_orientation(grey, orientation)))
+        rgb, alpha = rgb_and_alpha(image)
+    grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
+    if alpha is not None:
+        grey = np.where(alpha >= OPAQUE, grey, np.uint8(PAPER))
+    return np.ascontiguousarray(apply_exif_orientation(grey, orientation))
 
 
 def look(grey: np.ndarray) -> Look:

@@ -19,8 +19,8 @@ from pipeline.errors import BadInput
 from stages.io import importers
 from stages.io.importers.photographs import photographs
 from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
-from stages.io.photo import apply_exif_orientation, focal_from_exif, read_photo, working_size
-from stages.io.pictures import UnreadableImage, exif_of, opened, orientation_of
+from stages.io.photo import focal_from_exif, read_photo, working_size
+from stages.io.pictures import UnreadableImage, exif_of, opened
 from stages.sfm import ladder, pairs
 from stages.verdict import looks
 from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, Problem, Verdict, of_looks
@@ -77,8 +77,8 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
     unreadable: list[tuple[str, str]] = []
     for name in chosen:
         try:
-            seen[name] = looks.look_at(files[name])
-            small[name] = _small(files[name])
+            grey = looks.grey_of(files[name])
+            seen[name], small[name] = looks.look(grey), _small(files[name], grey)
         except UnreadableImage as error:
             unreadable.append((name, str(error)))
     if not small:
@@ -103,18 +103,16 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
     return Verdict(ordered[0].grade if ordered else "good", ordered, figures, rows)
 
 
-def _small(path: Path) -> Small:
+def _small(path: Path, grey: np.ndarray) -> Small:
+    """
+    grey  (H, W) uint8, the photograph as it is meant to be seen
+    """
     import cv2
 
     with opened(path) as image:
-        size, exif = image.size, exif_of(image)
-        focal = focal_from_exif(dict(exif.get_ifd(_EXIF)), *size)
-        orientation = orientation_of(image)
-        image.draft("L", (SIDE, SIDE))
-        grey = np.asarray(image.convert("L"))
-    grey = apply_exif_orientation(grey, orientation)
-    width, height = working_size(grey.shape[1], grey.shape[0], SIDE)
-    grey = cv2.resize(np.ascontiguousarray(grey), (width, height), interpolation=cv2.INTER_AREA)
+        size = image.size
+        focal = focal_from_exif(dict(exif_of(image).get_ifd(_EXIF)), *size)
+    grey = cv2.resize(grey, working_size(grey.shape[1], grey.shape[0], SIDE), interpolation=cv2.INTER_AREA)
     before = time.thread_time()
     keypoints, descriptors = cv2.SIFT_create(FEATURES).detectAndCompute(grey, None)  # type: ignore[attr-defined]
     seconds = time.thread_time() - before

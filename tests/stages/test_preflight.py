@@ -57,7 +57,7 @@ def problems(folder: Path, **settings: object) -> dict[str, str]:
 
 def small_of(picture: np.ndarray, path: Path) -> Small:
     Image.fromarray(picture).save(path)
-    return preflight._small(path)
+    return preflight._small(path, picture)
 
 
 def test_overlap_counts_what_moves_alike_and_what_stands_still(tmp_path: Path) -> None:

@@ -68,6 +68,18 @@ def test_files_are_looked_at_upright_and_what_is_no_picture_is_left_out(tmp_path
     assert looks.duplicates(found) == {"upright": "turned"}
 
 
+def test_deep_and_transparent_pictures_are_looked_at_as_they_are_seen(tmp_path: Path) -> None:
+    shown = picture_of(4)
+    Image.fromarray(shown).save(tmp_path / "plain.png")
+    Image.fromarray(shown.astype(np.uint16) * 257).save(tmp_path / "deep.png")
+    hidden = np.dstack([np.repeat(np.where(np.arange(320) < 200, shown, 255)[..., None], 3, 2), np.where(np.arange(320) < 200, 255, 0) * np.ones((240, 1))])
+    Image.fromarray(hidden.astype(np.uint8), "RGBA").save(tmp_path / "alpha.png")
+    plain, deep, alpha = (looks.grey_of(tmp_path / f"{name}.png") for name in ("plain", "deep", "alpha"))
+    assert (plain == shown).all()
+    assert (deep == shown).all()
+    assert (alpha == np.where(np.arange(320) < 200, shown, looks.PAPER)).all()
+
+
 # ------------------------------------------------------------------------------------------------------------ grades
 
 
