@@ -10,7 +10,7 @@ import numpy as np
 ALIKE = 0.004  # of the picture's diagonal: frames between which less has moved are alike
 APART = 0.4  # of a window: motion between two that are chosen, at least where
 AS_SHARP = 0.9  # a frame so far from the one before has this share of the sharpness of one that is nearer
-DISCOUNT = 3  # power of a frame's sharpness over the median round it, by which its motion counts less: a hand that shakes moves much, and for nothing
+DISCOUNT = 4  # power of a frame's sharpness over the median round it, by which its motion counts less: a hand that shakes moves much, and for nothing
 AROUND = 15  # frames on each side that this median is of
 BLURRED = 0.7  # of the median sharpness of the chosen round it
 NEIGHBOURS = 8  # chosen frames on each side that this median is of

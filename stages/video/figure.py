@@ -51,7 +51,7 @@ def write_frames_plot(record: Sequence[Mapping[str, Any]], target: Path) -> None
             axes.plot(time[verdict == which], sharp[verdict == which], ".", color=colour, label=f"{which}: {int((verdict == which).sum())}")
         axes.set(ylabel="sharpness", title=f"{video['video']}: {video['chosen']} of {len(time)} frames", ylim=(0.0, None))
         axes.set_xlabel("time / s")
-        axes.legend(frameon=False, loc="upper left")
+        axes.legend(frameon=False, loc="lower left")
         other = axes.twinx()
         other.plot(time, np.array(video["motion"]), color="tab:orange", linewidth=1.0)
         other.set_ylabel("motion / diagonals", color="tab:orange")

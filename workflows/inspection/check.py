@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -25,16 +26,43 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
     from stages.verdict.preflight import check
     from workflows.cli.resolve import Settings, read_preset
 
-    if not source.is_dir():
-        raise BadInput(f"{source}: no such folder. Expected photographs, or a posed data set.")
+    if not source.exists():
+        raise BadInput(f"{source}: no such folder or file. Expected photographs, a video, or a posed data set.")
     settings = Settings({stage.name: stage.settings for stage in workflow.stages})
     settings.put_table(read_preset(CPU_PRESET, workflow.presets).table, f"preset {CPU_PRESET}")
     for text in sets:
         settings.put_option(text)
-    found = check(source, settings.resolved()["poses"], num_threads()).document()
+    poses = settings.resolved()["poses"]
+    with TemporaryDirectory() as work:
+        found = check(with_frames_for_videos(source, poses, Path(work)), poses, num_threads()).document() | {"source": str(source)}
     found["forecast"]["memory_limit"] = None if limit is None else limit.bytes
     found["forecast"]["fits"] = limit is None or found["forecast"]["poses_bytes"] <= limit.bytes
     return found
+
+
+def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
+    """The folder itself; for a video, or a folder of videos, one with the frames that a run would choose. Raises BadInput."""
+    from pipeline.errors import BadInput
+    from stages.io.importers import candidates
+    from stages.io.material import find_material
+    from stages.sfm.colmap import num_threads
+    from stages.video.frames import Reader, frames_of
+    from stages.video.reading import UnreadableVideo
+
+    if (candidates(source, poses.allow_outside)[0] if poses.format == "auto" else poses.format) != "photographs":
+        return source
+    videos = find_material({"": source}, poses.allow_outside, _nothing).videos
+    if not videos:
+        return source
+    try:
+        frames_of(videos, count=poses.frames, max_side=poses.feature_image_size, reader=Reader(num_threads(), work, _nothing, _nothing, _nothing))
+    except UnreadableVideo as error:
+        raise BadInput(f"{source}: {error}. Copy or export the video again.") from error
+    return work
+
+
+def _nothing(*values: object) -> None:
+    """Who is told of progress and warnings, where nobody is."""
 
 
 def in_words(found: dict[str, Any]) -> list[str]:

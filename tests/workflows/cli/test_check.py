@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from tests.stages import clips
 from tests.workflows.command import Enerf
 
 
@@ -37,3 +38,12 @@ def test_check_refuses_what_is_no_folder_of_photographs(enerf: Enerf, tmp_path: 
     assert enerf("check", noise(tmp_path / "photos", 3), "--set", "poses.nonsense=1").code == 2
     (tmp_path / "empty").mkdir()
     assert "empty" in enerf("check", tmp_path / "empty").err
+
+
+def test_check_looks_at_the_frames_that_a_run_would_choose_of_a_video(enerf: Enerf, tmp_path: Path) -> None:
+    clip = clips.write_clip(tmp_path / "clip.mp4", clips.pan(12, 6.0))
+    told = enerf("check", clip, "--json", "--set", "poses.frames=5").object
+    assert (told["source"], told["format"], told["photographs"], told["sizes"]) == (str(clip), "photographs", 5, ["96x64"])
+    assert [path.name for path in tmp_path.iterdir()] == ["clip.mp4"]  # nothing is left
+    (tmp_path / "clip.mp4").write_bytes(b"no video")
+    assert "clip.mp4: unreadable" in enerf("check", clip).err
