@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.fuzz import binary, json_text, lines
 from benchmarks.fuzz.reader import Opened, Reader
-from tests.stages import captures
+from tests.stages import captures, exports
 
 COUNT = 3  # images of a data set
 EVERY = 100  # of so many inputs one goes through the command line: a whole poses stage takes as long as a hundred of them
@@ -166,4 +166,39 @@ for _suffix, _write, _changed in ((".bin", captures.colmap_bin, binary.changed_b
                 share=1 / 3,
             )
         )
+# Of exports of other programs the file that states the cameras.
+EXPORTED = {
+    "polycam": ("polycam", "keyframes/corrected_cameras/img_2.json", "a camera of Polycam"),
+    "record3d": ("record3d", "EXR_RGBD/metadata.json", "metadata.json of Record3D"),
+    "metashape": ("metashape", "cameras.xml", "Metashape's XML of cameras"),
+    "realitycapture_csv": ("realitycapture csv", "registration.csv", "RealityCapture's table of cameras"),
+    "realitycapture_xmp": ("realitycapture xmp", "images/img_2.xmp", "RealityCapture's XMP files"),
+    "opensfm": ("opensfm", "opensfm/reconstruction.json", "OpenSfM's reconstruction.json"),
+    "kapture_sensors": ("kapture", "sensors/sensors.txt", "Kapture's sensors.txt"),
+    "kapture_trajectories": ("kapture", "sensors/trajectories.txt", "Kapture's trajectories.txt"),
+    "scannetpp": ("scannet++", "dslr/nerfstudio/transforms.json", "ScanNet++'s transforms.json"),
+    "mvsnet": ("mvsnet", "cams/00000002_cam.txt", "MVSNet's cameras"),
+    "idr": ("idr", "cameras_sphere.npz", "cameras_sphere.npz of IDR"),
+    "nsvf": ("nsvf", "intrinsics.txt", "intrinsics.txt of NSVF"),
+    "tanks": ("tanks and temples", "Barn_COLMAP_SfM.log", "trajectories of Tanks and Temples"),
+}
+_BY_SUFFIX = {".json": json_text.changed, ".npz": binary.changed_bytes}
+
+
+def _exported(how: str) -> Callable[..., Path]:
+    return lambda folder, made=None: exports.EXPORTS[how][1](folder)[0]
+
+
+for _reader, (_how, _name, _what) in EXPORTED.items():
+    _READERS.append(
+        Reader(
+            _reader,
+            _what,
+            lambda how=_how, name=_name: [_bytes_of(_exported(how), name)],  # type: ignore[misc]
+            _BY_SUFFIX.get(Path(_name).suffix, lines.changed),
+            _opened(_exported(_how), _name),
+            every=EVERY,
+            share=0.1,
+        )
+    )
 READERS = {reader.name: reader for reader in _READERS}
