@@ -14,10 +14,11 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, rays
 from pipeline.files import remove
 from stages.sfm.colmap import every_image_read, quiet_pycolmap
-from stages.sfm.database import database_path, verified_pairs
+from stages.sfm.database import database_path, inlier_counts
 from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 
 MIN_MODEL_SIZE = 3  # registered photographs
+MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
 # Options of attempts. COLMAP's defaults want an initial pair with a triangulation angle of 16 degrees and 100 inliers. RELAXED is for little texture and
 # little parallax. FORWARD also keeps two-view tracks and points with small triangulation angles, as of forward motion.
 Options = Mapping[str, Mapping[str, object]]
@@ -213,12 +214,10 @@ def pair_agreement(work: Path, cameras: Mapping[int, Camera], *, tolerance: floa
         directions = {
             image_id: rays(camera, np.asarray(database.read_keypoints(image_id), np.float64)[:, :2])[1] for image_id, camera in cameras.items()
         }  # (N, 3) each
-        for first, second in verified_pairs(database_path(work)):
-            if first not in cameras or second not in cameras:
+        for (first, second), count in inlier_counts(database_path(work)).items():
+            if count < MIN_MATCHES or first not in cameras or second not in cameras:
                 continue
             inliers = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
-            if len(inliers) < 30:
-                continue
             a, b = directions[first][inliers[:, 0]], directions[second][inliers[:, 1]]
             baseline = cameras[second].centre - cameras[first].centre
             plane = np.cross(baseline, b)  # the epipolar plane of the second ray
