@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 # Bytes. Of a parameter: value, gradient, two moments, and one more while Gaussians are merged and written; of a stored voxel while they are merged; of a
 # pixel of a picture: its colours and mask; of a pixel of the one that is drawn: colours, transmittance, gradients and the Gaussians that cover its tile.
-PARAMETER, VOXEL, PIXEL, DRAWN = 20, 200, 4, 400
+PARAMETER, VOXEL, PIXEL, DRAWN = 20, 100, 4, 400
 
 
 def splats_needed(tree: NerfTree, count: int, sh_degree: int, pixels: int, largest: int) -> Need:

@@ -85,7 +85,7 @@ _VOLUMES = (
 _SPLATS = (
     Format(".ply", "3D Gaussians with view-dependent colours, as 3DGS writes them; the capture's frame", "what fewer Gaussians than voxels cannot show",
            "SuperSplat, Spark, PlayCanvas, Babylon.js, Unity, Unreal, Blender (add-ons), nerfstudio", "splats.ply", "write_splats"),
-    Format(".spz", "the same in a tenth of the bytes; y up", "precision: colours, sizes and opacities of 8 bits; the capture's axes",
+    Format(".spz", "the same in an eighth of the bytes; y up", "precision: colours, sizes and opacities of 8 bits; the capture's axes",
            "Scaniverse, SuperSplat, Spark, Babylon.js, Cesium", "splats.spz", "write_splats"),
     Format(".glb", "the same, in single precision (KHR_gaussian_splatting); y up; points where the extension is unknown",
            "the capture's axes (kept as a matrix in its extras)", "Cesium, Babylon.js, PlayCanvas", "splats.gltf", "write_splats"),
