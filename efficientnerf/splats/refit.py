@@ -15,7 +15,7 @@ import numpy as np
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.geometry.cameras import Camera, rows_of
 from efficientnerf.splats.gaussians import Gaussians, rotation_matrices
-from efficientnerf.splats.rendering import LANES, gaussians_from, grouped, lens_of, ungrouped, values_of
+from efficientnerf.splats.rendering import LANES, LOG_SCALES, gaussians_from, grouped, lens_of, ungrouped, values_of
 
 if TYPE_CHECKING:
     from efficientnerf.backends.numba.splats.fitting import Rates
@@ -152,7 +152,7 @@ def _rates(done: float) -> Rates:
     fall = LAST_RATE**done
     rates = np.asarray([MEANS, SCALES, ROTATIONS, OPACITIES, COLOURS, HARMONICS], np.float32) * np.float32(fall)
     return Rates(
-        rates, np.float32(MOMENTUM), np.float32(DECAY), np.float32(EPSILON), _corrections(MOMENTUM), _corrections(DECAY), np.float32(-30), np.float32(20)
+        rates, np.float32(MOMENTUM), np.float32(DECAY), np.float32(EPSILON), _corrections(MOMENTUM), _corrections(DECAY), *map(np.float32, LOG_SCALES)
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 NEAR = 0.05  # depth in front of which nothing is rendered, units of the training frame
 BESIDE = 0.15  # of the picture's width and height, beside it, up to where derivatives of the projection follow the means; as 3DGS
+LOG_SCALES = (-30.0, 20.0)  # what lies beyond is rendered as if it were this: float32 holds its square
 LANES = 16
 
 
@@ -82,7 +83,7 @@ def values_of(gaussians: Gaussians) -> np.ndarray:
     """(G, 11 + 3 K, 16) float32, rows as `efficientnerf.backends.numba.splats.projection` names them; what fills the last group cannot be seen."""
     count = len(gaussians)
     logits = np.log(gaussians.opacities) - np.log1p(-gaussians.opacities)
-    parts = gaussians.means, np.log(gaussians.scales), gaussians.rotations, logits[:, None], gaussians.harmonics.reshape(count, -1)
+    parts = gaussians.means, np.log(gaussians.scales).clip(*LOG_SCALES), gaussians.rotations, logits[:, None], gaussians.harmonics.reshape(count, -1)
     return grouped(np.concatenate(parts, axis=1))
 
 

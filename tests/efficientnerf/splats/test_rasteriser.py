@@ -127,6 +127,20 @@ def test_what_lies_behind_the_camera_or_beside_the_picture_is_not_rendered() -> 
     assert render(gaussians, view).opacity.max() == 0
 
 
+@pytest.mark.parametrize("far", [1e2, 1e10, 1e30, 3e38])
+@pytest.mark.parametrize("wide", [1e-38, 1.0, 1e10, 3e38])
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV_FISHEYE"])
+def test_whatever_a_file_may_hold_is_rendered_without_harm(far: float, wide: float, model: str) -> None:
+    view, gaussians = camera(model, (0.0,) * 4 if model == "OPENCV_FISHEYE" else ()), some(count=20)
+    places = np.concatenate([view.centre + view.forward * [[0.06], [1], [50]], np.clip(np.random.default_rng(0).normal(size=(17, 3)) * far, -3e38, 3e38)])
+    scales = np.tile([wide, 1e-38, 3e38], (20, 1))
+    gaussians = replace(gaussians, means=places.astype(np.float32), scales=scales.astype(np.float32), harmonics=gaussians.harmonics * np.float32(1e3))
+    image = render(gaussians, view)
+    assert np.isfinite(image.colour).all()
+    assert image.opacity.min() >= 0
+    assert image.opacity.max() <= 1
+
+
 def test_tiles_rendered_in_pieces_are_the_whole_and_ties_keep_their_order() -> None:
     gaussians = some(count=40)
     twice = gaussians.subset(np.tile(np.arange(40), 2))
