@@ -17,6 +17,7 @@ from stages.io.importers.source import MIN_IMAGES, Source
 from stages.io.pictures import MAX_SIDE
 
 Warn = Callable[[str], object]
+DECODERS = 16  # threads at most: each holds frames
 
 
 @dataclass
@@ -88,7 +89,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
         with contextlib.suppress(UnreadableVideo), opened(path) as video:  # said where it is read
             sizes.append(video.stored)
     refuse_large_videos(job, sizes)
-    reader = Reader(num_threads(), job.work / "videos", job.progress, job.safe_point, warn)
+    reader = Reader(min(DECODERS, num_threads()), job.work / "videos", job.progress, job.safe_point, warn)
     try:
         chosen = frames_of(found.videos, count=job.settings.frames, max_side=max_side, reader=reader)
     except UnreadableVideo as error:
