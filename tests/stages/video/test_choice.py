@@ -18,7 +18,7 @@ def steps_and_sharpness(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(1, 200), st.integers(1, 60), st.integers(0, 99))
+@given(st.integers(1, 90), st.integers(1, 40), st.integers(0, 99))
 def test_there_are_no_more_than_asked_for_and_no_two_alike(frames: int, count: int, seed: int) -> None:
     motion, sharpness = steps_and_sharpness(frames, seed)
     verdicts = choose(motion, sharpness, count)

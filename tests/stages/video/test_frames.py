@@ -84,11 +84,12 @@ def test_the_sharp_frames_of_a_clip_are_chosen_and_recorded(tmp_path: Path) -> N
 
 
 def test_frames_of_one_video_share_a_camera_and_those_of_two_do_not(tmp_path: Path) -> None:
-    clip(tmp_path / "source", "a.mp4")
-    clip(tmp_path / "source", "b.mov")
-    paths, record, _ = record_of(tmp_path / "source", tmp_path, frames=12)
-    assert [video["video"] for video in record["videos"]] == ["a.mp4", "b.mov"]
-    assert {name: {read_photo(path, 1000).maker for other, path in paths.items() if other.startswith(name)} for name in ("a.mp4", "b.mov")} == {
+    clip(tmp_path, "a.mp4")
+    clip(tmp_path, "b.mov")
+    reader = Reader(1, tmp_path / "work", lambda *values: None, lambda: None, lambda text: None)
+    found = frames_of(find_material({"": tmp_path}, False, lambda text: None).videos, count=12, max_side=1000, reader=reader)
+    assert [video["video"] for video in found.record] == ["a.mp4", "b.mov"]
+    assert {name: {read_photo(path, 1000).maker for other, path in found.paths.items() if other.startswith(name)} for name in ("a.mp4", "b.mov")} == {
         "a.mp4": {"video a.mp4"},
         "b.mov": {"video b.mov"},
     }
