@@ -38,7 +38,7 @@ THIN = 0.3  # least depth along the normal, voxels
 DIRECTIONS = 32  # that a colour is converted at
 LEVELS = (*range(0, 57, 3), 62)  # of cells: bits of the keys that they leave out, of the last all
 SHELL_SHARE, SHELL_MOST, SHELL_DISTANCE = 0.05, 10_000, 30.0  # Gaussians for the environment; their distance in half diagonals of the outermost cascade
-DEEPEST = 0.2  # of its distance, that a Gaussian of normalised device coordinates reaches along the view axis
+DEEPEST = 3.0  # longest standard deviation over the next one, of Gaussians of normalised device coordinates: along rays voxels are far longer than across
 AT_ONCE = 2**17  # voxels whose coefficients are decoded together
 VIEWS = 32  # that the size of voxels in pixels is taken from
 
@@ -248,7 +248,9 @@ def _in_the_world(tree: NerfTree, mean: np.ndarray, axes: np.ndarray, scales: np
     turned[:, :, 0] *= np.sign(np.linalg.det(turned))[:, None]
     world = tree.ndc.world(mean)
     far = np.linalg.norm(world - tree.ndc.world_from_camera[:3, 3], axis=1, keepdims=True)
-    return world, turned, np.minimum(np.sqrt(np.maximum(variance, (1e-6 * far) ** 2)), DEEPEST * far)
+    scales = np.sqrt(np.maximum(variance, (1e-6 * far) ** 2))  # ascending
+    scales[:, 2] = np.minimum(scales[:, 2], DEEPEST * scales[:, 1])
+    return world, turned, scales
 
 
 def _convert(tree: NerfTree, shown: Shown, begin: np.ndarray, weight: np.ndarray, out: np.ndarray, degree: int) -> None:
