@@ -43,7 +43,7 @@ class SplatsSettings:
     )
     count: Annotated[int, Meta(ge=1, le=MOST)] = setting(200_000, "Most Gaussians.", advanced=True)
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
-    iterations: Count = setting(300, "Steps in which they are fitted to pictures, each of a whole one; 0: none.", advanced=True)
+    iterations: Count = setting(300, "Steps in which they are fitted to pictures, each of a picture or of rows of a large one; 0: none.", advanced=True)
     pictures: Literal["photographs", "asset"] = setting(
         "photographs",
         "What they are fitted to: the training photographs, or the asset's own renders, as in any case where region is foreground.",

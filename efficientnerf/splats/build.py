@@ -24,7 +24,7 @@ Progress = Callable[[int, int, str], None]
 class Budget:
     """count   Gaussians at most
     degree  of their harmonics, 0 to 3; at most the asset's
-    steps   of the refit, each a whole picture; 0: the voxels merged, as they are
+    steps   of the refit, each of a picture or of rows of a large one; 0: the voxels merged, as they are
     seed    of the order of the pictures
     """
 
