@@ -92,12 +92,12 @@ def fused_opacity(fusion: Fusion, opacity: np.ndarray, low: np.ndarray, bounds_m
 
     wanted = maximum_filter(opacity > EMPTY, size=3).astype(np.uint8)
     wanted[opacity >= HAZE] = FILLED
-    distance, weight, spread = (np.zeros(opacity.shape, np.float32) for _ in range(3))
+    distance, weight = (np.zeros(opacity.shape, np.float32) for _ in range(2))
     for part in pieces(len(opacity), first=8):
         at = np.array([low[0] + part.start, low[1], low[2]], np.int64)
         fuse(
             np.asarray(bounds_min, np.float64), at, float(voxel), wanted[part], fusion.planes, fusion.cameras, fusion.lenses, TRUNCATION, distance[part],
-            weight[part], spread[part],
+            weight[part],
         )  # fmt: skip
     density = (TRUNCATION * (1 - 2 * opacity)).astype(np.float32)
     mixed = np.where(wanted > 0, (distance * weight + DENSITY_WEIGHT * density) / (weight + DENSITY_WEIGHT), density).astype(np.float32)

@@ -95,7 +95,7 @@ def fit_planes(depth, opacity, lens, begin, end, radius, band, out):  # type: ig
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distance, weight, spread):  # type: ignore[no-untyped-def]
+def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distance, weight):  # type: ignore[no-untyped-def]
     """Signed distance of voxels from the surface that views see, positive before it.
 
     first       (3,) float64 the corner of the grid, world; low (3,) int64 index of the first voxel
@@ -105,7 +105,6 @@ def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distanc
     truncation  of distances, voxels
     distance    (X, Y, Z) float32 mean of the views, voxels, from -truncation to truncation
     weight      (X, Y, Z) float32 sum of the views' confidences; zero where none sees it
-    spread      (X, Y, Z) float32 standard deviation of the distances
     """
     height, width = planes.shape[1], planes.shape[2]
     for i in numba.prange(wanted.shape[0]):
@@ -114,7 +113,7 @@ def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distanc
                 if wanted[i, j, k] == 0:
                     continue
                 px, py, pz = first[0] + (low[0] + i + 0.5) * voxel, first[1] + (low[1] + j + 0.5) * voxel, first[2] + (low[2] + k + 0.5) * voxel
-                total = sums = squares = behind = 0.0
+                total = sums = behind = 0.0
                 for c in range(len(cameras)):
                     m = cameras[c]
                     z = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
@@ -127,7 +126,7 @@ def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distanc
                     column, row = int(u), int(v)
                     pixel = planes[c, row, column]
                     if pixel[NEAREST] == 0.0 or 1.0 / pixel[NEAREST] - z > truncation * voxel:
-                        total, sums, squares = total + 1.0, sums + truncation, squares + truncation * truncation
+                        total, sums = total + 1.0, sums + truncation
                         continue
                     if pixel[CONFIDENCE] <= 0.0:
                         continue
@@ -140,10 +139,8 @@ def fuse(first, low, voxel, wanted, planes, cameras, lenses, truncation, distanc
                         behind += pixel[CONFIDENCE] if s > -DEEPEST * truncation else 0.0
                     elif s <= truncation:
                         share = pixel[CONFIDENCE] * cosine * (1.0 if s >= 0.0 else 1.0 + s / truncation)
-                        total, sums, squares = total + share, sums + share * s, squares + share * s * s
+                        total, sums = total + share, sums + share * s
                 if wanted[i, j, k] == FILLED and behind > ENOUGH and total < 0.1 * behind:
-                    total, sums, squares = total + behind, sums - truncation * behind, squares + truncation * truncation * behind
+                    total, sums = total + behind, sums - truncation * behind
                 if total > 0.0:
-                    mean = sums / total
-                    distance[i, j, k], weight[i, j, k] = mean, total
-                    spread[i, j, k] = np.sqrt(max(0.0, squares / total - mean * mean))
+                    distance[i, j, k], weight[i, j, k] = sums / total, total
