@@ -5,15 +5,16 @@ Where splats.make is off the report says so, and there is no more.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from msgspec import Meta
 
-from efficientnerf.settings import Count, Seed, setting
+from efficientnerf.settings import Auto, Count, Seed, given, setting
 from pipeline.errors import StageFailed
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
@@ -24,10 +25,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from efficientnerf.asset.tree import NerfTree
+    from efficientnerf.splats.build import Budget
     from efficientnerf.splats.gaussians import Gaussians
     from stages.memory.need import Need
 
 MOST = 5_000_000  # Gaussians: beyond that no program opens them
+PASSES, FEWEST_STEPS, MOST_STEPS = 4, 300, 900  # docs/experiments/splats.md
 PREVIEW = (480, 360)  # pixels, of each of the two pictures
 
 
@@ -41,9 +44,14 @@ class SplatsSettings:
     region: Literal["foreground", "all"] = setting(
         "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject with what supports it (foreground).", advanced=True
     )
-    count: Annotated[int, Meta(ge=1, le=MOST)] = setting(200_000, "Most Gaussians.", advanced=True)
+    count: Annotated[int, Meta(ge=1, le=MOST)] = setting(200_000, "Most Gaussians; no more are made than a picture has pixels.", advanced=True)
     sh_degree: Annotated[int, Meta(ge=0, le=3)] = setting(2, "Degree of the spherical harmonics of their colours.", advanced=True)
-    iterations: Count = setting(300, "Steps in which they are fitted to pictures, each of a picture or of rows of a large one; 0: none.", advanced=True)
+    iterations: Count | Auto = setting(
+        "auto",
+        "Steps in which they are fitted to pictures, each of a picture or of rows of a large one; 0: none; auto: four passes over all pixels, at least 300 and"
+        " at most 900.",
+        advanced=True,
+    )
     pictures: Literal["photographs", "asset"] = setting(
         "photographs",
         "What they are fitted to: the training photographs, or the asset's own renders, as in any case where region is foreground.",
@@ -61,7 +69,7 @@ def gaussians_of(
 
     Raises StageFailed where nothing shows.
     """
-    from efficientnerf.splats.build import Budget, NothingToShow, gaussians_of_asset
+    from efficientnerf.splats.build import NothingToShow, gaussians_of_asset
     from stages.io.refined_cameras import load_scene
     from stages.splatting.pictures import photographs, render_cameras, renders
 
@@ -70,9 +78,20 @@ def gaussians_of(
     else:
         views = photographs(captured[0], load_scene(*captured))
     try:
-        return gaussians_of_asset(tree, views, Budget(settings.count, settings.sh_degree, settings.iterations, settings.seed), progress)
+        return gaussians_of_asset(tree, views, budget_of(settings, [view.camera.width * view.camera.height for view in views]), progress)
     except NothingToShow as error:
         raise StageFailed(f"splats: {error}. Train longer, or bake the asset again.") from error
+
+
+def budget_of(settings: SplatsSettings, pixels: Sequence[int]) -> Budget:
+    """What Gaussians are made and fitted with, for pictures of so many pixels each."""
+    from efficientnerf.splats.build import Budget
+    from efficientnerf.splats.refit import PIXELS
+
+    steps = given(settings.iterations)
+    if steps is None:
+        steps = int(np.clip(math.ceil(PASSES * sum(pixels) / PIXELS), FEWEST_STEPS, MOST_STEPS))
+    return Budget(min(settings.count, max(1, int(np.median(pixels)))) if pixels else settings.count, settings.sh_degree, steps, settings.seed)
 
 
 def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path] | None = None) -> Need:
@@ -85,7 +104,7 @@ def needed(tree: NerfTree, settings: SplatsSettings, captured: tuple[Path, Path]
     own = captured is None or settings.pictures == "asset" or settings.region == "foreground"
     cameras = render_cameras(tree) if own or captured is None else [view.camera for view in views_of(load_scene(*captured), "train")]
     pixels = [camera.width * camera.height for camera in cameras]
-    return splats_needed(tree, settings.count, settings.sh_degree, sum(pixels), max(pixels, default=0))
+    return splats_needed(tree, budget_of(settings, pixels).count, settings.sh_degree, sum(pixels), max(pixels, default=0))
 
 
 def preview(tree: NerfTree, gaussians: Gaussians) -> np.ndarray:
@@ -133,4 +152,4 @@ def run(job: Job) -> None:
     job.say(f"{len(gaussians)} Gaussians in {time.monotonic() - started:.0f} s", gaussians=len(gaussians))
 
 
-STAGE = Stage(name="splats", version=2, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)
+STAGE = Stage(name="splats", version=3, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)

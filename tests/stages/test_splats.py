@@ -22,7 +22,7 @@ from stages.io.exporters.splats.ply import read_splats
 from stages.io.exporters.writing import source_frame
 from stages.io.png import read_png
 from stages.io.scene import load as load_scene
-from stages.splats import SplatsSettings, gaussians_of
+from stages.splats import SplatsSettings, budget_of, gaussians_of
 from stages.splatting.pictures import LONGER_SIDE, photographs, render_cameras, renders
 from tests.efficientnerf.balls import BOUNDS, CENTRE, RADIUS
 from tests.stages.balls import ORBIT, SIMILARITY, poses
@@ -137,3 +137,20 @@ def test_an_asset_that_shows_nothing_names_the_remedy(inputs: dict[str, Path], t
     job = Job(settings=QUICK, inputs={**inputs, "bake": tmp_path / "bake"}, out=tmp_path / "out", work=tmp_path / "work")
     with pytest.raises(StageFailed, match="Train longer"):
         splats.run(job)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "count", "steps"),
+    [
+        ([480 * 360] * 31, 480 * 360, 300),
+        ([640_000] * 100, 200_000, 900),
+        ([1008 * 756] * 40, 200_000, 466),
+        ([40_000] * 100, 40_000, 300),
+        ([], 200_000, 300),
+    ],
+)
+def test_more_pixels_take_more_steps_and_bear_more_gaussians(pixels: list[int], count: int, steps: int) -> None:
+    found = budget_of(SplatsSettings(), pixels)
+    assert (found.count, found.steps) == (count, steps)
+    assert budget_of(SplatsSettings(count=50, iterations=7), pixels).steps == 7
+    assert budget_of(SplatsSettings(count=50, iterations=7), pixels).count == 50
