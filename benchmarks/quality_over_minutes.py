@@ -35,7 +35,10 @@ MADE_VIEWS = {"size": 400, "train": 60, "val": 10, "test": 20}
 FILE = "quality_over_minutes"
 PEERS = "peers.json"
 # The asset is what counts, not the network.
-EVALUATION = ("evaluate.field_views=1", "evaluate.strips=off", "evaluate.captured_path_frames=off", "evaluate.field_background_rays=1", "mesh.texture=off")
+EVALUATION = (
+    "evaluate.field_views=1", "evaluate.strips=off", "evaluate.captured_path_frames=off", "evaluate.field_background_rays=1", "mesh.texture=off",
+    "splats.make=off",
+)  # fmt: skip
 ENERF = (sys.executable, "-m", "workflows.cli.main")
 LIBRARIES = ("torch", "numba", "numpy")
 

@@ -1,6 +1,6 @@
 """The splats stage: the asset as 3D Gaussians, which the programs of others render in real time; as PLY and SPZ, with a preview and a report.
 
-Where splats.make is off the report says so, and there is no more.
+Where splats.make is off, or auto and none can be made, the report says so, and there is no more.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from efficientnerf.settings import Auto, Count, Seed, given, setting
-from pipeline.errors import StageFailed
+from pipeline.errors import StageFailed, UsageError
 from pipeline.files import write_json
 from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs, SplatsInputs, SplatsOutputs, TrainOutputs, inputs_of, needs_of
@@ -38,8 +38,11 @@ PREVIEW = (480, 360)  # pixels, of each of the two pictures
 class SplatsSettings:
     """How the asset becomes 3D Gaussians."""
 
-    make: Literal["on", "off"] = setting(
-        "off", "Whether the run makes 3D Gaussians of its asset; 'enerf export RUN --splats' makes them in any case.", advanced=True
+    make: Literal["auto", "on", "off"] = setting(
+        "auto",
+        "Whether the run makes 3D Gaussians of its asset; auto: where there is memory for it and something shows; 'enerf export RUN --splats' makes them in any"
+        " case.",
+        advanced=True,
     )
     region: Literal["foreground", "all"] = setting(
         "all", "What becomes Gaussians: the whole scene with its surroundings (all), or the subject with what supports it (foreground).", advanced=True
@@ -127,6 +130,17 @@ def run(job: Job) -> None:
         write_json(outputs.report, {"gaussians": 0, "made": False})
         job.say("none are asked for (splats.make=off)", gaussians=0)
         return
+    try:
+        _make(job, outputs, settings)
+    except (StageFailed, UsageError) as error:
+        if settings.make == "on":
+            raise
+        write_json(outputs.report, {"gaussians": 0, "made": False, "reason": str(error)})
+        job.warn(f"no Gaussians are made, and the run goes on: {error}")
+
+
+def _make(job: Job, outputs: SplatsOutputs, settings: SplatsSettings) -> None:
+    """Raises UsageError where memory is too small, StageFailed where nothing shows."""
     from efficientnerf.asset.format import load
     from stages.framing.restriction import restricted
     from stages.io.exporters import SPLAT_EXPORTERS
@@ -152,4 +166,4 @@ def run(job: Job) -> None:
     job.say(f"{len(gaussians)} Gaussians in {time.monotonic() - started:.0f} s", gaussians=len(gaussians))
 
 
-STAGE = Stage(name="splats", version=3, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)
+STAGE = Stage(name="splats", version=4, settings=SplatsSettings, needs=needs_of(SplatsInputs), run=run)

@@ -27,7 +27,7 @@ NAMES = (
     "train",  # poses -> field, density voxels
     "bake",  # train, poses -> asset.nerftree
     "mesh",  # bake, train, poses -> PLY, GLB, OBJ
-    "splats",  # bake, train, poses -> 3D Gaussians as PLY and SPZ, where splats.make is on
+    "splats",  # bake, train, poses -> 3D Gaussians as PLY and SPZ, unless splats.make is off
     "evaluate",  # mesh, splats, bake, train, poses -> PSNR and SSIM of the network, of the asset, of the mesh and of the Gaussians
     "turntable",  # bake -> frames, video, EXR
     "points",  # bake -> PLY

@@ -12,7 +12,7 @@ import pytest
 from efficientnerf.asset.format import load, save
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.splats.rendering import render
-from pipeline.errors import StageFailed
+from pipeline.errors import StageFailed, UsageError
 from pipeline.stage import Job
 from stages import splats
 from stages.artifacts import SplatsOutputs
@@ -91,7 +91,7 @@ def test_they_look_like_the_asset_to_those_who_evaluate_them(made: SplatsOutputs
 
 
 def test_none_are_made_where_none_are_asked_for(inputs: dict[str, Path], tmp_path: Path) -> None:
-    splats.run(Job(settings=SplatsSettings(), inputs=dict.fromkeys(inputs, tmp_path), out=tmp_path / "out", work=tmp_path / "work"))
+    splats.run(Job(settings=SplatsSettings(make="off"), inputs=dict.fromkeys(inputs, tmp_path), out=tmp_path / "out", work=tmp_path / "work"))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["report.json"]
     assert load_splats(SplatsOutputs(tmp_path / "out"), load(inputs["bake"] / "asset.nerftree")) is None
 
@@ -154,3 +154,25 @@ def test_more_pixels_take_more_steps_and_bear_more_gaussians(pixels: list[int], 
     assert (found.count, found.steps) == (count, steps)
     assert budget_of(SplatsSettings(count=50, iterations=7), pixels).steps == 7
     assert budget_of(SplatsSettings(count=50, iterations=7), pixels).count == 50
+
+
+@pytest.mark.parametrize("why", ["nothing shows", "too little memory"])
+def test_a_run_goes_on_without_them_unless_they_are_asked_for(
+    why: str, inputs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise StageFailed("splats: nothing shows.") if why == "nothing shows" else UsageError("splats: too little memory.")
+
+    monkeypatch.setattr(splats, "gaussians_of", fails)
+    told: list[str] = []
+    for name, make in (("auto", "auto"), ("on", "on")):
+        job = Job(settings=replace(QUICK, make=make), inputs=inputs, out=tmp_path / name / "out", work=tmp_path / name / "work")
+        job._report = lambda event: told.append(event.get("text", ""))
+        if make == "on":
+            with pytest.raises((StageFailed, UsageError), match=why):
+                splats.run(job)
+        else:
+            splats.run(job)
+    assert sum("the run goes on" in text and why in text for text in told) == 1
+    assert json.loads((tmp_path / "auto/out/report.json").read_text())["reason"] == f"splats: {why}."
+    assert load_splats(SplatsOutputs(tmp_path / "auto/out"), load(inputs["bake"] / "asset.nerftree")) is None
