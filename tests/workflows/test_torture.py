@@ -44,7 +44,10 @@ def test_killed_and_signalled_toy_runs_end_in_the_same_artifacts(toy: tuple[Prep
     prepared, workflow = toy
     with (tmp_path / "book").open("w") as book:
         rounds = Rounds(tmp_path / "rounds", [prepared], 5, book, python_alone=True, workflow=workflow)
-        assert [rounds.round(prepared) for _ in range(2)] == [[]] * 2
+        for number in range(20):  # a quick run has ended before most of its moments
+            if number >= 2 and rounds.kills >= 4:
+                break
+            assert rounds.round(prepared) == []
     hits = [line for line in map(json.loads, (tmp_path / "book").read_text().splitlines()) if line["event"] == "hit"]
     assert [hit for hit in hits if hit["wrong"]] == []
     assert {hit["moment"] for hit in hits} == {"time", "call"}
