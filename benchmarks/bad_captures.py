@@ -146,7 +146,7 @@ def few(good: Pictures) -> Pictures:
     return dict(list(good.items())[::9])
 
 
-APART = ("components", "groups", "not registered", "sub-models", "no camera")
+APART = ("components", "groups", "not registered", "sub-models", "no camera", "folded")
 CAPTURES = (
     Capture("as it is", dict, ()),
     Capture("blur", each(lambda p, n: cv2.GaussianBlur(p, (0, 0), 4)), ("blurred", "blurry")),

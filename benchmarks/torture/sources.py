@@ -23,7 +23,7 @@ SETTINGS = (
     "poses.max_image_size=64", "poses.max_features=512", "poses.feature_image_size=320",
     "train.iterations=24", "train.checkpoint_every=8", "train.preview_every=12", "train.occupancy_warmup_steps=8", "train.max_rays_per_batch=128",
     "bake.resolution=24", "bake.visibility_rays=2000", "bake.refine_steps=4", "bake.refine_rays_per_batch=256",
-    "turntable.frames=4", "mesh.max_faces=400", "points.num_points=500",
+    "turntable.frames=4", "mesh.max_faces=400", "points.num_points=500", "splats.make=on", "splats.count=300", "splats.iterations=3",
 )  # fmt: skip
 OTHER = "poses.max_image_size=40"  # with it every artifact is another
 

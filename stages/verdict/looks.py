@@ -20,6 +20,7 @@ CLIPPED = (4, 250)  # levels that nothing is told by
 BLURRED = 0.15  # sharpness below which a photograph is blurred, whatever the others are
 LESS_SHARP = 0.77  # share of the capture's median, below which it is blurred among sharp ones
 STEP = 0.75  # stops from the capture's median that are a step of exposure
+DARK = -6.0  # stops below white, of the mean of linear light: little but noise is left
 MOST_CLIPPED = 0.4  # share of pixels without detail
 SAME = 1.5  # of 255, root mean square between two small pictures that are the same
 FLAT = 4.0  # of 255, standard deviation of a small picture that all others of its kind would be the same as
@@ -124,6 +125,11 @@ def of_other_exposure(looks: Mapping[str, Look]) -> list[str]:
         return []
     middle = float(np.median([each.brightness for each in looks.values()]))
     return sorted(name for name, each in looks.items() if abs(each.brightness - middle) > STEP)
+
+
+def dark(looks: Mapping[str, Look]) -> list[str]:
+    """The names of those that are too dark to show much, whatever the others are."""
+    return sorted(name for name, each in looks.items() if each.brightness < DARK)
 
 
 def clipped(looks: Mapping[str, Look]) -> list[str]:

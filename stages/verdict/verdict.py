@@ -28,6 +28,7 @@ LARGE_ERROR = 2.0  # px at LONGEST
 MOST_PLANAR = 0.8  # share of the pairs
 SMALL_ANGLE = 4.0  # degrees of parallax
 WITHOUT_TEXTURE = "blurred, dark or without texture"
+MOST_PIXELS = 1000  # of a reprojection error, that are told apart
 LONGEST = 1600  # px that reprojection errors are stated at
 MORE_PHOTOGRAPHS = "Take more photographs between those that do not fit together, with at least 60 % overlap between neighbours."
 
@@ -74,10 +75,15 @@ class Verdict:
             return f"Photographs: {self.grade}; {of} of them, {len(self.problems) or 'no'} problem{'' if len(self.problems) == 1 else 's'}."
         words = [f"{registered} of {of} photographs have a camera"]
         if self.figures.get("reprojection_error") is not None:
-            words.append(f"reprojection error {self.figures['reprojection_error']:.2f} px")
+            words.append(f"reprojection error {_pixels(self.figures['reprojection_error'], 2)}")
         if self.figures.get("triangulation_angle") is not None:
             words.append(f"parallax {self.figures['triangulation_angle']:.0f} degrees")
         return f"Cameras: {self.grade}; {', '.join(words)}."
+
+
+def _pixels(error: float, digits: int) -> str:
+    """A reprojection error in words: points behind a camera make it as large as can be."""
+    return f"{error:.{digits}f} px" if error < MOST_PIXELS else f"more than {MOST_PIXELS:,} px"
 
 
 def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | None = None) -> Verdict:
@@ -93,7 +99,7 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
     figures: dict[str, Any] = {
         "photographs": total,
         "registered": len(names),
-        "reprojection_error": capture.reprojection_error,
+        "reprojection_error": None if capture.reprojection_error is None else min(capture.reprojection_error, 1e9),
         "triangulation_angle": angle if angle is None else round(angle, 2),
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "points_per_image": None if counts is None else float(np.median(counts)),
@@ -187,7 +193,7 @@ def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | Non
     if capture.reprojection_error is not None and capture.photos:
         longest = float(np.median([max(photo.camera.width, photo.camera.height) for photo in capture.photos]))
         if capture.reprojection_error > LARGE_ERROR * max(1.0, longest / LONGEST):
-            sentence = f"The reprojection error is large: {capture.reprojection_error:.1f} px."
+            sentence = f"The reprojection error is large: {_pixels(capture.reprojection_error, 1)}."
             remedy = "Use one lens at one zoom, and a shutter fast enough for a moving camera; nothing in the scene should move."
             found.append(Problem("reprojection error", "usable", sentence, remedy))
     if counts is not None and len(counts):
@@ -205,6 +211,7 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
     for what, names, words, remedy in (
         ("blurred", looks_of.blurred(looks), "are blurred", "Move slower, give more light, or film at a faster shutter speed."),
         ("exposure", looks_of.of_other_exposure(looks), "are brighter or darker than the others by more than 0.75 stops", "Lock exposure and white balance."),
+        ("dark", looks_of.dark(looks), "are so dark that little but noise is left", "Give more light, or expose longer with the camera on a stand."),
         ("clipped", looks_of.clipped(looks), "are black or white in more than 40 % of their pixels", "Expose for the subject; black and white hold no detail."),
     ):
         if names:

@@ -168,6 +168,19 @@ def test_lost_photographs_have_the_registered_ones_that_they_failed_against() ->
     assert found.images["lost1.jpg"]["nearest"] == []
 
 
+def test_dark_pictures_are_named_even_where_all_are() -> None:
+    found = verdict_on(capture(), sharp(NAMES, **{name: {"brightness": -8.3} for name in NAMES}))
+    assert [(problem.what, problem.grade, problem.images) for problem in found.problems] == [("dark", "usable", tuple(NAMES))]
+
+
+@pytest.mark.parametrize("error", [5e150, float("inf")])
+def test_an_error_without_bounds_is_said_in_few_words(error: float) -> None:
+    found = verdict_on(capture(reprojection_error=error), sharp(NAMES))
+    assert "reprojection error more than 1,000 px" in found.summary()
+    assert json.loads(json.dumps(found.document(), allow_nan=False))["reprojection_error"] >= 1000
+    assert found.problems[0].sentence == "The reprojection error is large: more than 1,000 px."
+
+
 BARE = tuple((f"bare{k}.jpg", "only 3 features detected: blurred, dark or without texture") for k in range(4))
 
 
