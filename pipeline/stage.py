@@ -195,7 +195,8 @@ def type_in_words(hint: Any) -> str:
     """What a value of this type may be: `a whole number, at least 8, or auto`."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
-        return type_in_words(arguments[0]) + _limits_in_words(hint)
+        described = [limit.description for limit in arguments[1:] if limit.description is not None]
+        return described[0] if described else type_in_words(arguments[0]) + _limits_in_words(hint)
     if origin in (typing.Union, types.UnionType):
         arms = [type_in_words(arm) for arm in arguments]
         return (", or " if any("," in arm for arm in arms) else " or ").join(arms)

@@ -66,7 +66,9 @@ class PosesSettings:
         "What masks and alpha channels mean: outside of them is background, and the object alone is trained, on random colours (silhouette), or pixels outside"
         " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
     )
-    mask_from: Annotated[str, Meta(pattern="^(off|static|green|white|#[0-9a-fA-F]{6})$")] = setting(
+    mask_from: Annotated[
+        str, Meta(pattern="^(off|static|green|white|#[0-9a-fA-F]{6})$", description="off, static, green, white or a colour as #rrggbb")
+    ] = setting(
         "off",
         "Background that silhouettes are made from where photographs have no masks: one that stands still while the object turns (static), a screen of one"
         " colour (green, white, #rrggbb), or none (off).",
