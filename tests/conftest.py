@@ -20,7 +20,7 @@ import pytest
 for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ[variable] = "1"
 
-IN_MEMORY, ROOM = Path("/dev/shm"), 4 << 30  # all tests together leave under a tenth of it
+IN_MEMORY, ROOM = Path("/dev/shm"), 4 << 30
 if "PYTEST_DEBUG_TEMPROOT" not in os.environ and os.access(IN_MEMORY, os.W_OK) and shutil.disk_usage(IN_MEMORY).free >= ROOM:
     os.environ["PYTEST_DEBUG_TEMPROOT"] = str(IN_MEMORY)
 
