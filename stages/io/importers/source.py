@@ -105,6 +105,15 @@ class Source:
             self._real[path] = target
         return self._real[path]
 
+    def first_of(self, places: Sequence[str]) -> Path | None:
+        """The first of these files that is there; raises BadInput where it leads out of the source."""
+        for place in places:
+            path = self.root / place
+            if path.is_file():
+                self.real(path)
+                return path
+        return None
+
     def check_inside(self, path: Path) -> Path:
         """The path itself, which has passed the gate; BadInput otherwise."""
         self.real(path)

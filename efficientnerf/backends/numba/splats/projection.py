@@ -17,7 +17,7 @@ from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer, sigmoid
 from efficientnerf.backends.numba.splats.lanes import LANES, arctangent16, exp16
 from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max16, min16, select16, sqrt16, store16
-from efficientnerf.rendering import harmonics
+from efficientnerf.backends.numba.tree.view_colours import sh_basis
 
 MEAN, SCALE, ROTATION, OPACITY, HARMONICS = 0, 3, 6, 10, 11  # rows of values: logarithms of scales, logit of the opacity
 X, Y, CONIC_A, CONIC_B, CONIC_C, ALPHA, RED, WIDTH, HEIGHT, DEPTH = 0, 1, 2, 3, 4, 5, 6, 9, 10, 11  # of a projected Gaussian
@@ -27,8 +27,6 @@ LEAST_ALPHA, MOST_ALPHA = np.float32(1 / 255), np.float32(0.99)
 MOST_LOG_SCALE = np.float32(40)
 GROUPS_A_TASK = 64
 _NONE, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_C0, _C1 = np.float32(harmonics.C0), np.float32(harmonics.C1)
-_C2, _C3 = tuple(np.float32(c) for c in harmonics.C2), tuple(np.float32(c) for c in harmonics.C3)
 
 
 class Lens(NamedTuple):
@@ -155,27 +153,7 @@ def basis16(p, at, lens, degree, out):  # type: ignore[no-untyped-def]
     """Harmonics of the view directions of a group, `out` (K, 16)."""
     x, y, z = load16(p, at) - lens.centre[0], load16(p, at + 16) - lens.centre[1], load16(p, at + 32) - lens.centre[2]
     length = sqrt16(max16(x * x + y * y + z * z, np.float32(1e-30)))
-    x, y, z = x / length, y / length, z / length
-    xx, yy, zz = x * x, y * y, z * z
-    store16(out, 0, broadcast16(_C0))
-    if degree > 0:
-        store16(out, 16, y * -_C1)
-        store16(out, 32, z * _C1)
-        store16(out, 48, x * -_C1)
-    if degree > 1:
-        store16(out, 64, x * y * _C2[0])
-        store16(out, 80, y * z * _C2[1])
-        store16(out, 96, (zz * _TWO - xx - yy) * _C2[2])
-        store16(out, 112, x * z * _C2[3])
-        store16(out, 128, (xx - yy) * _C2[4])
-    if degree > 2:
-        store16(out, 144, y * (xx * np.float32(3) - yy) * _C3[0])
-        store16(out, 160, x * y * z * _C3[1])
-        store16(out, 176, y * (zz * np.float32(4) - xx - yy) * _C3[2])
-        store16(out, 192, z * (zz * _TWO - xx * np.float32(3) - yy * np.float32(3)) * _C3[3])
-        store16(out, 208, x * (zz * np.float32(4) - xx - yy) * _C3[4])
-        store16(out, 224, z * (xx - yy) * _C3[5])
-        store16(out, 240, x * (xx - yy * np.float32(3)) * _C3[6])
+    sh_basis(x / length, y / length, z / length, degree, out)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")

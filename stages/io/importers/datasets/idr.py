@@ -31,7 +31,7 @@ _AGAIN = "Write it again with IDR's preprocess_cameras.py."
 
 
 def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return _file(Source(folder, allow_outside)) is not None
+    return Source(folder, allow_outside).first_of(FILES) is not None
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
@@ -48,18 +48,10 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     return frames.capture_of(source, listed, settings, kind="idr", where=source.name_of(file), bounds=bounds, facts={"cameras": source.name_of(file)})
 
 
-def _file(source: Source) -> Path | None:
-    for name in FILES:
-        path = source.root / name
-        if path.is_file():
-            source.real(path)
-            return path
-    return None
-
 
 def _read(source: Source) -> tuple[Path, list[frames.Frame], np.ndarray | None]:
     """The archive, its frames, and the box round the object."""
-    file = _file(source)
+    file = source.first_of(FILES)
     if file is None:
         raise BadInput(f"{source.root}: no cameras of IDR: expected {' or '.join(FILES[:2])}. Choose another format with --as.")
     where = source.name_of(file)

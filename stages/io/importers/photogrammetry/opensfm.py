@@ -37,7 +37,7 @@ _FISHEYE = {"fisheye": ("k1", "k2"), "fisheye_opencv": ("k1", "k2", "k3", "k4")}
 
 
 def recognises(folder: Path, allow_outside: bool = False) -> bool:
-    return _file(Source(folder, allow_outside)) is not None
+    return Source(folder, allow_outside).first_of(PLACES) is not None
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
@@ -73,18 +73,10 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     )
 
 
-def _file(source: Source) -> Path | None:
-    for place in PLACES:
-        path = source.root / place
-        if path.is_file():
-            source.real(path)
-            return path
-    return None
-
 
 def _read(source: Source) -> tuple[Path, list[dict[str, Any]]]:
     """The file, and its reconstructions, that with most shots first."""
-    file = _file(source)
+    file = source.first_of(PLACES)
     if file is None:
         raise BadInput(f"{source.root}: no reconstruction of OpenSfM: expected {' or '.join(PLACES)}. Choose another format with --as.")
     document = read_json(source.real(file), _AGAIN)
