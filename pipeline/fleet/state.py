@@ -1,0 +1,258 @@
+"""The fleet folder, and FLEET/fleet.json: what became of each scene.
+
+    FLEET/fleet.json    the state, written whole whenever it changes; the contract with programs
+    FLEET/<scene>/      a run (pipeline/run.py)
+    FLEET/.requests/    what `retry` and `cancel` ask of the process that runs the fleet
+
+A fleet.json may come from anybody: every value is checked and bounded when it is read, and a scene's run lies in the fleet's folder.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from pipeline import files
+from pipeline.errors import BadInput, CorruptArtifact, UsageError
+from pipeline.failures import cannot_write, failed
+from pipeline.text import printable
+
+NAME = "fleet.json"
+FORMAT = "efficientnerf-fleet"
+VERSION = 1
+MOST_SCENES = 20_000
+MOST_BYTES = 256 * 2**20  # of fleet.json
+LONGEST_LINE = 500  # characters of a reason, a warning or a last line
+MOST_LINES = 20  # of warnings, and of last lines
+
+# Names that the fleet's own files and folders have.
+_RESERVED = frozenset({"index.html", "fleet.json", "fleet.csv", "thumbnails", "comparison", "comparison.html", "pages"})
+_NAME = re.compile(r"[^\W_][\w.-]{0,99}")
+
+FleetWord = Literal["running", "done", "failed", "cancelled", "interrupted"]
+SceneWord = Literal["waiting", "running", "done", "failed", "quarantined"]
+StageWord = Literal["waiting", "running", "done", "failed"]
+
+_Text = Annotated[str, msgspec.Meta(max_length=4 * LONGEST_LINE)]
+_Name = Annotated[str, msgspec.Meta(max_length=200)]
+_Path = Annotated[str, msgspec.Meta(max_length=4096)]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+_Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e12)]
+_Table = dict[_Name, dict[_Name, Any]]
+
+
+def is_scene_name(name: str) -> bool:
+    """Whether a scene may have this name: it names a folder of the fleet, in pages and on command lines. Letters, digits, ".", "_" and "-"."""
+    return _NAME.fullmatch(name) is not None and name.casefold() not in _RESERVED
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene of a fleet, as the manifest has it.
+
+    name      unique whatever its case, see `is_scene_name`
+    sources   absolute paths of its folders and videos
+    settings  stage -> setting -> value, where they are not the preset's
+    sweep     "stage.setting" -> value for a scene that a sweep made
+    shares    stage -> the scene before it that makes the same artifact: this one waits for it and takes it over
+    """
+
+    name: str
+    sources: tuple[str, ...]
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    preset: str | None = None
+    seed: int | None = None
+    sweep: Mapping[str, Any] | None = None
+    shares: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class StageState:
+    """One stage of a scene.
+
+    seconds      wall clock, of its last attempt; 0 while it waits
+    peak_memory  bytes
+    """
+
+    state: StageWord = "waiting"
+    seconds: _Seconds = 0.0
+    cpu_seconds: _Seconds = 0.0
+    peak_memory: _Count = 0
+    worker: _Name | None = None
+
+
+@dataclass
+class Verdict:
+    """What is to be thought of a scene's cameras."""
+
+    grade: _Name
+    summary: _Text
+
+
+@dataclass
+class SceneState:
+    """What became of one scene.
+
+    state       failed: by circumstances, the same command tries it again; quarantined: by itself, `retry` tries it again
+    reason      of a failed or quarantined scene, a sentence
+    metrics     what its evaluation measured, as the workflow has it
+    seconds     wall clock of its stages together
+    bytes       of its asset
+    stage       that runs now
+    last_lines  of a failed or quarantined scene: the last that its stage said
+    attempts    failures so far of the stage that it is at
+    run         its folder, relative to the fleet's
+    """
+
+    name: _Name
+    state: SceneWord = "waiting"
+    reason: _Text | None = None
+    metrics: dict[_Name, Any] = field(default_factory=dict)
+    seconds: _Seconds = 0.0
+    bytes: _Count = 0
+    stage: _Name | None = None
+    stages: dict[_Name, StageState] = field(default_factory=dict)
+    verdict: Verdict | None = None
+    warnings: Annotated[list[_Text], msgspec.Meta(max_length=MOST_LINES)] = field(default_factory=list)
+    last_lines: Annotated[list[_Text], msgspec.Meta(max_length=MOST_LINES)] = field(default_factory=list)
+    attempts: Annotated[int, msgspec.Meta(ge=0, le=10**6)] = 0
+    worker: _Name | None = None
+    run: _Path = ""
+    sources: Annotated[list[_Path], msgspec.Meta(max_length=100)] = field(default_factory=list)
+    settings: _Table = field(default_factory=dict)
+    preset: _Name | None = None
+    seed: Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)] | None = None
+    sweep: dict[_Name, Any] | None = None
+    shares: dict[_Name, _Name] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, scene: Scene) -> SceneState:
+        """The state of a scene that waits."""
+        return cls(
+            scene.name, run=scene.name, sources=list(scene.sources), settings={stage: dict(table) for stage, table in scene.settings.items()},
+            preset=scene.preset, seed=scene.seed, sweep=None if scene.sweep is None else dict(scene.sweep), shares=dict(scene.shares),
+        )  # fmt: skip
+
+    def scene(self) -> Scene:
+        """The scene that it is of."""
+        return Scene(self.name, tuple(self.sources), self.settings, self.preset, self.seed, self.sweep, self.shares)
+
+
+@dataclass
+class Totals:
+    """Scenes by state."""
+
+    waiting: _Count = 0
+    running: _Count = 0
+    done: _Count = 0
+    failed: _Count = 0
+    quarantined: _Count = 0
+
+    @classmethod
+    def of(cls, scenes: Sequence[SceneState]) -> Totals:
+        counts = dict.fromkeys(("waiting", "running", "done", "failed", "quarantined"), 0)
+        for scene in scenes:
+            counts[scene.state] += 1
+        return cls(**counts)
+
+
+@dataclass
+class FleetState:
+    """The whole fleet.
+
+    started, updated  ISO 8601, UTC
+    forecast_seconds  until its end, None where nothing is known yet
+    executor          "local" or "dask"
+    slots             stages that may run at a time
+    """
+
+    state: FleetWord = "running"
+    started: _Name = ""
+    updated: _Name = ""
+    forecast_seconds: _Seconds | None = None
+    executor: _Name = "local"
+    slots: _Count = 1
+    totals: Totals = field(default_factory=Totals)
+    scenes: Annotated[list[SceneState], msgspec.Meta(max_length=MOST_SCENES)] = field(default_factory=list)
+
+    @property
+    def exit_code(self) -> int:
+        """0 where all scenes are done, 3 where some are not."""
+        return 0 if all(scene.state == "done" for scene in self.scenes) else 3
+
+    def to_bytes(self) -> bytes:
+        """As fleet.json holds it."""
+        plain = {"format": FORMAT, "version": VERSION, **msgspec.to_builtins(self)}
+        return msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n"
+
+
+def check_scenes(scenes: Sequence[Scene]) -> None:
+    """Raise UsageError unless scenes can be of one fleet: their number, their names, whom they share with."""
+    if not 0 < len(scenes) <= MOST_SCENES:
+        raise UsageError(f"the fleet has {len(scenes)} scenes, expected 1 to {MOST_SCENES}.")
+    known: set[str] = set()
+    folders: set[str] = set()
+    for scene in scenes:
+        shown = printable(scene.name, 100)
+        if not is_scene_name(scene.name):
+            raise UsageError(f"scene {shown!r}: no name for a scene. Expected letters, digits, '.', '_' and '-', a letter or digit first, at most 100.")
+        if scene.name.casefold() in folders:
+            raise UsageError(f"scene {shown}: two scenes have this name; they would share a folder. Rename one.")
+        unknown = [donor for donor in scene.shares.values() if donor not in known]
+        if unknown:
+            raise UsageError(f"scene {shown}: shares an artifact of {printable(unknown[0], 100)!r}, which does not come before it.")
+        known.add(scene.name)
+        folders.add(scene.name.casefold())
+
+
+def write_fleet(fleet: Path, state: FleetState) -> None:
+    """Write FLEET/fleet.json whole. Raises PipelineError."""
+    try:
+        files.write_atomically(fleet / NAME, state.to_bytes())
+    except OSError as error:
+        raise cannot_write(fleet / NAME, error) from None
+
+
+def read_fleet(fleet: Path) -> FleetState:
+    """FLEET/fleet.json, checked. Raises BadInput where there is none or it is of another format, CorruptArtifact where it is damaged."""
+    path = fleet / NAME
+    try:
+        value = files.read_json(path, limit=MOST_BYTES, follow=False)
+    except FileNotFoundError:
+        raise BadInput(f"{fleet}: is no fleet (it has no {NAME}). Begin one: enerf fleet SCENES --out {fleet}") from None
+    except files.Unreadable as error:
+        if error.denied is not None:
+            raise failed(fleet, error.denied) from None
+        raise _damaged(path, str(error)) from None
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        raise BadInput(f"{path}: not of a fleet (expected format {FORMAT!r}).")
+    if value.get("version") != VERSION or type(value.get("version")) is not int:
+        raise BadInput(f"{path}: fleet format version {value.get('version')!r:.20}; this build reads {VERSION}. Upgrade efficientnerf.")
+    try:
+        found = msgspec.convert(value, FleetState)
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise _damaged(path, printable(error, 300)) from None
+    _check(path, found)
+    return found
+
+
+def _check(path: Path, found: FleetState) -> None:
+    """What types alone do not say."""
+    try:
+        check_scenes([scene.scene() for scene in found.scenes])
+    except UsageError as error:
+        raise _damaged(path, str(error)) from None
+    for scene in found.scenes:
+        if scene.run != scene.name:
+            raise _damaged(path, f"scene {scene.name}: its run is {printable(scene.run, 100)!r}, expected {scene.name!r}")
+        if any("\0" in source or not source.startswith("/") for source in scene.sources):
+            raise _damaged(path, f"scene {scene.name}: a source is no absolute path")
+
+
+def _damaged(path: Path, why: str) -> CorruptArtifact:
+    return CorruptArtifact(f"{path}: {why}. Remove it and give the fleet's command again: what its runs hold is kept.", (NAME,))
