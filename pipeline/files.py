@@ -115,6 +115,11 @@ def read_json(path: Path, limit: int = MAX_JSON, *, follow: bool = True) -> Any:
         raise Unreadable(f"larger than {limit} bytes")
     if not data.strip():
         raise Unreadable("the file is empty")
+    return json_value(data)
+
+
+def json_value(data: bytes) -> Any:
+    """The value that a JSON text of anybody's holds, finite and not deeply nested. Raises Unreadable."""
     if data.count(b"[") + data.count(b"{") > _CONTAINERS + len(data) // 64:
         raise Unreadable("it holds too many lists and objects")
     try:

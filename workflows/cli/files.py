@@ -217,7 +217,8 @@ def _restricted_with_cameras(
 @json_option
 @common_options
 def inspect(what: Path, as_json: bool) -> None:
-    """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, warnings."""
+    """Describe an asset, the cameras of a run, a data set or a folder of photographs: count, resolution, camera model, bounds, warnings; or a file that was
+    exported, a mesh, points or 3D Gaussians (.ply, .spz, .glb, of other programs too)."""
     from workflows.cli.output import listing, write_json
     from workflows.inspection.describe import describe, in_words
 

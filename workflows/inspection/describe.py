@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, EvaluateOutputs, PosesOutputs
-from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS
+from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS
 from workflows.asset import STAGES
 from workflows.cli.output import plain
 from workflows.cli.progress import size
@@ -18,7 +18,7 @@ MESHES = tuple(dict.fromkeys(each.extension for each in (*MESH_EXPORTERS.values(
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Facts about an asset, a run, the cameras of a run, a data set, a mesh or points; `what` says which. Raises BadInput and CorruptArtifact."""
+    """Facts about an asset, a run, the cameras of a run, a data set, a mesh, points or 3D Gaussians; `what` says which. Raises BadInput and CorruptArtifact."""
     if not path.exists():
         raise BadInput(f"{path}: no such file or folder.")
     if path.is_file():
@@ -42,6 +42,12 @@ def _describe_file(path: Path) -> dict[str, Any]:
     suffix = path.suffix.lower()
     if suffix == ".nerftree":
         return {"what": "asset", "path": str(path), **describe_asset(path)}
+    if suffix in SPLAT_EXPORTERS:
+        from stages.io.exporters.splats.description import describe_splats
+
+        splats = describe_splats(path)
+        if splats is not None:
+            return {"what": "splats", "path": str(path), "bytes": path.stat().st_size, **splats}
     if suffix in MESHES:
         return {"what": "mesh", "path": str(path), "bytes": path.stat().st_size, **_describe_mesh(path)}
     if path.name == PosesOutputs.scene:
@@ -52,7 +58,8 @@ def _describe_file(path: Path) -> dict[str, Any]:
         from stages.io.importers.description import describe_source
 
         return describe_source(path if suffix in SUFFIXES else path.parent)
-    raise BadInput(f"{path}: of no kind that can be described; expected an asset (.nerftree), a mesh ({', '.join(MESHES)}), a run or the folder of a data set.")
+    known = f"an asset (.nerftree), a mesh ({', '.join(MESHES)}), 3D Gaussians ({', '.join(SPLAT_EXPORTERS)}), a run or the folder of a data set"
+    raise BadInput(f"{path}: of no kind that can be described; expected {known}.")
 
 
 def _describe_run(path: Path) -> dict[str, Any]:

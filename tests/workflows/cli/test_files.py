@@ -26,6 +26,8 @@ from stages.io.exporters import MESH_EXPORTERS, POINT_EXPORTERS, SPLAT_EXPORTERS
 from stages.io.exporters.splats.ply import read_splats
 from stages.mesh import MeshSettings
 from stages.turntable import TurntableSettings
+from tests.stages.io.gaussians import scattered
+from tests.stages.io.meshes import Z_UP, block
 from tests.workflows.command import Result
 from workflows.cli.files import EXR, REGIONS, TEXTURES
 from workflows.cli.main import enerf as enerf_commands
@@ -262,6 +264,21 @@ def test_describing_an_asset(enerf: Enerf, ball: Path) -> None:
     found = enerf("inspect", ball, "--json").object
     assert (found["what"], found["resolution"], found["sh_degree"]) == ("asset", [24, 24, 24], 0)
     assert "resolution               [24, 24, 24]" in enerf("inspect", ball).out
+
+
+def test_describing_gaussians(enerf: Enerf, tmp_path: Path) -> None:
+    """And a file of another kind by that name, and a damaged one."""
+    for extension, kind in SPLAT_EXPORTERS.items():
+        kind.write(scattered(20), tmp_path / f"a{extension}", Z_UP)
+        found = enerf("inspect", tmp_path / f"a{extension}", "--json").object
+        assert (found["what"], found["gaussians"], found["sh_degree"]) == ("splats", 20, 2)
+        assert "gaussians                20" in enerf("inspect", tmp_path / f"a{extension}").out
+    MESH_EXPORTERS[".glb"].write(block(), tmp_path / "mesh.glb", Z_UP)
+    assert enerf("inspect", tmp_path / "mesh.glb", "--json").object["what"] == "mesh"
+    (tmp_path / "a.spz").write_bytes((tmp_path / "a.spz").read_bytes()[:-30])
+    result = enerf("inspect", tmp_path / "a.spz")
+    assert result.code == 2
+    assert "a.spz: " in result.err
 
 
 def test_broken_assets(enerf: Enerf, ball: Path, tmp_path: Path) -> None:
