@@ -3,7 +3,8 @@
 PipelineError
 ├── BadInput           2   the source, the run folder or a file given by the user cannot be used
 ├── UsageError         2   the request itself is wrong: a value of a wrong type, a stage that does not exist
-│   └── UnknownSetting 2   a setting that does not exist; names the nearest one
+│   ├── UnknownSetting 2   a setting that does not exist; names the nearest one
+│   └── Mistakes       2   several at once, in a file that was given
 ├── StageFailed        3   a stage raised; the original is its __cause__
 │   └── DiskFull       3   ... because the disk, or the quota, is full
 ├── CorruptArtifact    4   what a run holds is not what was written
@@ -36,6 +37,17 @@ class UsageError(PipelineError):
 
 class UnknownSetting(UsageError):
     """A setting that no stage has; the text names the nearest one."""
+
+
+class Mistakes(UsageError):
+    """All mistakes in what was given; the text says how many and names the first.
+
+    details  a line for each that is shown
+    """
+
+    def __init__(self, text: str, details: tuple[str, ...]) -> None:
+        super().__init__(text)
+        self.details = details
 
 
 class StageFailed(PipelineError):

@@ -1,8 +1,9 @@
 """What no run holds: links, pipes, sockets and devices. A run that a stranger packed may hold them, and lead what opens its files elsewhere.
 
 The engine writes and deletes within a run, and stages append to files of their scratch folders. One rule makes that safe: under the names that the
-engine and its stages use, a run holds plain files and folders, and in its scratch folders no file has a second name (a hard link). A run that
-breaks the rule is refused before anything in it is opened. The run's folder itself, and what lies above it, may be reached by links.
+engine and its stages use, a run holds plain files and folders, and in its scratch folders no file has a second name (a hard link). Artifacts may have
+such: they are replaced, never written in place (sharing.py). A run that breaks the rule is refused before anything in it is opened. The run's folder
+itself, and what lies above it, may be reached by links.
 """
 
 from __future__ import annotations
@@ -79,6 +80,14 @@ def _check(run: Path, name: str, status: os.stat_result) -> None:
         raise CorruptArtifact(f"{run}: {shown} is {kind}; a run holds plain files and folders, and nothing that leads out of it. {remedy}", (name,))
     if name in _FOLDERS:
         raise CorruptArtifact(f"{run}: {shown} is {kind}, expected a folder. Remove it.", (name,))
-    if status.st_nlink > 1 and status.st_size and (name == LOCK or name.startswith(f"{WORK}/")):
+    if status.st_nlink > 1 and status.st_size and (name == LOCK or _may_be_appended_to(name)):
         text = f"{shown} is one file with another elsewhere (a hard link) that would be written with it"
         raise CorruptArtifact(f"{run}: {text}. Copy the run without hard links, or remove the file.", (name,))
+
+
+def _may_be_appended_to(name: str) -> bool:
+    """Whether it lies in a scratch folder: what else .work holds is an artifact on its way in, out or away; see artifact.py."""
+    parts = name.split("/")
+    if parts[0] != WORK or len(parts) < 2:
+        return False
+    return not (parts[1].startswith(("old-", "trash-")) or parts[3:4] == ["out"])

@@ -1,0 +1,90 @@
+"""Artifacts that several runs share: the same request is the same artifact, so that one run makes it and others take it over.
+
+Published files are replaced, never written in place: runs share them by hard links, and each is whole by itself. Where the file system has no hard
+links between the two, files are copied.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from pathlib import Path
+
+from pipeline import artifact, manifest
+from pipeline.artifact import Workplace
+from pipeline.decide import decide
+from pipeline.errors import CorruptArtifact
+from pipeline.failures import failed
+from pipeline.hashes import Hashes
+from pipeline.links import WORK, refuse_links
+from pipeline.manifest import Manifest
+from pipeline.run import Run
+from pipeline.stage import Stage
+
+
+def take_over(run: Run, stage: Stage, donor: Path) -> bool:
+    """Publish in `run` the artifact of the run in the folder `donor`; returns whether that was done.
+
+    Nothing is done where the stage is fresh, where the donor's artifact is not of the very request that the stage has now, or where it is damaged: then the
+    stage has to be run. Every file is read and compared with its manifest. Raises RunLocked, CorruptArtifact where the donor holds links, and DiskFull.
+    """
+    with run.locked():
+        try:
+            artifact.recover(run.path, [stage.name])
+            decision = decide(stage, run)
+            if decision.fresh or decision.request is None:
+                return False
+            made = _made(donor, stage)
+            if made is None or made.request != decision.request:
+                return False
+            place = artifact.workplace(run.path, stage.name, decision.request)
+            artifact.prepare(place, run.path / WORK)
+            if not _linked(donor / stage.name, made, place):
+                artifact.abandon(place, run.path / WORK)
+                return False
+            artifact.publish(run.path, stage.name, place)
+        except OSError as error:
+            raise failed(run.path, error) from error
+        _forget(run, stage)
+    return True
+
+
+def _made(donor: Path, stage: Stage) -> Manifest | None:
+    """The manifest of the donor's artifact, or None where there is none that can be read."""
+    refuse_links(donor)
+    with contextlib.suppress(CorruptArtifact):
+        return manifest.read_manifest(donor / stage.name)
+    return None
+
+
+def _linked(source: Path, made: Manifest, place: Workplace) -> bool:
+    """Whether the files of an artifact, its manifest last, are in out/ now, each as its manifest says."""
+    try:
+        for name in made.outputs:
+            target = place.out / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _link(source / name, target)
+    except FileNotFoundError:
+        return False  # damaged, or replaced meanwhile
+    if artifact.differences(place.out, made.outputs).damaged:
+        return False
+    artifact.seal(place.out, made)
+    return True
+
+
+def _link(source: Path, target: Path) -> None:
+    """A second name for a file, or a copy of it."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except FileNotFoundError:
+        raise
+    except OSError:  # of another file system, of one that has no links, of a file with too many
+        shutil.copyfile(source, target, follow_symlinks=False)
+
+
+def _forget(run: Run, stage: Stage) -> None:
+    """Digests that were remembered are of the files before."""
+    hashes = Hashes(run.cache)
+    hashes.forget(f"{stage.name}/")
+    hashes.save()
