@@ -1,4 +1,4 @@
-"""Errors for the user: one or two lines, an exit code, and with --json an object as the last line."""
+"""Errors for the user: one or two lines (a line for each of several mistakes), an exit code, and with --json an object as the last line."""
 
 from __future__ import annotations
 
@@ -94,9 +94,11 @@ def report_failure(error: BaseException, *, as_json: bool, debug: bool) -> int:
 
         traceback.print_exception(error, file=sys.stderr)
     text = _shortened(printable(sentence(error)))
-    print(f"enerf: {text}", file=sys.stderr, flush=True)
+    details = [_shortened(printable(line)) for line in getattr(error, "details", ())]
+    print("\n  ".join([f"enerf: {text}", *details]), file=sys.stderr, flush=True)
     if as_json:
         from workflows.cli.output import write_json
 
+        facts |= {"details": details} if details else {}
         write_json({"event": "summary", "ok": False, "error": text, "kind": type(error).__name__, **facts, "exit_code": code})
     return code

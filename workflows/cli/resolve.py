@@ -94,7 +94,7 @@ def read_config(path: Path) -> Config:
     except OSError as error:
         raise UsageError(f"--config {path}: cannot be read ({error.strerror}).") from None
     try:
-        content = _toml(data.decode("utf-8"))
+        content = parse_toml(data.decode("utf-8"))
     except UnicodeDecodeError:
         raise BadInput(f"--config {path}: not a text file; expected TOML in UTF-8.") from None
     except ValueError as error:
@@ -112,10 +112,10 @@ def read_config(path: Path) -> Config:
     return Config(content, options)
 
 
-def _toml(text: str) -> dict[str, Any]:
+def parse_toml(text: str, limit: int = MAX_TOML) -> dict[str, Any]:
     """A TOML document of anybody. Raises ValueError, UnicodeDecodeError and tomllib.TOMLDecodeError being such."""
-    if len(text) > MAX_TOML:
-        raise ValueError(f"larger than {MAX_TOML} bytes")
+    if len(text) > limit:
+        raise ValueError(f"larger than {limit} bytes")
     if any(line.count(".") > _MAX_DOTS for line in text.splitlines()):
         raise ValueError(f"more than {_MAX_DOTS} dots on a line")
     try:
@@ -144,7 +144,7 @@ def parse_value(text: str) -> list[Any]:
     readings: list[Any] = []
     for candidate in (text, f"[{text}]") if "," in text else (text,):
         try:
-            parsed = _toml(f"value = {candidate}")
+            parsed = parse_toml(f"value = {candidate}")
         except ValueError:
             continue
         if parsed.keys() == {"value"}:
