@@ -7,6 +7,7 @@ The child is a fresh interpreter (`stages.sfm.child`), never a fork: threads of 
     from the child  {"event": "progress" | "warning" | "safe point", ...}, in the end "result", "error" or "stopped"
 
 At each safe point the child waits for the answer, so that signals are the parent's alone: the child ignores Ctrl-C and SIGTERM, and ends with its parent.
+A child that comes to no safe point, as within one bundle adjustment, is killed soon after it was asked to stop: what it has written is used again.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ import builtins
 import contextlib
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NoReturn
 
@@ -31,6 +34,8 @@ _BOOTSTRAP = "import sys; sys.path[:] = sys.argv[1:]; from stages.sfm.child impo
 _HANDLED = (signal.SIGINT, signal.SIGTERM)
 _TAIL_BYTES = 16384  # of the child's standard error that are kept
 _SHOWN_LINES, _SHOWN_CHARACTERS = 3, 240
+LOOK = 0.2  # seconds between two looks whether to stop, while the child says nothing
+GRACE = 1.2  # seconds that the child has to come to a safe point, once it was asked to stop
 _FRAMES = (" ", "\t", "*** ", "PC: @", "Current thread", "Thread 0x", "Stack (most", "Extension modules")  # beginnings of lines of a stack trace
 
 
@@ -49,12 +54,13 @@ def run(
 
     task  "cameras" of photographs, or "pairs" to match
 
-    The callables are called here, in the order in which the child calls them; what they raise stops the child at its next safe point and passes.
+    The callables are called here, in the order in which the child calls them, and `safe_point` also while it says nothing; what they raise stops the child
+    and passes: at its next safe point, or `GRACE` seconds later.
     An error of the child is raised again, of the same class. Raises ChildAborted where it ended without an answer.
     """
     child = _Child(task, arguments)
     try:
-        while (message := child.receive()) is not None:
+        while (message := child.receive(safe_point)) is not None:
             match message["event"]:
                 case "progress":
                     progress(*message["values"], **message["facts"])
@@ -88,20 +94,38 @@ class _Child:
             self.process = subprocess.Popen(command(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, former)
-        self._tail = bytearray()
+        self._tail, self._said, self._looked = bytearray(), bytearray(), 0  # _looked: how much of what it said holds no end of a line
         self._listener = threading.Thread(target=self._listen, name="last words of structure from motion", daemon=True)
         self._listener.start()
         self._write(json.dumps({"parent": os.getpid(), "task": task, "arguments": arguments}))
 
-    def receive(self) -> dict[str, Any] | None:
-        """The next message; None once the child has ended."""
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
+    def receive(self, idle: Callable[[], None]) -> dict[str, Any] | None:
+        """The next message; None once the child has ended. `idle` is called again and again until then."""
+        while (end := self._said.find(b"\n", self._looked)) < 0:
+            self._looked = len(self._said)
+            while not self._is_readable(LOOK):
+                idle()
+            if not (some := self._read()):
+                return None  # with half a line, or none
+            self._said += some
+        line = bytes(self._said[:end])
+        del self._said[: end + 1]
+        self._looked = 0
         try:
             message = json.loads(line)
-        except ValueError:  # the end of the pipe, or half a line before it
+        except ValueError:
             return None
         return message if isinstance(message, dict) else None
+
+    def _is_readable(self, seconds: float) -> bool:
+        assert self.process.stdout is not None
+        looks = select.poll()  # select() knows no descriptors from 1024 on
+        looks.register(self.process.stdout.fileno(), select.POLLIN)
+        return bool(looks.poll(1000 * seconds))
+
+    def _read(self) -> bytes:
+        assert self.process.stdout is not None
+        return os.read(self.process.stdout.fileno(), 65536)
 
     def answer(self, word: str) -> None:
         self._write(json.dumps(word))
@@ -113,13 +137,15 @@ class _Child:
             self.process.stdin.flush()
 
     def stop(self) -> None:
-        """Let the child go on to its next safe point and end there; at once where this is interrupted."""
-        assert self.process.stdout is not None
+        """Let the child end at its next safe point, or kill it; at once where this is interrupted."""
+        until = time.monotonic() + GRACE
         try:
             self.answer("stop")
-            while self.process.stdout.read(65536):
+            while (left := until - time.monotonic()) > 0 and (not self._is_readable(left) or self._read()):
                 pass
-            self.process.wait()
+            self.process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            self.process.kill()
         except BaseException:
             self.process.kill()
             raise
