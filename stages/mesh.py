@@ -253,4 +253,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
 
 
-STAGE = Stage(name="mesh", version=12, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))
+STAGE = Stage(name="mesh", version=13, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))

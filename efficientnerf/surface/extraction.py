@@ -10,7 +10,8 @@ import numpy as np
 from efficientnerf.surface.colours import surface_colours
 from efficientnerf.surface.fusion import Fusion
 from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_threshold, enclosed_cells, isosurface, silent
-from efficientnerf.surface.mesh import Mesh, PointCloud, decimate, rounds_within, sample, separate, smooth, smooth_normals, tidy, vertex_normals
+from efficientnerf.surface.mesh import Mesh, PointCloud, decimate, sample, separate, tidy, vertex_normals
+from efficientnerf.surface.smoothing import rounds_within, smooth, smooth_normals
 from efficientnerf.surface.visible_parts import Shown, visible_parts
 from efficientnerf.surface.volume import NdcVolume, Volume
 

@@ -1,4 +1,4 @@
-"""Triangle meshes: measuring, cleaning, smoothing, decimating and sampling them. Arrays in, arrays out.
+"""Triangle meshes: measuring, cleaning, decimating and sampling them. Arrays in, arrays out.
 
 V vertices, F faces (counter-clockwise seen from outside), C connected components.
 """
@@ -6,7 +6,6 @@ V vertices, F faces (counter-clockwise seen from outside), C connected component
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -107,6 +106,21 @@ def compact(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     used = np.zeros(len(vertices), bool)
     used[faces.ravel()] = True
     return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def face_neighbours(faces: np.ndarray, count: int) -> np.ndarray:
+    """(F, 3) the face across each edge (from a corner to the next), -1 where there is none or more than one; `count` is the number of vertices."""
+    tail, head = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    key = np.minimum(tail, head) * count + np.maximum(tail, head)
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    same = ordered[1:] == ordered[:-1]
+    alone = np.ones(len(key) + 1, bool)  # whether a run of equal edges begins here
+    alone[1:-1] = ~same
+    pair = np.flatnonzero(alone[:-2] & same & alone[2:]) if len(key) > 1 else np.zeros(0, np.int64)
+    out = np.full(len(key), -1, np.int64)
+    out[order[pair]], out[order[pair + 1]] = order[pair + 1] // 3, order[pair] // 3
+    return out.reshape(-1, 3)
 
 
 def face_components(faces: np.ndarray, count: int) -> np.ndarray:
@@ -244,22 +258,6 @@ def _simple_circuits(vertex: int, rows: list[int], faces: np.ndarray) -> list[li
     return circuits
 
 
-def smooth(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
-    """(V, 3) vertices after `rounds` of Taubin's smoothing: a step towards the mean of the neighbours, then a slightly longer one back.
-
-    Waves as short as a few edges (the terraces of marching cubes) vanish; the volume stays. Taubin, "A signal processing approach to fair
-    surface design", SIGGRAPH 1995, with lambda = 0.5 and a pass band of 0.1.
-    """
-    if rounds <= 0 or not len(faces):
-        return vertices
-    shrink, grow = 0.5, -1 / (1 / 0.5 - 0.1)
-    neighbours, degree = _neighbours(faces, len(vertices))
-    for _ in range(rounds):
-        for step in (shrink, grow):
-            vertices = vertices + step * (neighbours @ vertices / degree - vertices)
-    return vertices
-
-
 def decimate(vertices: np.ndarray, faces: np.ndarray, budget: int) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with at most about `budget` faces, by quadric edge collapse; as it was where it has no more.
 
@@ -296,81 +294,3 @@ def sample(vertices: np.ndarray, faces: np.ndarray, count: int, seed: int) -> tu
     face = np.minimum(np.searchsorted(cumulative, where, side="right"), len(faces) - 1)
     root, v = np.sqrt(rng.random(count)), rng.random(count)
     return face, np.stack([1 - root, root * (1 - v), root * v], 1)
-
-
-LEAST_ROUNDS = 6
-FITS, DRIFT_ROUNDS = 40, 24  # of vertices to normals at most, and of averaging what all vertices of a place have in common. docs/experiments/surface.md
-
-
-def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float = 0.6) -> np.ndarray:
-    """(V, 3) vertices after `rounds` of bilateral smoothing of the faces' normals, which keeps edges and, over a few edges, the volume.
-
-    sharpness  difference of two unit normals beyond which faces hardly count for each other. docs/experiments/surface.md
-
-    Each normal becomes the mean of its own and those of the three faces beside it, weighted by area and by exp(-difference^2 / (2 sharpness^2)); then vertices
-    go as far along the normals around them as makes the faces fit these. What the vertices of a place have gone along their normals in common is taken back:
-    thin parts would shrink to nothing. Zheng et al., "Bilateral normal filtering for mesh denoising", TVCG 2011; Sun et al., "Fast and effective
-    feature-preserving mesh denoising", TVCG 2007.
-    """
-    from scipy.sparse import csr_matrix
-
-    if rounds <= 0 or not len(faces):
-        return vertices
-    normals = _bilateral_normals(vertices, faces, rounds, sharpness)
-    around = csr_matrix((np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))), shape=(len(vertices), len(faces)))
-    count = np.maximum(np.diff(around.indptr), 1)[:, None]
-    outer = np.stack([around @ (normals * normals[:, axis, None]) for axis in range(3)], 1)  # (V, 3, 3) sums of n n^T
-    fitted = vertices
-    for _ in range(min(rounds, FITS)):
-        middle = fitted[faces].mean(1)
-        target = around @ (normals * (normals * middle).sum(1, keepdims=True))
-        fitted = fitted + (target - np.einsum("vij,vj->vi", outer, fitted)) / count
-    outward = vertex_normals(vertices, faces)
-    drift = ((fitted - vertices) * outward).sum(1, keepdims=True)
-    neighbours, degree = _neighbours(faces, len(vertices))
-    for _ in range(DRIFT_ROUNDS):
-        drift = 0.5 * drift + 0.5 * (neighbours @ drift) / degree
-    return fitted - drift * outward
-
-
-def rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
-    """How many rounds of smoothing spread over about `reach`, at least LEAST_ROUNDS: a round spreads over an edge, n rounds over the root of n edges."""
-    edge = float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean())
-    return max(LEAST_ROUNDS, int(min((reach / max(edge, 1e-300)) ** 2, 1e6)))
-
-
-def _bilateral_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float) -> np.ndarray:
-    """(F, 3) unit normals of faces after `rounds` of smoothing."""
-    from scipy.sparse import csr_matrix
-
-    first, second = _neighbouring_faces(faces, len(vertices))
-    vectors = face_vectors(vertices, faces)
-    area = np.linalg.norm(vectors, axis=1)
-    normals = vectors / np.maximum(area, 1e-300)[:, None]
-    pairs = (np.concatenate([first, second]), np.concatenate([second, first]))
-    for _ in range(rounds):
-        weight = np.exp(-((normals[first] - normals[second]) ** 2).sum(1) / (2 * sharpness**2))
-        beside = csr_matrix((np.concatenate([weight * area[second], weight * area[first]]), pairs), shape=(len(faces),) * 2)
-        sums = beside @ normals + area[:, None] * normals
-        normals = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
-    return np.asarray(normals)
-
-
-def _neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:
-    """Which vertices share an edge, a sparse matrix (V, V) of ones, and how many there are of each (V, 1), at least one."""
-    from scipy.sparse import csr_matrix
-
-    tail, head = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
-    rows, columns = np.concatenate([tail, head]), np.concatenate([head, tail])
-    neighbours = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    neighbours.data[:] = 1.0  # an edge is met once per face and direction; every neighbour counts alike
-    return neighbours, np.maximum(np.diff(neighbours.indptr), 1)[:, None]
-
-
-def _neighbouring_faces(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of faces with an edge in common; `count` is the number of vertices."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
-    key, owner = edges[:, 0] * count + edges[:, 1], np.tile(np.arange(len(faces)), 3)
-    order = np.argsort(key, kind="stable")
-    pair = np.flatnonzero(key[order][1:] == key[order][:-1])
-    return owner[order[pair]], owner[order[pair + 1]]

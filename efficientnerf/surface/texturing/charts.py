@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from efficientnerf.surface.mesh import face_vectors
+from efficientnerf.surface.mesh import face_neighbours, face_vectors
 
 SMOOTHING = 4  # rounds over neighbouring faces, of the normals that charts are grown by
 LIMIT = float(np.cos(np.radians(50)))  # of a smoothed normal to a chart's axis
@@ -43,7 +43,7 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
     """
     from efficientnerf.backends.numba.mesh.charts import grow
 
-    beside, vectors = neighbours(faces, len(vertices)), face_vectors(vertices, faces)
+    beside, vectors = face_neighbours(faces, len(vertices)), face_vectors(vertices, faces)
     areas = np.linalg.norm(vectors, axis=1)
     normals = np.divide(vectors, areas[:, None], out=np.zeros_like(vectors), where=areas[:, None] > 0)
     smooth, order = _smoothed(normals, areas, beside)
@@ -63,21 +63,6 @@ def charts_of(vertices: np.ndarray, faces: np.ndarray, texel: float) -> Charts:
             count = grow(order[out[order]], beside, normals, smooth, areas, LEAST, LIMIT, count, chart)
         chart = _connected(chart, beside)
     return flattened(vertices, faces, chart)
-
-
-def neighbours(faces: np.ndarray, count: int) -> np.ndarray:
-    """(F, 3) the face across each edge (from a corner to the next), -1 where there is none or more than one; `count` is the number of vertices."""
-    tail, head = faces.ravel(), faces[:, [1, 2, 0]].ravel()
-    key = np.minimum(tail, head) * count + np.maximum(tail, head)
-    order = np.argsort(key, kind="stable")
-    ordered = key[order]
-    same = ordered[1:] == ordered[:-1]
-    alone = np.ones(len(key) + 1, bool)  # whether a run of equal edges begins here
-    alone[1:-1] = ~same
-    pair = np.flatnonzero(alone[:-2] & same & alone[2:]) if len(key) > 1 else np.zeros(0, np.int64)
-    out = np.full(len(key), -1, np.int64)
-    out[order[pair]], out[order[pair + 1]] = order[pair + 1] // 3, order[pair] // 3
-    return out.reshape(-1, 3)
 
 
 def _smoothed(normals: np.ndarray, areas: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

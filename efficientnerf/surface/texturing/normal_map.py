@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from efficientnerf.backends.pieces import pieces
-from efficientnerf.surface.mesh import Mesh, Texture, face_vectors
+from efficientnerf.surface.mesh import Mesh, Texture
+from efficientnerf.surface.smoothing import smoothed_face_normals
 from efficientnerf.surface.texturing.atlas import Atlas, Texels
-from efficientnerf.surface.texturing.charts import neighbours
 from efficientnerf.surface.texturing.corners import split_at_seams
 from efficientnerf.surface.texturing.filling import texture_from
 from efficientnerf.surface.texturing.tangents import tangents
@@ -89,19 +89,9 @@ def corner_frames(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def dense_normals(dense: Dense, tick: Callable[[], None], rounds: int = ROUNDS, sharpness: float = SHARPNESS) -> np.ndarray:
-    """(V, 3) unit normals of the dense mesh's vertices: means of those of its faces, which are smoothed first, as `smooth_normals` of meshes does."""
-    from efficientnerf.backends.numba.mesh.normals import smooth_face_normals
-
-    faces, beside = dense.faces, neighbours(dense.faces, len(dense.vertices))
-    vectors = face_vectors(dense.vertices, faces)
-    area = np.linalg.norm(vectors, axis=1)
-    normals = vectors / np.maximum(area, 1e-300)[:, None]
-    other = np.empty_like(normals)
-    for _ in range(rounds):
-        for part in pieces(len(faces), first=4096):
-            tick()
-            smooth_face_normals(normals, area, beside, sharpness, part.start, part.stop, other)
-        normals, other = other, normals
+    """(V, 3) unit normals of the dense mesh's vertices: means of those of its faces, which are smoothed first."""
+    faces = dense.faces
+    normals, area = smoothed_face_normals(dense.vertices, faces, rounds, sharpness, tick)
     weighted = area[:, None] * normals
     total = np.stack([np.bincount(faces.ravel(), np.repeat(weighted[:, axis], 3), minlength=len(dense.vertices)) for axis in range(3)], 1)
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))

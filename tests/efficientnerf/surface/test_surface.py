@@ -10,21 +10,18 @@ from efficientnerf.surface.colours import surface_colours
 from efficientnerf.surface.extraction import points, surface
 from efficientnerf.surface.isosurface import NoSurface, automatic_threshold, enclosed_cells, isosurface
 from efficientnerf.surface.mesh import (
-    LEAST_ROUNDS,
     Mesh,
     decimate,
     face_areas,
     face_vectors,
     face_volumes,
     moved,
-    rounds_within,
     sample,
     separate,
-    smooth,
-    smooth_normals,
     tidy,
     topology,
 )
+from efficientnerf.surface.smoothing import LEAST_ROUNDS, rounds_within, smooth, smooth_normals, smoothed_face_normals
 
 LEVEL = 40.0
 NOBODY = np.zeros((0, 3))
@@ -273,6 +270,26 @@ def test_smoothing_normals_leaves_a_plane_and_takes_no_rounds_for_nothing() -> N
     np.testing.assert_allclose(smooth_normals(plane, faces, 8), plane, atol=1e-12)
     assert smooth_normals(plane, faces, 0) is plane
     assert len(smooth_normals(plane[:0], faces[:0], 3)) == 0
+
+
+def test_smoothed_normals_are_those_of_the_loops() -> None:
+    """Against a loop over faces and edges; the surface is open, and a face has no neighbour."""
+    rng = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(2)
+    vertices = np.concatenate([np.asarray(ball.vertices) * (1 + 0.05 * rng.standard_normal((len(ball.vertices), 1))), rng.standard_normal((3, 3))])
+    faces = np.concatenate([np.asarray(ball.faces)[7:], [[len(vertices) - 3, len(vertices) - 2, len(vertices) - 1]]])
+    normals, area = smoothed_face_normals(vertices, faces, 3, 0.3)
+    vectors = face_vectors(vertices, faces)
+    expected = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    edges = [{frozenset(edge) for edge in ((a, b), (b, c), (c, a))} for a, b, c in faces.tolist()]
+    beside = [[other for other in range(len(faces)) if other != face and edges[face] & edges[other]] for face in range(len(faces))]
+    assert {len(row) for row in beside} >= {0, 2, 3}
+    for _ in range(3):
+        weight = [np.array([area[n] * np.exp(-((expected[n] - expected[face]) ** 2).sum() / (2 * 0.3**2)) for n in row]) for face, row in enumerate(beside)]
+        sums = np.array([area[face] * expected[face] + weight[face] @ expected[row] if row else expected[face] for face, row in enumerate(beside)])
+        expected = sums / np.linalg.norm(sums, axis=1, keepdims=True)
+    np.testing.assert_allclose(area, np.linalg.norm(vectors, axis=1), rtol=1e-12)
+    np.testing.assert_allclose(normals, expected, atol=1e-9)
 
 
 def test_rounds_of_smoothing_go_with_the_number_of_faces() -> None:

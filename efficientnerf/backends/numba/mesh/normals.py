@@ -1,4 +1,4 @@
-"""Normals of a dense mesh where lines through points of a coarser one meet it (numba)."""
+"""Normals of faces, smoothed, and those of a dense mesh where lines through points of a coarser one meet it (numba)."""
 
 from __future__ import annotations
 
@@ -8,43 +8,37 @@ from efficientnerf.backends.numba.runtime import numba
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _cells_of(vertices, faces, face, low, cell, shape):  # type: ignore[no-untyped-def]
+    """Numbers of the cells that the box of a face reaches into, as a generator."""
+    begin, end = np.empty(3, np.int64), np.empty(3, np.int64)
+    for axis in range(3):
+        a, b, c = vertices[faces[face, 0], axis], vertices[faces[face, 1], axis], vertices[faces[face, 2], axis]
+        begin[axis] = min(max(np.int64(np.floor((min(a, b, c) - low[axis]) / cell)), 0), shape[axis] - 1)
+        end[axis] = min(max(np.int64(np.floor((max(a, b, c) - low[axis]) / cell)), 0), shape[axis] - 1) + 1
+    for i in range(begin[0], end[0]):
+        for j in range(begin[1], end[1]):
+            for k in range(begin[2], end[2]):
+                yield (i * shape[1] + j) * shape[2] + k
+
+
+@numba.njit(cache=True, error_model="numpy")
 def count_in_cells(vertices, faces, begin, end, low, cell, shape, first):  # type: ignore[no-untyped-def]
     """Adds to `first` (cells + 2,) int64, two places behind each cell, how many boxes of the faces `begin` to `end` reach into it.
 
     vertices (V, 3) float64, faces (F, 3) int64, low (3,) corner of the grid, cell its side, shape (3,) int64
     """
-    one, other = np.empty(3, np.int64), np.empty(3, np.int64)
     for face in range(begin, end):
-        _cells_of(vertices, faces, face, low, cell, shape, one, other)
-        for i in range(one[0], other[0] + 1):
-            for j in range(one[1], other[1] + 1):
-                for k in range(one[2], other[2] + 1):
-                    first[(i * shape[1] + j) * shape[2] + k + 2] += 1
+        for number in _cells_of(vertices, faces, face, low, cell, shape):
+            first[number + 2] += 1
 
 
 @numba.njit(cache=True, error_model="numpy")
 def put_in_cells(vertices, faces, begin, end, low, cell, shape, first, held):  # type: ignore[no-untyped-def]
     """Puts the faces `begin` to `end` into `held` (N,) int32, at the place that `first` has one behind their cells, which goes up."""
-    one, other = np.empty(3, np.int64), np.empty(3, np.int64)
     for face in range(begin, end):
-        _cells_of(vertices, faces, face, low, cell, shape, one, other)
-        for i in range(one[0], other[0] + 1):
-            for j in range(one[1], other[1] + 1):
-                for k in range(one[2], other[2] + 1):
-                    number = (i * shape[1] + j) * shape[2] + k + 1
-                    held[first[number]] = face
-                    first[number] += 1
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _cells_of(vertices, faces, face, low, cell, shape, one, other):  # type: ignore[no-untyped-def]
-    """The first and the last cell, along each axis, that the box of a face reaches into."""
-    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-    for axis in range(3):
-        least = min(vertices[a, axis], vertices[b, axis], vertices[c, axis])
-        most = max(vertices[a, axis], vertices[b, axis], vertices[c, axis])
-        one[axis] = min(max(np.int64(np.floor((least - low[axis]) / cell)), 0), shape[axis] - 1)
-        other[axis] = min(max(np.int64(np.floor((most - low[axis]) / cell)), 0), shape[axis] - 1)
+        for number in _cells_of(vertices, faces, face, low, cell, shape):
+            held[first[number + 1]] = face
+            first[number + 1] += 1
 
 
 @numba.njit(cache=True, error_model="numpy")

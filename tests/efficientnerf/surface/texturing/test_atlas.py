@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from efficientnerf.surface.mesh import face_areas
+from efficientnerf.surface.mesh import face_areas, face_neighbours
 from efficientnerf.surface.texturing.atlas import Atlas, atlas_of, gap_of
-from efficientnerf.surface.texturing.charts import charts_of, neighbours
+from efficientnerf.surface.texturing.charts import charts_of
 from efficientnerf.surface.texturing.filling import texture_from
 
 from .shapes import ball, box
@@ -82,7 +82,7 @@ def test_charts_are_connected_and_large_where_the_surface_is_even() -> None:
     assert charts.count == 6
     smooth = charts_of(*ball(4), 0.01)
     assert smooth.count < 30
-    beside = neighbours(ball(4)[1], len(ball(4)[0]))
+    beside = face_neighbours(ball(4)[1], len(ball(4)[0]))
     for chart in range(smooth.count):
         members = np.flatnonzero(smooth.chart == chart)
         reached, border = {int(members[0])}, [int(members[0])]

@@ -1,0 +1,100 @@
+"""Smoothing of meshes: Taubin's, and of the faces' normals, which keeps edges. Arrays in, arrays out.
+
+V vertices, F faces (counter-clockwise seen from outside).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.backends.pieces import pieces
+from efficientnerf.surface.mesh import face_neighbours, face_vectors, vertex_normals
+
+LEAST_ROUNDS = 6
+FITS, DRIFT_ROUNDS = 40, 24  # of vertices to normals at most, and of averaging what all vertices of a place have in common. docs/experiments/surface.md
+
+
+def smooth(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
+    """(V, 3) vertices after `rounds` of Taubin's smoothing: a step towards the mean of the neighbours, then a slightly longer one back.
+
+    Waves as short as a few edges (the terraces of marching cubes) vanish; the volume stays. Taubin, "A signal processing approach to fair
+    surface design", SIGGRAPH 1995, with lambda = 0.5 and a pass band of 0.1.
+    """
+    if rounds <= 0 or not len(faces):
+        return vertices
+    shrink, grow = 0.5, -1 / (1 / 0.5 - 0.1)
+    neighbours, degree = _neighbours(faces, len(vertices))
+    for _ in range(rounds):
+        for step in (shrink, grow):
+            vertices = vertices + step * (neighbours @ vertices / degree - vertices)
+    return vertices
+
+
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float = 0.6) -> np.ndarray:
+    """(V, 3) vertices after `rounds` of bilateral smoothing of the faces' normals, which keeps edges and, over a few edges, the volume.
+
+    sharpness  difference of two unit normals beyond which faces hardly count for each other. docs/experiments/surface.md
+
+    Each normal becomes the mean of its own and those of the three faces beside it, weighted by area and by exp(-difference^2 / (2 sharpness^2)); then vertices
+    go as far along the normals around them as makes the faces fit these. What the vertices of a place have gone along their normals in common is taken back:
+    thin parts would shrink to nothing. Zheng et al., "Bilateral normal filtering for mesh denoising", TVCG 2011; Sun et al., "Fast and effective
+    feature-preserving mesh denoising", TVCG 2007.
+    """
+    from scipy.sparse import csr_matrix
+
+    if rounds <= 0 or not len(faces):
+        return vertices
+    normals, _ = smoothed_face_normals(vertices, faces, rounds, sharpness)
+    around = csr_matrix((np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))), shape=(len(vertices), len(faces)))
+    count = np.maximum(np.diff(around.indptr), 1)[:, None]
+    outer = np.stack([around @ (normals * normals[:, axis, None]) for axis in range(3)], 1)  # (V, 3, 3) sums of n n^T
+    fitted = vertices
+    for _ in range(min(rounds, FITS)):
+        middle = fitted[faces].mean(1)
+        target = around @ (normals * (normals * middle).sum(1, keepdims=True))
+        fitted = fitted + (target - np.einsum("vij,vj->vi", outer, fitted)) / count
+    outward = vertex_normals(vertices, faces)
+    drift = ((fitted - vertices) * outward).sum(1, keepdims=True)
+    neighbours, degree = _neighbours(faces, len(vertices))
+    for _ in range(DRIFT_ROUNDS):
+        drift = 0.5 * drift + 0.5 * (neighbours @ drift) / degree
+    return fitted - drift * outward
+
+
+def rounds_within(reach: float, vertices: np.ndarray, faces: np.ndarray) -> int:
+    """How many rounds of smoothing spread over about `reach`, at least LEAST_ROUNDS: a round spreads over an edge, n rounds over the root of n edges."""
+    edge = float(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=-1).mean())
+    return max(LEAST_ROUNDS, int(min((reach / max(edge, 1e-300)) ** 2, 1e6)))
+
+
+def smoothed_face_normals(
+    vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpness: float, tick: Callable[[], None] = lambda: None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) unit normals of faces after `rounds` of bilateral smoothing (`smooth_normals`), and twice their areas (F,). `tick` is called often; what it
+    raises stops the work."""
+    from efficientnerf.backends.numba.mesh.normals import smooth_face_normals
+
+    vectors, beside = face_vectors(vertices, faces), face_neighbours(faces, len(vertices))
+    area = np.linalg.norm(vectors, axis=1)
+    normals = vectors / np.maximum(area, 1e-300)[:, None]
+    other = np.empty_like(normals)
+    for _ in range(rounds):
+        for part in pieces(len(faces), first=4096):
+            tick()
+            smooth_face_normals(normals, area, beside, sharpness, part.start, part.stop, other)
+        normals, other = other, normals
+    return normals, area
+
+
+def _neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:
+    """Which vertices share an edge, a sparse matrix (V, V) of ones, and how many there are of each (V, 1), at least one."""
+    from scipy.sparse import csr_matrix
+
+    tail, head = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
+    rows, columns = np.concatenate([tail, head]), np.concatenate([head, tail])
+    neighbours = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    neighbours.data[:] = 1.0  # an edge is met once per face and direction; every neighbour counts alike
+    return neighbours, np.maximum(np.diff(neighbours.indptr), 1)[:, None]
