@@ -24,10 +24,11 @@ LOCK = ".lock"
 HOLDER = ".lock.json"
 WORK = ".work"
 CACHE = ".cache"
+LEASE = ".lease"
 MAX_DEPTH = 200  # folders in folders; what deletes them goes down by recursion
 
 _FILES = (RUN, LOCK, HOLDER)
-_FOLDERS = (WORK, CACHE)
+_FOLDERS = (WORK, CACHE, LEASE)
 _STAGE = re.compile(r"[a-z][a-z0-9_]*")  # the folder of an artifact has the name of its stage
 
 

@@ -1,6 +1,6 @@
-"""One writer at a time: an operating system's lock on RUN/.lock, and beside it who holds it.
+"""One writer at a time: an operating system's lock on RUN/.lock, beside it who holds it, and a lease for other machines that share the folder.
 
-The lock ends with its process: a killed process never blocks a run.
+The lock ends with its process: a killed process never blocks a run on its own machine. On another the run is free once the lease has expired.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ import msgspec
 from pipeline import files
 from pipeline.errors import BadInput, PipelineError, RunLocked
 from pipeline.failures import cannot_write
-from pipeline.links import HOLDER, LOCK, refuse_links
+from pipeline.lease import EXPIRY, Held, Lease, acquire
+from pipeline.links import HOLDER, LOCK
 from pipeline.text import printable
 
 
@@ -62,29 +63,51 @@ def _is_alive(pid: int) -> bool:
 
 
 @contextmanager
-def lock(run: Path) -> Iterator[None]:
-    """Hold the run's lock. Raises RunLocked at once if another holds it, BadInput if the run cannot be written."""
+def lock(folder: Path) -> Iterator[Lease]:
+    """Hold the lock of a run or a fleet. Raises RunLocked at once if another holds it, BadInput if the folder cannot be written."""
     import filelock  # not needed by the commands that only read
 
-    refuse_links(run)  # before the lock's file is opened
-    guard = filelock.FileLock(run / LOCK, timeout=0, thread_local=False)
+    guard = filelock.FileLock(folder / LOCK, timeout=0, thread_local=False)
     try:
         guard.acquire()
+        decisive = True
     except filelock.Timeout:
-        holder = holder_of(run)
-        who = holder.text() if holder is not None else "a process that did not say who it is"
-        raise RunLocked(f"{run}: being written by {who}. Wait until it is done, or stop it.") from None
+        raise RunLocked(f"{folder}: being written by {_who(folder)}. Wait until it is done, or stop it.") from None
+    except NotImplementedError:  # a file system without such locks
+        decisive = False
     except OSError as error:
-        raise _cannot_lock(run, error) from None
+        raise _cannot_lock(folder, error) from None
     try:
-        _write_holder(run)
-        yield
+        with _leased(folder, decisive) as lease:
+            yield lease
     finally:
-        # An error in flight is the one to report, and without one all is done: a note of a dead process does no harm, and the lock ends with its process.
-        with contextlib.suppress(OSError):
-            (run / HOLDER).unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             guard.release()
+
+
+@contextmanager
+def _leased(folder: Path, decisive: bool) -> Iterator[Lease]:
+    try:
+        lease = acquire(folder, decisive=decisive)
+    except Held as held:
+        since = f"its lease was renewed {max(0.0, held.age):.0f} s ago; {EXPIRY:.0f} s after the last time it is free"
+        raise RunLocked(f"{folder}: being written by {_who(folder)}; {since}. Wait until it is done, or stop it.") from None
+    except OSError as error:
+        raise _cannot_lock(folder, error) from None
+    try:
+        _write_holder(folder)
+        yield lease
+    finally:
+        # An error in flight is the one to report, and without one all is done: a note of a dead process does no harm, and the lock ends with its process.
+        if lease.lost() is None:
+            with contextlib.suppress(OSError):
+                (folder / HOLDER).unlink(missing_ok=True)
+        lease.release()
+
+
+def _who(folder: Path) -> str:
+    holder = holder_of(folder)
+    return holder.text() if holder is not None else "a process that did not say who it is"
 
 
 def _cannot_lock(run: Path, error: OSError) -> PipelineError:

@@ -5,6 +5,7 @@
     RUN/.work/       what is being written
     RUN/.cache/      digests of files that have not changed since they were hashed; may be deleted at any time
     RUN/.lock        held while the run is written (lock.py)
+    RUN/.lease/      the same for other machines (lease.py)
 
 Nothing in it but the sources is an absolute path: a run may be moved or copied.
 """
@@ -23,10 +24,11 @@ from typing import Annotated, Any, Protocol
 import msgspec
 
 from pipeline import files
-from pipeline.errors import BadInput, CorruptArtifact
+from pipeline.errors import BadInput, CorruptArtifact, RunLocked
 from pipeline.executors.memory import MOST
 from pipeline.failures import cannot_write, failed
-from pipeline.links import CACHE, HOLDER, LOCK, RUN, refuse_links
+from pipeline.lease import Lease
+from pipeline.links import CACHE, HOLDER, LEASE, LOCK, RUN, refuse_links
 from pipeline.lock import Holder, holder_of, lock
 from pipeline.text import printable
 
@@ -96,6 +98,7 @@ class Run:
     created: float = field(default_factory=time.time)
     resume_text: ResumeText = field(default=resume_in_words, repr=False, compare=False)
     _holds: int = field(default=0, init=False, repr=False, compare=False)
+    _lease: Lease | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self.path = _absolute(self.path)
@@ -193,7 +196,8 @@ class Run:
             finally:
                 self._holds -= 1
             return
-        with lock(self.path):
+        refuse_links(self.path)  # before the lock's file is opened
+        with lock(self.path) as self._lease:
             self._holds = 1
             try:
                 self._clear_temporaries()
@@ -201,7 +205,13 @@ class Run:
                     self._set(_recorded(self.path))
                 yield
             finally:
-                self._holds = 0
+                self._holds, self._lease = 0, None
+
+    def check_held(self) -> None:
+        """Raise RunLocked where the lock that this process held was taken over: a machine may sleep, or lose the file server for a while."""
+        why = None if self._lease is None else self._lease.lost()
+        if why is not None:
+            raise RunLocked(f"{self.path}: no longer this process's to write: {why}. What is done is kept. Go on with: {self.how_to_resume()}")
 
     def _clear_temporaries(self) -> None:
         """What kills left of writing files outside of artifacts; if they cannot be removed, they do no harm."""
@@ -262,7 +272,7 @@ def _make_folder(path: Path) -> None:
 
 def _is_ours(name: str) -> bool:
     """Whether a kill while a run was created may have left a file of this name."""
-    return name in (LOCK, HOLDER) or files.is_temporary(name, NAME) or files.is_temporary(name, HOLDER)
+    return name in (LOCK, HOLDER, LEASE) or files.is_temporary(name, NAME) or files.is_temporary(name, HOLDER)
 
 
 def _absolute(path: Path) -> Path:

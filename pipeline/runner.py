@@ -144,6 +144,7 @@ class _Runner:
                 made = self._make(stage, request, place, reason)
             else:
                 self.emit("message", stage.name, text=f"{stage.name} was done before; only its publication had been cut short")
+            self.run.check_held()
             artifact.publish(self.run.path, stage.name, place)
         except (Exception, KeyboardInterrupt) as error:
             self._failed(stage, place, error)
@@ -168,7 +169,7 @@ class _Runner:
             memory=self.memory,
             stage=stage.name,
             report=self._report,
-            stop=self.stop,
+            stop=self.stopped,
         )
         usage = self.execute(stage, job)
         outputs = artifact.outputs_of(place.out, stage, self.hashes)
@@ -229,8 +230,13 @@ class _Runner:
             self.emit("interrupted", stage, text=str(interrupted), resume=go_on, exit_code=interrupted.exit_code)
         return interrupted
 
+    def stopped(self) -> int | None:
+        """The signal that arrived, or None. Raises RunLocked where the run is no longer ours."""
+        self.run.check_held()
+        return self.stop()
+
     def safe_point(self) -> None:
-        number = self.stop()
+        number = self.stopped()
         if number is not None:
             raise Interrupted(number)
 

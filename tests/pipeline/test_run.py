@@ -51,7 +51,7 @@ def test_an_empty_folder_will_do_and_so_will_what_a_kill_left(tmp_path: Path) ->
     for name in (".lock", ".lock.json", ".run.json.7.part"):
         (tmp_path / "run" / name).write_text("{")
     Run.create(tmp_path / "run")
-    assert sorted(os.listdir(tmp_path / "run")) == [".lock", "run.json"]
+    assert sorted(os.listdir(tmp_path / "run")) == [".lease", ".lock", "run.json"]
 
 
 def test_something_else_is_refused_and_left_alone(tmp_path: Path) -> None:

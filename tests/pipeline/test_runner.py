@@ -40,14 +40,14 @@ def test_all_run_once_and_then_nothing(run: Run) -> None:
     assert [event["stage"] for event in events.named("stage_done")] == ["list", "count", "double", "report"]
     assert all({"event", "stage", "time"} <= event.keys() for event in events)
     assert os.listdir(run.path / artifact.WORK) == []
-    before = {path: path.lstat().st_mtime_ns for path in run.path.rglob("*")}
+    before = {path: path.lstat().st_mtime_ns for path in run.path.rglob("*") if ".lease" not in path.parts}
 
     events = Events()
     again = run_stages(run, STAGES, report=events)
     assert [outcome.digest for outcome in again] == [outcome.digest for outcome in outcomes]
     assert set(actions(again).values()) == {"skipped"}
     assert [event["event"] for event in events] == ["stage_skipped"] * 4
-    after = {path: path.lstat().st_mtime_ns for path in run.path.rglob("*")}
+    after = {path: path.lstat().st_mtime_ns for path in run.path.rglob("*") if ".lease" not in path.parts}
     assert {path for path in before | after if before.get(path) != after.get(path)} <= {run.path, run.path / ".cache", run.cache}
 
 
@@ -133,7 +133,7 @@ def test_one_stage_alone_without_what_it_needs(run: Run) -> None:
 def test_a_dry_run_says_what_would_be_done_and_does_nothing(run: Run, tmp_path: Path) -> None:
     events = Events()
     assert set(actions(run_stages(run, STAGES, dry_run=True, report=events)).values()) == {"would run"}
-    assert sorted(os.listdir(run.path)) == [".lock", "run.json"]
+    assert sorted(os.listdir(run.path)) == [".lease", ".lock", "run.json"]
     assert "list: would run (never run)" in events.text()
     run_stages(run, STAGES)
     set_one(run, "count", steps=9)

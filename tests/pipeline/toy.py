@@ -94,11 +94,11 @@ def set_one(run: Run, stage: str, **values: Any) -> None:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, without what depends on the clock."""
+    """Every file below a folder, without what depends on the clock, and the lease."""
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.is_file() and not name.endswith(("manifest.json", "log.jsonl", "hashes.json")):
+        if path.is_file() and not name.endswith(("manifest.json", "log.jsonl", "hashes.json")) and not name.startswith(".lease/"):
             found[name] = path.read_bytes()
     return found
 

@@ -1,0 +1,222 @@
+"""A lease is held by one process at a time, whatever dies, sleeps or is slow; other machines are played by another name for this one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from pipeline import lease
+from pipeline.errors import CorruptArtifact, RunLocked
+from pipeline.lease import EXPIRY, Held, Lease, acquire
+from pipeline.lock import lock
+from pipeline.run import Run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@contextmanager
+def on(machine: str) -> Iterator[None]:
+    """As another machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lease, "machine", lambda: machine)
+        yield
+
+
+def age(folder: Path, seconds: float) -> None:
+    """Let the lease be as old as if its machine had been cut off for so long."""
+    newest = max((folder / ".lease").iterdir(), key=lambda path: int(path.name) if path.name.isdigit() else -1)
+    before = os.stat(newest).st_mtime - seconds
+    os.utime(newest, (before, before))
+
+
+def test_another_machine_waits_until_the_lease_has_expired(tmp_path: Path) -> None:
+    with on("a"):
+        held = acquire(tmp_path, decisive=True)
+    with on("b"):
+        with pytest.raises(Held):
+            acquire(tmp_path, decisive=True)
+        age(tmp_path, EXPIRY - 5)
+        with pytest.raises(Held) as found:
+            acquire(tmp_path, decisive=True)
+        assert EXPIRY - 6 < found.value.age < EXPIRY
+        age(tmp_path, 6)
+        other = acquire(tmp_path, decisive=True)
+    held.beat()
+    assert "took its lease over" in (held.lost() or "")
+    held.release()  # touches nothing of the other's
+    other.beat()
+    assert other.lost() is None
+    other.release()
+
+
+def test_what_was_given_back_is_free_at_once(tmp_path: Path) -> None:
+    with on("a"):
+        acquire(tmp_path, decisive=True).release()
+    with on("b"):
+        acquire(tmp_path, decisive=True).release()
+    assert [path.name for path in (tmp_path / ".lease").iterdir()] == ["2"]
+
+
+def test_a_renewed_lease_is_young_again(tmp_path: Path) -> None:
+    with on("a"):
+        held = acquire(tmp_path, decisive=True)
+    age(tmp_path, EXPIRY + 1)
+    held.beat()
+    with on("b"), pytest.raises(Held):
+        acquire(tmp_path, decisive=True)
+    held.release()
+
+
+def test_who_has_this_machines_lock_takes_over_from_a_dead_process_at_once(tmp_path: Path) -> None:
+    dead = acquire(tmp_path, decisive=True)
+    with pytest.raises(Held):  # without such locks nobody knows that it is dead
+        acquire(tmp_path, decisive=False)
+    acquire(tmp_path, decisive=True).release()
+    dead.beat()
+    assert dead.lost() is not None
+    dead.release()
+
+
+def test_who_saw_an_old_lease_and_was_slow_does_not_get_a_number_that_was_passed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between its look and its link others take over twice, and remove the lower numbers: its own link succeeds, and counts for nothing."""
+    with on("a"):
+        acquire(tmp_path, decisive=True).release()
+    created, later = lease._create, []
+
+    def slow(aside: Path, path: Path) -> bool:
+        monkeypatch.setattr(lease, "_create", created)
+        with on("c"):
+            acquire(tmp_path, decisive=True).release()
+            later.append(acquire(tmp_path, decisive=True))
+        return created(aside, path)
+
+    monkeypatch.setattr(lease, "_create", slow)
+    with on("b"), pytest.raises(Held):
+        acquire(tmp_path, decisive=True)
+    later[0].beat()
+    assert later[0].lost() is None
+    assert [path.name for path in (tmp_path / ".lease").iterdir()] == ["3"]
+    later[0].release()
+
+
+def test_of_many_at_once_one_gets_it(tmp_path: Path) -> None:
+    barrier, got = threading.Barrier(12), []
+
+    def take() -> None:
+        barrier.wait()
+        with contextlib.suppress(Held):
+            got.append(acquire(tmp_path, decisive=False))
+
+    for _ in range(5):
+        threads = [threading.Thread(target=take) for _ in range(12)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(got) == 1
+        got.pop().release()
+
+
+def test_without_links_one_gets_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*arguments: object, **more: object) -> None:
+        raise OSError(lease.errno.EPERM, "no links here")
+
+    monkeypatch.setattr(os, "link", refused)
+    held = acquire(tmp_path, decisive=True)
+    with on("b"), pytest.raises(Held):
+        acquire(tmp_path, decisive=True)
+    held.release()
+
+
+def test_a_lease_that_cannot_be_renewed_is_given_up_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = acquire(tmp_path, decisive=True)
+    now = lease.time.monotonic()
+
+    def failing(*arguments: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lease.os, "utime", failing)
+        patch.setattr(lease.time, "monotonic", lambda: now + EXPIRY - 1)
+        held.beat()
+        assert held.lost() is None
+        patch.setattr(lease.time, "monotonic", lambda: now + EXPIRY + 1)
+        held.beat()
+    assert "could not be renewed" in (held.lost() or "")
+    held.release()
+
+
+def test_a_removed_lease_is_lost(tmp_path: Path) -> None:
+    held = acquire(tmp_path, decisive=True)
+    held.path.unlink()
+    held.beat()
+    assert held.lost() == "its lease was removed"
+    held.release()
+
+
+@pytest.mark.parametrize("name", ["9" * 18, "1" + "0" * 15])
+def test_a_number_that_no_count_reaches_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / ".lease").mkdir()
+    (tmp_path / ".lease" / name).write_text("{}")
+    with pytest.raises(CorruptArtifact, match="no number of a lease"):
+        acquire(tmp_path, decisive=True)
+
+
+def test_what_a_stranger_left_in_it_is_no_lease(tmp_path: Path) -> None:
+    (tmp_path / ".lease").mkdir()
+    for name in ("x", "-1", "1.5", "٣", "1" * 30, "a.part"):
+        (tmp_path / ".lease" / name).write_text("[" * 1000)
+    held = acquire(tmp_path, decisive=True)
+    assert held.number == 1
+    held.release()
+
+
+def test_a_run_says_who_holds_it_and_since_when_its_lease_was_renewed(tmp_path: Path) -> None:
+    run = Run.create(tmp_path / "run")
+    other = Run.open(run.path)
+    with on("a"), run.locked():
+        # Another machine does not see this one's lock.
+        (run.path / ".lock").unlink()
+        with on("b"), pytest.raises(RunLocked, match=rf"being written by process {os.getpid()} on .* its lease was renewed \d s ago"), other.locked():
+            pass
+
+
+def test_who_lost_the_lease_publishes_nothing(tmp_path: Path) -> None:
+    from pipeline.runner import run_stages
+    from tests.pipeline.toy import STAGES, make_run
+
+    run = make_run(tmp_path)
+    taken: list[Lease] = []
+
+    def take_over(event: dict[str, object]) -> None:
+        if event["event"] == "stage_started" and event["stage"] == "count":
+            age(run.path, EXPIRY + 1)
+            with on("b"):
+                taken.append(acquire(run.path, decisive=True))
+            assert run._lease is not None
+            run._lease.beat()
+
+    with on("a"), pytest.raises(RunLocked, match=r"no longer this process's to write.*took its lease over"):
+        run_stages(run, STAGES, report=take_over)
+    assert (run.path / "list").is_dir()
+    assert not (run.path / "count").exists()
+    taken[0].beat()
+    assert taken[0].lost() is None
+    taken[0].release()
+
+
+def test_a_killed_process_blocks_nobody_on_its_machine(tmp_path: Path) -> None:
+    script = "import os, sys; from pathlib import Path; from pipeline.lock import lock\nwith lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    for _ in range(random.Random(1).randint(2, 4)):
+        assert subprocess.run([sys.executable, "-c", script, str(tmp_path)], cwd=ROOT, check=False).returncode == -9
+    with lock(tmp_path) as held:
+        assert held.lost() is None
