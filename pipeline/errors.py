@@ -4,7 +4,8 @@ PipelineError
 ├── BadInput           2   the source, the run folder or a file given by the user cannot be used
 ├── UsageError         2   the request itself is wrong: a value of a wrong type, a stage that does not exist
 │   ├── UnknownSetting 2   a setting that does not exist; names the nearest one
-│   └── Mistakes       2   several at once, in a file that was given
+│   ├── Mistakes       2   several at once, in a file that was given
+│   └── TooLittleMemory 2  a stage needs more memory than it may take
 ├── StageFailed        3   a stage raised; the original is its __cause__
 │   └── DiskFull       3   ... because the disk, or the quota, is full
 ├── CorruptArtifact    4   what a run holds is not what was written
@@ -48,6 +49,17 @@ class Mistakes(UsageError):
     def __init__(self, text: str, details: tuple[str, ...]) -> None:
         super().__init__(text)
         self.details = details
+
+
+class TooLittleMemory(UsageError):
+    """A stage needs more memory than it may take; found out before its work.
+
+    needed  bytes; 0 where it is not known
+    """
+
+    def __init__(self, text: str, needed: int = 0) -> None:
+        super().__init__(text)
+        self.needed = needed
 
 
 class StageFailed(PipelineError):

@@ -38,6 +38,7 @@ class Stage:
     run           writes its outputs into job.out
     reads_source  whether it is handed the source; then the files of the source are part of its request
     source_files  (source, settings) -> the files of the source that matter (cheap: they are hashed, not read); None: every file in it
+    uses_device   whether it computes on job.device
     volatile      fnmatch patterns of outputs (relative, posix) that depend on the clock: kept and hashed, but outside the
                   artifact's digest, so that a log does not make later stages stale
     """
@@ -49,6 +50,7 @@ class Stage:
     run: Callable[[Job], None]
     reads_source: bool = False
     source_files: Callable[[Path, Any], list[Path]] | None = None
+    uses_device: bool = False
     volatile: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

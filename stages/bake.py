@@ -259,5 +259,6 @@ STAGE = Stage(
     settings=BakeSettings,
     needs=needs_of(BakeInputs),
     run=run,
+    uses_device=True,
     volatile=(BakeOutputs.log, BakeOutputs.curve, f"{BakeOutputs.previews}/*"),
 )

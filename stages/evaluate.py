@@ -237,4 +237,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=5, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run)
+STAGE = Stage(name="evaluate", version=5, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True)

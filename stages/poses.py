@@ -198,11 +198,11 @@ def _formats(job: Job, settings: PosesSettings) -> list[str]:
 
 
 def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
+    from stages.cores import count_cores
     from stages.io.material import photographs_of
     from stages.io.pictures import UnreadableImage, read_header
     from stages.memory.poses import feature_threads
     from stages.sfm.background import silhouettes_with_surroundings
-    from stages.sfm.matches import num_threads
     from stages.sfm.reconstruction import find_cameras
 
     source = job.source
@@ -224,7 +224,7 @@ def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
             features=settings.max_features,
             matching=settings.matching,
             seed=settings.seed,
-            threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, num_threads()),
+            threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, count_cores()),
             masks=masks,
             work=job.work / name,
             progress=job.progress,

@@ -164,5 +164,6 @@ STAGE = Stage(
     settings=TrainSettings,
     needs=needs_of(TrainInputs),
     run=run,
+    uses_device=True,
     volatile=(TrainOutputs.log, TrainOutputs.curve, f"{TrainOutputs.previews}/*", TrainOutputs.report),
 )

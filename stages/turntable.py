@@ -107,4 +107,4 @@ def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None
         shutil.copyfile(path, job.out / path.name)
 
 
-STAGE = Stage(name="turntable", version=5, settings=TurntableSettings, needs=needs_of(TurntableInputs), run=run)
+STAGE = Stage(name="turntable", version=5, settings=TurntableSettings, needs=needs_of(TurntableInputs), run=run, uses_device=True)

@@ -15,10 +15,12 @@ class Workflow:
 
     stages   in order
     presets  the folder of its presets, TOML files
+    child    the module that runs its stages in processes of their own; see `pipeline.executors.serving`
     """
 
     stages: tuple[Stage, ...]
     presets: Path
+    child: str = "workflows.fleet.child"
 
 
 # Modules of `stages`, in order.

@@ -77,8 +77,8 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
 
     max_side  longest side of the frames, pixels
     """
+    from stages.cores import count_cores
     from stages.memory.poses import refuse_large_videos
-    from stages.sfm.matches import num_threads
     from stages.video.frames import Reader, frames_of
     from stages.video.reading import UnreadableVideo, opened
 
@@ -89,7 +89,7 @@ def with_frames(job: Job, found: Material, max_side: int, warn: Warn) -> Materia
         with contextlib.suppress(UnreadableVideo), opened(path) as video:  # said where it is read
             sizes.append(video.stored)
     refuse_large_videos(job, sizes)
-    reader = Reader(min(DECODERS, num_threads()), job.work / "videos", job.progress, job.safe_point, warn)
+    reader = Reader(min(DECODERS, count_cores()), job.work / "videos", job.progress, job.safe_point, warn)
     try:
         chosen = frames_of(found.videos, count=job.settings.frames, max_side=max_side, reader=reader)
     except UnreadableVideo as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pipeline.errors import UsageError
+from pipeline.errors import TooLittleMemory
 from pipeline.executors.memory import Limit, available_now, size_text
 from pipeline.stage import Job
 
@@ -52,7 +52,7 @@ def has_room(job: Job, need: Need) -> bool:
 
 
 def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:
-    """Record the need in the manifest; UsageError where it is more than the job may take. To be called before the work.
+    """Record the need in the manifest; TooLittleMemory where it is more than the job may take. To be called before the work.
 
     remedy  what to do about it, a sentence: which settings, with their values
     """
@@ -64,13 +64,14 @@ def refuse_what_does_not_fit(job: Job, need: Need, remedy: str) -> None:
 
 
 def refuse_more_than(limit: Limit | None, what: str, need: Need, remedy: str) -> None:
-    """UsageError where a need is more than the limit; None: no limit is known.
+    """TooLittleMemory where a need is more than the limit; None: no limit is known.
 
     what    has the need, the beginning of the sentence
     remedy  as for `refuse_what_does_not_fit`
     """
     if limit is not None and need.total > limit.bytes:
-        raise UsageError(f"{what}: needs {need.text()}; {size_text(limit.bytes)} may be taken ({limit.whose}). {remedy} Or give more by --memory.")
+        text = f"{what}: needs {need.text()}; {size_text(limit.bytes)} may be taken ({limit.whose}). {remedy} Or give more by --memory."
+        raise TooLittleMemory(text, need.total)
 
 
 def record(job: Job, need: Need) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import queue
@@ -13,7 +12,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-_PR_SET_PDEATHSIG = 1  # prctl(2), Linux alone
+from pipeline.executors.child import end_with
 
 
 class Stopped(Exception):
@@ -65,7 +64,7 @@ def main() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
     channel = Channel()
     request = channel.receive()
-    _end_with(request["parent"])
+    end_with(request["parent"])
     try:
         value = _work(request["task"])(request["arguments"], progress=channel.progress, safe_point=channel.safe_point, warn=channel.warn)
     except BaseException as error:
@@ -85,14 +84,6 @@ def _work(task: str) -> Callable[..., Any]:
     from stages.sfm.reconstruction import capture_for
 
     return capture_for
-
-
-def _end_with(parent: int) -> None:
-    """Die as soon as the parent does: `Channel` notices it too, but not while a library keeps Python from running."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def _was_stopped(error: BaseException | None) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -91,8 +90,3 @@ def every_image_read(pycolmap: Any, folder: Path) -> Iterator[None]:
 def _lines(path: Path) -> list[str]:
     with open(open_plain(path, follow=False), encoding="utf-8", errors="replace") as file:
         return file.read(2**20).splitlines()
-
-
-def num_threads() -> int:
-    """CPUs this process may use."""
-    return max(1, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from stages.cores import count_cores
 from stages.io.png import FAST, write_png
 from stages.sfm import pair_workers
-from stages.sfm.colmap import num_threads, quiet_pycolmap
+from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, pair_id_of, record, verified_pairs
 from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 from stages.sfm.pairs import Pair, aggregated, in_blocks, likeness_of, ordered
@@ -35,7 +36,7 @@ def extract_features(
     threads   None: as many as the process may use. An image's features do not depend on them
     contrast  that a feature must have, of COLMAP's default
     """
-    threads, place = threads or num_threads(), images_of(work).parent
+    threads, place = threads or count_cores(), images_of(work).parent
     with quiet_pycolmap() as pycolmap:
         with pycolmap.Database.open(database_path(work)) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}

@@ -22,9 +22,10 @@ import numpy as np
 from efficientnerf.geometry.cameras import Camera, resized
 from pipeline.errors import BadInput
 from pipeline.files import write_json
+from stages.cores import count_cores
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import ladder, mapping, matches, process
-from stages.sfm.colmap import num_threads, quiet_pycolmap
+from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
 from stages.sfm.images import Masks, WorkImage, prepare_images
 from stages.verdict.looks import look_at_all
@@ -137,7 +138,7 @@ def reconstruct(
         seed=seed,
         masks=masks,
         paths=_paths(folder, names),
-        threads=threads or num_threads(),
+        threads=threads or count_cores(),
         work=work,
         progress=progress,
         safe_point=safe_point,
@@ -154,7 +155,7 @@ def reconstruct(
         open_database(work, images, warn)
         matches.extract_features(work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
         found = ladder.find_models(
-            work, images, matching, features=features, seed=seed, threads=threads or num_threads(), progress=progress, safe_point=safe_point
+            work, images, matching, features=features, seed=seed, threads=threads or count_cores(), progress=progress, safe_point=safe_point
         )
     models, place = found.models, found.work
     rejected = [*unreadable, *_unregistered(place, images, models)]

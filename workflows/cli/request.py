@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from pipeline.artifact import listed
@@ -15,13 +15,16 @@ from pipeline.run import MOST_SOURCES, NAME, Run
 from workflows.asset import Workflow
 from workflows.budget import share_budget
 from workflows.cli.device import has_cuda
-from workflows.cli.resolve import Config, Settings, read_config, read_preset, seconds_of, table_of
+from workflows.cli.resolve import Config, Settings, Table, read_config, read_preset, seconds_of, table_of
 from workflows.cli.target import check_names, open_run, resume_command
 
 
 @dataclass(frozen=True)
 class Options:
-    """The options of the command line; None or empty where not given."""
+    """The options of the command line; None or empty where not given.
+
+    table  settings of a fleet's scene, as its manifest has them
+    """
 
     source: Path | None = None
     also: tuple[Path, ...] = ()
@@ -29,6 +32,7 @@ class Options:
     preset: str | None = None
     config: Path | None = None
     sets: tuple[str, ...] = ()
+    table: Table = field(default_factory=dict)
     seed: int | None = None
     budget: str | None = None
     target_mib: float | None = None
@@ -103,6 +107,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         if dropped:
             warnings.append(f"settings that this version does not have are left out: {listed(dropped)}")
     settings.put_table(config.table, f"--config {options.config}")
+    settings.put_table(options.table, "the manifest")
     for text in options.sets:
         settings.put_option(text)
     seed = standing.seed if seed is None and standing is not None and options.preset is not None else seed

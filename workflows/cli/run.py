@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -93,6 +92,7 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
     from workflows.cli.device import resolve_device
     from workflows.cli.output import closing, write_json
     from workflows.cli.progress import display
+    from workflows.report.pages import has_pages, write_pages
     from workflows.report.summary import in_words, summary
 
     device = resolve_device(plan.device)
@@ -105,8 +105,8 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
                 show({"event": "warning", "stage": "", "text": text, "time": time.time()})
             with nullcontext(run) if dry_run else plan.written() as run:
                 outcomes = run_stages(run, workflow().stages, device=device, memory=plan.memory, report=show, dry_run=dry_run, **selection)
-                if not dry_run:
-                    _describe(run, anew=any(outcome.action == "ran" for outcome in outcomes))
+                if not dry_run and (any(outcome.action == "ran" for outcome in outcomes) or not has_pages(run, workflow().stages)):
+                    write_pages(run, workflow().stages)
     except (Exception, KeyboardInterrupt) as error:
         raise Reported(error, summary(run.path, ())) from error
     facts = summary(run.path, outcomes)
@@ -114,26 +114,6 @@ def _work(plan: Plan, *, as_json: bool, quiet: bool, dry_run: bool, **selection:
         write_json({"event": "summary", "ok": True, **facts, "elapsed": time.monotonic() - started, "device": device, "exit_code": 0})
     elif not quiet and not dry_run:
         closing(*in_words(run.path, outcomes))
-
-
-def _describe(run: Run, *, anew: bool) -> None:
-    """Write the pages about the run: anew, or where an earlier call was cut short before it did."""
-    if anew or not _is_described(run):
-        from workflows.report.page import write_report
-        from workflows.report.viewer import write_run_viewer
-
-        write_run_viewer(run)
-        write_report(run, workflow().stages)
-
-
-def _is_described(run: Run) -> bool:
-    """Whether the page is there and no artifact was published after it: that is a rename of its folder, which sets ctime."""
-    try:
-        written = os.stat(run.path / "report.html", follow_symlinks=False).st_mtime_ns
-    except OSError:
-        return False
-    folders = (run.folder(stage.name) for stage in workflow().stages)
-    return all(os.stat(folder, follow_symlinks=False).st_ctime_ns <= written for folder in folders if os.path.lexists(folder))
 
 
 def _check_stages(selection: dict[str, Any]) -> None:

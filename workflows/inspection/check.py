@@ -22,7 +22,7 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
     Raises BadInput, UsageError.
     """
     from pipeline.errors import BadInput
-    from stages.sfm.colmap import num_threads
+    from stages.cores import count_cores
     from stages.verdict.preflight import check
     from workflows.cli.resolve import Settings, read_preset
 
@@ -34,7 +34,7 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
         settings.put_option(text)
     poses = settings.resolved()["poses"]
     with TemporaryDirectory() as work:
-        found = check(with_frames_for_videos(source, poses, Path(work)), poses, num_threads()).document() | {"source": str(source)}
+        found = check(with_frames_for_videos(source, poses, Path(work)), poses, count_cores()).document() | {"source": str(source)}
     found["forecast"]["memory_limit"] = None if limit is None else limit.bytes
     found["forecast"]["fits"] = limit is None or found["forecast"]["poses_bytes"] <= limit.bytes
     return found
@@ -43,9 +43,9 @@ def check_source(source: Path, sets: Sequence[str], limit: Limit | None, workflo
 def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
     """The folder itself; for a video, or a folder of videos, one with the frames that a run would choose. Raises BadInput."""
     from pipeline.errors import BadInput
+    from stages.cores import count_cores
     from stages.io.importers import candidates
     from stages.io.material import find_material
-    from stages.sfm.colmap import num_threads
     from stages.video.frames import Reader, frames_of
     from stages.video.reading import UnreadableVideo
 
@@ -55,7 +55,7 @@ def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
     if not videos:
         return source
     try:
-        frames_of(videos, count=poses.frames, max_side=poses.feature_image_size, reader=Reader(num_threads(), work, _nothing, _nothing, _nothing))
+        frames_of(videos, count=poses.frames, max_side=poses.feature_image_size, reader=Reader(count_cores(), work, _nothing, _nothing, _nothing))
     except UnreadableVideo as error:
         raise BadInput(f"{source}: {error}. Copy or export the video again.") from error
     return work

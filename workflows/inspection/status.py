@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -13,17 +14,18 @@ if TYPE_CHECKING:
 def run_status(run: Run, decisions: Sequence[Decision]) -> dict[str, Any]:
     """A run, who is writing it, and its stages."""
     holder = run.holder()
-    facts = {"run": str(run.path), "source": run.source, "also": run.also, "preset": run.preset, "seed": run.seed, "device": run.device}
-    return {**facts, "verdict": _verdict(run), "written_by": None if holder is None else holder.text(), "stages": [_stage(each) for each in decisions]}
+    facts: dict[str, Any] = {"run": str(run.path), "source": run.source, "also": run.also, "preset": run.preset, "seed": run.seed, "device": run.device}
+    facts |= {"verdict": camera_verdict(run.path), "written_by": None if holder is None else holder.text()}
+    return {**facts, "stages": [_stage(each) for each in decisions]}
 
 
-def _verdict(run: Run) -> dict[str, Any] | None:
+def camera_verdict(run: Path) -> dict[str, Any] | None:
     """The grade of the cameras and a sentence; None where there are none yet, or they say nothing that can be read."""
     from pipeline import files
     from stages.artifacts import PosesOutputs
 
     try:
-        found = files.read_json(PosesOutputs(run.folder(PosesOutputs.stage)).verdict)
+        found = files.read_json(PosesOutputs.of_run(run).verdict)
     except (OSError, files.Unreadable):
         return None
     if not isinstance(found, dict) or not all(isinstance(found.get(key), str) for key in ("grade", "summary")):

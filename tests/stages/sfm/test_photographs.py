@@ -18,9 +18,10 @@ from PIL import Image
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput, StageFailed
+from stages.cores import count_cores
 from stages.io.capture import Capture
 from stages.sfm import mapping, matches, pair_workers, pairs, process
-from stages.sfm.colmap import num_threads, quiet_pycolmap
+from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, open_database, record
 from stages.sfm.images import WorkImage, prepare_images
 from stages.sfm.pairs import all_pairs
@@ -447,7 +448,7 @@ def test_an_error_of_a_worker_is_one_of_the_stage(resumed: tuple[Path, list[Work
 
 
 def test_threads_are_those_allowed() -> None:
-    assert 1 <= num_threads() <= (os.cpu_count() or 1)
+    assert 1 <= count_cores() <= (os.cpu_count() or 1)
 
 
 def test_photographs_are_read_the_same_on_any_number_of_threads(tmp_path: Path) -> None:

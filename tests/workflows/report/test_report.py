@@ -249,5 +249,5 @@ def test_two_reports_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
     with ThreadPoolExecutor(4) as pool:
         for future in [pool.submit(write_report, run, []) for _ in range(40)]:
             future.result()
-    assert sorted(path.name for path in run.path.iterdir()) == [".lock", "report.html", "run.json"]
+    assert sorted(path.name for path in run.path.iterdir()) == [".lease", ".lock", "report.html", "run.json"]
     links((run.path / "report.html").read_text(encoding="utf-8"))

@@ -1,0 +1,292 @@
+"""Stages of runs in processes of their own: what takes one down (a crash in a library, the system's end of a process that takes too much memory) is then
+a failed stage and not the end of those that run beside it.
+
+A child works for one run (`pipeline.executors.serving` is its side) and is kept for the run's next stage: what it has imported and compiled is used again.
+One that prepares runs, which imports little, goes on to the next run.
+Parent and child speak lines of JSON:
+
+    to the child    {"kind": "prepare" | "stage" | "finish" | "end", ...}, see `Children.work`
+    from the child  the stages' events, then {"event": "result", "ok", ...}
+
+Each child leads a group of processes. It ends with its parent, and whatever it has started ends with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from pipeline.text import printable
+
+Event = dict[str, Any]
+Report = Callable[[Event], None]
+
+LAST_LINES = 20  # of standard error that are kept
+LONGEST_LINE = 500
+IDLE = 5.0  # seconds that a child without work is kept
+GRACE = 20.0  # seconds that a child has to reach a safe point once it is asked to stop
+PREPARES = "prepares runs "
+_PR_SET_PDEATHSIG = 1  # prctl(2), Linux alone
+
+# An entry of sys.path that is empty stands for the working folder, which may hold anything: the parent's own entries take its place first.
+_BOOTSTRAP = "import sys, runpy; name = sys.argv.pop(1); sys.path[:] = sys.argv[1:]; del sys.argv[1:]; runpy.run_module(name, run_name='__main__')"
+
+
+def end_with(parent: int) -> None:
+    """Let this process die as soon as its parent does, even while a library keeps Python from running."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def command_for(module: str) -> list[str]:
+    """The command that runs a module as a child, with the import path of this process."""
+    paths = [os.getcwd() if entry == "" else entry for entry in sys.path]
+    return [sys.executable, "-c", _BOOTSTRAP, module, *paths]
+
+
+class _Child:
+    """One process and its pipes. Its result is {"ok": False, "kind": "died", "signal", "text"} where it ended without one."""
+
+    def __init__(self, module: str, environment: Mapping[str, str]) -> None:
+        self.process = subprocess.Popen(
+            command_for(module), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True, env=dict(environment)
+        )
+        self.idle_since: float | None = None
+        self.stopping = False
+        self._lines: deque[str] = deque(maxlen=LAST_LINES)
+        self._listener = threading.Thread(target=self._listen, name="standard error of a stage", daemon=True)
+        self._listener.start()
+        self._write({"parent": os.getpid()})
+
+    def work(self, request: Mapping[str, Any], report: Report) -> Event:
+        assert self.process.stdout is not None
+        self._write(request)
+        while line := self.process.stdout.readline():
+            try:
+                message = json.loads(line)
+            except ValueError:  # half a line before its end
+                break
+            if message.get("event") == "result":
+                return {**message, "lines": self._last_lines()}
+            report(message)
+        return self._died()
+
+    def stop(self) -> None:
+        """Ask it to stop at its next safe point; after GRACE seconds it is killed."""
+        if not self.stopping:
+            self.stopping = True
+            with contextlib.suppress(ProcessLookupError):
+                self.process.send_signal(signal.SIGTERM)
+            timer = threading.Timer(GRACE, self.kill)
+            timer.daemon = True
+            timer.start()
+
+    def end(self) -> None:
+        """Let it end; it has no work."""
+        self._write({"kind": "end"})
+        with contextlib.suppress(OSError):
+            assert self.process.stdin is not None
+            self.process.stdin.close()
+        if not self._ended(GRACE):
+            self.kill()
+        self._reap()
+
+    def kill(self) -> None:
+        """It, and all that it has started."""
+        if self.process.returncode is None:  # its number is not another's before it is reaped
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+
+    def _died(self) -> Event:
+        if not self._ended(GRACE):
+            self.kill()
+        self._reap()
+        code = self.process.returncode
+        number = -code if code < 0 else None
+        how = f"was ended by {signal.Signals(number).name}" if number is not None else f"ended with exit code {code} and no answer"
+        return {"event": "result", "ok": False, "kind": "died", "signal": number, "text": f"its process {how}.", "lines": self._last_lines()}
+
+    def _ended(self, seconds: float) -> bool:
+        """Whether it has ended, or does within this time; it is not reaped yet, so that its group's number is still its own."""
+        deadline = time.monotonic() + seconds
+        while os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.005)
+        return True
+
+    def _reap(self) -> None:
+        """Once it has ended, or was killed."""
+        self.kill()  # what it started and left behind
+        self.process.wait()
+        self._listener.join(timeout=GRACE)
+        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
+            with contextlib.suppress(OSError):
+                assert pipe is not None
+                pipe.close()
+
+    def _write(self, request: Mapping[str, Any]) -> None:
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError, ValueError):  # a child that has ended is noticed where it is read from
+            self.process.stdin.write(json.dumps(request).encode() + b"\n")
+            self.process.stdin.flush()
+
+    def _listen(self) -> None:
+        assert self.process.stderr is not None
+        with contextlib.suppress(OSError, ValueError):
+            while line := self.process.stderr.readline(2**14):
+                if text := line.decode("utf-8", "replace").strip():
+                    self._lines.append(printable(text, LONGEST_LINE))
+
+    def _last_lines(self) -> list[str]:
+        return list(self._lines)
+
+
+class Children:
+    """The children of a worker, by run. Used from any number of threads; one works for a run at a time.
+
+    module  what a child runs: it calls `serving.serve`
+    most    children with a run that are kept at a time, with those that have no work
+    """
+
+    def __init__(self, module: str, most: int) -> None:
+        self.module = module
+        self.most = most
+        self._children: dict[str, tuple[tuple[int, tuple[int, ...]], _Child]] = {}
+        self._working: set[str] = set()
+        self._stopped: set[str] = set()
+        self._lock = threading.Lock()
+        # A child dies with the thread that started it (prctl): one that lives as long as this process starts all of them.
+        self._starter = ThreadPoolExecutor(1, thread_name_prefix="starter of stages")
+        self._closed = False
+
+    def work(self, request: Mapping[str, Any], report: Report, *, cores: int, gpus: Sequence[int] = ()) -> Event:
+        """What the child of a run answers to a request; never raises.
+
+        request  {"kind": "prepare" | "stage" | "finish", "run": path, ...}; "stage" with "stage", "device", "memory" (bytes or None)
+        cores    that it computes on
+        gpus     CUDA devices that it sees
+        """
+        run = self._name(request)
+        try:
+            child = self._child(run, (cores, tuple(gpus)))
+            if child is None:
+                return _stopped_result()
+            answer = child.work(request, report)
+            if child.stopping and answer.get("kind") != "died" and not answer["ok"]:
+                answer["kind"] = "stopped"
+            elif child.stopping and not answer["ok"]:
+                answer = {**_stopped_result(), "lines": answer["lines"]}
+            if child.stopping or child.process.returncode is not None:
+                self._drop(run)
+            return answer
+        except OSError as error:  # no process could be started
+            return {"event": "result", "ok": False, "kind": "died", "signal": None, "text": f"no process could be started: {error.strerror}.", "lines": []}
+        finally:
+            with self._lock:
+                self._working.discard(run)
+                self._stopped.discard(run)
+                if run in self._children:
+                    self._children[run][1].idle_since = time.monotonic()
+            timer = threading.Timer(IDLE, self.tidy)
+            timer.daemon = True
+            timer.start()
+
+    def _name(self, request: Mapping[str, Any]) -> str:
+        """Under which a child is kept: its run, which nothing else works for; any that prepares runs goes on with the next."""
+        with self._lock:
+            name, number = str(request["run"]), 0
+            if request["kind"] == "prepare":
+                while (name := f"{PREPARES}{number}") in self._working:
+                    number += 1
+            self._working.add(name)
+        return name
+
+    def stop(self, run: str) -> None:
+        """Ask what works for this run to stop at its next safe point."""
+        with self._lock:
+            if run in self._working:
+                self._stopped.add(run)
+            child = self._children.get(run)
+            if child is not None and run in self._working:
+                child[1].stop()
+
+    def tidy(self, kept: float = IDLE) -> None:
+        """End the children that have had no work for so many seconds."""
+        now = time.monotonic()
+        with self._lock:
+            idle = [run for run, (_, child) in self._children.items() if run not in self._working and now - (child.idle_since or now) >= kept - 0.1]
+            doomed = [self._children.pop(run)[1] for run in idle]
+        for child in doomed:
+            child.end()
+
+    def close(self) -> None:
+        """Kill all of them."""
+        with self._lock:
+            self._closed = True
+            doomed = [child for _, child in self._children.values()]
+        for child in doomed:
+            child.kill()
+        self.tidy(0.0)
+
+    def _child(self, run: str, kind: tuple[int, tuple[int, ...]]) -> _Child | None:
+        """The child of the run, with these cores and devices; None where it was asked to stop meanwhile."""
+        with self._lock:
+            former = self._children.get(run)
+            if former is not None and former[0] == kind:
+                former[1].idle_since = None
+                return None if run in self._stopped or self._closed else former[1]
+            if former is not None:
+                del self._children[run]
+            kept = [each for each in self._children if not each.startswith(PREPARES)]
+            idle = sorted((each for each in kept if each not in self._working), key=lambda each: self._children[each][1].idle_since or 0.0)
+            excess = [self._children.pop(each)[1] for each in idle[: max(0, len(kept) + 1 - self.most)]]
+        for child in [*excess, *([former[1]] if former is not None else [])]:
+            child.end()
+        new = self._starter.submit(_Child, self.module, _environment(*kind)).result()
+        with self._lock:
+            self._children[run] = (kind, new)
+            return None if run in self._stopped or self._closed else new
+
+    def _drop(self, run: str) -> None:
+        with self._lock:
+            found = self._children.pop(run, None)
+        if found is not None and found[1].process.returncode is None:
+            found[1].end()
+
+
+def _stopped_result() -> Event:
+    return {"event": "result", "ok": False, "kind": "stopped", "text": "stopped.", "lines": []}
+
+
+def _environment(cores: int, gpus: tuple[int, ...]) -> dict[str, str]:
+    """That of a child: numerical libraries compute on its cores, CUDA sees its devices."""
+    found = {**os.environ, "OMP_NUM_THREADS": str(cores), "NUMBA_NUM_THREADS": str(cores)}
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    names = [name for name in visible.split(",") if name]
+    found["CUDA_VISIBLE_DEVICES"] = ",".join(names[gpu] if gpu < len(names) else str(gpu) for gpu in gpus)
+    return found
+
+
+def folder_bytes(folder: Path) -> int:
+    """Of all files in a folder that are there while it is looked at."""
+    found = 0
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(OSError):
+                found += os.lstat(Path(parent, name)).st_size
+    return found

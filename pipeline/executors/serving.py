@@ -1,0 +1,135 @@
+"""The child's side of `pipeline.executors.child`: it is told what to do on standard input, and answers on standard output."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from pipeline.decide import survey
+from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, PipelineError, RunLocked, TooLittleMemory, UsageError
+from pipeline.executors.child import Event, end_with
+from pipeline.executors.memory import Limit
+from pipeline.failures import history
+from pipeline.run import Run
+from pipeline.runner import run_stages
+from pipeline.sharing import take_over
+from pipeline.stage import Stage
+
+
+class Program(Protocol):
+    """What a workflow knows and the engine does not.
+
+    stages  in order
+    """
+
+    @property
+    def stages(self) -> Sequence[Stage]: ...
+
+    def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
+        """Make the run of a scene, or bring its settings up to date; returns warnings. Raises PipelineError."""
+
+    def describe(self, run: Path) -> dict[str, Any]:
+        """What fleet.json shows of a run as it is now: "metrics", "bytes", "verdict"."""
+
+    def is_finished(self, run: Path) -> bool:
+        """Whether the pages about a run are there and newer than its stages."""
+
+    def finish(self, run: Path) -> None:
+        """Write the pages about a run whose stages are done."""
+
+
+class _Channel:
+    """The pipes to the parent, which nothing else uses from here on."""
+
+    def __init__(self) -> None:
+        self._out = os.dup(1)
+        os.dup2(2, 1)  # what a library prints is no message
+        self._lines: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        threading.Thread(target=self._read, name="requests of the parent", daemon=True).start()
+
+    def _read(self) -> None:
+        ending = False
+        with open(0, "rb", closefd=False) as lines:
+            for line in lines:
+                request = json.loads(line)
+                ending = request.get("kind") == "end"
+                self._lines.put(request)
+        if not ending:  # the parent has gone: the run may be another's by now
+            os.killpg(0, signal.SIGKILL)
+
+    def send(self, event: Event) -> None:
+        data = memoryview(json.dumps(event, default=str).encode() + b"\n")
+        try:
+            with self._lock:
+                while data:
+                    data = data[os.write(self._out, data) :]
+        except BrokenPipeError:
+            os.killpg(0, signal.SIGKILL)
+
+    def receive(self) -> dict[str, Any]:
+        found: dict[str, Any] = self._lines.get()
+        return found
+
+
+def serve(program: Program) -> None:
+    """Do what the parent asks for, until it asks for the end."""
+    channel = _Channel()
+    end_with(channel.receive()["parent"])
+    while (request := channel.receive())["kind"] != "end":
+        try:
+            answer = {"ok": True, **_answer(program, request, channel)}
+        except Exception as error:
+            answer = {"ok": False, **_failure(error)}
+        channel.send({"event": "result", **answer})
+    sys.stderr.flush()
+    os._exit(0)  # libraries that take the process down while they are unloaded have no say
+
+
+def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dict[str, Any]:
+    path = Path(request["run"])
+    if request["kind"] == "prepare":
+        for text in program.prepare(path, request["scene"]):
+            channel.send({"event": "warning", "stage": "", "text": text, "time": time.time()})
+        return {"stages": _survey(program, path), "finished": program.is_finished(path), **program.describe(path)}
+    if request["kind"] == "finish":
+        program.finish(path)
+        return program.describe(path)
+    name = request["stage"]
+    stage = next(each for each in program.stages if each.name == name)
+    if request.get("donor") and take_over(Run.open(path), stage, Path(request["donor"])):
+        channel.send({"event": "message", "stage": name, "text": f"{name}: taken over from {Path(request['donor']).name}", "time": time.time()})
+    memory = None if request["memory"] is None else Limit(request["memory"], "its share of the worker's memory")
+    outcome = run_stages(Run.open(path), program.stages, only=name, device=request["device"], memory=memory, report=channel.send)[0]
+    found = next(each for each in _survey(program, path) if each["name"] == name)
+    return {**found, "action": outcome.action, **program.describe(path)}
+
+
+def _survey(program: Program, path: Path) -> list[dict[str, Any]]:
+    """The stages of a run, whether each is up to date, and what it took."""
+    stages = []
+    for decision in survey(program.stages, Run.open(path)):
+        made = decision.manifest
+        facts = {} if made is None else {"seconds": made.seconds, "cpu_seconds": made.cpu_seconds, "peak_memory": made.peak_memory, "digest": made.digest}
+        stages.append({"name": decision.stage, "fresh": decision.fresh, "reason": decision.reason, **facts})
+    return stages
+
+
+def _failure(error: Exception) -> dict[str, Any]:
+    """A failure as `pipeline.fleet.failure` judges it."""
+    kinds = {TooLittleMemory: "refused", RunLocked: "locked", DiskFull: "disk", Interrupted: "stopped"}
+    kind = next((word for cls, word in kinds.items() if isinstance(error, cls)), None)
+    if kind is None and any(isinstance(cause, MemoryError) or type(cause).__name__ == "OutOfMemoryError" for cause in history(error)):
+        kind = "memory"
+    if kind is None:
+        kind = "input" if isinstance(error, (BadInput, UsageError, CorruptArtifact)) else "error"
+    text = str(error) if isinstance(error, PipelineError) else f"{type(error).__name__}: {error}"
+    return {"kind": kind, "text": text, "needed": getattr(error, "needed", None)}

@@ -1,0 +1,101 @@
+"""What becomes of a scene whose stage failed: tried again, differently, or given up with the reason.
+
+its worker died, or its process crashed       once more, on another worker if there is one
+memory ran out                                once more, in half of the memory
+it needs more memory than its share           once more, in what it needs, if a worker has that
+its run is locked                             again, until the lock is given back or the lease expires
+the disk is full, its run stayed locked       failed: by circumstances; the fleet's command tries it again
+anything else, or the same once more          quarantined: by itself; only `retry` tries it again
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pipeline.executors.memory import size_text
+from pipeline.text import printable
+
+LOCKED_SECONDS = 600.0  # that a run may stay locked by another process; a lease has expired long before
+LOCKED_PAUSE = 2.0
+_HEADROOM = 1.05  # of a stated need: buffers of files and pipes
+_LEAST = 64 * 2**20  # bytes; less memory is no memory
+
+
+@dataclass
+class Attempts:
+    """Failures so far of the stage that a scene is at.
+
+    lost_on  the workers on which it was lost
+    memory   bytes that it is to run in, where they are not the worker's share
+    """
+
+    crashes: int = 0
+    out_of_memory: int = 0
+    enlarged: int = 0
+    locked_since: float | None = None
+    lost_on: tuple[str, ...] = ()
+    memory: int | None = None
+
+    @property
+    def count(self) -> int:
+        return self.crashes + self.out_of_memory + self.enlarged
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """What to do now: "again", "later", or set the scene's state; with a reason, a sentence."""
+
+    action: Literal["again", "later", "failed", "quarantined"]
+    reason: str
+
+
+def remedy(what: str, result: Mapping[str, Any], attempts: Attempts, *, worker: str, given: int | None, largest: int | None, now: float) -> Remedy:
+    """Judge the result of a failed task, and count it in `attempts`.
+
+    what     the stage, for the reason
+    given    bytes that it might take; None: no limit was known
+    largest  bytes of the largest worker; None: no limit is known
+    now      seconds, of any clock
+    """
+    kind, text = result.get("kind"), printable(result.get("text") or "no reason was given.", 1500)
+    ended_for_memory = kind == "died" and result.get("signal") == signal.SIGKILL
+    if kind == "lost" or (kind in ("died", "stopped") and not ended_for_memory):
+        return _crashed(what, text, attempts, worker)
+    if kind == "memory" or ended_for_memory:
+        return _out_of_memory(what, text, attempts, given)
+    if kind == "refused":
+        return _refused(text, int(result.get("needed") or 0), attempts, largest)
+    if kind == "locked":
+        attempts.locked_since = now if attempts.locked_since is None else attempts.locked_since
+        return Remedy("later" if now - attempts.locked_since < LOCKED_SECONDS else "failed", text)
+    return Remedy("failed" if kind == "disk" else "quarantined", text)
+
+
+def _crashed(what: str, text: str, attempts: Attempts, worker: str) -> Remedy:
+    attempts.crashes += 1
+    attempts.lost_on = (*attempts.lost_on, worker)
+    if attempts.crashes == 1:
+        return Remedy("again", f"{what}: {text} It is tried once more.")
+    return Remedy("quarantined", f"{what}: {text} It was tried on {' and '.join(dict.fromkeys(attempts.lost_on))}.")
+
+
+def _out_of_memory(what: str, text: str, attempts: Attempts, given: int | None) -> Remedy:
+    attempts.out_of_memory += 1
+    shown = "" if given is None else f" in {size_text(given)}"
+    if attempts.out_of_memory == 1 and (given is None or given >= 2 * _LEAST):
+        attempts.memory = None if given is None else given // 2
+        return Remedy("again", f"{what}: memory ran out{shown} ({text.rstrip('.')}). It is tried once more, in less.")
+    return Remedy("quarantined", f"{what}: memory ran out{' again' if attempts.out_of_memory > 1 else ''}{shown} ({text.rstrip('.')}).")
+
+
+def _refused(text: str, needed: int, attempts: Attempts, largest: int | None) -> Remedy:
+    asked = int(_HEADROOM * needed)
+    if attempts.enlarged or not needed or attempts.out_of_memory or (largest is not None and needed > largest):
+        before = "memory ran out, and with less it does not begin: " if attempts.out_of_memory else ""
+        return Remedy("quarantined", before + text)
+    attempts.enlarged += 1
+    attempts.memory = asked if largest is None else min(asked, largest)
+    return Remedy("again", text)

@@ -1,0 +1,351 @@
+"""Runs the scenes of a fleet: the stages of each in order, those of different scenes side by side where there is room.
+
+The truth about a scene is its run: what a stage has published is never done again, whatever happens to this process. fleet.json tells it to others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import Interrupted, RunLocked
+from pipeline.fleet import requests
+from pipeline.fleet.failure import LOCKED_PAUSE, Attempts, remedy
+from pipeline.fleet.forecast import forecast_seconds
+from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, FleetState, FleetWord, Scene, SceneState, StageState, Totals, Verdict, write_fleet
+from pipeline.fleet.workers import Demand, Message, Room, Task, Worker, Workers
+from pipeline.text import printable
+
+Report = Callable[[dict[str, Any]], None]
+
+WRITE_SECONDS = 1.0  # between two writings of fleet.json, and TIMES as long as one takes
+TIMES = 20.0
+LOOK_SECONDS = 1.0  # between two looks for requests, and for workers that came or went
+WORKERLESS_SECONDS = 300.0  # that a fleet waits while it has no worker
+
+
+@dataclass(frozen=True)
+class StageOf:
+    """A stage of the workflow, as far as it is scheduled."""
+
+    name: str
+    uses_device: bool = False
+
+
+@dataclass
+class _Progress:
+    """A scene as it is being run.
+
+    todo      stages that are not up to date, in order; None before its run is prepared
+    finished  whether its pages are written
+    """
+
+    state: SceneState
+    number: int
+    todo: list[str] | None = None
+    finished: bool = False
+    task: Task | None = None
+    stop_reason: str | None = None
+    not_before: float = 0.0
+    last_worker: str | None = None
+    attempts: Attempts = field(default_factory=Attempts)
+    lines: list[str] = field(default_factory=list)
+
+    @property
+    def what(self) -> str:
+        """The stage to run next, or "prepare" or "finish"."""
+        return "prepare" if self.todo is None else self.todo[0] if self.todo else "finish"
+
+
+class Scheduler:
+    """One call of `enerf fleet`.
+
+    fleet    its folder, whose lock is held
+    states   all scenes, as they were before: done ones are looked at again, quarantined ones left alone
+    stages   of the workflow, in order
+    device   "cpu" or "cuda"
+    report   takes events, each with "scene": those of stages, and scene_done, scene_failed, scene_quarantined, retry
+    written  called after each writing of fleet.json
+    stop     returns the number of the signal that arrived, or None
+    lost     returns why the fleet's lock is lost, or None
+    """
+
+    def __init__(
+        self, fleet: Path, states: Sequence[SceneState], stages: Sequence[StageOf], workers: Workers, *, device: str = "cpu", report: Report | None = None,
+        written: Callable[[FleetState], None] | None = None, stop: Callable[[], int | None] = lambda: None, lost: Callable[[], str | None] = lambda: None,
+    ) -> None:  # fmt: skip
+        self.fleet = fleet
+        self.stages = {stage.name: stage for stage in stages}
+        self.workers = workers
+        self.device = device
+        self.state = FleetState(started=_now(), executor=workers.executor, slots=0, scenes=list(states))
+        self._report, self._written, self._stop, self._lost = report, written, stop, lost
+        self._all = {state.name: _Progress(state, number) for number, state in enumerate(states)}
+        self._open = [each for each in self._all.values() if each.state.state != "quarantined"]
+        self._tasks: dict[int, _Progress] = {}
+        self._room = Room()
+        self._alive: Sequence[Worker] = ()
+        self._next_number = 0
+        self._next_write = self._next_look = 0.0
+        self._workerless_since: float | None = None
+        self._changed = True
+        self._cancelled = self._ending = False
+        for each in self._open:
+            each.state.state, each.state.reason, each.state.stage, each.state.worker, each.state.attempts = "waiting", None, None, None, 0
+
+    def run(self) -> FleetState:
+        """Until every scene is done, failed or quarantined. Raises Interrupted; RunLocked where another took the fleet over."""
+        number: int | None = None
+        try:
+            while self._open and (number := self._stop()) is None and not self._cancelled:
+                self._look()
+                self._admit()
+                for message in self.workers.receive(0.5):
+                    self._heed(message)
+                self._write()
+            self._wind_down()
+        finally:
+            self.workers.close()
+        self._write("interrupted" if number is not None and self._open else "cancelled" if self._cancelled else "done" if self._all_done() else "failed")
+        if number is not None and self._open:
+            raise Interrupted(number)
+        return self.state
+
+    def _all_done(self) -> bool:
+        return all(each.state.state == "done" for each in self._all.values())
+
+    def _look(self) -> None:
+        """Now and then: which workers there are, what was requested, whether the fleet is still ours."""
+        now = time.monotonic()
+        if now < self._next_look:
+            return
+        self._next_look = now + LOOK_SECONDS
+        if (why := self._lost()) is not None:
+            raise RunLocked(why)
+        self._alive = self.workers.alive()
+        self.state.slots = sum(worker.capacity for worker in self._alive)
+        self._workerless_since = None if self._alive else self._workerless_since or now
+        if self._workerless_since is not None and now - self._workerless_since > WORKERLESS_SECONDS:
+            for each in list(self._open):
+                self._give_up(each, "failed", f"no worker was there for {WORKERLESS_SECONDS / 60:.0f} minutes.")
+        for request in requests.take(self.fleet):
+            self._obey(request)
+
+    def _obey(self, request: requests.Request) -> None:
+        if request.do == "cancel" and request.scenes is None:
+            self._cancelled = True
+            return
+        for name in request.scenes if request.scenes is not None else self._all:
+            each = self._all.get(name)
+            if each is None:
+                continue
+            if request.do == "retry" and each.state.state in ("failed", "quarantined"):
+                each.state.state, each.state.reason, each.attempts, each.todo, each.stop_reason = "waiting", None, Attempts(), None, None
+                self._open.append(each)
+                self._changed = True
+            if request.do == "cancel" and each in self._open:
+                if each.task is not None:
+                    each.stop_reason = "cancelled."
+                    self.workers.stop(each.task)
+                else:
+                    self._give_up(each, "failed", "cancelled.")
+
+    def _admit(self) -> None:
+        """Start what there is room for: stages that use a device first, then scenes that have begun, then in the manifest's order."""
+        now = time.monotonic()
+        full: set[Demand] = set()
+        open_to_all = list(self._alive)
+        for each in sorted((each for each in self._open if each.task is None and each.not_before <= now), key=self._order):
+            demand = self._demand(each)
+            if demand in full or not self._has_its_share(each):
+                continue
+            others = [worker for worker in open_to_all if worker.name not in each.attempts.lost_on]
+            place = self._room.place(demand, others or open_to_all, each.last_worker)
+            if place is not None:
+                self._start(each, *place)
+            elif demand.memory is not None and open_to_all:
+                # What needs more than a share would wait for ever beside those that do not: the largest worker is left to it.
+                open_to_all.remove(max(open_to_all, key=lambda worker: worker.memory or 0))
+            elif len(others) == len(open_to_all):
+                full.add(demand)
+
+    def _order(self, each: _Progress) -> tuple[bool, bool, int]:
+        uses = each.what in self.stages and self.stages[each.what].uses_device
+        return not (uses and self.device == "cuda"), each.todo is None, each.number
+
+    def _demand(self, each: _Progress) -> Demand:
+        stage = self.stages.get(each.what)
+        return Demand(uses_gpu=self.device == "cuda" and stage is not None and stage.uses_device, memory=each.attempts.memory)
+
+    def _has_its_share(self, each: _Progress) -> bool:
+        """Whether the scene that makes the next artifact for this one, too, has done so, or never will."""
+        donor = self._donor(each)
+        return donor is None or donor.state.state not in ("waiting", "running") or (donor.todo is not None and each.what not in donor.todo)
+
+    def _donor(self, each: _Progress) -> _Progress | None:
+        return self._all.get(each.state.shares.get(each.what, ""))
+
+    def _start(self, each: _Progress, worker: Worker, memory: int | None, gpu: int | None) -> None:
+        request: dict[str, Any] = {"kind": each.what, "run": str(self.fleet / each.state.run)}
+        if each.what == "prepare":
+            scene = each.state.scene()
+            plain = {"name": scene.name, "sources": list(scene.sources), "settings": scene.settings, "preset": scene.preset, "seed": scene.seed}
+            request["scene"] = plain
+        elif each.what in self.stages:
+            donor = self._donor(each)
+            facts = {"stage": each.what, "device": self.device if self.stages[each.what].uses_device else "cpu", "memory": memory}
+            request |= {"kind": "stage", "donor": None if donor is None else str(self.fleet / donor.state.run), **facts}
+            each.state.stages.setdefault(each.what, StageState()).state = "running"
+            each.state.stages[each.what].worker = worker.name
+        self._next_number += 1
+        each.task = Task(self._next_number, worker.name, request, worker.share_of_cores, memory, gpu)
+        each.state.state, each.state.worker, each.last_worker = "running", worker.name, worker.name
+        each.state.stage = each.what if each.what in self.stages else None
+        each.lines = []
+        self._tasks[each.task.number] = each
+        self._room.take(each.task)
+        self._changed = True
+        self.workers.start(each.task)
+
+    def _heed(self, message: Message) -> None:
+        each = self._tasks.get(message.task)
+        if each is None or each.task is None:
+            return  # of a task that was given up
+        if message.kind == "event":
+            self._event(each, message.content)
+            return
+        task, each.task = each.task, None
+        del self._tasks[task.number]
+        self._room.give(task)
+        self._changed = True
+        self._record(each, message.content)
+        if message.content.get("ok"):
+            self._done(each, task, message.content)
+        else:
+            self._failed(each, task, message.content)
+
+    def _event(self, each: _Progress, event: dict[str, Any]) -> None:
+        text = printable(event.get("text") or "", LONGEST_LINE)
+        if event.get("event") in ("message", "warning", "stage_failed") and text:
+            each.lines = [*each.lines, text][-MOST_LINES:]
+        if event.get("event") == "warning" and text not in each.state.warnings:
+            each.state.warnings = [*each.state.warnings, text][:MOST_LINES]
+            self._changed = True
+        self._tell(each, event.pop("event", "message"), **event)
+
+    def _record(self, each: _Progress, result: Mapping[str, Any]) -> None:
+        """What an answer says of the run: what its stages took, what they made."""
+        for found in [*result.get("stages", []), *([result] if "fresh" in result else [])]:
+            if found.get("name") not in self.stages or not found.get("fresh"):
+                continue
+            worker = each.state.stages[found["name"]].worker if found["name"] in each.state.stages else None
+            numbers = {name: found.get(name) or 0 for name in ("seconds", "cpu_seconds", "peak_memory")}
+            each.state.stages[found["name"]] = StageState("done", worker=worker, **numbers)
+        each.state.seconds = sum(stage.seconds for stage in each.state.stages.values() if stage.state == "done")
+        if "metrics" in result:
+            each.state.metrics = dict(result["metrics"] or {})
+            each.state.bytes = int(result.get("bytes") or 0)
+            verdict = result.get("verdict")
+            each.state.verdict = None if verdict is None else Verdict(printable(verdict["grade"], 200), printable(verdict["summary"], 4 * LONGEST_LINE))
+
+    def _done(self, each: _Progress, task: Task, result: Mapping[str, Any]) -> None:
+        kind = task.request["kind"]
+        each.attempts, each.state.attempts, each.state.stage = Attempts(), 0, None
+        if kind == "prepare":
+            # A stage that is up to date but for one before it is run, too: it is skipped at once where that gave the same again.
+            each.todo = [found["name"] for found in result["stages"] if not found["fresh"]]
+            each.finished = not each.todo and bool(result["finished"])
+            for name in self.stages:
+                each.state.stages.setdefault(name, StageState())
+            for name in each.todo:
+                each.state.stages[name].state = "waiting"
+        elif kind == "stage" and each.todo:
+            each.todo.pop(0)
+        else:
+            each.finished = True
+        if each.finished:
+            self._open.remove(each)
+            each.state.state, each.state.worker, each.state.last_lines = "done", None, []
+            self._tell(each, "scene_done", seconds=each.state.seconds)
+        elif each.stop_reason is not None:
+            self._give_up(each, "failed", each.stop_reason)
+
+    def _failed(self, each: _Progress, task: Task, result: Mapping[str, Any]) -> None:
+        stage = task.request.get("stage")
+        if stage in each.state.stages:
+            each.state.stages[stage].state = "waiting"
+        each.lines = [*each.lines, *(printable(line, LONGEST_LINE) for line in result.get("lines", []))][-MOST_LINES:]
+        if each.stop_reason is not None:
+            self._give_up(each, "failed", each.stop_reason)
+            return
+        if self._ending and result.get("kind") in ("stopped", "died", "lost"):
+            return
+        now = time.monotonic()
+        largest = None if any(worker.memory is None for worker in self._alive) else max((worker.memory or 0 for worker in self._alive), default=None)
+        judged = remedy(
+            stage or task.request["kind"], result, each.attempts, worker=task.worker,
+            given=each.attempts.memory if each.attempts.memory is not None else task.memory, largest=largest, now=now,
+        )  # fmt: skip
+        each.state.attempts = each.attempts.count
+        if judged.action in ("failed", "quarantined"):
+            if stage in each.state.stages:
+                each.state.stages[stage].state = "failed"
+            self._give_up(each, judged.action, judged.reason)
+            return
+        each.not_before = now + LOCKED_PAUSE if judged.action == "later" else 0.0
+        each.state.state, each.state.reason, each.state.worker = "waiting", judged.reason[: 4 * LONGEST_LINE], None
+        if judged.action == "again":  # a stage that was published all the same is skipped
+            self._tell(each, "retry", text=judged.reason)
+
+    def _give_up(self, each: _Progress, state: str, reason: str) -> None:
+        each.state.state = "failed" if state == "failed" else "quarantined"
+        each.state.reason = printable(reason, 4 * LONGEST_LINE)
+        each.state.last_lines, each.state.stage, each.state.worker = each.lines, None, None
+        self._open.remove(each)
+        self._changed = True
+        self._tell(each, f"scene_{state}", text=reason)
+
+    def _wind_down(self) -> None:
+        """Stop what still runs, and wait for it."""
+        self._ending = True
+        for each in list(self._tasks.values()):
+            assert each.task is not None
+            self.workers.stop(each.task)
+        while self._tasks:
+            for message in self.workers.receive(0.5):
+                self._heed(message)
+            self._write()
+        for each in self._open:
+            each.state.state, each.state.stage, each.state.worker = "waiting", None, None
+            for stage in each.state.stages.values():
+                stage.state = "waiting" if stage.state == "running" else stage.state
+
+    def _write(self, ending: FleetWord | None = None) -> None:
+        now = time.monotonic()
+        if ending is None and (not self._changed or now < self._next_write):
+            return
+        self.state.state = ending or "running"
+        self.state.updated, self.state.totals = _now(), Totals.of(self.state.scenes)
+        self.state.forecast_seconds = 0.0 if ending is not None else forecast_seconds(self.state.scenes, list(self.stages), self.state.slots)
+        write_fleet(self.fleet, self.state)
+        if self._written is not None:
+            self._written(self.state)
+        self._changed = False
+        self._next_write = now + max(WRITE_SECONDS, TIMES * (time.monotonic() - now))
+
+    def _tell(self, each: _Progress, event: str, **facts: Any) -> None:
+        if self._report is not None:
+            self._report({"time": time.time(), **facts, "event": event, "scene": each.state.name})
+
+
+def states_for(scenes: Sequence[Scene], former: FleetState | None) -> list[SceneState]:
+    """The state of each scene before it runs: that of the same scene in an earlier call, else waiting. A scene that has changed begins anew."""
+    known = {} if former is None else {state.name: state for state in former.scenes}
+    return [known[scene.name] if scene.name in known and known[scene.name].scene() == scene else SceneState.of(scene) for scene in scenes]
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

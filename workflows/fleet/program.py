@@ -1,0 +1,64 @@
+"""What the engine of fleets does not know of a workflow: how a scene becomes a run, what is shown of it, its pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.run import NAME, Run
+from pipeline.stage import Stage
+from stages.artifacts import BakeOutputs
+from workflows.asset import Workflow
+
+_PARTS = ("network", "asset", "mesh", "splats")
+
+
+@dataclass(frozen=True)
+class WorkflowProgram:
+    """`pipeline.executors.serving.Program` of a workflow."""
+
+    workflow: Workflow
+
+    @property
+    def stages(self) -> Sequence[Stage]:
+        return self.workflow.stages
+
+    def prepare(self, run: Path, scene: dict[str, Any]) -> list[str]:
+        """As `enerf run` does it: of a run that is there, settings that the manifest does not have become those of its preset again."""
+        from workflows.cli.request import Options, plan_run
+        from workflows.cli.target import open_run
+
+        preset = scene["preset"] or (open_run(run).preset if (run / NAME).is_file() else None)
+        sources = [Path(source) for source in scene["sources"]]
+        options = Options(source=sources[0] if sources else None, also=tuple(sources[1:]), preset=preset, seed=scene["seed"], table=scene["settings"])
+        plan = plan_run(run, self.workflow, options)
+        with plan.written():
+            return plan.warnings
+
+    def describe(self, run: Path) -> dict[str, Any]:
+        """The verdict on its cameras, PSNR and SSIM of what was made, and the size of its asset."""
+        from workflows.inspection.status import camera_verdict
+        from workflows.report.summary import metrics
+
+        found = metrics(run) or {}
+        shown = {part: {name: found[part].get(name) for name in ("psnr", "ssim")} for part in _PARTS if found.get(part)}
+        try:
+            size = BakeOutputs.of_run(run).asset.stat().st_size
+        except OSError:
+            size = 0
+        return {"metrics": shown, "bytes": size, "verdict": camera_verdict(run)}
+
+    def is_finished(self, run: Path) -> bool:
+        from workflows.report.pages import has_pages
+
+        return has_pages(Run.open(run), self.stages)
+
+    def finish(self, run: Path) -> None:
+        from workflows.cli.target import open_run
+        from workflows.report.pages import write_pages
+
+        opened = open_run(run)
+        with opened.locked():
+            write_pages(opened, self.stages)

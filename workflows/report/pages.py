@@ -1,0 +1,30 @@
+"""The pages about a run: its report and its viewer, written once its stages are done."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.run import Run
+    from pipeline.stage import Stage
+
+
+def write_pages(run: Run, stages: Sequence[Stage]) -> None:
+    """Write them of what the run holds now."""
+    from workflows.report.page import write_report
+    from workflows.report.viewer import write_run_viewer
+
+    write_run_viewer(run)
+    write_report(run, stages)
+
+
+def has_pages(run: Run, stages: Sequence[Stage]) -> bool:
+    """Whether the report is there and no artifact was published after it: that is a rename of its folder, which sets ctime."""
+    try:
+        written = os.stat(run.path / "report.html", follow_symlinks=False).st_mtime_ns
+    except OSError:
+        return False
+    folders = (run.folder(stage.name) for stage in stages)
+    return all(os.stat(folder, follow_symlinks=False).st_ctime_ns <= written for folder in folders if os.path.lexists(folder))
