@@ -4,8 +4,8 @@
     RUN/<stage>/     an artifact (artifact.py)
     RUN/.work/       what is being written
     RUN/.cache/      digests of files that have not changed since they were hashed; may be deleted at any time
-    RUN/.lock        held while the run is written (lock.py)
-    RUN/.lease/      the same for other machines (lease.py)
+    RUN/.lock        held while the run is written (locks/lock.py)
+    RUN/.lease/      the same for other machines (locks/lease.py)
 
 Nothing in it but the sources is an absolute path: a run may be moved or copied.
 """
@@ -27,9 +27,9 @@ from pipeline import files
 from pipeline.errors import BadInput, CorruptArtifact, RunLocked
 from pipeline.executors.memory import MOST
 from pipeline.failures import cannot_write, failed
-from pipeline.lease import Lease
 from pipeline.links import CACHE, HOLDER, LEASE, LOCK, RUN, refuse_links
-from pipeline.lock import Holder, holder_of, lock
+from pipeline.locks.lease import Lease
+from pipeline.locks.lock import Holder, holder_of, lock
 from pipeline.text import printable
 
 NAME = RUN

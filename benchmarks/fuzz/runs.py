@@ -136,7 +136,7 @@ def _sha(value: Any) -> str:
 
 
 def _lock(run: Path) -> None:
-    from pipeline.lock import holder_of
+    from pipeline.locks.lock import holder_of
 
     holder = holder_of(run)
     if holder is not None:

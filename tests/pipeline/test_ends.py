@@ -16,7 +16,7 @@ import pytest
 from pipeline import artifact, files
 from pipeline.decide import decide
 from pipeline.errors import BadInput, DiskFull, Interrupted, PipelineError, StageFailed
-from pipeline.lock import HOLDER
+from pipeline.locks.lock import HOLDER
 from pipeline.run import Run
 from pipeline.runner import run_stages, verify
 from pipeline.stage import Stage

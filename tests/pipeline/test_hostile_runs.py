@@ -18,7 +18,7 @@ from pipeline import files
 from pipeline.decide import decide, survey
 from pipeline.errors import PipelineError, UsageError
 from pipeline.hashes import Hashes
-from pipeline.lock import holder_of
+from pipeline.locks.lock import holder_of
 from pipeline.run import Run
 from pipeline.runner import run_stages, verify
 from pipeline.stage import settings_from

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import lease
 from pipeline.errors import CorruptArtifact, RunLocked
-from pipeline.lease import EXPIRY, Held, Lease, acquire
-from pipeline.lock import lock
+from pipeline.locks import lease
+from pipeline.locks.lease import EXPIRY, Held, Lease, acquire
+from pipeline.locks.lock import lock
 from pipeline.run import Run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -215,7 +215,7 @@ def test_who_lost_the_lease_publishes_nothing(tmp_path: Path) -> None:
 
 
 def test_a_killed_process_blocks_nobody_on_its_machine(tmp_path: Path) -> None:
-    script = "import os, sys; from pathlib import Path; from pipeline.lock import lock\nwith lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
+    script = "import os, sys; from pathlib import Path; from pipeline.locks.lock import lock\nwith lock(Path(sys.argv[1])): os.kill(os.getpid(), 9)"
     for _ in range(random.Random(1).randint(2, 4)):
         assert subprocess.run([sys.executable, "-c", script, str(tmp_path)], cwd=ROOT, check=False).returncode == -9
     with lock(tmp_path) as held:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import BadInput, RunLocked
-from pipeline.lock import holder_of
+from pipeline.locks.lock import holder_of
 from pipeline.run import Run
 from tests.pipeline.toy import contents
 

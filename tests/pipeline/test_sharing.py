@@ -11,7 +11,7 @@ import pytest
 from pipeline.artifact import WORK
 from pipeline.decide import decide, survey
 from pipeline.errors import CorruptArtifact, RunLocked
-from pipeline.lock import lock
+from pipeline.locks.lock import lock
 from pipeline.manifest import read_manifest
 from pipeline.run import Run
 from pipeline.runner import run_stages, verify

@@ -22,8 +22,8 @@ import msgspec
 from pipeline import files
 from pipeline.errors import BadInput, PipelineError, RunLocked
 from pipeline.failures import cannot_write
-from pipeline.lease import EXPIRY, Held, Lease, acquire
 from pipeline.links import HOLDER, LOCK
+from pipeline.locks.lease import EXPIRY, Held, Lease, acquire
 from pipeline.text import printable
 
 

@@ -7,7 +7,7 @@ Whoever finds it free creates the next number, which exactly one can: a file is 
 O_EXCL where there are no links. No number is ever given twice while a higher one is there, so that one who was slow to take over finds out. A holder
 that finds a higher number than its own, or could not renew its own for EXPIRY seconds, has lost the lease and must write nothing more.
 
-Within one machine an operating system's lock decides (`pipeline.lock`): who has that may take over at once from a process of the same machine.
+Within one machine an operating system's lock decides (`pipeline.locks.lock`): who has that may take over at once from a process of the same machine.
 """
 
 from __future__ import annotations
