@@ -1,0 +1,161 @@
+"""Settings and options of scenes, checked as `enerf run` checks them, with all mistakes instead of the first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import Mistakes, PipelineError, UsageError
+from pipeline.text import printable
+from workflows.asset import Workflow
+from workflows.budget import share_budget
+from workflows.cli.resolve import Settings, nearest, parse_value, read_preset, seconds_of
+
+Table = dict[str, dict[str, Any]]
+
+MOST_SHOWN = 50  # mistakes
+OPTIONS = ("preset", "as", "seed", "budget")  # what a manifest says beside settings, by the names of the options of `enerf run`
+GIVEN_BY_HAND = ("poses.allow_outside",)  # settings that no manifest decides: the operator does, on the command line
+
+
+class Text(str):
+    """A value as the text of a CSV's cell or of an option: it is read as after `--set stage.name=`."""
+
+
+@dataclass
+class Choice:
+    """What was chosen for a scene, or for all: settings that are not the preset's, and options."""
+
+    settings: Table = field(default_factory=dict)
+    preset: str | None = None
+    seed: int | None = None
+    budget: float | None = None
+
+    def over(self, other: Choice) -> Choice:
+        """This one where it says something, the other elsewhere."""
+        settings = {stage: {**other.settings.get(stage, {}), **self.settings.get(stage, {})} for stage in {**other.settings, **self.settings}}
+        return Choice(
+            settings,
+            other.preset if self.preset is None else self.preset,
+            other.seed if self.seed is None else self.seed,
+            other.budget if self.budget is None else self.budget,
+        )
+
+    def with_budget(self, sources: Sequence[Path]) -> Table:
+        """The settings, with what the budget makes of them."""
+        if self.budget is None:
+            return self.settings
+        parts = share_budget(self.budget, _format(self.settings.get("poses", {}), sources))
+        return {**self.settings, **{stage: {**self.settings.get(stage, {}), "time_budget": seconds} for stage, seconds in parts.items()}}
+
+
+def _format(poses: Mapping[str, Any], sources: Sequence[Path]) -> str | None:
+    """The format that sources are read as; None where that is not known yet."""
+    from stages.io.importers import detect
+
+    stated = poses.get("format", "auto")
+    if stated != "auto":
+        return str(stated)
+    if len(sources) != 1:
+        return "photographs"
+    try:
+        return detect(sources[0], bool(poses.get("allow_outside", False)))
+    except (PipelineError, OSError):
+        return None
+
+
+class Checker:
+    """Collects mistakes while values are checked against a workflow's settings."""
+
+    def __init__(self, workflow: Workflow, what: str) -> None:
+        self.workflow = workflow
+        self.what = what
+        self.mistakes: list[tuple[int, str]] = []
+        self._settings = Settings({stage.name: stage.settings for stage in workflow.stages})
+        self._known: dict[tuple[str, str, str], Any] = {}
+
+    def mistake(self, text: str, *, line: int | None = None, scene: str | None = None) -> None:
+        """Keep a mistake; `text` says what was found and what was expected."""
+        where = ", ".join(part for part in (f"line {line}" if line else "", f"scene {printable(scene, 100)}" if scene else "") if part)
+        self.mistakes.append((line or 0, f"{where}: {text}" if where else text))
+
+    def end(self) -> None:
+        """Raise Mistakes if there are any."""
+        if not self.mistakes:
+            return
+        texts = [text for _, text in sorted(self.mistakes, key=lambda each: each[0])]
+        shown = [*texts[:MOST_SHOWN], f"and {len(texts) - MOST_SHOWN} more"] if len(texts) > MOST_SHOWN else texts
+        what = printable(self.what, 1000)
+        if len(texts) == 1:
+            raise Mistakes(f"{what}: {texts[0]}", ())
+        raise Mistakes(f"{what}: {len(texts)} mistakes; nothing was run:", tuple(shown))
+
+    def value(self, stage: str, name: str, value: Any) -> Any:
+        """A setting's value as JSON holds it. Raises UsageError."""
+        key = (stage, name, f"{type(value).__name__} {value!r}")
+        if key not in self._known:
+            if f"{stage}.{name}" in GIVEN_BY_HAND:
+                raise UsageError(f"{stage}.{name}: found in a manifest, expected on the command line alone (--allow-outside).")
+            self._settings.put(stage, name, parse_value(str(value).strip()) if isinstance(value, Text) else [value], "")
+            self._known[key] = _plain(self._settings.values[stage][name])
+        return self._known[key]
+
+    def settings(self, table: Mapping[str, Any], where: Mapping[str, int | None], *, scene: str | None = None) -> Table:
+        """Stage -> setting -> value of the values that are right; the others are kept as mistakes.
+
+        where  "stage.setting", or "stage" -> line
+        """
+        found: Table = {}
+        for stage, entries in table.items():
+            if not isinstance(entries, Mapping) or not entries:
+                self.unknown(stage, where.get(stage), scene)
+                continue
+            for name, value in entries.items():
+                try:
+                    found.setdefault(stage, {})[name] = self.value(stage, name, value)
+                except UsageError as error:
+                    line = where.get(f"{stage}.{name}", where.get(stage))
+                    self.mistake(str(error).removeprefix(": "), line=line, scene=scene)
+        return found
+
+    def unknown(self, key: str, line: int | None, scene: str | None) -> None:
+        """A key that is neither an option nor a stage with settings."""
+        if key in self._settings.types:
+            self.mistake(f"{key}: found no table of settings, expected {key}.NAME = VALUE.", line=line, scene=scene)
+            return
+        known = ["source", "sources", *OPTIONS, *self._settings.types]
+        text = f"found {printable(key, 100)!r}, expected source, sources, {', '.join(OPTIONS)} or the settings of a stage.{nearest(key, known)}"
+        self.mistake(text, line=line, scene=scene)
+
+    def options(self, values: Mapping[str, Any], where: Mapping[str, int | None], *, scene: str | None = None) -> Choice:
+        """Those of OPTIONS that are there; mistakes are kept."""
+        found = Choice()
+        for name, value in values.items():
+            try:
+                self._option(found, name, value)
+            except UsageError as error:
+                self.mistake(str(error).removeprefix(": ").removeprefix("--"), line=where.get(name), scene=scene)
+        return found
+
+    def _option(self, found: Choice, name: str, value: Any) -> None:
+        if name == "seed":
+            try:
+                found.seed = int(value) if isinstance(value, Text) else value
+            except ValueError:
+                found.seed = None
+            if type(found.seed) is not int or not -(2**63) <= found.seed < 2**63:
+                raise UsageError(f"seed: found {printable(repr(value), 100)}, expected a whole number.")
+        elif not isinstance(value, str):
+            raise UsageError(f"{name}: found {printable(repr(value), 100)}, expected text.")
+        elif name == "preset":
+            found.preset = read_preset(str(value), self.workflow.presets).name
+        elif name == "as":
+            found.settings.setdefault("poses", {})["format"] = self.value("poses", "format", str(value))
+        else:
+            found.budget = seconds_of(str(value))
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
