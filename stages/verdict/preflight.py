@@ -23,7 +23,7 @@ from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened
 from stages.sfm import ladder, pairs
 from stages.verdict import looks
-from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, Problem, Verdict, of_looks
+from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, Problem, Verdict, of_looks, worded
 
 SIDE = 560  # px, longest side of the pictures that overlap is told on
 FEATURES = 800  # of a picture
@@ -195,7 +195,8 @@ def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) ->
     found = []
     lost = tuple(names[i] for group in groups[1:] for i in group)
     if lost:
-        sentence = f"{len(lost)} of {len(names)} photographs that were looked at overlap with no other, or only among themselves: {abbreviated(list(lost))}."
+        words = worded(len(lost), "overlap with no other, or only among themselves", "overlaps with no other")
+        sentence = f"{len(lost)} of {len(names)} photographs that were looked at {words}: {abbreviated(list(lost))}."
         grade = "failed" if len(groups[0]) < MIN_IMAGES else "poor" if share < 0.5 else "usable" if share < 0.9 else "good"
         found.append(Problem("overlap", grade, sentence, MORE_PHOTOGRAPHS, lost))
     if overlaps:
@@ -218,11 +219,12 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
     if unreadable:
         which = abbreviated([f"{name} {why}" for name, why in unreadable])
         grade = "usable" if len(unreadable) > 0.1 * (len(small) + len(unreadable)) else "good"
-        sentence = f"{len(unreadable)} photographs cannot be read: {which}."
+        sentence = f"{len(unreadable)} {worded(len(unreadable), 'photographs', 'photograph')} cannot be read: {which}."
         found.append(Problem("unreadable", grade, sentence, "Copy or convert them again.", tuple(dict(unreadable))))
     if count < FEW:
         grade = "failed" if count < MIN_IMAGES else "poor" if count < 6 else "usable"
-        found.append(Problem("few", grade, f"There are only {count} photographs.", "20 or more all round a subject are better."))
+        sentence = f"There {worded(count, 'are', 'is')} only {count} {worded(count, 'photographs', 'photograph')}."
+        found.append(Problem("few", grade, sentence, "20 or more all round a subject are better."))
     tiny = tuple(name for name, each in small.items() if max(each.size) < SMALL)
     if len(tiny) > 0.5 * len(small):
         found.append(Problem("small", "usable", f"{len(tiny)} photographs are smaller than {SMALL} px.", "Give the originals, of 1000 px or more.", tiny))

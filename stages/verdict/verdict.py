@@ -81,6 +81,11 @@ class Verdict:
         return f"Cameras: {self.grade}; {', '.join(words)}."
 
 
+def worded(count: int, many: str, one: str) -> str:
+    """The words that go with a number."""
+    return one if count == 1 else many
+
+
 def _pixels(error: float, digits: int) -> str:
     """A reprojection error in words: points behind a camera make it as large as can be."""
     return f"{error:.{digits}f} px" if error < MOST_PIXELS else f"more than {MOST_PIXELS:,} px"
@@ -143,7 +148,7 @@ def _of_registration(capture: Capture, registered: int, total: int, in_folder: i
             sentence = f"The model that was read has cameras of {registered} of the {in_folder} photographs in the folder."
             found.append(Problem("few of the folder", "poor" if share < 0.5 else "usable", sentence, remedy, lost))
     elif lost:
-        sentence = f"{len(lost)} of {total} photographs have no camera: {abbreviated(list(lost))}."
+        sentence = f"{len(lost)} of {total} photographs {worded(len(lost), 'have', 'has')} no camera: {abbreviated(list(lost))}."
         grade = "poor" if share < 0.5 else "usable" if share < 0.95 else "good"
         found.append(Problem("not registered", grade, sentence, MORE_PHOTOGRAPHS, lost))
     found += _of_parts(capture)
@@ -158,7 +163,8 @@ def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
     found = []
     bare = tuple(name for name, reason in capture.rejected if WITHOUT_TEXTURE in reason)
     if len(bare) > SHARE * (len(capture.photos) + len(capture.rejected)):
-        sentence = f"{len(bare)} photographs show hardly a feature; they are {WITHOUT_TEXTURE}: {abbreviated(list(bare))}."
+        words = worded(len(bare), "photographs show hardly a feature; they are", "photograph shows hardly a feature; it is")
+        sentence = f"{len(bare)} {words} {WITHOUT_TEXTURE}: {abbreviated(list(bare))}."
         remedy = "Photograph a subject with texture in good light; put a patterned cloth or newspaper under a plain one."
         found.append(Problem("without texture", "poor", sentence, remedy, bare))
     planar = capture.facts.get("planar_pairs")
@@ -200,7 +206,8 @@ def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | Non
         few = tuple(photo.camera.name for photo, count in zip(capture.photos, counts, strict=True) if count < FEW_POINTS)
         if few:
             grade = "usable" if len(few) > SHARE * len(counts) else "good"
-            sentence = f"{len(few)} photographs see fewer than {FEW_POINTS} sparse points; their cameras are less sure: {abbreviated(list(few))}."
+            seeing, unsure = worded(len(few), "photographs see", "photograph sees"), worded(len(few), "their cameras are", "its camera is")
+            sentence = f"{len(few)} {seeing} fewer than {FEW_POINTS} sparse points; {unsure} less sure: {abbreviated(list(few))}."
             found.append(Problem("few points", grade, sentence, "Texture helps: leave more of the surroundings in view.", few))
     return found
 
@@ -209,18 +216,19 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
     """Problems of the pictures themselves."""
     found = []
     for what, names, words, remedy in (
-        ("blurred", looks_of.blurred(looks), "are blurred", "Move slower, give more light, or film at a faster shutter speed."),
-        ("exposure", looks_of.of_other_exposure(looks), "are brighter or darker than the others by more than 0.75 stops", "Lock exposure and white balance."),
-        ("dark", looks_of.dark(looks), "are so dark that little but noise is left", "Give more light, or expose longer with the camera on a stand."),
-        ("clipped", looks_of.clipped(looks), "are black or white in more than 40 % of their pixels", "Expose for the subject; black and white hold no detail."),
+        ("blurred", looks_of.blurred(looks), "blurred", "Move slower, give more light, or film at a faster shutter speed."),
+        ("exposure", looks_of.of_other_exposure(looks), "brighter or darker than the others by more than 0.75 stops", "Lock exposure and white balance."),
+        ("dark", looks_of.dark(looks), "so dark that little but noise is left", "Give more light, or expose longer with the camera on a stand."),
+        ("clipped", looks_of.clipped(looks), "black or white in more than 40 % of their pixels", "Expose for the subject; black and white hold no detail."),
     ):
         if names:
             share = len(names) / len(looks)
-            sentence = f"{len(names)} of {len(looks)} photographs ({share:.0%}) {words}: {abbreviated(names)}."
+            sentence = f"{len(names)} of {len(looks)} photographs ({share:.0%}) {worded(len(names), 'are', 'is')} {words}: {abbreviated(names)}."
             found.append(Problem(what, "usable" if share > SHARE else "good", sentence, remedy, tuple(names)))
     same = looks_of.duplicates(looks)
     if same:
-        sentence = f"{len(same)} photographs are the same picture as another: {abbreviated([f'{name} as {first}' for name, first in same.items()])}."
+        words = worded(len(same), "photographs are", "photograph is")
+        sentence = f"{len(same)} {words} the same picture as another: {abbreviated([f'{name} as {first}' for name, first in same.items()])}."
         grade = "poor" if len(looks) - len(same) < 3 else "usable" if len(same) > 0.4 * len(looks) else "good"
         found.append(Problem("duplicates", grade, sentence, "They add nothing; photographs from other places would.", tuple(same)))
     return found

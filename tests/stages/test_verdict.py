@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -114,6 +115,21 @@ def test_nothing_stands_against_a_good_capture() -> None:
     assert found.summary() == "Cameras: good; 24 of 24 photographs have a camera, reprojection error 0.50 px, parallax 43 degrees."
     assert found.images["03.jpg"]["points"] == 200
     assert json.loads(json.dumps(found.document()))["grade"] == "good"
+
+
+def test_one_photograph_and_many_are_told_of_in_their_own_words() -> None:
+    def sentence(what: str, capture: Capture, looks: dict[str, Look]) -> str:
+        return next(each.sentence for each in verdict_on(capture, looks).problems if each.what == what)
+
+    assert sentence("not registered", capture(rejected=LOST[:1]), sharp(NAMES)) == "1 of 25 photographs has no camera: lost0.jpg."
+    assert sentence("not registered", capture(rejected=LOST[:2]), sharp(NAMES)) == "2 of 26 photographs have no camera: lost0.jpg, lost1.jpg."
+    one, two = ({name: {"sharpness": 0.01} for name in NAMES[:count]} for count in (1, 2))
+    assert sentence("blurred", capture(), sharp(NAMES, **one)) == "1 of 24 photographs (4%) is blurred: 00.jpg."
+    assert sentence("blurred", capture(), sharp(NAMES, **two)) == "2 of 24 photographs (8%) are blurred: 00.jpg, 01.jpg."
+    tracks = tuple(tuple(range(1, 24)) for _ in range(200))
+    points = SparsePoints(np.random.default_rng(0).normal(0, 1, (200, 3)), np.zeros((200, 3), np.uint8), np.ones(200), tracks)
+    few = "1 photograph sees fewer than 60 sparse points; its camera is less sure: 00.jpg."
+    assert sentence("few points", replace(capture(), points=points), sharp(NAMES)) == few
 
 
 LOST = tuple((f"lost{k}.jpg", "overlaps no other photograph well enough") for k in range(30))
