@@ -69,7 +69,7 @@ def viewer_page(
     script, style = script_text(), (FOLDER / "viewer.css").read_text(encoding="utf-8")
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(FOLDER), autoescape=True, undefined=jinja2.StrictUndefined)
     head = environment.get_template("viewer.html.j2").render(
-        title=title, script_hash=_hash(script), style_hash=_hash(style), style=Markup(style), facts=Markup(_json_for_html(facts))
+        title=title, script_hash=policy_hash(script), style_hash=policy_hash(style), style=Markup(style), facts=Markup(json_for_html(facts))
     )
     parts = [head.encode("utf-8"), b"\n"]
     for part in _parts(asset):
@@ -96,12 +96,12 @@ def _parts(asset: bytes) -> Iterator[bytes]:
         yield base64.b64encode(packed[begin : begin + PART])
 
 
-def _hash(text: str) -> str:
+def policy_hash(text: str) -> str:
     """As a Content-Security-Policy names a script."""
     return base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
 
 
-def _json_for_html(value: Any) -> str:
+def json_for_html(value: Any) -> str:
     """JSON that ends no element and begins no comment, whatever its texts hold."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

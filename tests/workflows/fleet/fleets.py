@@ -1,0 +1,71 @@
+"""Fleets that never ran, for tests of what shows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from pipeline.fleet.state import FleetState, SceneState, StageState, Totals, Verdict
+from stages.artifacts import TurntableOutputs
+
+NASTY = '</script><script>alert("x")</script> & <b>\x1b[2J'
+STAGES = ("poses", "train", "bake", "turntable")
+
+
+def done(name: str, psnr: float = 30.0, seconds: float = 8.0, size: int = 2_000_000, **more: object) -> SceneState:
+    """A scene that is done; its stages took equally long."""
+    stages = {stage: StageState("done", seconds / len(STAGES)) for stage in STAGES}
+    metrics = {"asset": {"psnr": psnr, "ssim": 0.9}, "network": {"psnr": psnr + 1, "ssim": 0.95}}
+    return SceneState(name, "done", metrics=metrics, seconds=seconds, bytes=size, stages=stages, run=name, verdict=Verdict("good", "All is well."), **more)  # type: ignore[arg-type]
+
+
+def fleet(*scenes: SceneState, state: str = "running") -> FleetState:
+    made = FleetState(started="2026-11-23T03:00:00Z", updated="2026-11-23T04:00:00Z", forecast_seconds=90.0, slots=2, scenes=list(scenes))
+    made.state, made.totals = state, Totals.of(made.scenes)  # type: ignore[assignment]
+    return made
+
+
+def mixed(count: int = 24, state: str = "running") -> FleetState:
+    """A tenth is quarantined with what a stranger might write into a message, some wait or run."""
+    scenes = []
+    for number in range(count):
+        name = f"scene-{number:03d}"
+        if number % 10 == 3:
+            scenes.append(SceneState(name, "quarantined", NASTY, stage=None, last_lines=[NASTY, "last"], warnings=[NASTY], run=name, sources=[f"/{NASTY}"]))
+        elif number % 10 in (5, 7):
+            waiting = number % 10 == 5
+            scenes.append(
+                SceneState(name, "waiting" if waiting else "running", stage=None if waiting else "train", run=name, worker=None if waiting else NASTY)
+            )
+        else:
+            scenes.append(done(name, 20 + number % 7, 10 + number % 3, 1_000_000 * (1 + number % 5)))
+    return fleet(*scenes, state=state)
+
+
+def short_video(path: Path) -> bytes:
+    """Some frames of H.264; the file is removed."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 96, 72, "yuv420p"
+        for number in range(5):
+            frame = av.VideoFrame.from_ndarray(np.full((72, 96, 3), 40 * number, np.uint8))
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    data = path.read_bytes()
+    path.unlink()
+    return data
+
+
+def with_pictures(folder: Path, state: FleetState) -> None:
+    """Posters and a turntable's file in the runs of scenes that are done."""
+    video = short_video(folder / "short.mp4")
+    for scene in state.scenes:
+        if scene.state == "done":
+            made = TurntableOutputs.of_run(folder / scene.name)
+            made.folder.mkdir(parents=True)
+            Image.new("RGB", (320, 200), (200, 120, 40)).save(made.poster)
+            made.video.write_bytes(video)

@@ -1,0 +1,257 @@
+"""Pages of fleets: what stands on them, that names stay text, that nothing is asked for from elsewhere, and that they are whole whenever they are read."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import hashlib
+import io
+import json
+import os
+import re
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from pipeline.fleet.state import FleetState, SceneState
+from stages.figures.pareto import pareto_front, pareto_plot
+from stages.figures.thumbnails import HEIGHT, WIDTH, write_thumbnail
+from stages.io.pictures import UnreadableImage
+from tests.workflows.fleet.fleets import NASTY, done, fleet, mixed, with_pictures
+from workflows.fleet.pages.comparison import best, mean_results, results, settings_of, write_comparison
+from workflows.fleet.pages.index import index_page
+from workflows.fleet.pages.spreadsheet import fleet_csv
+from workflows.fleet.pages.updates import Pages
+
+
+def facts(page: str) -> dict[str, Any]:
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    out: dict[str, Any] = json.loads(found[1])
+    return out
+
+
+def test_the_page_has_what_the_state_has() -> None:
+    state = mixed()
+    found = facts(index_page(state, title="t", pictures={"scene-000": 7}))
+    assert [scene["name"] for scene in found["scenes"]] == [scene.name for scene in state.scenes]
+    first, broken = found["scenes"][0], found["scenes"][3]
+    assert (first["psnr"], first["ssim"], first["seconds"], first["bytes"], first["grade"]) == (20, 0.9, 10, 1_000_000, "good")
+    assert first["report"] == "scene-000/report.html"
+    assert first["picture"] == "thumbnails/scene-000.webp?7"
+    assert first["video"] == "scene-000/turntable/turntable.mp4"
+    assert (broken["state"], broken["report"], broken["picture"], broken["video"]) == ("quarantined", None, None, None)
+    assert found["bytes"] == sum(scene.bytes for scene in state.scenes)
+    assert sum(found["totals"].values()) == 24
+
+
+def test_names_and_messages_stay_text() -> None:
+    page = index_page(mixed(), title=NASTY, comparison="comparison.html")
+    assert page.count("<script") == 2, "the data and the script"
+    assert "<b>" not in page
+    assert "\x1b" not in page
+    reason = facts(page)["scenes"][3]["reason"]
+    assert reason.startswith("</script><script>alert")
+    assert "\\x1b" in reason
+
+
+def test_the_policy_allows_the_pages_own_script_and_style_alone() -> None:
+    page = index_page(mixed(), title="t")
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', page)
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    assert rules["default-src"] == "'none'"
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
+    styles = re.findall(r"<style>(.*?)</style>", page, re.DOTALL)
+    assert len(scripts) == len(styles) == 1
+    for rule, text in (("script-src", scripts[0]), ("style-src", styles[0])):
+        assert rules[rule] == f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+    assert not re.search(r"(?:https?:)?//\w", re.sub(r'<script id="data".*?</script>', "", page, flags=re.DOTALL))
+
+
+def test_figures_that_are_none_are_left_out() -> None:
+    for metrics in (
+        {},
+        {"asset": None},
+        {"asset": {"psnr": None}},
+        {"asset": {"psnr": "x"}},
+        {"asset": {"psnr": True}},
+        {"asset": []},
+        {"asset": {"psnr": 1e300}},
+    ):
+        scene = SceneState("a", "done", metrics=metrics, run="a")
+        assert facts(index_page(fleet(scene), title="t"))["scenes"][0]["psnr"] is None
+        assert fleet_csv(fleet(scene)).splitlines()[1].split(",")[3] == ""
+    only_field = SceneState("a", "done", metrics={"network": {"psnr": 20.0, "ssim": None}}, run="a")
+    assert facts(index_page(fleet(only_field), title="t"))["scenes"][0]["psnr"] == 20.0
+
+
+def test_csv_reads_back() -> None:
+    state = mixed()
+    state.scenes[0].sweep = {"train.iterations": 2000}
+    state.scenes[1].reason = "=1+1"
+    rows = list(csv.DictReader(io.StringIO(fleet_csv(state), newline="")))
+    assert [row["name"] for row in rows] == [scene.name for scene in state.scenes]
+    assert float(rows[0]["psnr"]) == 20.0
+    assert rows[0]["train.iterations"] == "2000"
+    assert rows[1]["train.iterations"] == ""
+    assert rows[1]["reason"] == "'=1+1", "no spreadsheet takes it for a formula"
+    assert rows[3]["reason"].startswith("</script>")
+    assert "\x1b" not in fleet_csv(state)
+
+
+def test_pages_are_written_with_thumbnails_and_at_the_end(tmp_path: Path) -> None:
+    state = mixed()
+    with_pictures(tmp_path, state)
+    pages = Pages(tmp_path)
+    pages(state)
+    assert pages.trouble is None
+    first = (tmp_path / "index.html").stat().st_mtime_ns
+    pages(state)
+    assert (tmp_path / "index.html").stat().st_mtime_ns == first, "not so soon"
+    state.state = "done"
+    pages(state)
+    assert facts((tmp_path / "index.html").read_text("utf-8"))["state"] == "done"
+    made = {path.stem for path in (tmp_path / "thumbnails").iterdir()}
+    assert made == {scene.name for scene in state.scenes if scene.state == "done"}
+    assert {path.name for path in tmp_path.iterdir() if path.is_file()} == {"index.html", "fleet.csv"}
+
+
+def test_a_thumbnail_is_made_again_of_another_picture_only(tmp_path: Path) -> None:
+    state = fleet(done("a"), state="done")
+    with_pictures(tmp_path, state)
+    Pages(tmp_path)(state)
+    thumbnail = tmp_path / "thumbnails" / "a.webp"
+    with Image.open(thumbnail) as image:
+        assert image.size == (WIDTH, HEIGHT)
+    assert thumbnail.stat().st_size < 10_000
+    before = thumbnail.stat().st_ino
+    Pages(tmp_path)(state)
+    assert thumbnail.stat().st_ino == before
+    os.utime(thumbnail, ns=(1, 1))
+    Pages(tmp_path)(state)
+    assert thumbnail.stat().st_ino != before
+
+
+def test_pictures_that_are_none_end_nothing(tmp_path: Path) -> None:
+    state = fleet(done("a"), done("b"), state="done")
+    with_pictures(tmp_path, state)
+    (tmp_path / "a" / "turntable" / "frame_0000.png").write_bytes(b"no picture")
+    (tmp_path / "b" / "turntable" / "frame_0000.png").unlink()
+    with pytest.raises(UnreadableImage):
+        write_thumbnail(tmp_path / "a" / "turntable" / "frame_0000.png", tmp_path / "x.webp")
+    pages = Pages(tmp_path)
+    pages(state)
+    assert pages.trouble is None
+    assert [scene["picture"] for scene in facts((tmp_path / "index.html").read_text("utf-8"))["scenes"]] == [None, None]
+
+
+def test_a_folder_that_cannot_be_written_is_told_not_raised(tmp_path: Path) -> None:
+    pages = Pages(tmp_path / "nowhere")
+    pages(mixed())
+    assert pages.trouble is not None
+    assert "nowhere" in pages.trouble
+
+
+def test_whoever_reads_the_page_finds_a_whole_one(tmp_path: Path) -> None:
+    state, stopped, cut = mixed(50, state="done"), threading.Event(), []
+    Pages(tmp_path)(state)
+
+    def read() -> None:
+        while not stopped.is_set():
+            text = (tmp_path / "index.html").read_text("utf-8")
+            if not text.endswith("</html>"):
+                cut.append(len(text))
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(20):
+        Pages(tmp_path)(state)
+    stopped.set()
+    reader.join()
+    assert cut == []
+
+
+def sweep() -> FleetState:
+    """Two scenes, two settings of two values each; the first scene of each makes the poses."""
+    scenes = []
+    for number, name in enumerate("ab"):
+        for iterations in (1, 2):
+            for size in (8, 24):
+                values = {"train.iterations": iterations, "bake.max_mib": size}
+                scene = done(f"{name}--iterations-{iterations}--max_mib-{size}", 20 + number + iterations + size / 8, 40, size * 1_000_000, sweep=values)
+                if iterations + size > 9:
+                    scene.shares = {"poses": f"{name}--iterations-1--max_mib-8"}
+                    scene.stages["poses"].seconds = 0.0
+                scenes.append(scene)
+    return fleet(*scenes, state="done")
+
+
+def test_a_comparison_counts_what_was_shared_as_if_it_had_been_made() -> None:
+    state = sweep()
+    found = results(state, settings_of(state))
+    assert [each.seconds for each in found] == [40.0] * 8
+    assert [each.scene for each in found] == ["a"] * 4 + ["b"] * 4
+    means = mean_results(found)
+    assert [each.values for each in means] == [(1, 8), (1, 24), (2, 8), (2, 24)]
+    assert [each.psnr for each in means] == [22.5, 24.5, 23.5, 25.5]
+    assert best(means, "seconds") == {3}
+    assert best(means, "megabytes") == {2, 3}
+
+
+def test_means_are_over_scenes_that_are_whole() -> None:
+    state = sweep()
+    state.scenes[0].state = "quarantined"
+    found = results(state, settings_of(state))
+    assert found[0].psnr is None
+    assert mean_results(found) == [], "one scene is no mean"
+    assert best(found, "seconds") == {7}
+
+
+def test_a_page_of_a_sweep(tmp_path: Path) -> None:
+    state = sweep()
+    assert write_comparison(tmp_path, state)
+    page = (tmp_path / "comparison.html").read_text("utf-8")
+    assert "train.iterations, bake.max_mib. 8 of 8 runs are done." in page
+    assert page.count('<a href="a--iterations-1--max_mib-8/report.html">report</a>') == 1
+    for name in ("comparison/psnr_over_seconds.png", "comparison/psnr_over_megabytes.png"):
+        assert f'<img src="{name}"' in page
+        with Image.open(tmp_path / name) as image:
+            assert image.width > 600
+    before = {path.name: path.read_bytes() for path in (tmp_path / "comparison").iterdir()}
+    write_comparison(tmp_path, state)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "comparison").iterdir()} == before
+    assert not write_comparison(tmp_path, mixed())
+
+
+def test_a_sweep_that_has_nothing_yet_has_a_page(tmp_path: Path) -> None:
+    state = sweep()
+    for scene in state.scenes:
+        scene.state, scene.metrics = "waiting", {}
+    assert write_comparison(tmp_path, state)
+    assert "0 of 8 runs are done" in (tmp_path / "comparison.html").read_text("utf-8")
+
+
+def test_the_front_is_what_no_other_beats() -> None:
+    """Against the definition."""
+    import random
+
+    drawn = random.Random(5)
+    for _ in range(200):
+        points = [(drawn.randrange(6), drawn.randrange(6)) for _ in range(drawn.randrange(12))]
+
+        def beats(one: tuple[int, int], other: tuple[int, int]) -> bool:
+            return one != other and one[0] <= other[0] and one[1] >= other[1]
+
+        expected = {place for place, point in enumerate(points) if not any(beats(other, point) for other in points)}
+        front = pareto_front(points)
+        assert set(front) == expected
+        assert [points[place][0] for place in front] == sorted(points[place][0] for place in front)
+
+
+def test_a_plot_of_nothing_and_of_wide_costs(tmp_path: Path) -> None:
+    pareto_plot(tmp_path / "a.png", {}, x_label="x", y_label="y")
+    pareto_plot(tmp_path / "b.png", {"a": [(1, 20, "one"), (100, 30, "two")], "b": [(0.0, 1, "")]}, x_label="x", y_label="y")
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()

@@ -1,0 +1,1 @@
+"""FLEET/index.html, FLEET/comparison.html and FLEET/fleet.csv."""

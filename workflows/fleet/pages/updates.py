@@ -1,0 +1,122 @@
+"""Pages of a fleet that goes on: written whole, now and then, and at its end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from datetime import datetime
+from pathlib import Path
+
+from pipeline.files import write_atomically
+from pipeline.fleet.state import FleetState, SceneState
+from stages.artifacts import PosesOutputs, TurntableOutputs
+from workflows.fleet.pages import comparison, index, spreadsheet
+
+SECONDS = 5.0  # between two writings, and TIMES as long as one takes
+TIMES = 20.0
+THUMBNAIL_SECONDS = 1.0  # of work on thumbnails in one writing, while the fleet runs
+
+
+class Pages:
+    """Writes index.html, fleet.csv, thumbnails and, of a sweep, comparison.html. Call it with each new state.
+
+    fleet    its folder
+    trouble  why the last writing failed, or None: pages that cannot be written end no fleet
+    """
+
+    def __init__(self, fleet: Path) -> None:
+        self.fleet = fleet
+        self.trouble: str | None = None
+        self._next = 0.0
+        self._pictures: dict[str, tuple[str, int]] = {}  # scene -> what its thumbnail is of, and when it was made
+        self._done_before: int | None = None
+
+    def __call__(self, state: FleetState) -> None:
+        """Write the pages if it is time, and in any case once the fleet has ended."""
+        if self._done_before is None:
+            self._done_before = sum(scene.state == "done" for scene in state.scenes)
+        began = time.monotonic()
+        if state.state == "running" and began < self._next:
+            return
+        try:
+            self._write(state)
+            self.trouble = None
+        except OSError as error:
+            self.trouble = f"{error.filename or self.fleet}: {error.strerror or error}"
+        self._next = time.monotonic() + max(SECONDS, TIMES * (time.monotonic() - began))
+
+    def _write(self, state: FleetState) -> None:
+        self._make_thumbnails(state)
+        ended = state.state != "running"
+        compared = comparison.write_comparison(self.fleet, state, plots=ended)
+        pictures = {name: made for name, (_, made) in self._pictures.items() if made}
+        title = self.fleet.absolute().name
+        page = index.index_page(state, title=title, pictures=pictures, throughput=self._throughput(state), comparison=comparison.NAME if compared else None)
+        write_atomically(self.fleet / index.NAME, page.encode("utf-8"), durable=ended)
+        write_atomically(self.fleet / spreadsheet.NAME, spreadsheet.fleet_csv(state).encode("utf-8"), durable=ended)
+
+    def _throughput(self, state: FleetState) -> float | None:
+        """Scenes an hour since this process began."""
+        done = sum(scene.state == "done" for scene in state.scenes) - (self._done_before or 0)
+        with contextlib.suppress(ValueError):
+            seconds = (datetime.fromisoformat(state.updated) - datetime.fromisoformat(state.started)).total_seconds()
+            return 3600 * done / seconds if done > 0 and seconds > 1 else None
+        return None
+
+    def _make_thumbnails(self, state: FleetState) -> None:
+        """Of scenes whose turntable, or whose photographs before that, have come since; as many as there is time for."""
+        from stages.figures.thumbnails import write_thumbnail
+        from stages.io.pictures import UnreadableImage
+
+        began, running = time.monotonic(), state.state == "running"
+        folder = self.fleet / index.THUMBNAILS
+        folder.mkdir(exist_ok=True)
+        for scene in state.scenes:
+            stage = _shown_stage(scene)
+            known = self._pictures.get(scene.name)
+            if stage is None or (known is not None and known[0] == stage):
+                continue
+            if running and time.monotonic() - began > THUMBNAIL_SECONDS:
+                return
+            target = folder / f"{scene.name}.webp"
+            picture = _picture(self.fleet / scene.name, stage)
+            if picture is None:
+                continue
+            try:
+                if not _is_newer(target, picture):
+                    write_thumbnail(picture, target)
+                self._pictures[scene.name] = stage, os.stat(target).st_mtime_ns
+            except UnreadableImage:
+                self._pictures[scene.name] = stage, 0  # it is not tried again
+
+
+def _shown_stage(scene: SceneState) -> str | None:
+    """The stage whose picture stands for a scene: the last that is done of those that have one."""
+    for stage in (TurntableOutputs.stage, PosesOutputs.stage):
+        found = scene.stages.get(stage)
+        if found is not None and found.state == "done":
+            return stage
+    return None
+
+
+def _picture(run: Path, stage: str) -> Path | None:
+    if stage == TurntableOutputs.stage:
+        return TurntableOutputs.of_run(run).poster
+    return next((Path(entry) for entry in _pictures_in(PosesOutputs.of_run(run).images)), None)
+
+
+def _pictures_in(folder: Path) -> list[str]:
+    """The first picture below a folder, by name."""
+    for parent, folders, names in os.walk(folder):
+        folders.sort()
+        if names:
+            return [os.path.join(parent, min(names))]
+    return []
+
+
+def _is_newer(target: Path, picture: Path) -> bool:
+    """Whether a thumbnail was made after its picture was published."""
+    with contextlib.suppress(OSError):
+        return os.stat(target).st_mtime_ns > os.stat(picture).st_ctime_ns
+    return False
