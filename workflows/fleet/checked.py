@@ -92,15 +92,19 @@ class Checker:
             raise Mistakes(f"{what}: {texts[0]}", ())
         raise Mistakes(f"{what}: {len(texts)} mistakes; nothing was run:", tuple(shown))
 
-    def value(self, stage: str, name: str, value: Any) -> Any:
-        """A setting's value as JSON holds it. Raises UsageError."""
+    def value(self, stage: str, name: str, value: Any, *, by_hand: bool = False) -> Any:
+        """A setting's value as JSON holds it, of a manifest or, `by_hand`, of the command line. Raises UsageError."""
         key = (stage, name, f"{type(value).__name__} {value!r}")
         if key not in self._known:
-            if f"{stage}.{name}" in GIVEN_BY_HAND:
+            if f"{stage}.{name}" in GIVEN_BY_HAND and not by_hand:
                 raise UsageError(f"{stage}.{name}: found in a manifest, expected on the command line alone (--allow-outside).")
             self._settings.put(stage, name, parse_value(str(value).strip()) if isinstance(value, Text) else [value], "")
             self._known[key] = _plain(self._settings.values[stage][name])
         return self._known[key]
+
+    def given(self, table: Mapping[str, Mapping[str, Any]]) -> Table:
+        """Settings of the command line, whose values may be Text, as JSON holds them. Raises UsageError."""
+        return {stage: {name: self.value(stage, name, value, by_hand=True) for name, value in entries.items()} for stage, entries in table.items()}
 
     def settings(self, table: Mapping[str, Any], where: Mapping[str, int | None], *, scene: str | None = None) -> Table:
         """Stage -> setting -> value of the values that are right; the others are kept as mistakes.

@@ -20,7 +20,7 @@ import csv
 import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,7 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
 
     given  a manifest, a folder of scenes, a glob, or several folders and videos
     fleet  the fleet's folder: what it has begun may have lost its sources
-    over   what the command line says for all scenes, over the manifest
+    over   what the command line says for all scenes, over the manifest; its values may be Text
     roots  folders beside the manifest's own that its sources may lie in
     """
     checker = Checker(workflow, given[0] if len(given) == 1 else f"{len(given)} sources")
@@ -81,7 +81,9 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
     if len(entries) > MOST_SCENES:
         raise UsageError(f"{printable(checker.what, 1000)}: found {len(entries)} scenes, expected at most {MOST_SCENES}.")
     _check_names(entries, checker)
-    reader = _Reader(checker, base, inside, fleet, common, over or Choice())
+    given_by_hand = over or Choice()
+    given_by_hand = replace(given_by_hand, settings=Checker(workflow, "--set").given(given_by_hand.settings))
+    reader = _Reader(checker, base, inside, fleet, common, given_by_hand)
     scenes = [reader.scene(entry) for entry in entries]
     checker.end()
     return scenes

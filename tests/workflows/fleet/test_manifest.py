@@ -12,7 +12,7 @@ from pipeline.errors import BadInput, Mistakes, PipelineError, UsageError
 from pipeline.fleet.state import Scene, check_scenes
 from tests.workflows.command import Enerf
 from workflows.asset import WORKFLOW
-from workflows.fleet.checked import Choice
+from workflows.fleet.checked import Choice, Text
 from workflows.fleet.lines import lines_of
 from workflows.fleet.manifest import MAX_BYTES, read_manifest
 
@@ -91,7 +91,9 @@ def test_csv_says_the_same(place: Path, separator: str, mark: str) -> None:
 
 
 def test_the_command_line_is_over_the_manifest(place: Path) -> None:
-    chair, table = read(written(TOML), over=Choice({"train": {"iterations": 7}}, preset="high", seed=9))
+    given = {"train": {"iterations": Text("7")}, "poses": {"allow_outside": Text("true")}}
+    chair, table = read(written(TOML), over=Choice(given, preset="high", seed=9))
+    assert chair.settings["poses"]["allow_outside"] is True
     for scene in (chair, table):
         assert (scene.preset, scene.seed, scene.settings["train"]["iterations"]) == ("high", 9, 7)
     assert chair.settings["bake"] == {"max_mib": 8.0}
