@@ -89,6 +89,16 @@ def presets_section() -> list[str]:
     return lines
 
 
+def command_section(command: click.Command, name: str, above: click.Context) -> list[str]:
+    """The help of a command, and of those under it."""
+    context = click.Context(command, info_name=name, parent=above, terminal_width=110, max_content_width=110)
+    lines = ["", f"{'#' * (2 + context.command_path.count(' ') - 1)} {context.command_path}", "", "```", command.get_help(context), "```"]
+    if isinstance(command, click.Group):
+        for inner in command.list_commands(context):
+            lines += command_section(command.commands[inner], inner, context)
+    return lines
+
+
 def commands_page() -> str:
     lines = [NOTE, "# Commands", ""]
     context = click.Context(enerf, info_name="enerf", terminal_width=110, max_content_width=110)
@@ -96,8 +106,7 @@ def commands_page() -> str:
     for name in enerf.list_commands(context):
         command = enerf.get_command(context, name)
         assert command is not None
-        inner = click.Context(command, info_name=name, parent=context, terminal_width=110, max_content_width=110)
-        lines += ["", f"## enerf {name}", "", "```", command.get_help(inner), "```"]
+        lines += command_section(command, name, context)
     return "\n".join(lines) + "\n"
 
 

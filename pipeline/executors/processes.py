@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.executors.child import Children
+from pipeline.executors.child import Children, Report
 from pipeline.fleet.workers import Message, Task, Worker
 
 PROGRESS_SECONDS = 0.5  # between two reports of a task's progress
@@ -37,13 +37,7 @@ class Processes:
         self._children.stop(str(task.request["run"]))
 
     def receive(self, timeout: float) -> list[Message]:
-        found = []
-        try:
-            found.append(self._messages.get(timeout=timeout))
-            while True:
-                found.append(self._messages.get_nowait())
-        except queue.Empty:
-            return found
+        return received(self._messages, timeout)
 
     def close(self) -> None:
         self._children.close()
@@ -57,7 +51,18 @@ class Processes:
         self._messages.put(Message(task.number, "result", result))
 
 
-def without_haste(report: Any, seconds: float = PROGRESS_SECONDS) -> Any:
+def received(messages: queue.SimpleQueue[Message], timeout: float) -> list[Message]:
+    """All that has come; after at most so many seconds if nothing has."""
+    found = []
+    try:
+        found.append(messages.get(timeout=timeout))
+        while True:
+            found.append(messages.get_nowait())
+    except queue.Empty:
+        return found
+
+
+def without_haste(report: Report, seconds: float = PROGRESS_SECONDS) -> Report:
     """Passes events on, but progress that comes within so many seconds of the last one's."""
     last = -seconds
 

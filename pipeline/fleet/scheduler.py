@@ -253,7 +253,7 @@ class Scheduler:
 
     def _done(self, each: _Progress, task: Task, result: Mapping[str, Any]) -> None:
         kind = task.request["kind"]
-        each.attempts, each.state.attempts, each.state.stage = Attempts(), 0, None
+        each.attempts, each.state.attempts, each.state.stage, each.state.reason = Attempts(), 0, None, None
         if kind == "prepare":
             # A stage that is up to date but for one before it is run, too: it is skipped at once where that gave the same again.
             each.todo = [found["name"] for found in result["stages"] if not found["fresh"]]

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.workflows.command import Result
+from tests.workflows.fleet_child import CHILD, PRESETS
 from tests.workflows.toys import TOYS
 from workflows.asset import Workflow
 from workflows.cli.main import main
@@ -16,7 +17,7 @@ from workflows.cli.main import main
 @pytest.fixture
 def enerf(capfd: pytest.CaptureFixture[str], request: pytest.FixtureRequest) -> Callable[..., Result]:
     """enerf("run", ...) in this process, on the toy workflow where the test has `toys`."""
-    workflow = Workflow(TOYS, request.getfixturevalue("toys").parent / "presets") if "toys" in request.fixturenames else None
+    workflow = Workflow(TOYS, request.getfixturevalue("toys").parent / "presets", CHILD) if "toys" in request.fixturenames else None
 
     def call(*arguments: object) -> Result:
         capfd.readouterr()
@@ -35,6 +36,7 @@ def toys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     (presets / "preview.toml").write_text('description = "Toy."\n[train]\niterations = 3\n', encoding="utf-8")
     (presets / "tiny.toml").write_text('description = "Smaller toy."\n[train]\niterations = 1\nrate = 2\n', encoding="utf-8")
     monkeypatch.setattr("workflows.cli.device.cuda_device_count", lambda: 0)
+    monkeypatch.setenv(PRESETS, str(presets))
     source = tmp_path / "source"
     source.mkdir()
     (source / "a.txt").write_text("words", encoding="utf-8")

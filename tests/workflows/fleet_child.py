@@ -11,6 +11,7 @@ from workflows.asset import Workflow
 from workflows.fleet.program import WorkflowProgram
 
 CHILD = "tests.workflows.fleet_child"
+PRESETS = "ENERF_TOY_PRESETS"
 
 if __name__ == "__main__":
-    serve(WorkflowProgram(Workflow(TOYS, Path(os.environ["ENERF_TOY_PRESETS"]), CHILD)))
+    serve(WorkflowProgram(Workflow(TOYS, Path(os.environ[PRESETS]), CHILD)))

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,5 +46,7 @@ def test_commands_of_the_readme_exist() -> None:
     calls = re.findall(r"^    enerf (\w+)(.*)$", text, flags=re.MULTILINE)
     assert len(calls) > 10
     for name, arguments in calls:
-        options = {option for parameter in enerf.commands[name].params for option in parameter.opts}
+        command = enerf.commands[name]
+        command = command.commands["run"] if isinstance(command, click.Group) else command  # that of `enerf fleet SCENES`
+        options = {option for parameter in command.params for option in parameter.opts}
         assert set(re.findall(r"(?<= )--[a-z-]+", arguments.partition("#")[0])) <= options

@@ -15,6 +15,7 @@ import click
 from workflows.cli import assets, files, paper, presets, run, state
 from workflows.cli.failures import report_failure
 from workflows.cli.output import exit_code, watched
+from workflows.fleet.command import fleet
 
 if TYPE_CHECKING:
     from workflows.asset import Workflow
@@ -38,6 +39,7 @@ def enerf() -> None:
 for command in (
     run.run,
     run.stage,
+    fleet,
     state.check,
     state.status,
     state.verify,

@@ -1,0 +1,306 @@
+"""The scheduler on simulated workers: every scene comes to its end, and nothing takes more than there is."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import signal
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import Interrupted, RunLocked
+from pipeline.fleet import requests, scheduler
+from pipeline.fleet.scheduler import Scheduler, StageOf, states_for
+from pipeline.fleet.state import FleetState, Scene, SceneState, read_fleet
+from pipeline.fleet.workers import Task, Worker
+from tests.pipeline.fleet.simulated import STAGES, Simulated, done, scene_of, what
+
+GIB = 2**30
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scheduler looks at its workers and writes its file whenever it may."""
+    monkeypatch.setattr(scheduler, "LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(scheduler, "WRITE_SECONDS", 0.0)
+    monkeypatch.setattr(scheduler, "TIMES", 0.0)
+    monkeypatch.setattr(scheduler, "LOCKED_PAUSE", 0.0)
+
+
+def scenes(count: int) -> list[Scene]:
+    return [Scene(f"s{number}", (f"/shoots/{number}",)) for number in range(count)]
+
+
+def run(fleet: Path, workers: Simulated, chosen: list[Scene], **more: Any) -> FleetState:
+    states = states_for(chosen, more.pop("former", None))
+    stages = [StageOf("poses"), StageOf("train", True), StageOf("bake", True)]
+    found = Scheduler(fleet, states, stages, workers, **more).run()
+    assert read_fleet(fleet) == found
+    return found
+
+
+def at(scene: str, stage: str, result: dict[str, Any], times: int = 10**6) -> Any:
+    """An answer that is `result` for a stage of a scene, the first times, and else that all went well."""
+    left = itertools.count()
+
+    def answer(task: Task) -> dict[str, Any]:
+        return result if (scene_of(task), what(task.request)) == (scene, stage) and next(left) < times else done(task)
+
+    return answer
+
+
+def state_of(found: FleetState, name: str) -> SceneState:
+    return next(scene for scene in found.scenes if scene.name == name)
+
+
+def test_every_scene_is_prepared_then_its_stages_run_in_order_then_it_is_finished(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 4, slots=2), Worker("b", 4, slots=1)])
+    found = run(tmp_path, workers, scenes(7))
+    assert (found.state, found.exit_code, found.totals.done) == ("done", 0, 7)
+    for scene in scenes(7):
+        assert [stage for name, stage, _ in workers.log if name == scene.name] == ["prepare", *STAGES, "finish"]
+    assert {worker: count for worker, (_, count) in workers.most.items()} == {"a": 2, "b": 1}
+    assert state_of(found, "s3").seconds == 6.0
+    assert workers.closed
+
+
+def test_scenes_that_have_begun_come_first_and_go_on_where_they_were(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 1), Worker("b", 1)])
+    run(tmp_path, workers, scenes(6))
+    for scene in scenes(6):
+        assert len({worker for name, _, worker in workers.log if name == scene.name}) == 1
+    order = [name for name, stage, _ in workers.log if stage == "finish"]
+    assert order.index("s0") < order.index("s4")
+
+
+def test_stages_of_different_scenes_share_a_machine_with_a_device(tmp_path: Path) -> None:
+    """While one scene trains on the device, the cameras of the next are found."""
+    workers = Simulated([Worker("a", 4, gpus=(0,), slots=1)])
+    together: Counter[frozenset[str]] = Counter()
+    workers.between = lambda: together.update([frozenset(what(task.request) for task in workers.running.values())])
+    assert run(tmp_path, workers, scenes(8), device="cuda").state == "done"
+    assert any({"poses"} < names and names & {"train", "bake"} for names in together)
+    assert workers.most["a"][1] == 2
+
+
+def test_stages_are_admitted_by_memory_and_a_large_one_is_not_kept_waiting_for_ever(tmp_path: Path) -> None:
+    refused = {"ok": False, "kind": "refused", "text": "train: needs 7.0 GiB.", "needed": 7 * GIB}
+    workers = Simulated([Worker("a", 8, 8 * GIB, slots=4)], at("s0", "train", refused, times=1))
+    found = run(tmp_path, workers, scenes(12))
+    assert found.totals.done == 12
+    assert workers.most["a"] == (8 * GIB, 4)
+    names = [name for name, stage, _ in workers.log if stage == "train"]
+    assert names.count("s0") == 2
+    assert names.index("s11") > len(names) - 1 - names[::-1].index("s0")  # it did not have to wait for all others
+
+
+def test_more_memory_than_any_worker_has_is_the_scenes_own_fault(tmp_path: Path) -> None:
+    refused = {"ok": False, "kind": "refused", "text": "train: needs 9.0 GiB.", "needed": 9 * GIB}
+    workers = Simulated([Worker("a", 8, 8 * GIB, slots=2)], at("s1", "train", refused))
+    found = run(tmp_path, workers, scenes(3))
+    assert found.state == "failed"
+    assert (state_of(found, "s1").state, state_of(found, "s1").reason) == ("quarantined", "train: needs 9.0 GiB.")
+    assert found.totals.done == 2
+
+
+@pytest.mark.parametrize("result", [{"kind": "memory", "text": "out of memory."}, {"kind": "died", "signal": signal.SIGKILL, "text": "ended by SIGKILL."}])
+def test_what_ran_out_of_memory_is_tried_once_in_half(tmp_path: Path, result: dict[str, Any]) -> None:
+    given: list[int | None] = []
+
+    def answer(task: Task) -> dict[str, Any]:
+        if what(task.request) == "bake":
+            given.append(task.memory)
+            assert task.request["memory"] == task.memory
+            return {"ok": False, "lines": ["it said this"], **result}
+        return done(task)
+
+    found = run(tmp_path, Simulated([Worker("a", 2, 4 * GIB)], answer), scenes(1))
+    assert given == [4 * GIB, 2 * GIB]
+    scene = found.scenes[0]
+    assert scene.state == "quarantined"
+    assert "memory ran out again in 2.0 GiB" in (scene.reason or "")
+    assert scene.last_lines == ["it said this"]
+    assert scene.stages["bake"].state == "failed"
+    assert scene.stages["train"].state == "done"
+
+
+def test_a_stage_whose_worker_died_goes_to_another_and_is_given_up_when_that_dies_too(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 1), Worker("b", 1), Worker("c", 1)], lambda task: None if what(task.request) == "train" else done(task))
+
+    def lose() -> None:
+        for task in list(workers.running.values()):
+            if what(task.request) == "train" and len(workers.workers) > 1:
+                workers.lose(task.worker)
+                return
+
+    workers.between = lose
+    told: list[dict[str, Any]] = []
+    found = run(tmp_path, workers, scenes(1), report=told.append)
+    tried = [worker for _, stage, worker in workers.log if stage == "train"]
+    assert len(tried) == len(set(tried)) == 2
+    assert found.scenes[0].state == "quarantined"
+    assert all(worker in (found.scenes[0].reason or "") for worker in tried)
+    assert [event["event"] for event in told] == ["retry", "scene_quarantined"]
+
+
+def test_attempts_are_counted_for_each_stage(tmp_path: Path) -> None:
+    """A long scene on poor machines is not given up for one loss in each of its stages."""
+    lost: set[str] = set()
+
+    def answer(task: Task) -> dict[str, Any]:
+        if what(task.request) in lost or task.request["kind"] != "stage":
+            return done(task)
+        lost.add(what(task.request))
+        return {"ok": False, "kind": "died", "signal": signal.SIGSEGV, "text": "ended by SIGSEGV."}
+
+    found = run(tmp_path, Simulated([Worker("a", 1)], answer), scenes(1))
+    assert (found.state, lost) == ("done", set(STAGES))
+
+
+def test_a_locked_run_is_waited_for(tmp_path: Path) -> None:
+    locked = {"ok": False, "kind": "locked", "text": "being written by process 7 on b."}
+    assert run(tmp_path, Simulated([Worker("a", 1)], at("s0", "train", locked, times=30)), scenes(2)).state == "done"
+
+
+def test_a_run_that_stays_locked_fails_by_circumstances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.fleet import failure
+
+    monkeypatch.setattr(failure, "LOCKED_SECONDS", 0.0)
+    locked = {"ok": False, "kind": "locked", "text": "being written by process 7 on b."}
+    found = run(tmp_path, Simulated([Worker("a", 1)], at("s0", "train", locked)), scenes(2))
+    assert (state_of(found, "s0").state, state_of(found, "s0").reason) == ("failed", "being written by process 7 on b.")
+    again = run(tmp_path, Simulated([Worker("a", 1)]), scenes(2), former=read_fleet(tmp_path))
+    assert again.state == "done"
+
+
+def test_what_is_up_to_date_is_not_run(tmp_path: Path) -> None:
+    def answer(task: Task) -> dict[str, Any]:
+        if task.request["kind"] != "prepare":
+            return done(task)
+        fresh = {"s0": STAGES, "s1": STAGES, "s2": STAGES[:1]}[scene_of(task)]
+        stages = [{"name": name, "fresh": name in fresh, "seconds": 3.0} for name in STAGES]
+        return {"ok": True, "stages": stages, "finished": scene_of(task) == "s0"}
+
+    workers = Simulated([Worker("a", 1)], answer)
+    assert run(tmp_path, workers, scenes(3)).state == "done"
+    ran = {name: [stage for scene, stage, _ in workers.log if scene == name] for name in ("s0", "s1", "s2")}
+    assert ran == {"s0": ["prepare"], "s1": ["prepare", "finish"], "s2": ["prepare", "train", "bake", "finish"]}
+
+
+def test_shared_artifacts_are_made_once_and_waited_for(tmp_path: Path) -> None:
+    chosen = [Scene("a", ("/x",)), Scene("b", ("/x",), shares={"poses": "a", "train": "a"}), Scene("c", ("/x",), shares={"poses": "a"})]
+    workers = Simulated([Worker("w", 4, slots=4)])
+    made: list[tuple[str, str, Any]] = []
+    start = workers.start
+
+    def started(task: Task) -> None:
+        made.append((scene_of(task), what(task.request), task.request.get("donor")))
+        start(task)
+
+    workers.start = started  # type: ignore[method-assign]
+    assert run(tmp_path, workers, chosen).state == "done"
+    order = [(scene, stage) for scene, stage, _ in made]
+    donors = {(scene, stage): donor for scene, stage, donor in made}
+    assert donors["b", "poses"] == donors["c", "poses"] == donors["b", "train"] == str(tmp_path / "a")
+    assert donors["a", "poses"] is donors["b", "bake"] is donors["c", "train"] is None
+    assert order.index(("b", "train")) > order.index(("a", "train")) + 1 or order.index(("b", "train")) > order.index(("a", "bake")) - 1
+
+
+def test_who_shares_with_a_scene_that_failed_does_it_alone(tmp_path: Path) -> None:
+    chosen = [Scene("a", ("/x",)), Scene("b", ("/x",), shares={"poses": "a"})]
+    found = run(tmp_path, Simulated([Worker("w", 4, slots=4)], at("a", "poses", {"ok": False, "kind": "input", "text": "no."})), chosen)
+    assert {scene.name: scene.state for scene in found.scenes} == {"a": "quarantined", "b": "done"}
+
+
+def test_a_signal_stops_all_and_leaves_nothing_running(tmp_path: Path) -> None:
+    calls = itertools.count()
+    workers = Simulated([Worker("a", 2, slots=2)])
+    with pytest.raises(Interrupted) as caught:
+        run(tmp_path, workers, scenes(5), stop=lambda: signal.SIGINT if next(calls) > 6 else None)
+    assert caught.value.exit_code == 130
+    found = read_fleet(tmp_path)
+    assert found.state == "interrupted"
+    assert not workers.running
+    assert workers.closed
+    assert {scene.state for scene in found.scenes} <= {"waiting", "done"}
+    assert not [stage for scene in found.scenes for stage in scene.stages.values() if stage.state == "running"]
+    assert run(tmp_path, Simulated([Worker("a", 2, slots=2)]), scenes(5), former=found).state == "done"
+
+
+def test_a_lost_lease_ends_it_without_a_word_to_the_file(tmp_path: Path) -> None:
+    calls = itertools.count()
+    workers = Simulated([Worker("a", 1)])
+    with pytest.raises(RunLocked, match="taken"):
+        run(tmp_path, workers, scenes(5), lost=lambda: "taken" if next(calls) > 4 else None)
+    assert workers.closed
+    assert read_fleet(tmp_path).state == "running"  # it is another's now
+
+
+def test_requests_are_obeyed_while_it_runs(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 1)], at("s0", "poses", {"ok": False, "kind": "input", "text": "no."}, times=1))
+    asked: list[str] = []
+
+    def ask() -> None:
+        if not asked and any(scene == "s1" for scene, _, _ in workers.log):
+            asked.append("")
+            requests.ask(tmp_path, "retry", ["s0", "nobody"])
+            requests.ask(tmp_path, "cancel", ["s1", "s3"])
+
+    workers.between = ask
+    found = run(tmp_path, workers, scenes(5))
+    assert {scene.name: scene.state for scene in found.scenes} == {"s0": "done", "s1": "failed", "s2": "done", "s3": "failed", "s4": "done"}
+    assert state_of(found, "s3").reason == "cancelled."
+    assert requests.take(tmp_path) == []
+
+
+def test_a_cancelled_fleet_ends(tmp_path: Path) -> None:
+    workers = Simulated([Worker("a", 1)])
+    workers.between = lambda: requests.ask(tmp_path, "cancel", None) if len(workers.log) == 7 else None
+    found = run(tmp_path, workers, scenes(50))
+    assert (found.state, found.exit_code) == ("cancelled", 3)
+    assert not workers.running
+    assert found.totals.waiting > 40
+
+
+def test_without_a_worker_it_waits_and_then_gives_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    workers = Simulated([])
+    calls = itertools.count()
+    workers.between = lambda: workers.workers.append(Worker("late", 1)) if next(calls) == 5 else None
+    assert run(tmp_path, workers, scenes(2)).state == "done"
+    monkeypatch.setattr(scheduler, "WORKERLESS_SECONDS", 0.0)
+    found = run(tmp_path, Simulated([]), scenes(2))
+    assert {scene.state for scene in found.scenes} == {"failed"}
+    assert "no worker was there" in (found.scenes[0].reason or "")
+
+
+def test_whatever_happens_every_scene_comes_to_an_end(tmp_path: Path) -> None:
+    """Random failures of every kind and workers that come and go: no scene is lost, no run has two writers, no worker has more than it holds."""
+    for seed in range(30):
+        chance = random.Random(seed)
+        kinds = ["input", "error", "memory", "refused", "locked", "disk", "died", "lost", "stopped", "nonsense"]
+
+        def answer(task: Task, chance: random.Random = chance, kinds: list[str] = kinds) -> dict[str, Any]:
+            if chance.random() < 0.8:
+                return done(task)
+            return {"ok": False, "kind": chance.choice(kinds), "signal": chance.choice([None, 9, 11]), "text": "x", "needed": chance.randrange(6) * GIB}
+
+        workers = Simulated([Worker(f"w{n}", chance.randint(1, 8), chance.choice([None, 4 * GIB]), slots=chance.randint(1, 3)) for n in range(3)], answer)
+        numbers = itertools.count(10)
+
+        def come_and_go(workers: Simulated = workers, chance: random.Random = chance, numbers: Any = numbers) -> None:
+            if chance.random() < 0.1 and len(workers.workers) > 1:
+                workers.lose(chance.choice(workers.workers).name)
+            if chance.random() < 0.1:
+                workers.workers.append(Worker(f"w{next(numbers)}", 2, 4 * GIB, slots=2))
+
+        workers.between = come_and_go
+        fleet = tmp_path / str(seed)
+        fleet.mkdir()
+        found = run(fleet, workers, scenes(12))
+        assert {scene.state for scene in found.scenes} <= {"done", "failed", "quarantined"}
+        assert all((scene.reason is None) == (scene.state == "done") for scene in found.scenes)
+        assert all(memory <= 4 * GIB for name, (memory, _) in workers.most.items() if name.startswith("w1") and len(name) > 2)
+        assert not workers.running

@@ -1,0 +1,215 @@
+"""`enerf fleet`, and under it `status`, `retry` and `cancel`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from workflows.cli.options import common_options, device_option, folder_type, json_option, memory_option, quiet_option, set_option, workflow
+
+if TYPE_CHECKING:
+    from pipeline.fleet.state import FleetState, SceneState
+    from workflows.fleet.running import Placement
+
+CLUSTERS = ("local", "ssh", "slurm", "pbs", "lsf", "sge", "htcondor", "oar")  # of pipeline/executors/dask.py, which --help does not import
+
+
+class _Fleet(click.Group):
+    """A group with a default command: `enerf fleet SCENES ...` is `enerf fleet run SCENES ...`."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if not args or args[0] not in (*self.commands, *ctx.help_option_names):
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(cls=_Fleet, short_help="Run many scenes, here or on many machines; one bad scene stops no other.")
+def fleet() -> None:
+    """Many scenes by one command. Each is a run under FLEET, as 'enerf run' makes it.
+
+    \b
+    enerf fleet shoots/ --out fleet            a run for each folder in shoots/
+    enerf fleet scenes.toml --out fleet        scenes with settings of their own
+    enerf fleet status fleet
+
+    The same command again does what is missing or stale. 'enerf fleet run --help' lists the options. A folder that has the name of a command is
+    given as ./status.
+    """
+
+
+def _placement_options(command: Any) -> Any:
+    """Those that say where stages run."""
+    for option in reversed((
+        click.option("--jobs", type=click.IntRange(1, 1024), default=1, metavar="N",
+                     help="Stages at a time on each worker, beside one for each CUDA device; they share its cores and memory. By default 1."),
+        click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler whose workers are used, as tcp://host:8786."),
+        click.option("--cluster", type=click.Choice(CLUSTERS), help="Start a Dask cluster: local worker processes, by ssh, or jobs of a batch queue."),
+        click.option("--cluster-options", type=folder_type, metavar="FILE", help="A TOML file with the options of the cluster."),
+        device_option,
+        memory_option,
+    )):  # fmt: skip
+        command = option(command)
+    return command
+
+
+@fleet.command(short_help="Run the scenes of a manifest, or go on with them.")
+@click.argument("scenes", nargs=-1, required=True, metavar="SCENES...")
+@click.option("--out", "folder", required=True, type=folder_type, metavar="FLEET", help="The folder of the fleet.")
+@click.option("--preset", metavar="NAME", help="Preset to start from, for all scenes.")
+@set_option
+@click.option("--seed", type=int, help="Seed of every stage with random choices.")
+@click.option("--sweep", "sweeps", multiple=True, metavar="STAGE.NAME=A,B,...", help="Run each scene with each of these values; may be repeated.")
+@_placement_options
+@json_option
+@quiet_option
+@common_options
+def run(
+    scenes: tuple[str, ...], folder: Path, preset: str | None, sets: tuple[str, ...], seed: int | None, sweeps: tuple[str, ...], as_json: bool, quiet: bool,
+    **options: Any,
+) -> int:  # fmt: skip
+    """Run SCENES under FLEET: a manifest (.toml, .csv), a folder of scenes, a pattern as 'shoots/*/', or several folders and videos.
+
+    A scene that fails is tried again where that may help, and else set aside with the reason; the others go on. Exit code 0 where all scenes are
+    done, 3 where some are not.
+    """
+    from workflows.fleet.checked import Choice
+    from workflows.fleet.manifest import read_manifest
+    from workflows.fleet.options import settings_of
+    from workflows.fleet.running import check_fleet_folder
+    from workflows.fleet.sweeps import read_sweeps, swept
+
+    check_fleet_folder(folder)
+    over = Choice(settings_of(sets, workflow()), preset, seed)
+    chosen = swept(read_manifest(scenes, workflow(), folder, over=over), read_sweeps(sweeps, workflow()), workflow().stages)
+    return _run(folder, chosen, as_json=as_json, quiet=quiet, retry=None, **options)
+
+
+@fleet.command(short_help="Show what became of each scene.")
+@click.argument("folder", metavar="FLEET", type=folder_type)
+@json_option
+@common_options
+def status(folder: Path, as_json: bool) -> None:
+    """Show the state of each scene of FLEET, and who runs it."""
+    from pipeline.fleet.state import read_fleet
+    from pipeline.locks.lock import holder_of
+    from workflows.cli.output import listing, write_json
+
+    found, holder = read_fleet(folder), holder_of(folder)
+    if as_json:
+        import msgspec
+
+        write_json({**msgspec.to_builtins(found), "written_by": None if holder is None else holder.text()}, indent=1)
+        return
+    listing(*_overview(folder, found), *(_line(scene) for scene in found.scenes))
+    if holder is not None:
+        listing(f"It is being run by {holder.text()}.")
+    elif found.state == "running":
+        listing("The process that ran it has ended. Give the fleet's command again to go on.")
+
+
+@fleet.command(short_help="Try failed and quarantined scenes again.")
+@click.argument("folder", metavar="FLEET", type=folder_type)
+@click.argument("names", nargs=-1, metavar="[SCENE]...")
+@_placement_options
+@json_option
+@quiet_option
+@common_options
+def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **options: Any) -> int:
+    """Try the failed and quarantined scenes of FLEET again, or those that are named: by the process that runs it, or here."""
+    from pipeline.fleet import requests
+    from pipeline.fleet.state import read_fleet
+    from workflows.cli.output import closing
+    from workflows.fleet.running import is_running, scenes_to_retry
+
+    chosen = scenes_to_retry(read_fleet(folder).scenes, names)
+    if is_running(folder):
+        requests.ask(folder, "retry", chosen)
+        closing(f"{folder}: {len(chosen)} scenes are tried again by the process that runs it")
+        return 0
+    return _run(folder, None, as_json=as_json, quiet=quiet, retry=chosen, **options)
+
+
+@fleet.command(short_help="Stop a fleet that runs, or some of its scenes.")
+@click.argument("folder", metavar="FLEET", type=folder_type)
+@click.argument("names", nargs=-1, metavar="[SCENE]...")
+@common_options
+def cancel(folder: Path, names: tuple[str, ...]) -> None:
+    """Let the process that runs FLEET, here or elsewhere, stop at the next safe point; or only the scenes that are named. What is done is kept."""
+    from pipeline.errors import BadInput
+    from pipeline.fleet import requests
+    from pipeline.fleet.state import read_fleet
+    from workflows.cli.output import closing
+    from workflows.fleet.running import is_running
+
+    known = {scene.name for scene in read_fleet(folder).scenes}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise BadInput(f"{unknown[0]}: the fleet has no such scene. 'enerf fleet status {folder}' lists them.")
+    if not is_running(folder):
+        raise BadInput(f"{folder}: nobody runs it; there is nothing to cancel.")
+    requests.ask(folder, "cancel", names or None)
+    closing(f"{folder}: {'all of it' if not names else f'{len(names)} scenes'} will stop at the next safe point")
+
+
+def _placement(jobs: int, scheduler: str | None, cluster: str | None, cluster_options: Path | None, device: str | None, memory: str | None) -> Placement:
+    from pipeline.errors import UsageError
+    from workflows.cli.device import resolve_device
+    from workflows.cli.options import memory_limit
+    from workflows.fleet.options import read_cluster_options
+    from workflows.fleet.running import Placement
+
+    if scheduler is not None and cluster is not None:
+        raise UsageError("--scheduler and --cluster: give one. --scheduler uses a Dask cluster that runs, --cluster starts one.")
+    if cluster_options is not None and cluster is None:
+        raise UsageError(f"--cluster-options {cluster_options}: for which cluster? Give --cluster, too.")
+    remote = scheduler is not None or cluster is not None
+    if remote and memory is not None:
+        raise UsageError("--memory is of this machine; Dask's workers have limits of their own (dask worker --memory-limit).")
+    # Other machines may have devices that this one has not.
+    resolved = ("cuda" if device == "cuda" else "cpu") if remote else resolve_device(device or "auto")
+    given = {} if cluster_options is None else read_cluster_options(cluster_options)
+    return Placement(jobs, scheduler, cluster, given, resolved, memory_limit(memory))
+
+
+def _run(folder: Path, scenes: Any, *, as_json: bool, quiet: bool, retry: Any, **options: Any) -> int:
+    """Run a fleet, display its progress, and print the summary; returns the exit code."""
+    from dataclasses import asdict
+
+    from pipeline.fleet.state import read_fleet
+    from workflows.cli.failures import Reported
+    from workflows.cli.output import closing, write_json
+    from workflows.fleet.display import display
+    from workflows.fleet.running import run_fleet
+
+    placement = _placement(**options)
+    try:
+        with display(folder, as_json=as_json, quiet=quiet) as show:
+            found = run_fleet(folder, scenes, workflow(), placement, retry=retry, report=show, written=show.written)
+    except (Exception, KeyboardInterrupt) as error:
+        raise Reported(error, {"fleet": str(folder)}) from error
+    if as_json:
+        write_json({"event": "summary", "ok": found.exit_code == 0, "fleet": str(folder), "totals": asdict(found.totals), "exit_code": found.exit_code})
+    elif not quiet:
+        closing(*_overview(folder, found), *(_line(scene) for scene in read_fleet(folder).scenes if scene.state in ("failed", "quarantined")))
+    return found.exit_code
+
+
+def _overview(folder: Path, found: FleetState) -> list[str]:
+    from workflows.cli.progress import duration
+
+    counts = {name: getattr(found.totals, name) for name in ("done", "running", "waiting", "failed", "quarantined")}
+    ahead = "" if not found.forecast_seconds else f", about {duration(found.forecast_seconds)} to go"
+    lines = [f"{folder}: {found.state}; " + ", ".join(f"{count} {name}" for name, count in counts.items() if count) + ahead]
+    if counts["quarantined"]:
+        lines.append(f"To try again what is quarantined: enerf fleet retry {folder}")
+    return lines
+
+
+def _line(scene: SceneState) -> str:
+    from workflows.cli.progress import duration, size
+
+    psnr = scene.metrics.get("asset", {}).get("psnr") if isinstance(scene.metrics.get("asset"), dict) else None
+    parts = [duration(scene.seconds) if scene.seconds else "", size(scene.bytes) if scene.bytes else "", f"{psnr:.2f} dB" if isinstance(psnr, float) else ""]
+    return f"{scene.name:<24} {scene.state:<11} {'  '.join(part for part in (*parts, scene.stage or '', scene.reason or '') if part)}".rstrip()
