@@ -74,6 +74,7 @@ def run(
     A scene that fails is tried again where that may help, and else set aside with the reason; the others go on. Exit code 0 where all scenes are
     done, 3 where some are not.
     """
+    from workflows.cli.resolve import read_preset
     from workflows.fleet.checked import Choice
     from workflows.fleet.manifest import read_manifest
     from workflows.fleet.options import settings_of
@@ -81,6 +82,8 @@ def run(
     from workflows.fleet.sweeps import read_sweeps, swept
 
     check_fleet_folder(folder)
+    if preset is not None:
+        read_preset(preset, workflow().presets)
     over = Choice(settings_of(sets, workflow()), preset, seed)
     chosen = swept(read_manifest(scenes, workflow(), folder, over=over), read_sweeps(sweeps, workflow()), workflow().stages)
     return _run(folder, chosen, as_json=as_json, quiet=quiet, retry=None, **options)

@@ -1,4 +1,4 @@
-"""What a fleet says while it runs: a line for each stage that ends and whatever goes wrong, JSON lines, or nothing but what goes wrong."""
+"""What a fleet says while it runs: a live table on a terminal, else a line for each stage that ends; JSON lines; or only what goes wrong."""
 
 from __future__ import annotations
 
@@ -6,31 +6,57 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.fleet.state import FleetState
 from pipeline.text import printable
 from workflows.cli.output import write_json
 from workflows.cli.progress import duration
 
+if TYPE_CHECKING:
+    from workflows.fleet.table import LiveTable
+
 _BAD = ("scene_failed", "scene_quarantined", "retry", "warning")
 
 
 class Show:
-    """Takes the scheduler's events, and the state whenever it was written."""
+    """Takes the scheduler's events, and the state whenever it was written: pages are made of it.
 
-    def __init__(self, fleet: Path, *, as_json: bool, quiet: bool) -> None:
-        self.fleet, self.as_json, self.quiet = fleet, as_json, quiet
+    table  the live table; None where there is no terminal
+    """
+
+    def __init__(self, fleet: Path, *, as_json: bool, quiet: bool, table: LiveTable | None = None) -> None:
+        from workflows.fleet.pages.updates import Pages
+
+        self.as_json, self.quiet, self.table = as_json, quiet, table
+        self._pages = Pages(fleet)
+        self._trouble: str | None = None
 
     def __call__(self, event: dict[str, Any]) -> None:
         if self.as_json:
             if not (self.quiet and event["event"] == "progress"):
                 write_json(event)
-        elif (line := sentence(event)) is not None and (not self.quiet or event["event"] in _BAD):
+            return
+        line, bad = sentence(event), event["event"] in _BAD
+        if self.table is not None:
+            self.table(event)
+            if line is not None and bad:
+                self.table.say(line)
+        elif line is not None and (bad or not self.quiet):
             print(line, file=sys.stderr, flush=True)
 
     def written(self, state: FleetState) -> None:
-        """fleet.json was written: so are the pages made of it."""
+        """fleet.json was written."""
+        if self.table is not None:
+            self.table.written(state)
+        self._pages(state)
+        if self._pages.trouble is not None and self._pages.trouble != self._trouble:
+            text = f"the fleet's pages cannot be written: {self._pages.trouble}"
+            if self.as_json:
+                write_json({"event": "warning", "scene": "", "text": text})
+            else:
+                print(printable(text), file=sys.stderr, flush=True)
+        self._trouble = self._pages.trouble
 
 
 def sentence(event: dict[str, Any]) -> str | None:
@@ -50,7 +76,12 @@ def sentence(event: dict[str, Any]) -> str | None:
 
 @contextmanager
 def display(fleet: Path, *, as_json: bool, quiet: bool) -> Iterator[Show]:
-    """The display for the options."""
-    yield Show(fleet, as_json=as_json, quiet=quiet)
-    if as_json:
+    """The display for the options and the kind of output."""
+    if as_json or quiet or not sys.stderr.isatty():
+        yield Show(fleet, as_json=as_json, quiet=quiet)
         sys.stdout.flush()
+        return
+    from workflows.fleet.table import LiveTable
+
+    with LiveTable() as table:
+        yield Show(fleet, as_json=as_json, quiet=quiet, table=table)

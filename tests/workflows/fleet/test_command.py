@@ -50,6 +50,8 @@ def test_the_scenes_of_a_folder_are_as_one_by_one(enerf: Enerf, scenes: Path, tm
     result = enerf("fleet", scenes, "--out", fleet, "--preset", "tiny", "--jobs", 2)
     assert result.code == 0, result.err
     assert set(states(fleet).values()) == {"done"}
+    assert (fleet / "index.html").is_file()
+    assert (fleet / "fleet.csv").read_text(encoding="utf-8").count("done") == 4
     assert fleet_json(fleet)["totals"] == {"waiting": 0, "running": 0, "done": 4, "failed": 0, "quarantined": 0}
     for number in (0, 3):
         alone = tmp_path / f"alone{number}"
