@@ -13,8 +13,9 @@ from stages.io.pictures import UnreadableImage, exif_of, grey_of, opened, orient
 FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm; the "35 mm equivalent" focal length refers to it
 
 _MAKE, _MODEL, _EXIF = 271, 272, 34665
-_FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X = 37386, 41989, 41486, 41488, 40962
+_FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X, _LENS = 37386, 41989, 41486, 41488, 40962, 42036
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_FISHEYE = ("fisheye", "fish-eye", "fish eye")  # in names of lenses; rectilinear ones of the same focal lengths do not have it
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class DecodedPhoto:
     orientation    EXIF's number, 1 where there is none
     focal          pixels of the source, from EXIF, or None
     maker          make and model
+    fisheye        whether EXIF names a fisheye lens
     """
 
     rgb: np.ndarray
@@ -36,6 +38,7 @@ class DecodedPhoto:
     orientation: int
     focal: float | None
     maker: str
+    fisheye: bool = False
 
 
 def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
@@ -69,7 +72,7 @@ def read_photo(path: Path, max_side: int) -> DecodedPhoto:
     opaque = None
     if alpha is not None and (alpha < 128).any():
         opaque = _resized(apply_exif_orientation(alpha, orientation), (rgb.shape[1], rgb.shape[0])) >= 128
-    return DecodedPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *taken), maker)
+    return DecodedPhoto(rgb, opaque, width, height, orientation, focal_from_exif(details, *taken), maker, names_fisheye(details))
 
 
 def read_alpha(path: Path) -> np.ndarray | None:
@@ -127,6 +130,11 @@ def focal_from_exif(details: Any, width: int, height: int) -> float | None:
         pixels = focal * density / unit * width / taken
         return pixels if 0.2 < pixels / max(width, height) < 20 else None  # many writers state a wrong density
     return None
+
+
+def names_fisheye(details: Any) -> bool:
+    """Whether the name of the lens in EXIF data says that it is a fisheye."""
+    return any(word in str(details.get(_LENS, "")).lower() for word in _FISHEYE)
 
 
 def _number(value: Any) -> float | None:

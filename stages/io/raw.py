@@ -14,7 +14,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 
 _ORIENTATIONS = {0: 1, 3: 3, 5: 8, 6: 6}  # LibRaw's -> EXIF's
 _PLAIN, _EXIF = (271, 272), 34665  # make, model; the directory of
-_DETAILS = (37386, 41989, 41486, 41488, 40962)  # focal lengths, density of the sensor's pixels
+_DETAILS = (37386, 41989, 41486, 41488, 40962, 42036)  # focal lengths, density of the sensor's pixels, name of the lens
 
 
 class NoLibRaw(ValueError):

@@ -29,6 +29,7 @@ _WRITTEN = ("", "-wal", "-shm", "-journal")  # files of a database
 _BLOBS = {"F": 72, "E": 72, "H": 72, "qvec": 32, "tvec": 24}  # bytes, where there are any
 MAX_IMAGES = 2147483647  # COLMAP's
 _MAX_KEYPOINTS = 2**20
+FISHEYE_FOCAL = 0.4  # of the longest side: 180 degrees along the diagonal of a picture of 4:3
 HOMOGRAPHIES = (4, 5, 6)  # of COLMAP's two-view geometries: planar, panoramic, either of them
 
 Row = dict[str, Any]
@@ -87,10 +88,19 @@ def _list_images(aside: Path, work: Path, images: Sequence[WorkImage]) -> None:
 def _first_guess(image: WorkImage) -> Any:
     """SIMPLE_RADIAL, which few photographs suffice for; `mapping.bundle_adjusted` tries OPENCV. Without EXIF data the initial focal length is 1.2
     times the longest side, as COLMAP has it.
+
+    Of a fisheye lens OPENCV_FISHEYE. Its focal length counts as known: pairs are then verified by rays, which lie on epipolar planes, while on such pictures
+    no fundamental matrix fits.
     """
     pycolmap = import_pycolmap()
     scale = np.sqrt(image.work_width * image.work_height / (image.width * image.height))
-    focal = image.focal * scale if image.focal else 1.2 * max(image.work_width, image.work_height)
+    usual = FISHEYE_FOCAL if image.fisheye else 1.2
+    focal = image.focal * scale if image.focal else usual * max(image.work_width, image.work_height)
+    if image.fisheye:
+        params = [focal, focal, image.work_width / 2, image.work_height / 2, 0.0, 0.0, 0.0, 0.0]
+        camera = pycolmap.Camera(model="OPENCV_FISHEYE", width=image.work_width, height=image.work_height, params=params)
+        camera.has_prior_focal_length = True
+        return camera
     camera = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=image.work_width, height=image.work_height, params=[focal, image.work_width / 2, image.work_height / 2, 0.0]
     )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Annotated
+from typing import Annotated, TypedDict, Unpack
 
 import msgspec
 import numpy as np
@@ -20,11 +20,21 @@ from stages.io.pictures import UnreadableImage
 from stages.io.png import FAST, read_png, write_png
 from stages.scratch import note, noted, once, opened
 
-LAYOUT = 4  # of the work folder; raise it when what is written there changes meaning
+LAYOUT = 5  # of the work folder; raise it when what is written there changes meaning
 
 Side = Annotated[int, msgspec.Meta(ge=1, le=2**20)]  # pixels
 Progress = Callable[..., None]
 SafePoint = Callable[[], None]
+
+
+class Callables(TypedDict):
+    """What a long piece of work calls: how far it is, whether to go on, and what the user should know."""
+
+    progress: Progress
+    safe_point: SafePoint
+    warn: Callable[..., None]
+
+
 Masks = Mapping[str, Path | None]  # file of the mask of each photograph that has one; None: what is transparent is used, too
 WHOLE = "whole"  # in the place of the digest of a mask
 
@@ -38,7 +48,8 @@ class WorkImage:
     width, height   of the photograph after EXIF rotation, pixels
     work_width, work_height  of the copy
     focal           pixels of the photograph, from its EXIF data, or None
-    camera_key      photographs with equal keys share a COLMAP camera: same size, maker and focal length; without either same folder
+    camera_key      photographs with equal keys share a COLMAP camera: same size, maker, focal length and kind of lens; without either same folder
+    fisheye         whether it was taken through a fisheye lens
     """
 
     name: str
@@ -49,6 +60,7 @@ class WorkImage:
     work_height: Side
     focal: Annotated[float, msgspec.Meta(gt=0)] | None
     camera_key: str
+    fisheye: bool = False
 
 
 def _sha256(path: Path) -> str:
@@ -68,24 +80,26 @@ def prepare_images(
     features: int,
     seed: int,
     masks: Masks,
+    lens: str = "auto",
     paths: Mapping[str, Path] | None = None,
     threads: int = 1,
     work: Path,
-    progress: Progress,
-    safe_point: SafePoint,
-    warn: Callable[..., None],
+    **callables: Unpack[Callables],
 ) -> tuple[list[WorkImage], list[tuple[str, str]]]:
     """Copies of the photographs in `work/images` after EXIF rotation, longest side at most `max_side`; without those that cannot be read.
 
     masks    of some or all names; None: the photograph as a whole, whatever its alpha channel says
+    lens     "fisheye", "perspective", or "auto": fisheye where EXIF data say so
     paths    of some or all names: the file that is read, where it is not the name below the folder
     threads  on which photographs are read
     returns  the copies in sorted order of name, and (name, reason) of each photograph left out
 
     What an earlier, killed call with the same photographs and settings left in `work` is kept, anything else there is removed.
     """
+    safe_point, warn = callables["safe_point"], callables["warn"]
     paths = {name: folder / name for name in names} | dict(paths or {})
-    request = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "photographs": _digests(paths, masks, safe_point)}
+    request: dict[str, object] = {"layout": LAYOUT, "max_side": max_side, "features": features, "seed": seed, "lens": lens}
+    request["photographs"] = _digests(paths, masks, safe_point)
     _begin(work, json.dumps(request, indent=1, sort_keys=True).encode())
     ordered, warn_once = sorted(paths), once(warn)
     known: list[Copy | None] = []
@@ -93,7 +107,7 @@ def prepare_images(
         safe_point()
         known.append(noted(_note_of(index, work), Copy, warn_once, partial(_check, name, index, max_side, work)))
     fresh = in_order(
-        lambda index: _copy(ordered[index], paths[ordered[index]], index, max_side, masks, work),
+        lambda index: _copy(ordered[index], paths[ordered[index]], index, max_side, masks, lens, work),
         [index for index, copied in enumerate(known) if copied is None],
         threads,
         safe_point,
@@ -111,7 +125,7 @@ def prepare_images(
             if copied.remark:
                 warn(f"{name}: {copied.remark}")
             images.append(copied.image)
-        progress(index + 1, len(paths), "reading photographs")
+        callables["progress"](index + 1, len(paths), "reading photographs")
     return images, rejected
 
 
@@ -158,7 +172,7 @@ def _file(index: int) -> str:
     return f"{index:05d}.png"
 
 
-def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, work: Path) -> tuple[Copy, list[Path]]:
+def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, lens: str, work: Path) -> tuple[Copy, list[Path]]:
     """Copy one photograph; with the files written."""
     try:
         photo: DecodedPhoto = read_photo(path, max_side)
@@ -183,7 +197,9 @@ def _copy(name: str, path: Path, index: int, max_side: int, masks: Masks, work: 
     # Nothing tells the cameras of photographs without EXIF data apart but the folder, or of several sources the source, that they are in.
     maker = photo.maker if photo.maker or focal else PurePosixPath(name).parts[0] if "/" in name else ""
     key = f"{photo.width}x{photo.height} {maker} {focal if focal is None else round(focal, 1)}"
-    return Copy(WorkImage(name, _file(index), photo.width, photo.height, width, height, focal, key), remark), outputs
+    fisheye = lens == "fisheye" or (lens == "auto" and photo.fisheye)
+    key += " fisheye" if fisheye else ""
+    return Copy(WorkImage(name, _file(index), photo.width, photo.height, width, height, focal, key, fisheye), remark), outputs
 
 
 def _check(name: str, index: int, max_side: int, work: Path, copied: Copy, outputs: Collection[str]) -> None:

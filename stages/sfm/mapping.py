@@ -38,7 +38,7 @@ def sub_models(work: Path, images: Sequence[WorkImage], seed: int, options: Opti
 
 def continued(work: Path, images: Sequence[WorkImage], model: Any, seed: int, options: Options, progress: Progress, safe_point: SafePoint) -> list[Any]:
     """A model with more photographs registered, as far as the matches of `work` let them, and other sub-models; largest first."""
-    fixed = any(camera.focal_length == prior for camera, prior in _cameras_with_exif_focal(images, model))
+    fixed = any(camera.mean_focal_length() == prior for camera, prior in _cameras_with_exif_focal(images, model))
     return _incremental_mapping(work, len(images), seed, options, progress, safe_point, refine_camera=not fixed, start=model)
 
 
@@ -53,7 +53,7 @@ def _with_exif_focal(
 ) -> list[Any]:
     """`models`; or, where a focal length contradicts its EXIF data (forward motion does not determine it), those found with intrinsics fixed at
     the EXIF data, if they register as many photographs with about the same reprojection error."""
-    if not models or not any(contradicts_exif(camera.focal_length, prior) for camera, prior in _cameras_with_exif_focal(images, models[0])):
+    if not models or not any(contradicts_exif(camera.mean_focal_length(), prior) for camera, prior in _cameras_with_exif_focal(images, models[0])):
         return models
     fixed = _incremental_mapping(work, len(images), seed, options_of_attempt, progress, safe_point, refine_camera=False)
     if num_registered(fixed) >= num_registered(models) and fixed[0].compute_mean_reprojection_error() < 1.15 * models[0].compute_mean_reprojection_error():
@@ -138,11 +138,12 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
     Intrinsics fixed at the EXIF data stay.
     """
     with quiet_pycolmap() as pycolmap:
-        fixed = {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.focal_length == prior}
+        fixed = {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.mean_focal_length() == prior}
         safe_point()
         _bundle_adjust(pycolmap, model, fixed)
         counts = _images_of_cameras(model)
-        refinable = [camera_id for camera_id in sorted(counts) if camera_id not in fixed and counts[camera_id] >= 10]  # fewer would be overfitted
+        simple = {camera_id for camera_id in counts if model.cameras[camera_id].model == pycolmap.CameraModelId.SIMPLE_RADIAL}
+        refinable = [camera_id for camera_id in sorted(simple - fixed) if counts[camera_id] >= 10]  # fewer would be overfitted
         if not refinable:
             return model
         richer = model.__deepcopy__({})

@@ -15,7 +15,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.sfm import ladder, mapping, matches, process
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
-from stages.sfm.images import Masks, WorkImage, prepare_images
+from stages.sfm.images import Callables, Masks, WorkImage, prepare_images
 from stages.verdict.looks import look_at_all
 from stages.verdict.verdict import WITHOUT_TEXTURE, failed, triangulation_angle
 
@@ -47,10 +47,9 @@ def find_cameras(
     seed: int = 0,
     threads: int | None = None,
     masks: Masks | None = None,
+    lens: str = "auto",
     work: Path,
-    progress: Callable[..., None],
-    safe_point: Callable[[], None],
-    warn: Callable[..., None],
+    **callables: Unpack[Callables],
 ) -> Capture:
     """Find the pose and the intrinsics of each photograph's camera.
 
@@ -60,6 +59,7 @@ def find_cameras(
     threads         on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
     matching        "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
     masks           of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
+    lens            "fisheye", "perspective", or "auto": fisheye where EXIF data say so
     work            scratch folder; what a killed call left in it is used again, and the result has the same bits
     returns         a Capture of kind "photographs"; photographs that were not registered are in `rejected`, with the reason
 
@@ -69,11 +69,11 @@ def find_cameras(
     """
     masks, paths = masks or {}, _paths(folder, names)
     arguments: dict[str, Any] = {"folder": os.path.abspath(folder), "names": {name: os.path.abspath(path) for name, path in paths.items()}}
-    arguments |= {"max_side": max_side, "features": features, "matching": matching, "seed": seed, "threads": threads}
+    arguments |= {"max_side": max_side, "features": features, "matching": matching, "seed": seed, "threads": threads, "lens": lens}
     arguments |= {"masks": {name: mask and os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
     resumed = database_path(work).exists()
     try:
-        found = process.run(arguments, progress=progress, safe_point=safe_point, warn=warn)
+        found = process.run(arguments, **callables)
     except process.ChildAborted:
         if resumed:  # what was left by an earlier attempt may be what COLMAP cannot bear
             remove_database(work)
@@ -123,12 +123,12 @@ def reconstruct(
     seed: int,
     threads: int | None = None,
     masks: Masks,
+    lens: str = "auto",
     work: Path,
-    progress: Callable[..., None],
-    safe_point: Callable[[], None],
-    warn: Callable[..., None],
+    **callables: Unpack[Callables],
 ) -> Capture:
     """`find_cameras` in this process."""
+    progress, safe_point = callables["progress"], callables["safe_point"]
     work.mkdir(parents=True, exist_ok=True)
     images, unreadable = prepare_images(
         folder,
@@ -137,12 +137,11 @@ def reconstruct(
         features=features,
         seed=seed,
         masks=masks,
+        lens=lens,
         paths=_paths(folder, names),
         threads=threads or count_cores(),
         work=work,
-        progress=progress,
-        safe_point=safe_point,
-        warn=warn,
+        **callables,
     )
     if len(images) < mapping.MIN_MODEL_SIZE:
         raise BadInput(
@@ -152,7 +151,7 @@ def reconstruct(
     if matching == "auto":
         matching = ladder.matching_for(len(images))
     with _full_disk_named(work):
-        open_database(work, images, warn)
+        open_database(work, images, callables["warn"])
         matches.extract_features(work, images, features=features, threads=threads, progress=progress, safe_point=safe_point)
         found = ladder.find_models(
             work, images, matching, features=features, seed=seed, threads=threads or count_cores(), progress=progress, safe_point=safe_point
@@ -164,7 +163,7 @@ def reconstruct(
     facts = _facts_of_matching(images, found, matching)
     capture = _capture(folder, place, images, mapping.bundle_adjusted(place, images, models[0], safe_point), masks, rejected, facts)
     for sentence in capture.warnings:
-        warn(sentence)
+        callables["warn"](sentence)
     return capture
 
 
@@ -349,6 +348,6 @@ def _model_warnings(photos: Sequence[Photo], points: SparsePoints, agreement: fl
         focal, longest = camera.intrinsics["fx"], max(camera.width, camera.height)
         if prior and mapping.contradicts_exif(focal, prior):
             warnings.append(f"{camera.name}: focal length {focal:.0f} px, but {prior:.0f} px by its EXIF data; cropped or edited photographs may explain it.")
-        elif not 0.35 < focal / longest < 6.0:
+        elif not (0.15 if camera.model == "OPENCV_FISHEYE" else 0.35) < focal / longest < 6.0:
             warnings.append(f"{camera.name}: an unlikely focal length, {focal:.0f} px at {longest} px wide.")
     return warnings

@@ -1,0 +1,65 @@
+"""Cameras of photographs that a fisheye lens took: half of all directions in one picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.poses import aligned_errors
+from benchmarks.scenes import room as rooms
+from efficientnerf.geometry.cameras import Camera, rays
+from stages.io.photo import read_photo
+from stages.sfm.images import WorkImage, prepare_images
+from stages.sfm.reconstruction import find_cameras
+
+WIDTH, HEIGHT = 400, 300
+LENS = (132.0, 132.4, 200.0, 150.0, 0.03, -0.008, 0.002, -0.0005)  # 174 degrees from left to right
+NAME = "AF Fisheye 8mm F2.8"
+QUIET: dict[str, Any] = {"progress": lambda *a, **k: None, "safe_point": lambda: None, "warn": lambda *a, **k: None}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Camera]]:
+    made = rooms.cameras(10, WIDTH, HEIGHT, "OPENCV_FISHEYE", LENS)
+    return rooms.write(tmp_path_factory.mktemp("room"), made, NAME), made
+
+
+def test_cameras_and_lens_are_those_that_took_the_photographs(room: tuple[Path, list[Camera]], tmp_path: Path) -> None:
+    folder, made = room
+    found = find_cameras(folder, [camera.name for camera in made], work=tmp_path, **QUIET)
+    assert [photo.camera.name for photo in found.photos] == [camera.name for camera in made]
+    assert {photo.camera.model for photo in found.photos} == {"OPENCV_FISHEYE"}
+    assert not found.warnings
+    errors = aligned_errors(np.array([photo.camera.centre for photo in found.photos]), np.array([camera.centre for camera in made]))
+    assert np.sqrt((errors**2).mean()) < 0.001
+    # The directions of pixels from their camera, out to the corners.
+    pixels = np.array([[x, y] for x in (5.0, 100.0, 200.0, 395.0) for y in (5.0, 150.0, 295.0)])
+    one, other = (rays(camera, pixels)[1] @ camera.world_from_camera[:3, :3] for camera in (found.photos[0].camera, made[0]))
+    assert np.degrees(np.arccos(np.clip((one * other).sum(1), -1, 1))).max() < 0.5
+
+
+def prepared(folder: Path, work: Path, lens: str) -> list[WorkImage]:
+    names = sorted(path.name for path in folder.iterdir())
+    return prepare_images(folder, names, max_side=100, features=100, seed=0, masks={}, lens=lens, work=work, **QUIET)[0]
+
+
+def test_the_lens_is_told_by_exif_and_overruled_by_the_setting(room: tuple[Path, list[Camera]], tmp_path: Path) -> None:
+    folder = tmp_path / "mixed"
+    folder.mkdir()
+    (folder / "a.jpg").write_bytes((room[0] / "room_00.jpg").read_bytes())
+    with Image.open(room[0] / "room_01.jpg") as image:
+        image.save(folder / "b.jpg")  # without EXIF data
+    assert [read_photo(folder / name, 100).fisheye for name in ("a.jpg", "b.jpg")] == [True, False]
+    for lens, expected in (("auto", [True, False]), ("fisheye", [True, True]), ("perspective", [False, False])):
+        images = prepared(folder, tmp_path / lens, lens)
+        assert [image.fisheye for image in images] == expected
+        assert len({image.camera_key for image in images}) == len(set(expected))
+
+
+def test_another_lens_makes_the_scratch_folder_anew(room: tuple[Path, list[Camera]], tmp_path: Path) -> None:
+    for lens in ("perspective", "fisheye"):
+        assert {image.fisheye for image in prepared(room[0], tmp_path, lens)} == {lens == "fisheye"}
