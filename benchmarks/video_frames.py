@@ -1,9 +1,10 @@
 """Frames chosen of a video against every n-th: a hand-held clip is rendered from a run's asset, with motion blur where the hand shakes.
 
-    python -m benchmarks.video_frames RUN OUT [--seconds 10] [--fps 12] [--chosen 40] [--longest 400] [--no-cameras]
+    python -m benchmarks.video_frames RUN OUT [--seconds 10] [--fps 12] [--chosen 40] [--longest 400] [--no-cameras] [--assets 3m]
 
 OUT gets clip.mp4, truth.json (pose and true blur of each frame) and result.json: blur and sharpness of both choices, the share of frames whose cameras were
-found, and how far the centres are from the true ones.
+found, and how far the centres are from the true ones. With --assets, an asset is made of each choice in that time, with the true cameras; its PSNR is that of
+the same sharp pictures from places between the frames.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +21,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.poses import aligned_errors
+from benchmarks.stage_runs import cost_of, read_json
 from efficientnerf.asset import format
 from efficientnerf.asset.rendering import render
-from efficientnerf.geometry.cameras import Camera, project
+from efficientnerf.geometry.cameras import Camera, opengl_from_pose, project
 from pipeline.errors import BadInput
 from stages.artifacts import BakeOutputs, PosesOutputs
 from stages.figures.plots import to_uint8
@@ -39,6 +42,7 @@ SHAKES = ((0.08, 0.13), (0.22, 0.3), (0.45, 0.5), (0.62, 0.72), (0.86, 0.9))  # 
 SHAKE, SHAKE_HZ = 0.045, 3.5  # radians, a second
 STANDS = ((0.32, 0.4), (0.74, 0.8))  # and in which it stands
 DENSE = 1500
+TEST_VIEWS = 16
 
 
 def place(time: np.ndarray) -> np.ndarray:
@@ -70,8 +74,7 @@ def camera_at(cameras: list[Camera], time: float, seconds: float) -> Camera:
 def rendered(run: Path, frames: int, fps: int, longest: int, truth: list[dict[str, Any]]) -> Iterator[np.ndarray]:
     """The frames; what is known of each goes into `truth`."""
     tree = format.load(BakeOutputs.of_run(run).asset)
-    captured = scene.load(PosesOutputs.of_run(run).folder)
-    cameras = captured_cameras([view.camera for view in captured.views], DENSE, longest)
+    cameras = path_of(run, longest)
     seconds = frames / fps
     middle = np.median([camera.centre + camera.forward * np.linalg.norm(camera.centre) for camera in cameras], axis=0)[None]
     for index in range(frames):
@@ -83,6 +86,51 @@ def rendered(run: Path, frames: int, fps: int, longest: int, truth: list[dict[st
         pictures = [render(tree, camera_at(cameras, time, seconds), normals=False).colour for time in times]
         truth.append({"blur": blur, "centre": camera_at(cameras, (opens + closes) / 2, seconds).centre.tolist()})
         yield to_uint8(np.mean([np.clip(picture, 0, 1) ** 2.2 for picture in pictures], axis=0) ** (1 / 2.2))
+
+
+def path_of(run: Path, longest: int) -> list[Camera]:
+    return captured_cameras([view.camera for view in scene.load(PosesOutputs.of_run(run).folder).views], DENSE, longest)
+
+
+def write_data_set(run: Path, frames: dict[int, Path], count: int, seconds: float, longest: int, out: Path) -> Path:
+    """A transforms.json with frames of a clip for training, with the cameras of the middle of their exposure, and sharp test views between them.
+
+    frames  by number, of the clip's `count`
+    """
+    from PIL import Image
+
+    shutil.rmtree(out, ignore_errors=True)
+    (out / "images").mkdir(parents=True)
+    tree, cameras = format.load(BakeOutputs.of_run(run).asset), path_of(run, longest)
+    entries: dict[str, list[tuple[str, Camera]]] = {"train": [], "test": []}
+    for number, path in sorted(frames.items()):
+        name = f"images/frame_{number:06d}.png"
+        shutil.copyfile(path, out / name)
+        entries["train"].append((name, camera_at(cameras, number / count + SHUTTER / seconds / 2, seconds)))
+    for k in range(TEST_VIEWS):
+        camera, name = camera_at(cameras, (k + 0.5) / TEST_VIEWS, seconds), f"images/test_{k:02d}.png"
+        Image.fromarray(to_uint8(render(tree, camera, normals=False).colour)).save(out / name)
+        entries["test"].append((name, camera))
+    lens = cameras[0]
+    document = {
+        "camera_model": "PINHOLE", "w": lens.width, "h": lens.height,
+        "fl_x": lens.params[0], "fl_y": lens.params[0], "cx": lens.params[1], "cy": lens.params[2],
+        **{f"{split}_filenames": [name for name, _ in rows] for split, rows in entries.items()},
+        "frames": [
+            {"file_path": name, "transform_matrix": opengl_from_pose(camera.world_from_camera).tolist()} for rows in entries.values() for name, camera in rows
+        ],
+    }  # fmt: skip
+    (out / "transforms.json").write_text(json.dumps(document, indent=1))
+    return out
+
+
+def psnr_of_asset(source: Path, out: Path, budget: str) -> dict[str, Any]:
+    """PSNR and SSIM of the test views of a data set's asset."""
+    shutil.rmtree(out, ignore_errors=True)
+    command = [sys.executable, "-m", "workflows.cli.main", "run", str(source), "--out", str(out), "--budget", budget, "--quiet", "--until", "evaluate"]
+    cost = cost_of([*command, "--set", "evaluate.captured_path_frames=off", "--set", "splats.make=off"])
+    asset = read_json(out / "evaluate" / "metrics.json")["asset"]
+    return {"psnr": asset["psnr"], "ssim": asset["ssim"], "views": asset["views"], **cost}
 
 
 def measured(paths: dict[str, Path], numbers: list[int], truth: list[dict[str, Any]], sharpness: list[float], work: Path | None) -> dict[str, Any]:
@@ -128,6 +176,7 @@ def main() -> None:
     parser.add_argument("--chosen", type=int, default=40)
     parser.add_argument("--longest", type=int, default=400)
     parser.add_argument("--no-cameras", action="store_true")
+    parser.add_argument("--assets", metavar="BUDGET", help="make an asset of each choice in this time")
     arguments = parser.parse_args()
     clip, frames = arguments.out / "clip.mp4", round(arguments.seconds * arguments.fps)
     if not clip.exists():
@@ -147,6 +196,10 @@ def main() -> None:
     for name, paths, numbers in (("chosen", chosen.paths, ours), ("every_nth", plain, nth)):
         work = None if arguments.no_cameras else arguments.out / f"cameras_{name}"
         result[name] = measured(paths, numbers, truth, sharpness, work)
+        if arguments.assets:
+            chosen_files = {int(Path(path_name).stem): path for path_name, path in paths.items()}
+            folder = write_data_set(arguments.run, chosen_files, frames, frames / arguments.fps, arguments.longest, arguments.out / f"data_{name}")
+            result[name]["asset"] = psnr_of_asset(folder, arguments.out / f"run_{name}", arguments.assets)
         (arguments.out / "result.json").write_text(json.dumps(result, indent=1))
     print(json.dumps(result, indent=1))
 

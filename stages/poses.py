@@ -7,9 +7,8 @@ Images are not undistorted: later stages trace the distorted rays.
 
 from __future__ import annotations
 
-import contextlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,7 +23,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import PosesOutputs
 from stages.cores import count_cores, in_order
 from stages.io import importers
-from stages.io.capture import Capture, Photo, Silhouettes, SparsePoints
+from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.io.scene import SPLITS, Scene, View, save, save_points
 
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
 else:
     Format = Literal[importers.FORMATS]  # the names of the table of importers
 
-Find = Callable[[str, Mapping[str, Path | None]], Capture]
 WHITE = (1.0, 1.0, 1.0)  # what Realistic Synthetic is composited on for every published figure
 
 
@@ -67,11 +65,19 @@ class PosesSettings:
         " of them are left out (ignore); auto: silhouette where they keep one compact object in nearly all photographs, and for renders with alpha.",
     )
     mask_from: Annotated[
-        str, Meta(pattern="^(off|static|green|white|#[0-9a-fA-F]{6})$", description="off, static, green, white or a colour as #rrggbb")
+        str, Meta(pattern="^(auto|off|static|green|white|#[0-9a-fA-F]{6})$", description="auto, off, static, green, white or a colour as #rrggbb")
     ] = setting(
-        "off",
+        "auto",
         "Background that silhouettes are made from where photographs have no masks: one that stands still while the object turns (static), a screen of one"
-        " colour (green, white, #rrggbb), or none (off).",
+        " colour (green, white, #rrggbb), or none (off); auto: static where cameras found by the object alone show that it turned.",
+        advanced=True,
+    )
+    mask_model: str = setting(
+        "off", "ONNX file of a network that tells a subject from its background (as rembg has them), by which silhouettes are made; off: none.", advanced=True
+    )
+    mask_polarity: Literal["auto", "white", "black"] = setting(
+        "auto",
+        "What is kept of given masks: what is not black in them (white), or what is (black); auto: white, unless black shows one compact object in nearly all.",
         advanced=True,
     )
     test_every: Annotated[int, Meta(ge=2)] = setting(8, "Every n-th image in sorted order is a test view, where the source states no split.", advanced=True)
@@ -83,10 +89,10 @@ class PosesSettings:
     )
     strict: bool = setting(False, "Refuse a source with images that are missing, unreadable or not registered, instead of warning.")
     allow_outside: bool = setting(False, "Read images that lie, or are linked to, outside the source folder.", advanced=True)
-    lens: Literal["auto", "perspective", "equirectangular"] = setting(
+    lens: Literal["auto", "perspective", "fisheye", "equirectangular"] = setting(
         "auto",
-        "What photographs and videos show: what a lens projects (perspective), or 360 degrees (equirectangular), which are cut into views of pinhole cameras;"
-        " auto: 360 degrees where a photograph is twice as wide as high and says so (XMP).",
+        "What photographs and videos show: what a usual lens projects (perspective), a fisheye lens (fisheye), or 360 degrees (equirectangular), which are cut"
+        " into views of pinhole cameras; auto: fisheye where EXIF names such a lens, 360 degrees where a picture is twice as wide as high and XMP says so.",
         advanced=True,
     )
     matching: Literal["auto", "exhaustive", "retrieval", "sequential"] = setting(
@@ -162,11 +168,20 @@ def run(job: Job) -> None:
     write_contact_sheet(scene, job.out, capture.rejected, capture.rejected_files)
 
 
-STAGE = Stage(name="poses", version=5, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=importers.files)
+def files(source: Path, settings: PosesSettings) -> list[Path]:
+    """What the scene depends on: files of the source, and the network that masks are made by."""
+    network = [] if settings.mask_model == "off" else [Path(settings.mask_model)]
+    return [*importers.files(source, settings), *network]
+
+
+STAGE = Stage(name="poses", version=6, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
     """The capture of the job's source, by structure from motion where the format states no cameras. Raises BadInput."""
+    from stages.masking.photographs import cameras_of_photographs, masks_made_for
+    from stages.masking.polarity import capture_kept_white
+
     assert job.source is not None
     possible = _formats(job, settings)
     name = possible[0]
@@ -176,10 +191,11 @@ def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:
         capture = importers.IMPORTERS[name].read(job.source, settings)
         for sentence in capture.warnings:
             warn(sentence)
-        made = _made_masks(job, {photo.camera.name: photo.image for photo in capture.photos if photo.mask is None}, warn)
+        capture = capture_kept_white(job, capture)
+        made = masks_made_for(job, {photo.camera.name: photo.image for photo in capture.photos if photo.mask is None}, warn)
         capture = replace(capture, photos=tuple(replace(photo, mask=made.get(photo.camera.name, photo.mask)) for photo in capture.photos))
     else:
-        capture = _find_cameras(job, settings, warn)
+        capture = cameras_of_photographs(job, warn)
     if settings.strict and capture.rejected:
         which = abbreviated([f"{image} ({why})" for image, why in capture.rejected])
         raise BadInput(f"{job.source}: {len(capture.rejected)} images cannot be used: {which}. Refused by --strict.")
@@ -197,91 +213,6 @@ def _formats(job: Job, settings: PosesSettings) -> list[str]:
     return found
 
 
-def _find_cameras(job: Job, settings: PosesSettings, warn: Any) -> Capture:
-    from stages.cores import count_cores
-    from stages.io.material import photographs_of
-    from stages.io.pictures import UnreadableImage, read_header
-    from stages.memory.poses import feature_threads
-    from stages.sfm.background import silhouettes_with_surroundings
-    from stages.sfm.reconstruction import find_cameras
-
-    source = job.source
-    assert source is not None
-    found = photographs_of(job, warn)
-    paths = found.paths
-    masks = {**found.masks, **_made_masks(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
-    sizes = []
-    for path in paths.values():
-        job.safe_point()
-        with contextlib.suppress(UnreadableImage):  # said where it is read
-            sizes.append(read_header(path).size)
-
-    def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
-        return find_cameras(
-            source,
-            paths,
-            max_side=settings.feature_image_size,
-            features=settings.max_features,
-            matching=settings.matching,
-            seed=settings.seed,
-            threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, count_cores()),
-            masks=masks,
-            work=job.work / name,
-            progress=job.progress,
-            safe_point=job.safe_point,
-            warn=warn,
-        )
-
-    kind = silhouettes_with_surroundings(paths, masks, _mask_choice(settings), job.safe_point)
-    # Alpha channels leave pixels out where these are no silhouettes.
-    capture = _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths)) if kind else find("cameras", masks)
-    return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected})
-
-
-def _made_masks(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, Path]:
-    """Masks made for these photographs, by name, as `poses.mask_from` says."""
-    from stages.masking.made import made_masks
-
-    how = job.settings.mask_from
-    if how == "off" or not paths:
-        return {}
-    return made_masks(paths, how, job.work / "masks", safe_point=job.safe_point, progress=job.progress, warn=warn)
-
-
-def _mask_choice(settings: PosesSettings) -> str:
-    """What masks mean: those that are made from a background are silhouettes."""
-    return "silhouette" if settings.mask_from != "off" and settings.masks == "auto" else settings.masks
-
-
-def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None]) -> Capture:
-    """The capture found from all of the photographs; or from what their silhouettes keep, where these fit to each other better then: the object was turned.
-
-    masks, everywhere  what leaves out what is not of the object, and what does not
-    """
-    from stages.framing.mask_use import MIN_AGREEING, share_that_fits
-    from stages.io.silhouettes import SmallPictures
-
-    def fit(found: Capture) -> float:
-        return share_that_fits(found, kind, SmallPictures()) * len(found.photos)
-
-    what = "masks" if kind.masks else "alpha channels"
-    job.say(f"{what} are taken for silhouettes; features are looked for outside of them, too: the background moves with the object")
-    whole: Capture | None = None
-    with contextlib.suppress(BadInput):
-        found = find("cameras", everywhere)
-        whole = replace(found, photos=tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in found.photos))
-        if fit(whole) >= MIN_AGREEING * len(whole.photos):
-            return whole
-    job.say("the silhouettes do not fit to these cameras; they are looked for again by the object alone")
-    try:
-        alone = find("cameras_of_object", masks)
-    except BadInput:
-        if whole is None:
-            raise
-        return whole
-    return alone if whole is None or fit(alone) > fit(whole) else whole
-
-
 def _format_of(capture: Capture) -> str:
     return capture.kind if capture.kind in importers.IMPORTERS else "photographs"
 
@@ -291,9 +222,10 @@ def with_mask_use(job: Job, capture: Capture, small: SmallPictures, warn: Any) -
     import numpy as np
 
     from stages.framing.mask_use import doubts, find_mask_use, points_of_object, without_silhouette
+    from stages.masking.photographs import mask_choice
 
     renders = _may_be_renders(capture)
-    use = find_mask_use(capture, _mask_choice(job.settings), renders, small, job.safe_point)
+    use = find_mask_use(capture, mask_choice(job.settings, capture.facts), renders, small, job.safe_point)
     for sentence in use.sentences:
         job.say(sentence)
     for sentence in doubts(use):

@@ -9,6 +9,9 @@ import numpy as np
 
 from efficientnerf.geometry.cameras import Camera
 
+# A fact of photographs whose background stands still while the subject turns: whether cameras were found without it.
+BACKGROUND, LEFT_OUT, SEEN = "background", "left out", "stands still"
+
 
 @dataclass(frozen=True)
 class Photo:

@@ -113,7 +113,7 @@ def with_views(job: Job, found: Material, max_side: int, warn: Warn) -> Material
     from stages.io.pictures import UnreadableImage, read_header
     from stages.video.panorama import VIEWS, is_panorama, views_of
 
-    if job.settings.lens == "perspective":
+    if job.settings.lens in ("perspective", "fisheye"):
         return found
     panoramas: dict[str, Path] = {}
     for name, path in found.paths.items():

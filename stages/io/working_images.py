@@ -210,7 +210,9 @@ def _read_mask(photo: Photo, orientation: int) -> tuple[np.ndarray, bool, list[s
     except UnreadableImage as error:
         raise UnreadableImage(f"its mask {printable(photo.mask.name)} is {error}") from error
     expected = photo.camera.width, photo.camera.height
-    mask = upright_mask(decoded.pixels[..., :3].max(-1), orientation, *expected)  # any colour counts as not black
+    alpha = decoded.pixels[..., 3] if decoded.pixels.shape[-1] == 4 else None
+    by_alpha = alpha is not None and (alpha < 255).any()  # as Brush has it; else any colour counts as not black
+    mask = upright_mask(decoded.pixels[..., 3 if by_alpha else slice(0, 3)].reshape(*decoded.pixels.shape[:2], -1).max(-1), orientation, *expected)
     found = mask.shape[1], mask.shape[0]
     sizes = f"the mask is {found[0]}x{found[1]}, its image {expected[0]}x{expected[1]}"
     if not same_aspect(found, expected):

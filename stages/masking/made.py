@@ -25,8 +25,32 @@ def made_masks(
     how    static, green, white or #rrggbb
     Raises BadInput where no photograph has one.
     """
+    make = _by_stillness(paths, sorted(paths), safe_point) if how == STATIC else _by_key(how)
+    return _all_made(paths, make, folder, f"--mask {how}", "such background", safe_point=safe_point, progress=progress, warn=warn)
+
+
+def masks_by_network(
+    paths: Mapping[str, Path], model: Path, folder: Path, *, safe_point: Callable[[], None], progress: Callable[[int, int, str], None], warn: Warn
+) -> dict[str, Path]:
+    """The same of photographs in which a network finds a subject. Raises UsageError and BadInput."""
+    return _all_made(paths, _by_network(model), folder, f"--mask-model {model.name}", "subject", safe_point=safe_point, progress=progress, warn=warn)
+
+
+def _all_made(
+    paths: Mapping[str, Path],
+    make: Callable[[Path, Path], bool],
+    folder: Path,
+    option: str,
+    what: str,
+    *,
+    safe_point: Callable[[], None],
+    progress: Callable[[int, int, str], None],
+    warn: Warn,
+) -> dict[str, Path]:
+    """
+    make  writes the mask of a photograph to a file; whether it has one
+    """
     names = sorted(paths)
-    make = _by_stillness(paths, names, safe_point) if how == STATIC else _by_key(how)
     folder.mkdir(parents=True, exist_ok=True)
     found, without = {}, []
     for number, name in enumerate(names):
@@ -41,10 +65,27 @@ def made_masks(
         except UnreadableImage:
             continue  # said where it is read
     if not found:
-        raise BadInput(f"--mask {how}: no photograph shows such a background. Choose another, or leave --mask away.")
+        article = "such a background" if what == "such background" else f"a {what}"
+        raise BadInput(f"{option}: no photograph shows {article}. Choose another, or leave {option.split()[0]} away.")
     if without:
-        warn(f"--mask {how}: no such background in {len(without)} of {len(names)} photographs, as in {without[0]}: they get no mask", images=without)
+        warn(f"{option}: no {what} in {len(without)} of {len(names)} photographs, as in {without[0]}: they get no mask", images=without)
     return found
+
+
+def _by_network(model: Path) -> Callable[[Path, Path], bool]:
+    from stages.masking.network import MaskNetwork
+    from stages.masking.static import sharpened
+
+    network = MaskNetwork(model)
+
+    def make(photograph: Path, target: Path) -> bool:
+        photo = _read(photograph, MASK_SIDE)
+        mask = network.mask(photo.rgb)
+        if mask is not None:
+            _write(sharpened(mask, photo.rgb), photo, target)
+        return mask is not None
+
+    return make
 
 
 def _by_key(how: str) -> Callable[[Path, Path], bool]:

@@ -29,13 +29,13 @@ class StillBackground:
         if len(stack) < FEWEST:
             raise BadInput(f"--mask static needs at least {FEWEST} photographs of one size; these are {len(stack)}.")
         stack = stack[np.linspace(0, len(stack) - 1, min(len(stack), MOST)).astype(int)]
-        self._exposure = np.median(stack[:, _border(stack.shape[1:3])].mean(-1))
+        self._exposure = np.median(stack[:, border_of(stack.shape[1:3])].mean(-1))
         even = np.stack([self._even(each) for each in stack])
         spread = np.median(np.abs(even - np.median(even, axis=0)).max(-1), axis=0)  # (h, w)
         self._limit = float(np.clip(NOISE * np.quantile(spread, QUIET), LEAST_DIFFERENCE, MOST_DIFFERENCE))
         self._colour, support = _commonest(even, self._limit / 2)
         self._never = support < max(LEAST_SUPPORT, LEAST_SEEN * len(even))
-        still = float((spread < self._limit)[_border(spread.shape)].mean())
+        still = float((spread < self._limit)[border_of(spread.shape)].mean())
         if still < LEAST_STILL:
             raise BadInput(
                 f"--mask static: only {still:.0%} of the border is the same in most photographs. It is for a camera on a stand and an object that turns; where"
@@ -59,7 +59,7 @@ class StillBackground:
 
     def _even(self, image: np.ndarray) -> np.ndarray:
         """An image in float32, its border as bright as that of the others."""
-        own = float(np.median(image[_border(image.shape[:2])].mean(-1)))
+        own = float(np.median(image[border_of(image.shape[:2])].mean(-1)))
         return np.asarray(image * ((self._exposure + 1) / (own + 1)), np.float32)
 
 
@@ -90,7 +90,8 @@ def sharpened(mask: np.ndarray, rgb: np.ndarray) -> np.ndarray:
     return without_specks(np.round(np.clip((soft - 0.25) * 2, 0, 1) * 255).astype(np.uint8))
 
 
-def _border(shape: tuple[int, ...]) -> np.ndarray:
+def border_of(shape: tuple[int, ...]) -> np.ndarray:
+    """(h, w) bool: the strip along the border of a picture."""
     wide = max(1, round(BORDER * max(shape)))
     strip = np.ones(shape, bool)
     strip[wide:-wide, wide:-wide] = False

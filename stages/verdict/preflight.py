@@ -206,7 +206,7 @@ def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) ->
             found.append(Problem("stands still", "poor", sentence, "Walk round the subject; one place shows no depth."))
         elif np.mean([0.2 < share < 0.9 for share in still]) > 0.5:
             sentence = "Part of the picture stands still while the rest moves: probably a subject that turns before a camera on a stand."
-            remedy = "Give masks of the subject (a folder masks/), or take it before a background without texture."
+            remedy = "A run leaves the background out where it is certain of it. Else give masks of the subject (a folder masks/), or --mask static."
             found.append(Problem("background", "usable", sentence, remedy))
         elif float(np.median([overlap.plane for overlap in overlaps.values()])) > 0.95:
             sentence = "Neighbouring photographs differ as if the camera had only turned, or as if all were flat and far away."

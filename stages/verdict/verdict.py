@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from stages.io.capture import Capture, Photo, SparsePoints
+from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo, SparsePoints
 from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.verdict import looks as looks_of
 from stages.verdict.looks import Look
 
+FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", BACKGROUND)  # of a capture, that stand among the figures
 GRADES = ("good", "usable", "poor", "failed")
 NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
 FEW = 12  # views all round a subject
@@ -108,7 +109,7 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
         "triangulation_angle": angle if angle is None else round(angle, 2),
         "points": 0 if capture.points is None else len(capture.points.xyz),
         "points_per_image": None if counts is None else float(np.median(counts)),
-        **{key: capture.facts[key] for key in ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs") if key in capture.facts},
+        **{key: capture.facts[key] for key in FACTS if key in capture.facts},
         "sharpness": round(float(np.median([each.sharpness for each in looks.values()])), 3) if looks else None,
     }
     problems = [
@@ -171,7 +172,18 @@ def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
     if flat and isinstance(planar, float) and planar > MOST_PLANAR:
         sentence = f"In {planar:.0%} of the pairs one homography explains all matches: the camera only turned on the spot, or all is one flat thing."
         found.append(Problem("one place", "poor", sentence, "Move round the subject between photographs; turning the camera alone shows no depth."))
+    if BACKGROUND in capture.facts:
+        found.append(_of_background(capture.facts[BACKGROUND] == LEFT_OUT))
     return found
+
+
+def _of_background(left_out: bool) -> Problem:
+    """Of a subject that turned before a background that stands still."""
+    sentence = "The background stands still while the subject turns"
+    if left_out:
+        return Problem("background", "good", f"{sentence}: it is left out, and the subject alone is made.", "To make both, walk round the subject.")
+    remedy = "Turn it by less between photographs, give it texture, or take it before a background without any."
+    return Problem("background", "poor", f"{sentence}, and the subject alone shows too little to find cameras by.", remedy)
 
 
 def _of_parts(capture: Capture) -> list[Problem]:

@@ -336,3 +336,41 @@ def test_the_old_setting_is_answered_and_read() -> None:
     assert moved("poses", "alpha") == "poses.alpha is now poses.masks, composite is now silhouette, mask is now ignore."
     for before, after in {"composite": "silhouette", "mask": "ignore", "auto": "auto"}.items():
         assert updated("poses", PosesSettings, {"alpha": before}) == {"masks": after}
+
+
+@pytest.mark.parametrize("how", ["nerfstudio", "colmap"])
+def test_masks_that_show_the_object_in_black_are_turned_round_and_said(how: str, tmp_path: Path) -> None:
+    """The same scene, byte for byte but for what its report says."""
+    made, said, _ = run(with_masks(how, tmp_path / "source", lambda index, camera: 255 - ball(index, camera)), tmp_path / "black")
+    usual, as_ever, _ = run(with_masks(how, tmp_path / "usual", ball), tmp_path / "white")
+    assert any(text.startswith("masks keep what is black") for text in said)
+    assert not any("black" in text for text in as_ever)
+    assert made.background == usual.background == WHITE
+    np.testing.assert_array_equal(made.bounds, usual.bounds)
+    for one, other in zip(made.views, usual.views, strict=True):
+        np.testing.assert_array_equal(scene.read_image(tmp_path / "black/poses", one), scene.read_image(tmp_path / "white/poses", other))
+
+
+def test_which_level_is_kept_can_be_stated(tmp_path: Path) -> None:
+    source = with_masks("colmap", tmp_path / "source", lambda index, camera: 255 - ball(index, camera))
+    made, said, _ = run(source, tmp_path / "white", mask_polarity="white")
+    assert made.background is None
+    assert not any("keep what is black" in text for text in said)
+    usual = with_masks("colmap", tmp_path / "usual", but_for_a_thing)
+    made, said, _ = run(usual, tmp_path / "black", mask_polarity="black", masks="ignore")
+    assert "masks keep what is black: what is white in them is left out" in said
+    for index, view in enumerate(made.views):
+        np.testing.assert_array_equal(scene.read_mask(tmp_path / "black/poses", view), but_for_a_thing(index, captures.cameras()[index]) == 0)
+
+
+def test_a_mask_may_be_an_alpha_channel(tmp_path: Path) -> None:
+    """As Brush has it: whatever the colours below it are."""
+    source = with_masks("colmap", tmp_path / "source", ball)
+    for index, camera in enumerate(captures.cameras()):
+        level = (0, 255)[index % 2]
+        captures.write_picture(source / "masks" / camera.name, np.dstack([np.full((HEIGHT, WIDTH, 3), level, np.uint8), ball(index, camera)]))
+    made, _, _ = run(source, tmp_path)
+    assert made.background == WHITE
+    for index, view in enumerate(made.views):
+        found = scene.read_image(tmp_path / "poses", view)[..., 3].astype(int)
+        assert abs(found - ball(index, captures.cameras()[index])).max() <= working_images.TRANSPARENT

@@ -39,6 +39,7 @@ class Options:
     frames: int | None = None
     lens: str | None = None
     mask_from: str | None = None
+    mask_model: str | None = None
     device: str | None = None
     memory: str | None = None
     strict: bool = False
@@ -113,14 +114,7 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
     seed = standing.seed if seed is None and standing is not None and options.preset is not None else seed
     if seed is not None:
         settings.put_seed(seed)
-    for name, value, origin in (
-        ("format", options.format, f"--as {options.format}"),
-        ("mask_from", options.mask_from, f"--mask {options.mask_from}"),
-        ("strict", options.strict or None, "--strict"),
-        ("frames", options.frames, f"--frames {options.frames}"),
-        ("lens", options.lens, f"--lens {options.lens}"),
-        ("allow_outside", options.allow_outside or None, "--allow-outside"),
-    ):
+    for name, value, origin in _of_poses(options):
         if value is not None:
             settings.put("poses", name, [value], origin)
     sources = _sources([path for path in (options.source, *options.also) if path is not None], standing)
@@ -141,6 +135,19 @@ def plan_run(path: Path, workflow: Workflow, options: Options) -> Plan:
         memory=memory, also=sources[1:], resume_text=resume_command,
     )  # fmt: skip
     return Plan(run, standing is None, run.device or "auto", limit, warnings, lambda: plan_run(path, workflow, options))
+
+
+def _of_poses(options: Options) -> tuple[tuple[str, object, str], ...]:
+    """The settings of the stage poses that have options of their own: name, value or None, and the option."""
+    return (
+        ("format", options.format, f"--as {options.format}"),
+        ("mask_from", options.mask_from, f"--mask {options.mask_from}"),
+        ("mask_model", options.mask_model and os.path.abspath(options.mask_model), f"--mask-model {options.mask_model}"),
+        ("strict", options.strict or None, "--strict"),
+        ("frames", options.frames, f"--frames {options.frames}"),
+        ("lens", options.lens, f"--lens {options.lens}"),
+        ("allow_outside", options.allow_outside or None, "--allow-outside"),
+    )
 
 
 def _format(settings: Settings, sources: Sequence[Path]) -> str | None:

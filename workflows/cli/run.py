@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 @click.option("--frames", type=int, metavar="N", help="Most frames that are chosen of videos, 150 by default; sets poses.frames.")
 @click.option("--mask", "mask_from", metavar="BACKGROUND",
               help="Make silhouettes: static (the object turns before it) or a screen's colour: green, white or #rrggbb; sets poses.mask_from.")  # fmt: skip
-@click.option("--lens", metavar="LENS", help="equirectangular: what is given shows 360 degrees; sets poses.lens. By default photographs that say so do.")
+@click.option("--mask-model", metavar="FILE", help="Make silhouettes by this network, an ONNX file as rembg has them; sets poses.mask_model.")
+@click.option("--lens", metavar="LENS", help="fisheye, or equirectangular (360 degrees); sets poses.lens. By default photographs that say so are taken so.")
 @click.option("--strict", is_flag=True, help="Refuse a source with missing or unreadable images.")
 @click.option("--allow-outside", is_flag=True, help="Allow a data set to refer to files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Show what would be done and why; do nothing.")

@@ -2,8 +2,8 @@
 
 Videos count where there are no photographs: a phone keeps a short clip beside each of its own.
 
-A mask lies in a folder `masks` beside or inside that of the images, or at the top of the source, at the image's own relative path, as
-IMG_1.png or (COLMAP's way) IMG_1.jpg.png for IMG_1.jpg; where it is black, the image is left out.
+A mask lies in a folder `masks` beside or inside that of the images, or at the top of the source, at the image's own relative path. That of IMG_1.jpg is called
+IMG_1.png (nerfstudio), IMG_1.jpg.png (COLMAP), IMG_1.mask.png or IMG_1.jpg.mask (Brush), or IMG_1_mask.png; where it is black, the image is left out.
 """
 
 from __future__ import annotations
@@ -70,14 +70,22 @@ def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
         for place in dict.fromkeys(places):
             if place not in listings:
                 by_stem: dict[str, Path] = {}
-                for path in images_in(place):
+                for path in [*images_in(place), *_with_mask_as_suffix(place)]:
                     by_stem.setdefault(path.stem.lower(), path)
                 listings[place] = by_stem
-            mask = listings[place].get(image.name.lower()) or listings[place].get(image.stem.lower())
+            stem = image.stem.lower()
+            mask = next((listings[place][name] for name in (image.name.lower(), stem, f"{stem}.mask", f"{stem}_mask") if name in listings[place]), None)
             if mask is not None:
                 found[image] = source.check_inside(mask)
                 break
     return found
+
+
+def _with_mask_as_suffix(folder: Path) -> list[Path]:
+    """Pictures that are called IMG_1.mask, whatever format they have."""
+    if not os.path.isdir(folder):
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ".mask" and not path.name.startswith(".") and path.is_file())
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:

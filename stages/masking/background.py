@@ -1,0 +1,77 @@
+"""Whether photographs with silhouettes show a background that moves with the object, in which features help, or one that stands still while it turns.
+
+Where the camera goes round an object, all that stands beside it gives features, and the object alone often too few. Where the object turns before a camera on
+a stand, the background says that nothing moved. docs/experiments/silhouettes.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Camera
+from stages.framing.mask_use import alike
+from stages.framing.scene_bounds import chosen_photos
+from stages.io.capture import Photo, Silhouettes
+from stages.io.photo import read_photo
+from stages.io.pictures import UnreadableImage, read_header
+from stages.io.silhouettes import SMALL, SmallPictures
+
+MOST_PAIRS = 24  # of photographs that follow each other
+FINE = 4.0  # px at `SMALL`, standard deviation of the blur that texture is told from shading by
+STANDING = 0.5  # correlation of the texture of two photographs, from which the background is the same
+LEAST_TEXTURE = 1.0  # of 255, standard deviation
+
+
+def silhouettes_with_surroundings(paths: Mapping[str, Path], masks: Mapping[str, Path], choice: str, safe_point: Callable[[], None]) -> Silhouettes:
+    """Which of masks and alpha channels are silhouettes before a background in which features should be looked for, too; of alpha channels where colours
+    were left below what is transparent.
+
+    paths, masks  file of each photograph, and of its mask, by name
+    choice        `poses.masks`
+    """
+    photos = [photo for name in sorted(paths) if (photo := photo_without_camera(name, paths[name], masks.get(name))) is not None]
+    kind, small = Silhouettes(alpha=not masks, masks=bool(masks)), SmallPictures()
+    pictures = [] if choice == "ignore" else [(photo, small.mask(photo) if masks else small.alpha(photo)) for photo in chosen_photos(photos)]
+    if all(picture is None for _, picture in pictures) or (choice == "auto" and alike(pictures)[0]):
+        return Silhouettes()
+    return Silhouettes() if stands_still(photos, kind, small, safe_point) else kind
+
+
+def stands_still(photos: Sequence[Photo], kind: Silhouettes, small: SmallPictures, safe_point: Callable[[], None]) -> bool:
+    """Whether what lies outside of the silhouettes is the same in photographs that follow each other, or has no texture at all."""
+    import cv2
+
+    found: list[float] = []
+    for index in range(0, len(photos) - 1, -(-len(photos) // MOST_PAIRS)):
+        safe_point()
+        pair = []
+        for photo in photos[index : index + 2]:
+            mask = small.mask(photo) if kind.masks else small.alpha(photo)
+            try:
+                grey = read_photo(photo.image, SMALL).rgb.astype(np.float32).mean(2)
+            except UnreadableImage:
+                continue
+            if mask is None:
+                continue
+            mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            outside = (cv2.dilate((mask > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) == 0).astype(np.float32)
+            smooth = cv2.GaussianBlur(grey * outside, (0, 0), FINE) / np.maximum(cv2.GaussianBlur(outside, (0, 0), FINE), 1e-3)
+            pair.append((grey - smooth, outside > 0))
+        if len(pair) == 2 and pair[0][0].shape == pair[1][0].shape:
+            outside = pair[0][1] & pair[1][1]
+            one, other = (texture[outside] for texture, _ in pair)
+            if outside.any() and min(one.std(), other.std()) >= LEAST_TEXTURE:
+                found.append(float(np.corrcoef(one, other)[0, 1]))
+    return not found or float(np.median(found)) >= STANDING
+
+
+def photo_without_camera(name: str, image: Path, mask: Path | None) -> Photo | None:
+    """A photo whose camera has its size alone; None where it cannot be read."""
+    try:
+        width, height = read_header(image).size
+    except UnreadableImage:
+        return None
+    return Photo(Camera(name, width, height, "SIMPLE_PINHOLE", (float(width), width / 2, height / 2), np.eye(4)), image, mask)

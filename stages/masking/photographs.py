@@ -1,0 +1,176 @@
+"""Cameras of photographs that state none: found by what masks keep, or by all that the photographs show, whichever the camera moved past."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import BadInput, UsageError
+from pipeline.stage import Job
+from stages.io.capture import BACKGROUND, LEFT_OUT, SEEN, Capture, Silhouettes
+
+Find = Callable[[str, Mapping[str, Path | None]], Capture]
+
+
+def cameras_of_photographs(job: Job, warn: Any) -> Capture:
+    """The capture of the job's photographs and videos. Raises BadInput."""
+    from stages.io.material import photographs_of
+    from stages.masking.polarity import kept_white
+
+    found = photographs_of(job, warn)
+    paths, settings = found.paths, job.settings
+    find = _search(job, paths, warn)
+    given = kept_white(job, paths, found.masks)
+    masks = {**given.masks, **masks_made_for(job, {name: path for name, path in paths.items() if name not in found.masks}, warn)}
+    if not masks and settings.mask_from == "auto" and settings.masks != "ignore":
+        capture, seen = _of_turning_subject(job, find, paths)
+    else:
+        capture, seen = None, False
+    if capture is None:
+        capture = _by_masks(job, find, paths, masks, given.inverted)
+    if seen:
+        capture = replace(capture, facts={**capture.facts, BACKGROUND: SEEN})
+    return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected})
+
+
+def _by_masks(job: Job, find: Find, paths: Mapping[str, Path], masks: Mapping[str, Path], inverted: Mapping[str, Path]) -> Capture:
+    """The capture of photographs with these masks; with the inverted ones in their place where these are silhouettes of one thing."""
+    from stages.masking.background import silhouettes_with_surroundings
+    from stages.masking.polarity import SAID
+
+    def search(masks: Mapping[str, Path]) -> Capture:
+        kind = silhouettes_with_surroundings(paths, masks, mask_choice(job.settings, {}), job.safe_point)
+        # Alpha channels leave pixels out where these are no silhouettes.
+        return _found_by_surroundings(job, find, kind, masks, {} if kind.masks else dict.fromkeys(paths)) if kind else find("cameras", masks)
+
+    if not inverted:
+        return search(masks)
+    try:
+        capture = search(masks)
+    except BadInput:  # what surrounds a subject that turned stands still
+        other = None
+        with contextlib.suppress(BadInput):
+            other = search(inverted)
+        if other is None or not _fit(other):
+            raise
+    else:
+        other = replace(capture, photos=tuple(replace(photo, mask=inverted.get(photo.camera.name)) for photo in capture.photos))
+        if not _fit(other):
+            return capture
+    job.say(SAID)
+    return other
+
+
+def masks_made_for(job: Job, paths: Mapping[str, Path], warn: Any) -> dict[str, Path]:
+    """Masks made for these photographs, by name, as `poses.mask_from` and `poses.mask_model` say."""
+    from stages.masking.made import made_masks, masks_by_network
+
+    common: dict[str, Any] = {"safe_point": job.safe_point, "progress": job.progress, "warn": warn}
+    if not paths:
+        return {}
+    if job.settings.mask_model != "off" and job.settings.mask_from not in ("auto", "off"):
+        raise UsageError(f"--mask {job.settings.mask_from} and --mask-model: masks are made in one way. Give one of them.")
+    if job.settings.mask_model != "off":
+        return masks_by_network(paths, Path(job.settings.mask_model), job.work / "masks", **common)
+    if job.settings.mask_from in ("auto", "off"):
+        return {}
+    return made_masks(paths, job.settings.mask_from, job.work / "masks", **common)
+
+
+def mask_choice(settings: Any, facts: Mapping[str, object]) -> str:
+    """What masks mean: those that are made of a background, or by a network, are silhouettes."""
+    made = settings.mask_from not in ("auto", "off") or settings.mask_model != "off" or facts.get(BACKGROUND) == LEFT_OUT
+    return "silhouette" if made and settings.masks == "auto" else str(settings.masks)
+
+
+def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
+    """Structure from motion on photographs, with a scratch folder of its own for each name."""
+    from stages.cores import count_cores
+    from stages.io.pictures import UnreadableImage, read_header
+    from stages.memory.poses import feature_threads
+    from stages.sfm.reconstruction import find_cameras
+
+    source, settings = job.source, job.settings
+    assert source is not None
+    sizes = []
+    for path in paths.values():
+        job.safe_point()
+        with contextlib.suppress(UnreadableImage):  # said where it is read
+            sizes.append(read_header(path).size)
+
+    def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
+        return find_cameras(
+            source,
+            paths,
+            max_side=settings.feature_image_size,
+            features=settings.max_features,
+            matching=settings.matching,
+            seed=settings.seed,
+            threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, count_cores()),
+            masks=masks,
+            lens="perspective" if settings.lens == "equirectangular" else settings.lens,
+            work=job.work / name,
+            progress=job.progress,
+            safe_point=job.safe_point,
+            warn=warn,
+        )
+
+    return find
+
+
+def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path]) -> tuple[Capture | None, bool]:
+    """The capture of a subject that turned before a background that stands still, or None; and whether it looks as if one did."""
+    from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
+
+    masks = masks_of_turning_subject(paths, job.work / "masks", safe_point=job.safe_point, progress=job.progress)
+    if not masks:
+        return None, False
+    job.say("the background stands still from photograph to photograph: cameras are looked for by the subject alone; --mask off uses all of the picture")
+    with contextlib.suppress(BadInput):
+        capture = find("cameras_of_subject", masks)
+        if turn([photo for photo in capture.photos if photo.mask is not None]) >= LEAST_TURN:
+            return replace(capture, facts={**capture.facts, BACKGROUND: LEFT_OUT}), False
+        job.say("the cameras all look the same way; the background may be far away, and all of the picture is used")
+        return None, False
+    job.say("the subject alone shows too little; cameras are looked for by all of the picture")
+    return None, True
+
+
+def _fit(capture: Capture) -> bool:
+    """Whether the masks of nearly all photographs are silhouettes of one thing."""
+    from stages.framing.mask_use import MIN_AGREEING, share_that_fits
+    from stages.io.silhouettes import SmallPictures
+
+    return share_that_fits(capture, Silhouettes(masks=True), SmallPictures()) >= MIN_AGREEING
+
+
+def _found_by_surroundings(job: Job, find: Find, kind: Silhouettes, masks: Mapping[str, Path], everywhere: Mapping[str, None]) -> Capture:
+    """The capture found from all of the photographs; or from what their silhouettes keep, where these fit to each other better then: the object was turned.
+
+    masks, everywhere  what leaves out what is not of the object, and what does not
+    """
+    from stages.framing.mask_use import MIN_AGREEING, share_that_fits
+    from stages.io.silhouettes import SmallPictures
+
+    def fit(found: Capture) -> float:
+        return share_that_fits(found, kind, SmallPictures()) * len(found.photos)
+
+    what = "masks" if kind.masks else "alpha channels"
+    job.say(f"{what} are taken for silhouettes; features are looked for outside of them, too: the background moves with the object")
+    whole: Capture | None = None
+    with contextlib.suppress(BadInput):
+        found = find("cameras", everywhere)
+        whole = replace(found, photos=tuple(replace(photo, mask=masks.get(photo.camera.name)) for photo in found.photos))
+        if fit(whole) >= MIN_AGREEING * len(whole.photos):
+            return whole
+    job.say("the silhouettes do not fit to these cameras; they are looked for again by the object alone")
+    try:
+        alone = find("cameras_of_object", masks)
+    except BadInput:
+        if whole is None:
+            raise
+        return whole
+    return alone if whole is None or fit(alone) > fit(whole) else whole

@@ -1,0 +1,90 @@
+"""Which level of given masks is kept. White is, as nerfstudio, Brush and COLMAP have it; but masks of an object that was painted black are met with, too.
+
+Masks that are white but for one compact thing in nearly all photographs either leave it out or show it the other way round. They show it where all of these
+black shapes are views of one thing: then they fit to its visual hull, which what moves through a scene does not. docs/experiments/silhouettes.md
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from pipeline.errors import BadInput
+from pipeline.stage import Job
+from stages.framing import scene_bounds
+from stages.framing.mask_use import MIN_AGREEING, alike, share_that_fits
+from stages.io.capture import Capture, Photo, Silhouettes
+from stages.io.pictures import UnreadableImage, read_header
+from stages.io.png import FAST, write_png
+from stages.io.silhouettes import SmallPictures
+from stages.io.working_images import mask_levels
+from stages.masking.background import photo_without_camera
+
+INVERTED = "masks keep what is black: what is white in them is left out"
+SAID = INVERTED + "; --set poses.mask_polarity=white takes them the other way round"
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Masks by name of the photograph.
+
+    masks      that keep what is white, as far as is known
+    inverted   the same with black and white exchanged, where cameras have yet to show whether that is right; else none
+    """
+
+    masks: dict[str, Path]
+    inverted: dict[str, Path] = field(default_factory=dict)
+
+
+def kept_white(job: Job, paths: Mapping[str, Path], masks: Mapping[str, Path]) -> Kept:
+    """The masks of photographs without cameras, each turned round where `poses.mask_polarity` says so; and turned round where they look like it."""
+    polarity = job.settings.mask_polarity
+    if not masks or polarity == "white" or (polarity == "auto" and job.settings.masks == "ignore"):
+        return Kept(dict(masks))
+    photos = [photo for name in sorted(masks) if (photo := photo_without_camera(name, paths[name], masks[name])) is not None]
+    if polarity == "black":
+        job.say(INVERTED)
+        return Kept({**masks, **_turned_round(job, photos)})
+    return Kept(dict(masks), _turned_round(job, photos) if _look_inverted(photos) else {})
+
+
+def capture_kept_white(job: Job, capture: Capture) -> Capture:
+    """The same of a capture with cameras; masks whose format says which level is left out (`Photo.mask_ignore`) stay."""
+    polarity = job.settings.mask_polarity
+    photos = [photo for photo in capture.photos if photo.mask is not None and photo.mask_ignore == "black"]
+    if not photos or polarity == "white":
+        return capture
+    if polarity == "auto":
+        if job.settings.masks == "ignore" or not _look_inverted(photos):
+            return capture
+        flipped = replace(capture, photos=tuple(replace(photo, mask_ignore="white") for photo in photos))
+        if share_that_fits(flipped, Silhouettes(masks=True), SmallPictures()) < MIN_AGREEING:
+            return capture
+    job.say(SAID if polarity == "auto" else INVERTED)
+    masks = _turned_round(job, photos)
+    return replace(capture, photos=tuple(replace(photo, mask=masks.get(photo.camera.name, photo.mask)) for photo in capture.photos))
+
+
+def _look_inverted(photos: Sequence[Photo]) -> bool:
+    """Whether masks leave out one compact thing in nearly all photographs, and do not keep one."""
+    chosen = scene_bounds.chosen_photos(photos)
+    small, flipped = SmallPictures(), SmallPictures()
+    if not alike([(photo, small.mask(photo)) for photo in chosen])[0]:
+        return False
+    return not alike([(photo, flipped.mask(replace(photo, mask_ignore="white"))) for photo in chosen])[0]
+
+
+def _turned_round(job: Job, photos: Sequence[Photo]) -> dict[str, Path]:
+    """Name -> mask with black and white exchanged, in the scratch folder; those that cannot be used are left out, and named where they are read."""
+    folder = job.work / "masks_turned_round"
+    folder.mkdir(parents=True, exist_ok=True)
+    made = {}
+    for number, photo in enumerate(photos):
+        job.safe_point()
+        with contextlib.suppress(UnreadableImage, BadInput):
+            levels = mask_levels(replace(photo, mask_ignore="white"), read_header(photo.image).orientation)[0]
+            write_png(levels, folder / f"{number:05d}.png", compress_level=FAST, durable=False)
+            made[photo.camera.name] = folder / f"{number:05d}.png"
+    return made

@@ -1,0 +1,92 @@
+"""A subject that turns before a camera on a stand: told from a camera that moves, masked, and its cameras found by it alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.poses import aligned_errors
+from efficientnerf.geometry.cameras import Camera
+from pipeline.stage import Job
+from stages.io.capture import BACKGROUND, LEFT_OUT
+from stages.io.png import write_png
+from stages.masking.photographs import mask_choice
+from stages.masking.turning import border_stands_still, masks_of_turning_subject, turn
+from stages.poses import PosesSettings, read
+from stages.verdict.verdict import verdict_on
+from tests.stages import turntables
+
+COUNT = 11
+
+
+def written(folder: Path, pictures: list[np.ndarray]) -> dict[str, Path]:
+    folder.mkdir()
+    for number, picture in enumerate(pictures):
+        write_png(picture, folder / f"{number:02d}.png")
+    return {path.name: path for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def turntable(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Camera]]:
+    cameras = turntables.cameras(COUNT, 100.0)
+    folder = tmp_path_factory.mktemp("turntable") / "photographs"
+    written(folder, [turntables.picture(camera, number) for number, camera in enumerate(cameras)])
+    return folder, cameras
+
+
+def found_in(paths: dict[str, Path], work: Path) -> dict[str, Path]:
+    return masks_of_turning_subject(paths, work, safe_point=lambda: None, progress=lambda *_: None)
+
+
+def test_a_subject_before_a_standing_wall_is_found_by_itself(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
+    folder, cameras = turntable
+    events: list[dict[str, Any]] = []
+    job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=folder, stage="poses", report=events.append)
+    capture = read(job, PosesSettings(), job.warn)
+    assert capture.facts[BACKGROUND] == LEFT_OUT
+    assert any("the background stands still" in event.get("text", "") for event in events)
+    assert mask_choice(job.settings, capture.facts) == "silhouette"
+    assert len(capture.photos) >= 0.9 * COUNT
+    assert all(photo.mask is not None for photo in capture.photos)
+    true = np.array([cameras[int(Path(photo.camera.name).stem)].centre for photo in capture.photos])
+    errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), true)
+    assert np.sqrt((errors**2).mean()) < 0.02
+    problems = {problem.what: problem for problem in verdict_on(capture, {}).problems}
+    assert problems["background"].grade == "good"
+    assert "left out" in problems["background"].sentence
+
+
+def test_what_moves_with_the_camera_or_has_no_texture_is_no_standing_background(turntable: tuple[Path, list[Camera]], tmp_path: Path) -> None:
+    cameras = turntables.cameras(10)
+    moving = [turntables.picture(camera, number, wall_moves=True) for number, camera in enumerate(cameras)]
+    plain = [turntables.picture(camera, number, wall=np.full((240, 320, 3), 200.0)) for number, camera in enumerate(cameras)]
+    few = dict(list({path.name: path for path in sorted(turntable[0].iterdir())}.items())[:7])
+    for name, paths in (("moving", written(tmp_path / "moving", moving)), ("plain", written(tmp_path / "plain", plain)), ("few", few)):
+        assert not border_stands_still(paths, lambda: None), name
+        assert not found_in(paths, tmp_path / f"{name} masks"), name
+
+
+def test_nothing_is_left_out_where_nothing_moves_or_all_inside_a_frame_does(tmp_path: Path) -> None:
+    camera = turntables.cameras(1)[0]
+    same = written(tmp_path / "same", [turntables.picture(camera, number) for number in range(9)])
+    assert border_stands_still(same, lambda: None)
+    assert not found_in(same, tmp_path / "same masks")
+    rng = np.random.default_rng(0)
+    frame = turntables.wall_picture()
+    framed = []
+    for _ in range(9):
+        framed.append(frame.astype(np.uint8))
+        framed[-1][20:-20, 20:-20] = rng.integers(0, 255, (200, 280, 3))
+    assert not found_in(written(tmp_path / "framed", framed), tmp_path / "framed masks")
+
+
+def test_turn_is_the_largest_angle_between_view_directions() -> None:
+    from stages.io.capture import Photo
+
+    photos = [Photo(camera, Path("none.png")) for camera in turntables.cameras(8)]
+    assert turn(photos[:1]) == pytest.approx(0.0, abs=1e-5)
+    assert 40 < turn(photos[:2]) < 50
+    assert turn(photos) > 120
