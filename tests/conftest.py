@@ -20,6 +20,8 @@ import pytest
 for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ[variable] = "1"
 
+os.environ["ENERF_FEATURE_CACHE_MIB"] = "0"  # a test detects features itself
+
 IN_MEMORY, ROOM = Path("/dev/shm"), 4 << 30
 if "PYTEST_DEBUG_TEMPROOT" not in os.environ and os.access(IN_MEMORY, os.W_OK) and shutil.disk_usage(IN_MEMORY).free >= ROOM:
     os.environ["PYTEST_DEBUG_TEMPROOT"] = str(IN_MEMORY)

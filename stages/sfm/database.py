@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +116,29 @@ def copy_rows(source: Path, target: Path, tables: Sequence[tuple[str, str]], key
             if rows is None:
                 raise StageFailed(f"poses: COLMAP has matched no pair {image_ids_of_pair(key)}. Run again: what is done is kept.")
             _insert(fresh, tables, rows)
+
+
+def rows_of(path: Path, tables: Sequence[tuple[str, str]], keys: Iterable[int]) -> Iterator[tuple[int, list[Row]]]:
+    """(key, its row of each of the tables without the key), of those keys that have all."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        for key in keys:
+            if (rows := _rows(connection, tables, key)) is not None:
+                yield key, [{name: value for name, value in row.items() if name != column} for (_, column), row in zip(tables, rows, strict=True)]
+
+
+def insert_features(path: Path, image: int, rows: Sequence[Row]) -> bool:
+    """Give an image, which has none, features as `rows_of` returned them; False where they are not what COLMAP can read."""
+    with contextlib.closing(sqlite3.connect(path, timeout=60.0)) as connection, connection:
+        whole = [{column: image, **row} for (_, column), row in zip(FEATURES, rows)]
+        columns = [{row[1] for row in connection.execute(f"PRAGMA table_info({table})")} for table, _ in FEATURES]
+        if [set(row) for row in whole] != columns:
+            return False
+        try:
+            _check_features(image, whole, image)
+        except (ValueError, TypeError):
+            return False
+        _insert(connection, FEATURES, whole)
+    return True
 
 
 def copy_database(work: Path, place: Path) -> None:

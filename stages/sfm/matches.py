@@ -10,7 +10,7 @@ import numpy as np
 
 from stages.cores import count_cores
 from stages.io.png import FAST, write_png
-from stages.sfm import pair_workers
+from stages.sfm import feature_cache, pair_workers
 from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import FEATURES, PAIRS, database_path, pair_id_of, record, verified_pairs
 from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
@@ -31,7 +31,7 @@ def extract_features(
     progress: Progress,
     safe_point: SafePoint,
 ) -> None:
-    """SIFT features of the images that have none yet, a few images at a time.
+    """SIFT features of the images that have none yet, a few images at a time; those that were detected before are taken from where they are kept.
 
     threads   None: as many as the process may use. An image's features do not depend on them
     contrast  that a feature must have, of COLMAP's default
@@ -53,7 +53,7 @@ def extract_features(
         options.num_threads = threads
         options.sift.max_num_features = features
         options.sift.peak_threshold *= contrast
-        done = len(known)
+        asked, done = {"features": features, "contrast": contrast}, len(known)
         progress(done, len(images), "detecting features")
         for octave in (-1, 0):
             options.sift.first_octave = octave
@@ -61,15 +61,24 @@ def extract_features(
             for start in range(0, len(todo), 2 * threads):
                 safe_point()
                 some = [image.file for image in todo[start : start + 2 * threads]]
-                for _ in range(2):
-                    pycolmap.extract_features(
-                        database_path(work), place / "images", some, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
-                    )
-                    if not _check_readable(place, _without_features(pycolmap, work, ids, some)):
-                        break
+                keys = {ids[file]: key for file, key in feature_cache.keys_of(place, some, {**asked, "octave": octave}).items()}
+                there = set(feature_cache.take(database_path(work), keys))
+                if rest := [file for file in some if ids[file] not in there]:
+                    _extract(pycolmap, work, rest, ids, reader, options)
+                    feature_cache.put(database_path(work), {ids[file]: keys[ids[file]] for file in rest})
                 record(work, f"features_{Path(some[0]).stem}", FEATURES, [ids[file] for file in some])
                 done += len(some)
                 progress(done, len(images), "detecting features")
+
+
+def _extract(pycolmap: Any, work: Path, files: Sequence[str], ids: Mapping[str, int], reader: Any, options: Any) -> None:
+    place = images_of(work).parent
+    for _ in range(2):
+        pycolmap.extract_features(
+            database_path(work), place / "images", files, reader_options=reader, extraction_options=options, device=pycolmap.Device.cpu
+        )
+        if not _check_readable(place, _without_features(pycolmap, work, ids, files)):
+            break
 
 
 def _without_features(pycolmap: Any, work: Path, ids: Mapping[str, int], files: Sequence[str]) -> list[str]:
