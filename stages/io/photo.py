@@ -14,6 +14,7 @@ FULL_FRAME_DIAGONAL = float(np.hypot(36.0, 24.0))  # mm; the "35 mm equivalent" 
 
 _MAKE, _MODEL, _EXIF = 271, 272, 34665
 _FOCAL, _FOCAL_35, _PLANE_X, _PLANE_UNIT, _PIXELS_X, _LENS = 37386, 41989, 41486, 41488, 40962, 42036
+_GPS = 34853
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FISHEYE = ("fisheye", "fish-eye", "fish eye")  # in names of lenses; rectilinear ones of the same focal lengths do not have it
 
@@ -135,6 +136,31 @@ def focal_from_exif(details: Any, width: int, height: int) -> float | None:
 def names_fisheye(details: Any) -> bool:
     """Whether the name of the lens in EXIF data says that it is a fisheye."""
     return any(word in str(details.get(_LENS, "")).lower() for word in _FISHEYE)
+
+
+def read_gps_position(path: Path) -> tuple[float, float, float] | None:
+    """(latitude, longitude) in degrees and altitude in metres of a picture's EXIF data; None without any of them. Raises UnreadableImage."""
+    with opened(path) as image:
+        tags = dict(exif_of(image).get_ifd(_GPS))
+    latitude, longitude = _degrees(tags.get(2), tags.get(1), "NS", 90.0), _degrees(tags.get(4), tags.get(3), "EW", 180.0)
+    try:
+        altitude = float(tags[6]) * (-1.0 if tags.get(5) in (1, b"\x01") else 1.0)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None
+    known = latitude is not None and longitude is not None and np.isfinite(altitude) and abs(altitude) < 100_000.0
+    return (latitude, longitude, altitude) if known else None  # type: ignore[return-value]
+
+
+def _degrees(value: Any, side: Any, sides: str, most: float) -> float | None:
+    """Of degrees, minutes and seconds on one of two sides."""
+    try:
+        whole = sum(float(part) / 60**power for power, part in enumerate(tuple(value)[:3]))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    which = str(side).strip(" \0").upper()
+    if which not in tuple(sides) or not 0 <= whole <= most:
+        return None
+    return whole if which == sides[0] else -whole
 
 
 def _number(value: Any) -> float | None:

@@ -19,6 +19,7 @@ def cameras_of_photographs(job: Job, warn: Any) -> Capture:
     """The capture of the job's photographs and videos. Raises BadInput."""
     from stages.io.material import photographs_of
     from stages.masking.polarity import kept_white
+    from stages.sfm.gps import with_gps
 
     found = photographs_of(job, warn)
     paths, settings = found.paths, job.settings
@@ -33,6 +34,9 @@ def cameras_of_photographs(job: Job, warn: Any) -> Capture:
         capture = _by_masks(job, find, paths, masks, given.inverted)
     if seen:
         capture = replace(capture, facts={**capture.facts, BACKGROUND: SEEN})
+    capture, sentence = with_gps(capture, paths)
+    if sentence:
+        job.say(sentence)
     return replace(capture, rejected_files={name: paths[name] for name, _ in capture.rejected})
 
 

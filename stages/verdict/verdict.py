@@ -19,7 +19,7 @@ from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.verdict import looks as looks_of
 from stages.verdict.looks import Look
 
-FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", BACKGROUND)  # of a capture, that stand among the figures
+FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", "gps", BACKGROUND)  # of a capture, that stand among the figures
 GRADES = ("good", "usable", "poor", "failed")
 NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
 FEW = 12  # views all round a subject
@@ -79,6 +79,8 @@ class Verdict:
             words.append(f"reprojection error {_pixels(self.figures['reprojection_error'], 2)}")
         if self.figures.get("triangulation_angle") is not None:
             words.append(f"parallax {self.figures['triangulation_angle']:.0f} degrees")
+        if (used := self.figures.get("gps", {}).get("used", "nothing")) != "nothing":
+            words.append(f"{used} by GPS")
         return f"Cameras: {self.grade}; {', '.join(words)}."
 
 

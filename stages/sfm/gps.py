@@ -1,0 +1,101 @@
+"""Scale and up of cameras that were found, by the GPS positions in the EXIF data of their photographs.
+
+The cameras are aligned to the positions by a robust similarity (Umeyama 1991, "Least-squares estimation of transformation parameters between two point
+patterns", reweighted). How well the two agree decides what is used: a phone's positions are metres off, which says nothing of a capture two metres wide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from efficientnerf.geometry.cameras import Similarity
+from stages.io.capture import Capture
+from stages.io.photo import read_gps_position
+from stages.io.pictures import UnreadableImage
+
+FEWEST = 6  # photographs with a position
+ROUNDS = 20
+SCALE, UP = 0.1, 0.03  # median distance to the positions over their extent, up to which the scale and the upward axis are taken from them
+FLAT = 0.1  # extent across the longest line through the cameras, over that along it: below, they turn about it freely
+_A, _F = 6378137.0, 1 / 298.257223563  # WGS 84: semi-major axis in metres, flattening
+
+
+def enu_from_gps(positions: np.ndarray) -> np.ndarray:
+    """(N, 3) metres east, north and up of the first position, from (N, 3) latitude and longitude in degrees and altitude in metres on WGS 84."""
+    latitude, longitude, altitude = np.radians(positions[:, 0]), np.radians(positions[:, 1]), positions[:, 2]
+    squared = _F * (2 - _F)  # eccentricity
+    normal = _A / np.sqrt(1 - squared * np.sin(latitude) ** 2)
+    across = (normal + altitude) * np.cos(latitude)
+    earth = np.stack([across * np.cos(longitude), across * np.sin(longitude), (normal * (1 - squared) + altitude) * np.sin(latitude)], 1)
+    (sin, cos), (sin_l, cos_l) = ((np.sin(angle[0]), np.cos(angle[0])) for angle in (latitude, longitude))
+    axes = np.array([[-sin_l, cos_l, 0.0], [-sin * cos_l, -sin * sin_l, cos], [cos * cos_l, cos * sin_l, sin]])
+    return np.asarray((earth - earth[0]) @ axes.T)
+
+
+def robust_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """The similarity that takes most of (N, 3) points near to (N, 3) others: squared distances, each weighted by how far it is from the usual."""
+    weights = np.ones(len(source))
+    found = Similarity.identity()
+    for _ in range(ROUNDS):
+        found = _weighted_similarity(source, target, weights / weights.sum())
+        distance = np.linalg.norm(found.points(source) - target, axis=1)
+        weights = 1 / (1 + (distance / max(2 * float(np.median(distance)), 1e-9)) ** 2)
+    return found
+
+
+def _weighted_similarity(source: np.ndarray, target: np.ndarray, weights: np.ndarray) -> Similarity:
+    a, b = source - weights @ source, target - weights @ target
+    u, singular, vt = np.linalg.svd((b * weights[:, None]).T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    scale = float((singular * sign).sum() / max((weights * (a**2).sum(1)).sum(), 1e-300))
+    return Similarity(scale, rotation, weights @ target - scale * rotation @ (weights @ source))
+
+
+def with_gps(capture: Capture, files: Mapping[str, Path]) -> tuple[Capture, str]:
+    """The capture in metres, and with the upward axis of the earth, as far as GPS positions determine them; and a sentence, empty without positions.
+
+    files  of the photographs, by name
+    """
+    positions = {}
+    for photo in capture.photos:
+        try:
+            position = read_gps_position(files[photo.camera.name])
+        except UnreadableImage:
+            continue
+        if position is not None:
+            positions[photo.camera.name] = position
+    if not positions:
+        return capture, ""
+    words = f"{len(positions)} of {len(capture.photos)} photographs have a GPS position"
+    if len(positions) < max(FEWEST, len(capture.photos) / 2):
+        return _with_facts(capture, {"photographs": len(positions), "used": "nothing"}), f"{words}: too few to be used."
+    centres = np.array([photo.camera.centre for photo in capture.photos if photo.camera.name in positions])
+    places = enu_from_gps(np.array([positions[photo.camera.name] for photo in capture.photos if photo.camera.name in positions]))
+    aligned = robust_similarity(centres, places)
+    distance = float(np.median(np.linalg.norm(aligned.points(centres) - places, axis=1)))
+    spread = np.linalg.svd(aligned.scale * (centres - centres.mean(0)), compute_uv=False) / np.sqrt(len(centres))  # m, along three axes
+    extent = float(np.linalg.norm(spread))
+    facts: dict[str, object] = {"photographs": len(positions), "extent": round(extent, 3), "distance": round(distance, 3)}
+    words += f", {distance:.2g} m from the cameras found in the median"
+    if not np.isfinite(distance) or aligned.scale <= 0 or distance > SCALE * extent:
+        return _with_facts(capture, facts | {"used": "nothing"}), f"{words}: too far for an extent of {extent:.2g} m, and not used."
+    if distance > UP * extent or spread[1] < FLAT * spread[0]:
+        scaled = Similarity(aligned.scale, np.eye(3), np.zeros(3))
+        return _moved(_with_facts(capture, facts | {"used": "scale"}), scaled), f"{words}: the scale is taken from them."
+    moved = replace(_moved(capture, aligned), up=np.array([0.0, 0.0, 1.0]))
+    return _with_facts(moved, facts | {"used": "scale and up"}), f"{words}: scale and upward axis are taken from them."
+
+
+def _moved(capture: Capture, similarity: Similarity) -> Capture:
+    photos = tuple(replace(photo, camera=similarity.camera(photo.camera)) for photo in capture.photos)
+    points = capture.points and replace(capture.points, xyz=similarity.points(capture.points.xyz))
+    return replace(capture, photos=photos, points=points, metric=True)
+
+
+def _with_facts(capture: Capture, facts: Mapping[str, object]) -> Capture:
+    return replace(capture, facts={**capture.facts, "gps": dict(facts)})
