@@ -44,6 +44,7 @@ ERROR_RAYS = 2**16  # training pixels that the report's PSNR is measured on
 TIMED_RAYS = 2**14  # of which so many are timed
 # docs/experiments/refinement.md
 MIN_STEPS, STEP_RAYS_PER_VOXEL, SCENE_STEP_RAYS_PER_VOXEL = 320, 15, 6  # see `refinement_steps`
+UNREFINED = 0.1  # of the steps that are usual: with fewer the asset is hardly refined
 ERROR_MAP = 0.9  # bake.error_map but for forward-facing scenes; docs/experiments/tree-training.md
 UNBOUNDED_VIEW_DEPENDENT_LR_RATIO = 0.2  # bake.view_dependent_lr_ratio without a constant background
 
@@ -222,6 +223,8 @@ def refined(
     del tree  # the state has values of its own
     made = Refinement(job, s, targets, room, stopwatch, point, log, None if seconds is None else seconds - finish, per_ray, samples, baked)
     tree = made.run()
+    if point.state.step < UNREFINED * steps:
+        job.warn(_unrefined(point.state.step, steps))
     report |= {"steps": point.state.step, "schedule": point.schedule.state(), "time_budget": settings.time_budget}
     report["psnr_before"], report["psnr_after"] = (round(psnr_of(error), 3) for error in (before, fit.error(tree, targets, sample, settings.seed)))
     job.record("schedule", point.schedule.state())
@@ -229,6 +232,12 @@ def refined(
         report["holes"] = _holes(job, tree, samples, point.pruned or Pruned())
     _publish(job, log)
     return tree, report
+
+
+def _unrefined(taken: int, usual: int) -> str:
+    """What a time budget that was too short has come to, and what to do."""
+    done = f"bake.time_budget left time for {taken} step{'' if taken == 1 else 's'} of the refinement, where {usual:,} are usual"
+    return f"{done}: the asset is hardly better than it was baked. Give more time (--budget) or fewer voxels (bake.max_mib), or run it while nothing else does."
 
 
 def _first_point(job: Job, tree: NerfTree, schedule: RefinementSchedule, stopwatch: Stopwatch, cells: int, *, timed: bool, capped: bool) -> Point:

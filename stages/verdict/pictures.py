@@ -12,6 +12,8 @@ PANEL = 520  # px
 MARGIN = 16
 POINTS = 4000  # sparse points that are drawn
 PAPER, INK, GREY, LOST, GOOD = (255, 255, 255), (32, 32, 32), (186, 190, 196), (200, 40, 40), (35, 100, 170)
+BORDER = 1.25  # of the box that is shown
+REACH, MOST_POINTS = 2.0, 0.95  # of the cameras' own box, that points may widen it to; quantile of the points, along each axis
 MOST_SHEET = 48  # photographs of the sheet by sharpness
 CELL = 900  # px, of the picture of matches, at most
 
@@ -30,9 +32,8 @@ def camera_plot(centres: np.ndarray, forward: np.ndarray, points: np.ndarray, lo
     sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + 3 * MARGIN + 20), PAPER)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=12)
     draw.text((MARGIN, MARGIN), title, INK, font)
-    shown = np.concatenate([centres, lost]) if len(centres) else np.zeros((1, 3))
-    middle = (shown.min(0) + shown.max(0)) / 2
-    half = max(float(np.ptp(shown, axis=0).max()) / 2, 1e-9) * 1.25
+    low, high = shown_box(np.concatenate([centres, lost]), points)
+    middle, half = (low + high) / 2, max(float((high - low).max()) / 2, 1e-9) * BORDER
     some = points[:: max(1, len(points) // POINTS)]
     for panel, (name, across, up) in enumerate((("from above", 0, 1), ("from the side", 0, 2))):
         left, top = MARGIN + panel * (PANEL + MARGIN), 2 * MARGIN + 20
@@ -44,6 +45,19 @@ def camera_plot(centres: np.ndarray, forward: np.ndarray, points: np.ndarray, lo
         _draw_panel(draw, (left, top), at(some), at(centres), at(centres + 0.09 * half * forward), at(lost))
         draw.text((left + 6, top + 4), name, INK, font)
     write_png(np.asarray(sheet), path)
+
+
+def shown_box(cameras: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (3,) of the box round cameras (C, 3) and most of the points (N, 3) that they look at: what lies to one side of them is shown too, but not what is
+    so far away that the cameras would be a speck."""
+    if not len(cameras):
+        return np.zeros(3), np.zeros(3)
+    low, high = cameras.min(0), cameras.max(0)
+    if len(points):
+        middle, reach = (low + high) / 2, REACH * float((high - low).max()) / 2
+        nearest, farthest = np.quantile(points, [1 - MOST_POINTS, MOST_POINTS], axis=0)
+        low, high = np.minimum(low, np.maximum(nearest, middle - reach)), np.maximum(high, np.minimum(farthest, middle + reach))
+    return low, high
 
 
 def _draw_panel(draw: Any, corner: tuple[int, int], points: np.ndarray, centres: np.ndarray, ends: np.ndarray, lost: np.ndarray) -> None:

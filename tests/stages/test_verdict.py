@@ -245,6 +245,19 @@ def test_pictures_show_cameras_in_blue_and_lost_ones_in_red_and_repeat(tmp_path:
     assert (tmp_path / "b.png").read_bytes() == (tmp_path / "c.png").read_bytes()
 
 
+def test_what_lies_to_one_side_of_the_cameras_is_in_their_plot() -> None:
+    cameras, points = np.random.default_rng(0).uniform(-1, 1, (2, 50, 3))
+    low, high = pictures.shown_box(cameras, points * 0.5)
+    assert (low == cameras.min(0)).all()  # in their midst nothing changes
+    assert (high == cameras.max(0)).all()
+    beside = pictures.shown_box(cameras, points * 0.1 + np.array([0, 1.5, 0]))
+    assert 1.5 < beside[1][1] < 1.7
+    assert (beside[0] == low).all()
+    far = pictures.shown_box(cameras, points + np.array([0, 1000.0, 0]))
+    assert far[1][1] == pytest.approx((low + high)[1] / 2 + (high - low).max())
+    assert all((corner == 0).all() for corner in pictures.shown_box(np.zeros((0, 3)), points))
+
+
 def test_matches_are_squares_of_their_pair(tmp_path: Path) -> None:
     names = ["a", "b", "c", "d"]
     pictures.match_picture(names, ["d"], [("a", "b", 1000), ("c", "d", 600), ("a", "zz", 5)], tmp_path / "m.png")

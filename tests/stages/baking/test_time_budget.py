@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -131,9 +132,13 @@ def test_an_interrupted_bake_keeps_to_its_plan(inputs: dict[str, Path], tmp_path
 
 
 def test_a_budget_that_is_over_ends_in_an_asset_all_the_same(inputs: dict[str, Path], tmp_path: Path) -> None:
-    made = job(tmp_path, replace(QUICK, time_budget=0.01), **inputs)
+    events: list[dict[str, Any]] = []
+    made = job(tmp_path, replace(QUICK, time_budget=0.01), events=events, **inputs)
     bake.run(made)
     assert [one["iterations"] for one in fitted(made)["schedule"]] == [1, 1]
+    warned = [event["text"] for event in events if event["event"] == "warning"]
+    assert len(warned) == 1
+    assert re.match(r"bake\.time_budget left time for 2 steps of the refinement, where [1-9][\d,]{2,} are usual: ", warned[0])
 
 
 @pytest.mark.parametrize("steps", [0, 1, 7, 12])
