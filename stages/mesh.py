@@ -179,6 +179,20 @@ def describe(mesh: Mesh, frame: SourceFrame) -> dict[str, Any]:
     }
 
 
+def preview_of(mesh: Mesh, metadata: Mapping[str, Any], *, clipped: bool) -> np.ndarray:
+    """(H, W, 3) uint8: a mesh of the training frame from four sides, of a capture from one side those that its cameras saw.
+
+    clipped  whether the mesh ends at a region's border. One that does not may reach far behind its subject: then the nearest four fifths are shown
+    """
+    from stages.figures.shading import IN_FRONT, render_sides
+
+    orbit = metadata.get("orbit", {})
+    heading, elevation = float(orbit.get("heading", 0.0)), float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
+    if not orbit.get("forward_facing", False):
+        return render_sides(mesh, heading=heading, elevation=elevation)
+    return render_sides(mesh, heading=heading, elevation=0.0, turns=IN_FRONT, shown=1.0 if clipped else 0.8)
+
+
 def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: SourceFrame, job: Job) -> None:
     """The files of a mesh without faces, and a warning: what else a run makes of its asset does not depend on there being one."""
     from stages.io.png import write_png
@@ -196,7 +210,6 @@ def write_empty(outputs: MeshOutputs, mesh: Mesh, seen: list[AssetView], frame: 
 @compiling_kernels
 def run(job: Job) -> None:
     from efficientnerf.asset.format import load
-    from stages.figures.shading import IN_FRONT, render_sides
     from stages.framing.restriction import restricted
     from stages.io.exporters import MESH_EXPORTERS
     from stages.io.exporters.writing import source_frame
@@ -228,11 +241,7 @@ def run(job: Job) -> None:
     if dense is not None:
         found = with_relief(found, dense, lambda: texture_progress(1, 1, "normal map"))
     job.safe_point()
-    orbit = tree.metadata.get("orbit", {})
-    elevation = float(np.clip(orbit.get("elevation", 20.0), 10.0, 35.0))
-    forward = bool(orbit.get("forward_facing", False))
-    sides: dict[str, Any] = {"turns": IN_FRONT, "shown": 0.8} if forward else {}
-    write_png(render_sides(found, heading=float(orbit.get("heading", 0.0)), elevation=0.0 if forward else elevation, **sides), outputs.preview)
+    write_png(preview_of(found, tree.metadata, clipped=border is not None), outputs.preview)
     watch.lap("preview")
     job.safe_point()
     mesh = in_capture(found, frame)
@@ -253,4 +262,4 @@ def run(job: Job) -> None:
     job.say(f"{report['faces']} faces in {report['components']} component{'s' if report['components'] != 1 else ''}{facts_of(report)}", **facts)
 
 
-STAGE = Stage(name="mesh", version=13, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))
+STAGE = Stage(name="mesh", version=14, settings=MeshSettings, needs=needs_of(MeshInputs), run=run, volatile=(MeshOutputs.timings,))

@@ -15,6 +15,7 @@ from efficientnerf.asset import format
 from efficientnerf.asset.region import Region
 from efficientnerf.asset.tree import tree_from_voxels
 from efficientnerf.geometry.cameras import Camera, Similarity, rays
+from efficientnerf.surface.mesh import Mesh
 from pipeline.errors import CorruptArtifact, Interrupted, StageFailed, UsageError
 from pipeline.stage import Job
 from stages import mesh as stage
@@ -284,3 +285,17 @@ def test_time_passes_for_the_part_that_is_reported_next() -> None:
     now[0] += 128
     watch.lap("files")
     assert watch.seconds == {"surface": 3, "cleaning and decimation": 4, "colours at vertices": 8, "photographs": 80, "charts": 32, "files": 128}
+
+
+def test_the_preview_of_a_capture_from_one_side_shows_all_of_a_subject_that_is_clipped() -> None:
+    """What is not clipped may reach far behind the subject: there the outmost fifth is left out."""
+    y, z = (part.ravel() for part in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij"))
+    corner = 21 * np.arange(20)[:, None] + np.arange(20)
+    faces = np.concatenate([np.stack([corner, corner + 21, corner + 22], -1), np.stack([corner, corner + 22, corner + 1], -1)]).reshape(-1, 3)
+    outer = np.abs(y * z) > 0.6
+    square = Mesh(np.stack([0 * y, y, z], 1), faces, np.tile([1.0, 0, 0], (441, 1)), np.where(outer[:, None], [1.0, 0, 0], [0, 1.0, 0]), {})
+    orbit = {"orbit": {"heading": 0.0, "elevation": 20.0, "forward_facing": True}}
+    whole, middle = (stage.preview_of(square, orbit, clipped=clipped) for clipped in (True, False))
+    assert whole.shape == middle.shape == (840, 1680, 3)
+    assert (whole == (255, 0, 0)).all(-1).sum() > 1000
+    assert not (middle == (255, 0, 0)).all(-1).any()
