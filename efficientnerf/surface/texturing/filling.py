@@ -4,13 +4,18 @@ of the texture have no seams."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from efficientnerf.backends.pieces import pieces
 from efficientnerf.surface.texturing.atlas import Atlas
 
+if TYPE_CHECKING:
+    from efficientnerf.surface.mesh import Mesh
+
 RINGS = 6  # of vertices, over which the colours that photographs show are carried on to where none shows anything. docs/experiments/textures.md
+NEAREST = 8  # vertices, of which what is further away has the mean, by the square of the distance
 SEEN = 0.5  # texels' worth of photographs, from which the colour of a vertex is known
 EMPTY = 128  # what a texture holds that has no texel at all
 
@@ -32,19 +37,20 @@ def texture_from(atlas: Atlas, colours: np.ndarray) -> np.ndarray:
 
 
 def carried_on(
-    faces: np.ndarray, vertex_colours: np.ndarray, atlas: Atlas, colours: np.ndarray, known: np.ndarray, expected: np.ndarray,
-    tick: Callable[[], None] = lambda: None,
-) -> np.ndarray:  # fmt: skip
-    """(V, 3) float32 colours of vertices, 0-1: what photographs show round each; where they show nothing, the mean of the vertices beside it that are known,
-    ring by ring; further away those that they have, `vertex_colours` (V, 3). An asset has no colours of its own where no photograph looks.
+    mesh: Mesh, atlas: Atlas, colours: np.ndarray, known: np.ndarray, expected: np.ndarray, tick: Callable[[], None] = lambda: None
+) -> np.ndarray:
+    """(V, 3) float32 colours of a mesh's vertices, 0-1: what photographs show round each; where they show nothing, the mean of the vertices beside it that are
+    known, ring by ring; further away that of the nearest in space, as on the back of a wall. An asset has no colours of its own where no photograph looks:
+    those of `mesh` stay where photographs show none of it at all.
 
     colours  (T, 3) uint8 of the texels
     known    (T,) share of each that is from photographs; the rest is from
     expected (T, 3) uint8
     """
     from scipy.sparse import csr_matrix
+    from scipy.spatial import cKDTree
 
-    count, texels = len(vertex_colours), atlas.texels
+    faces, count, texels = mesh.faces, len(mesh.vertices), atlas.texels
     sums, total = np.zeros((count, 3)), np.zeros(count)
     for corner in range(3):
         at, share = faces[texels.face, corner], texels.share[:, corner]
@@ -62,4 +68,13 @@ def carried_on(
         new = ~reached & (weight > 0)
         out[new] = mean[new] / weight[new, None]
         reached |= new
-    return np.where(reached[:, None], out, vertex_colours).astype(np.float32)
+    tick()
+    if not reached.any():
+        return np.asarray(mesh.colours, np.float32)
+    if not reached.all():
+        near = min(NEAREST, int(reached.sum()))
+        distance, which = cKDTree(mesh.vertices[reached]).query(mesh.vertices[~reached], k=near)
+        share = 1 / np.maximum(distance.reshape(-1, near), 1e-12) ** 2
+        share /= share.sum(axis=1, keepdims=True)
+        out[~reached] = np.einsum("vk,vkc->vc", share, out[reached][which.reshape(-1, near)])
+    return out.astype(np.float32)

@@ -266,7 +266,7 @@ class PhotographTexture:
         """Colours (T, 3) uint8 of the texels, and what share of each is from photographs (T,). `mesh`: this one, with the colours that the asset has at its
         vertices, which tell outliers at first."""
         expected = interpolated(mesh, self.atlas, tick)
-        around = carried_on(self.faces, mesh.colours, self.atlas, *self.colours(expected, tick=tick), expected, tick)
+        around = carried_on(mesh, self.atlas, *self.colours(expected, tick=tick), expected, tick)
         return self.colours(interpolated(replace(mesh, colours=around), self.atlas, tick), tick=tick)
 
     def colours(

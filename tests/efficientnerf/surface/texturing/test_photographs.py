@@ -11,6 +11,7 @@ from numba import get_num_threads, set_num_threads
 from efficientnerf.geometry.cameras import Camera, project
 from efficientnerf.surface.mesh import Mesh, vertex_normals
 from efficientnerf.surface.texturing.atlas import atlas_of
+from efficientnerf.surface.texturing.filling import carried_on
 from efficientnerf.surface.texturing.photographs import REACH, Photograph, PhotographTexture, edge_distance, halved, photograph, survey, texels_wanted
 
 from .shapes import ball, box, cameras, pattern, photographed, textured
@@ -81,7 +82,7 @@ def test_a_face_that_is_hidden_gets_nothing() -> None:
 
 
 def test_where_nothing_is_seen_the_colours_beside_it_are_carried_on() -> None:
-    """The asset is black where no photograph looks: just beyond what is seen it is not believed, on the far side it is."""
+    """The asset is black where no photograph looks: it is believed nowhere, but where photographs show none of the mesh."""
     vertices, faces = ball(4)
     photos = [photographed(vertices, faces, camera, lambda points: np.full((len(points), 3), [0.8, 0.4, 0.2])) for camera in cameras(4) if camera.centre[2] > 0]
     normals = vertex_normals(vertices, faces)
@@ -100,7 +101,26 @@ def test_where_nothing_is_seen_the_colours_beside_it_are_carried_on() -> None:
     assert off.mean() < 0.01
     far = unseen & (apart > 0.9) & (points[:, 2] < -0.1)
     assert far.any()
-    assert (colours[far] == 0).all()
+    np.testing.assert_allclose(colours[far] / 255, np.tile([0.8, 0.4, 0.2], (far.sum(), 1)), atol=0.1)
+    nothing = np.zeros(len(points), np.float32)
+    np.testing.assert_array_equal(carried_on(mesh, atlas, colours, nothing, colours), mesh.colours)
+
+
+def test_the_back_of_a_wall_has_the_colours_of_its_front() -> None:
+    """Two sides of a wall that share no edge, red to the left and blue to the right; photographs show the front."""
+    y, z = (part.ravel() for part in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21), indexing="ij"))
+    corner = (21 * np.arange(20)[:, None] + np.arange(20)).ravel()
+    side = np.concatenate([np.stack([corner, corner + 21, corner + 22], -1), np.stack([corner, corner + 22, corner + 1], -1)])
+    vertices, faces = np.concatenate([np.stack([x + 0 * y, y, z], 1) for x in (0.05, -0.05)]), np.concatenate([side, side[:, ::-1] + 441])
+    atlas = atlas_of(vertices, faces, np.inf, 128)
+    points = atlas.texels.values(vertices, faces)
+    colours = np.where(points[:, 1:2] < 0, np.uint8([200, 0, 0]), np.uint8([0, 0, 200]))
+    known = (points[:, 0] > 0).astype(np.float32)
+    mesh = Mesh(vertices, faces, vertex_normals(vertices, faces), np.ones((882, 3), np.float32))
+    found = 255 * carried_on(mesh, atlas, colours, known, np.full_like(colours, 255))
+    back = found[441:]
+    np.testing.assert_allclose(back[y < -0.3], np.tile([200, 0, 0], ((y < -0.3).sum(), 1)), atol=2)
+    np.testing.assert_allclose(back[y > 0.3], np.tile([0, 0, 200], ((y > 0.3).sum(), 1)), atol=2)
 
 
 def test_masks_and_alpha_are_kept_to() -> None:
