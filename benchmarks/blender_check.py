@@ -93,7 +93,7 @@ def six_sides(mesh: Mesh, size: int) -> list[Camera]:
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     centre, reach = (low + high) / 2, float(np.linalg.norm(high - low))
     angles = [(0.0, 15.0), (90.0, 15.0), (180.0, 15.0), (270.0, 15.0), (45.0, 70.0), (225.0, -35.0)]
-    return [Camera(f"side {n}", size, size, "SIMPLE_PINHOLE", (2.2 * size, size / 2, size / 2), pose_on_sphere(tuple(centre), 1.7 * reach, *angle))
+    return [Camera(f"side {n}", size, size, "SIMPLE_PINHOLE", (2.2 * size, size / 2, size / 2), pose_on_sphere(tuple(centre), 2.4 * reach, *angle))
             for n, angle in enumerate(angles)]  # fmt: skip
 
 
