@@ -5,15 +5,22 @@ V vertices, F faces. Everything is in the frame of the volume (`efficientnerf.su
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from efficientnerf.surface.colours import surface_colours
 from efficientnerf.surface.fusion import Fusion
 from efficientnerf.surface.isosurface import NoSurface, Progress, automatic_threshold, enclosed_cells, isosurface, silent
 from efficientnerf.surface.mesh import Mesh, PointCloud, decimate, sample, separate, tidy, vertex_normals
+from efficientnerf.surface.silhouettes import fitted_to_silhouettes
 from efficientnerf.surface.smoothing import rounds_within, smooth, smooth_normals
 from efficientnerf.surface.visible_parts import Shown, visible_parts
 from efficientnerf.surface.volume import NdcVolume, Volume
+
+if TYPE_CHECKING:
+    from efficientnerf.surface.agreement import AssetView
 
 # Rounds of smoothing normals for each of smoothing, at most, and how sharp the edges are that stay. docs/experiments/surface.md
 NORMALS, FUSED_NORMALS = (1, 6, 0.6), (8, 80, 0.2)  # of surfaces of densities alone, and of fused ones
@@ -60,6 +67,7 @@ def surface(
     viewpoints: np.ndarray = _NO_VIEWPOINTS,
     shown: Shown | None = None,
     fusion: Fusion | None = None,
+    silhouettes: Sequence[AssetView] = (),
     dense: list[tuple[np.ndarray, np.ndarray]] | None = None,
     progress: Progress = silent,
 ) -> Mesh:
@@ -72,6 +80,7 @@ def surface(
     viewpoints     (N, 3) camera positions that may lie inside the volume: what can be seen from there is not filled
     shown          how much views of the world show of components: those that they do not show are removed; None: hollows and what is in them are
     fusion         depths of views, which decide where the surface is wherever they agree; None: the densities alone do
+    silhouettes    views of the asset by pinhole cameras, whose silhouettes the surface gets where it is sharply curved
     dense          is given vertices and faces as they were before decimation, in the training frame
     progress       called with (done, total, text); what it raises stops the work
 
@@ -90,7 +99,9 @@ def surface(
     if len(triangles):
         times, most, sharpness = NORMALS if fusion is None else FUSED_NORMALS
         most = min(most, rounds_within(SMOOTHING_REACH * float(np.linalg.norm(np.ptp(vertices, axis=0))), vertices, triangles))
-        vertices = np.clip(smooth_normals(vertices, triangles, min(times * rounds, most), sharpness), vertices.min(0), vertices.max(0))
+        low, high = vertices.min(0), vertices.max(0)
+        vertices = smooth_normals(vertices, triangles, min(times * rounds, most), sharpness)
+        vertices = np.clip(fitted_to_silhouettes(vertices, triangles, silhouettes, lambda: progress(0, 1, "colours")), low, high)
     normals = vertex_normals(vertices, triangles)
     colours = surface_colours(volume, vertices, normals, progress, None if ndc is None else ndc.view_directions)
     mesh = Mesh(vertices, triangles, normals, colours, facts)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from efficientnerf.surface.agreement import AssetView
 
 MIN_FACES = 20
+SKIPPED = 2  # of the views whose depths are fused, one in so many has its silhouette fitted
 BORDER = 0.6  # voxels of a cascade from the borders of its box, and of the one before, in which its surface has lids
 ALONG = 0.7  # cosine of a lid's normal to that of the border
 
@@ -48,7 +49,7 @@ def scene_surface(
     if not tree.outer:
         return surface(
             volume_of(tree, region), threshold, faces=faces, min_component=min_component, rounds=rounds, viewpoints=viewpoints, shown=shown,
-            fusion=_fusion(0, tree, views, progress), dense=dense, progress=progress,
+            fusion=_fusion(0, tree, views, progress), silhouettes=views[::SKIPPED], dense=dense, progress=progress,
         )  # fmt: skip
     found = []
     sizes = np.bincount(voxel_cascades(tree), minlength=len(cascades_of(tree)))
@@ -59,7 +60,8 @@ def scene_surface(
         try:
             mesh = surface(
                 volume_of(part, region), _level(threshold, number), faces=share, min_component=min_component, rounds=rounds, viewpoints=viewpoints,
-                shown=shown, fusion=_fusion(number, part, views, progress), dense=dense, progress=progress,
+                shown=shown, fusion=_fusion(number, part, views, progress), silhouettes=views[::SKIPPED] if number == 0 else (), dense=dense,
+                progress=progress,
             )  # fmt: skip
         except NoSurface:
             continue

@@ -26,7 +26,7 @@ def smooth(vertices: np.ndarray, faces: np.ndarray, rounds: int) -> np.ndarray:
     if rounds <= 0 or not len(faces):
         return vertices
     shrink, grow = 0.5, -1 / (1 / 0.5 - 0.1)
-    neighbours, degree = _neighbours(faces, len(vertices))
+    neighbours, degree = vertex_neighbours(faces, len(vertices))
     for _ in range(rounds):
         for step in (shrink, grow):
             vertices = vertices + step * (neighbours @ vertices / degree - vertices)
@@ -58,7 +58,7 @@ def smooth_normals(vertices: np.ndarray, faces: np.ndarray, rounds: int, sharpne
         fitted = fitted + (target - np.einsum("vij,vj->vi", outer, fitted)) / count
     outward = vertex_normals(vertices, faces)
     drift = ((fitted - vertices) * outward).sum(1, keepdims=True)
-    neighbours, degree = _neighbours(faces, len(vertices))
+    neighbours, degree = vertex_neighbours(faces, len(vertices))
     for _ in range(DRIFT_ROUNDS):
         drift = 0.5 * drift + 0.5 * (neighbours @ drift) / degree
     return fitted - drift * outward
@@ -89,7 +89,7 @@ def smoothed_face_normals(
     return normals, area
 
 
-def _neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:
+def vertex_neighbours(faces: np.ndarray, count: int) -> tuple[Any, np.ndarray]:
     """Which vertices share an edge, a sparse matrix (V, V) of ones, and how many there are of each (V, 1), at least one."""
     from scipy.sparse import csr_matrix
 
