@@ -61,12 +61,13 @@ def render(
 
     _check_camera(camera, supersample)
     behind = _background(background)
-    if tree.ndc is None and dispatch.tree_backend(tree) == "triton":
+    on_device = dispatch.tree_backend(tree) == "triton"
+    if on_device and tree.ndc is None:
         from efficientnerf.backends.triton import tree as cuda_tree
 
-        on_device = cuda_tree.render_image(cuda_tree.device_tree_of(tree), camera, background=background, supersample=supersample)
-        rendering = Rendering(*(part.cpu().numpy() for part in on_device))
-    elif tree.ndc is not None or tree.lookup == "nearest":
+        parts = cuda_tree.render_image(cuda_tree.device_tree_of(tree), camera, background=background, supersample=supersample)
+        rendering = Rendering(*(part.cpu().numpy() for part in parts))
+    elif on_device or tree.lookup == "nearest":
         rendering = _render_by_rays(tree, camera, background, supersample, rays_per_band)
     else:
         return Rendering(*render_image(tree, camera, supersample, behind, normals=normals, rays_per_band=rays_per_band))
@@ -144,7 +145,7 @@ def _render_single_rays(tree: NerfTree, camera: Camera, background: tuple[float,
 
 
 def _render_by_rays(tree: NerfTree, camera: Camera, background: tuple[float, float, float] | None, supersample: int, rays_per_band: int) -> Rendering:
-    """An image band by band of `render_rays`: of a tree whose frame is not the world, where rays of one camera diverge, or that is not interpolated."""
+    """An image band by band of `render_rays`: of a tree that is not interpolated, or on a device of one whose frame is not the world, where rays diverge."""
     height, width, n = camera.height, camera.width, supersample
     if n == 1:
         return _render_single_rays(tree, camera, background, rays_per_band)

@@ -13,32 +13,62 @@ from efficientnerf.geometry.ndc import BEYOND, Ndc, NdcRays
 BLOCK = 4096  # rays per task
 
 
+def ndc_numbers(ndc: Ndc) -> np.ndarray:
+    """A reference camera for kernels, (15,) float64: its rotation row by row, its position, slopes a and b, and the near plane."""
+    return np.concatenate([np.ravel(ndc.world_from_camera[:3, :3]), ndc.world_from_camera[:3, 3], ndc.slopes, [ndc.near]]).astype(np.float64)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def warp_ray(x, y, z, dx, dy, dz, ndc):  # type: ignore[no-untyped-def]
+    """`Ndc.rays` of a ray from (x, y, z) along (dx, dy, dz): origin and direction, and the way back, begin, ds_dt and dlogz_dt; `ndc` see `ndc_numbers`."""
+    a, b, near = ndc[12], ndc[13], ndc[14]
+    x, y, z = x - ndc[9], y - ndc[10], z - ndc[11]
+    x, y, z = x * ndc[0] + y * ndc[3] + z * ndc[6], x * ndc[1] + y * ndc[4] + z * ndc[7], x * ndc[2] + y * ndc[5] + z * ndc[8]
+    dx, dy, dz = dx * ndc[0] + dy * ndc[3] + dz * ndc[6], dx * ndc[1] + dy * ndc[4] + dz * ndc[7], dx * ndc[2] + dy * ndc[5] + dz * ndc[8]
+    reaches, t = True, 0.0
+    if z < near:
+        reaches = dz > 1e-9
+        t = (near - z) / dz if reaches else 0.0
+    x, y, z = x + t * dx, y + t * dy, max(z + t * dz, near) if reaches else near
+    inverse = 1 / z
+    jx, jy, jz = a * (dx - x * dz * inverse) * inverse, b * (dy - y * dz * inverse) * inverse, 2 * near * dz * inverse * inverse
+    g = np.sqrt(jx * jx + jy * jy + jz * jz)
+    if not reaches or g < 1e-12:
+        return 0.0, 0.0, BEYOND, 0.0, 0.0, 1.0, t, 1.0, dz * inverse
+    shorter = 1 / g
+    return a * x * inverse, b * y * inverse, 1 - 2 * near * inverse, jx * shorter, jy * shorter, jz * shorter, t, g, dz * inverse
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def world_distance(along, begin, ds_dt, dlogz_dt):  # type: ignore[no-untyped-def]
+    """`efficientnerf.geometry.ndc.world_distance` of one point, float32."""
+    rest = ds_dt - dlogz_dt * along
+    return np.float32(begin + along / rest) if rest > 1e-6 * ds_dt else np.float32(np.inf)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def world_normal(x, y, z, nx, ny, nz, ndc):  # type: ignore[no-untyped-def]
+    """`Ndc.world_normals` of one normal at a point, float32."""
+    depth = 2 * ndc[14] / max(1 - z, 1e-9)
+    x, y = x * depth / ndc[12], y * depth / ndc[13]
+    nx, ny, nz = ndc[12] * nx, ndc[13] * ny, 2 * ndc[14] * nz
+    nz = (nz - x * nx - y * ny) / depth
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    scale = 1 / length if length > 0 else 0.0
+    return (
+        np.float32((ndc[0] * nx + ndc[1] * ny + ndc[2] * nz) * scale), np.float32((ndc[3] * nx + ndc[4] * ny + ndc[5] * nz) * scale),
+        np.float32((ndc[6] * nx + ndc[7] * ny + ndc[8] * nz) * scale),
+    )  # fmt: skip
+
+
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _warp_rays(origins, directions, rotation, position, a, b, near, beyond, start, along, begin, ds_dt, dlogz_dt):  # type: ignore[no-untyped-def]
+def _warp_rays(origins, directions, ndc, start, along, begin, ds_dt, dlogz_dt):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(origins) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(origins), block * BLOCK + BLOCK)):
-            px, py, pz = origins[n, 0] - position[0], origins[n, 1] - position[1], origins[n, 2] - position[2]
-            vx, vy, vz = directions[n, 0], directions[n, 1], directions[n, 2]
-            x, y = px * rotation[0, 0] + py * rotation[1, 0] + pz * rotation[2, 0], px * rotation[0, 1] + py * rotation[1, 1] + pz * rotation[2, 1]
-            z = px * rotation[0, 2] + py * rotation[1, 2] + pz * rotation[2, 2]
-            dx, dy = vx * rotation[0, 0] + vy * rotation[1, 0] + vz * rotation[2, 0], vx * rotation[0, 1] + vy * rotation[1, 1] + vz * rotation[2, 1]
-            dz = vx * rotation[0, 2] + vy * rotation[1, 2] + vz * rotation[2, 2]
-            reaches, t = True, 0.0
-            if z < near:
-                reaches = dz > 1e-9
-                t = (near - z) / dz if reaches else 0.0
-            x, y, z = x + t * dx, y + t * dy, max(z + t * dz, near) if reaches else near
-            jx, jy, jz = a * (dx * z - x * dz) / (z * z), b * (dy * z - y * dz) / (z * z), 2 * near * dz / (z * z)
-            g = np.sqrt(jx * jx + jy * jy + jz * jz)
-            begin[n], dlogz_dt[n] = t, dz / z
-            if not reaches or g < 1e-12:
-                start[n, 0], start[n, 1], start[n, 2] = 0.0, 0.0, beyond
-                along[n, 0], along[n, 1], along[n, 2] = 0.0, 0.0, 1.0
-                ds_dt[n] = 1.0
-                continue
-            start[n, 0], start[n, 1], start[n, 2] = a * x / z, b * y / z, 1 - 2 * near / z
-            along[n, 0], along[n, 1], along[n, 2] = jx / g, jy / g, jz / g
-            ds_dt[n] = g
+            x, y, z, dx, dy, dz, begin[n], ds_dt[n], dlogz_dt[n] = warp_ray(
+                origins[n, 0], origins[n, 1], origins[n, 2], directions[n, 0], directions[n, 1], directions[n, 2], ndc
+            )
+            start[n, 0], start[n, 1], start[n, 2], along[n, 0], along[n, 1], along[n, 2] = x, y, z, dx, dy, dz
 
 
 def warp_rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> NdcRays:
@@ -46,14 +76,13 @@ def warp_rays(ndc: Ndc, origins: np.ndarray, directions: np.ndarray) -> NdcRays:
     count = len(origins)
     start, along = np.empty((count, 3)), np.empty((count, 3))
     begin, ds_dt, dlogz_dt = np.empty(count), np.empty(count), np.empty(count)
-    pose = np.ascontiguousarray(ndc.world_from_camera, np.float64)
-    given = (np.ascontiguousarray(part, np.float64) for part in (origins, directions, pose[:3, :3], pose[:3, 3]))
-    _warp_rays(*given, *ndc.slopes, ndc.near, BEYOND, start, along, begin, ds_dt, dlogz_dt)
+    given = (np.ascontiguousarray(part, np.float64) for part in (origins, directions))
+    _warp_rays(*given, ndc_numbers(ndc), start, along, begin, ds_dt, dlogz_dt)
     return NdcRays(start, along, begin, ds_dt, dlogz_dt)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _unwarp_hits(start, along, begin, ds_dt, dlogz_dt, distance, normal, rotation, a, b, near, out_distance, out_normal):  # type: ignore[no-untyped-def]
+def _unwarp_hits(start, along, begin, ds_dt, dlogz_dt, distance, normal, ndc, out_distance, out_normal):  # type: ignore[no-untyped-def]
     for block in numba.prange((len(start) + BLOCK - 1) // BLOCK):
         for n in range(block * BLOCK, min(len(start), block * BLOCK + BLOCK)):
             s = np.float64(distance[n])
@@ -61,17 +90,10 @@ def _unwarp_hits(start, along, begin, ds_dt, dlogz_dt, distance, normal, rotatio
             out_normal[n, 0] = out_normal[n, 1] = out_normal[n, 2] = 0
             if not np.isfinite(s):
                 continue
-            remaining = ds_dt[n] - dlogz_dt[n] * s
-            if remaining > 1e-6 * ds_dt[n]:
-                out_distance[n] = begin[n] + s / remaining
-            z = 2 * near / max(1 - (start[n, 2] + s * along[n, 2]), 1e-9)
-            x, y = (start[n, 0] + s * along[n, 0]) * z / a, (start[n, 1] + s * along[n, 1]) * z / b
-            nx, ny, nz = a * normal[n, 0], b * normal[n, 1], 2 * near * np.float64(normal[n, 2])
-            nz = (nz - x * nx - y * ny) / z
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if length > 0:
-                for k in range(3):
-                    out_normal[n, k] = (rotation[k, 0] * nx + rotation[k, 1] * ny + rotation[k, 2] * nz) / length
+            out_distance[n] = world_distance(s, begin[n], ds_dt[n], dlogz_dt[n])
+            x, y, z = start[n, 0] + s * along[n, 0], start[n, 1] + s * along[n, 1], start[n, 2] + s * along[n, 2]
+            nx, ny, nz = np.float64(normal[n, 0]), np.float64(normal[n, 1]), np.float64(normal[n, 2])
+            out_normal[n, 0], out_normal[n, 1], out_normal[n, 2] = world_normal(x, y, z, nx, ny, nz, ndc)
 
 
 def unwarp_hits(ndc: Ndc, warped: NdcRays, distance: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,8 +103,7 @@ def unwarp_hits(ndc: Ndc, warped: NdcRays, distance: np.ndarray, normal: np.ndar
     normal    (R, 3) float32 in normalised device coordinates
     """
     out = np.empty(len(distance), np.float32), np.empty((len(distance), 3), np.float32)
-    rotation = np.ascontiguousarray(ndc.world_from_camera[:3, :3], np.float64)
-    _unwarp_hits(*warped, np.ascontiguousarray(distance), np.ascontiguousarray(normal), rotation, *ndc.slopes, ndc.near, *out)
+    _unwarp_hits(*warped, np.ascontiguousarray(distance), np.ascontiguousarray(normal), ndc_numbers(ndc), *out)
     return out
 
 

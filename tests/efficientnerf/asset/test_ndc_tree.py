@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.backends.numba.tree import rendering
 from efficientnerf.backends.numba.tree.march import PACKED_EARLY_STOP
-from efficientnerf.geometry.cameras import rays
-from tests.efficientnerf.walls import DEPTH, NEAR, camera_at, wall
+from efficientnerf.geometry.cameras import Camera, rays
+from tests.efficientnerf.walls import DEPTH, NEAR, camera_at, looking_along_y, wall
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.8, -0.5, -0.4), (0.2, 2.5, 0.1)], ids=["reference", "beside and behind", "beyond the near plane"])
@@ -107,6 +108,34 @@ def test_a_picture_whose_voxels_are_painted_once_is_the_reference(place: str) ->
     np.testing.assert_allclose(seen.normal.reshape(-1, 3), np.where(alone.opacity[:, None] >= 0.5, alone.normal, 0), atol=1e-4)
     # Close by, colours are those of each ray, but for rounding.
     assert (np.abs(seen.colour.reshape(-1, 3) - alone.colour).max() > 1e-5) == (place != "close")
+
+
+LENSES = {"PINHOLE": (60.0, 55.0, 20.0, 14.0), "SIMPLE_RADIAL": (60.0, 20.0, 15.0, -0.05), "OPENCV_FISHEYE": (60.0, 55.0, 20.0, 15.0, 0.02, 0.0, 0.001, 0.0)}
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("place", [*PLACES.values(), (0.0, 20.0, 0.0)], ids=[*PLACES, "behind the wall"])
+def test_rays_that_are_warped_in_the_kernel_are_those_that_are_given(model: str, place: tuple[float, float, float]) -> None:
+    """Rays of a camera that stands anywhere and looks aside, too, some of which never come to the near plane. Seen from the very reference camera rays run
+    along the faces of voxels, of which rounding says whose they are."""
+    surroundings = np.random.default_rng(2).random((8, 16, 3)).astype(np.float32)
+    tree = replace(wall(0.4, voxels=48, degree=2, hard=0.02), environment=surroundings)
+    turned = looking_along_y()
+    turned[:3, :3] = turned[:3, :3] @ np.array([[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]])
+    for pose in (looking_along_y(), turned):
+        pose[:3, 3] += np.array([0.0137, -0.0071, 0.0093]) + place
+        camera = Camera("a", 40, 30, model, LENSES[model], pose)
+        seen, (origins, directions) = render(tree, camera), rays(camera)
+        given = render_rays(tree, origins, directions, eye=camera.centre, columns=camera.width)
+        np.testing.assert_allclose(seen.opacity.reshape(-1), given.opacity, atol=1e-3)
+        assert (np.abs(seen.opacity.reshape(-1) - given.opacity) > 1e-5).mean() < 2e-3  # rays that end a sample sooner or later
+        np.testing.assert_allclose(seen.colour.reshape(-1, 3), given.colour, atol=1e-3)
+        depth = given.depth * (directions @ camera.forward)
+        hit = np.isfinite(depth)
+        assert np.array_equal(np.isfinite(seen.depth.reshape(-1)), hit)
+        np.testing.assert_allclose(seen.depth.reshape(-1)[hit], depth[hit], rtol=1e-4)
+        np.testing.assert_allclose(seen.normal.reshape(-1, 3), given.normal, atol=2e-3)
+        assert hit.mean() > 0.3 or pose is turned or place == (0.0, 20.0, 0.0)
 
 
 def test_rays_in_rows_have_to_fill_them() -> None:

@@ -105,6 +105,8 @@ def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int, 
     assert np.array_equal(np.sort(packed.voxel_of[:-1]), np.arange(count))
     assert np.array_equal(packed.density[:-1], tree.density_values[packed.voxel_of[:-1]])
     assert packed.density[-1] == 0
+    assert np.array_equal(packed.coordinates[:, :count].T, voxel_coordinates(tree)[packed.voxel_of[:-1]])
+    assert packed.first_voxel.tolist() == [0, count]
     cells = np.pad(tree.brick_index, 1, constant_values=-1).repeat(brick, 0).repeat(brick, 1).repeat(brick, 2)[brick - 1 :, brick - 1 :, brick - 1 :]
     found = pairs(packed, brick)
     for table, live, place in zip(found, packed.has_density, packed.cells, strict=True):
@@ -127,14 +129,19 @@ def test_rows_find_the_voxels_of_a_brick_and_of_the_layer_around_it(brick: int, 
 
 @pytest.mark.parametrize("brick", [1, 2, 4, 5])
 @pytest.mark.parametrize("degree", range(5))
-@pytest.mark.parametrize("layout", ["floats", "codes"])
-def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, layout: str) -> None:
+@pytest.mark.parametrize("layout", ["floats", "codes", "wide codes"])
+def test_view_colours_are_the_sums_of_voxels_harmonics(brick: int, degree: int, layout: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if layout == "wide codes":
+        monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_COORDINATES", 0)
     tree = random_tree(brick, brick=brick, degree=degree, share=0.5)
-    if layout == "codes":
-        tree = in_codes(tree, (1,) * ((degree + 1) ** 2 - 1), 200)
+    if layout != "floats":
+        tree = in_codes(tree, (1,) * ((degree + 1) ** 2 - 1), 300 if layout == "wide codes" else 200)
     centre, packed = np.array([-31.0, 12.5, 57.0]), packed_of(tree)
     direction, bits = np.concatenate([np.eye(3), -centre[:, None]], axis=1), np.zeros((len(tree.density_values) + 1, 4), np.uint16)
-    compute_view_colours(0, len(packed.cells), 0, packed, tree.brick, direction, np.zeros(5), np.float32(2), tree.degree, bits)
+    assert packed.coordinates.dtype == (np.int32 if layout == "wide codes" else np.uint16)
+    count = len(tree.density_values)
+    for first, end in ((0, 5), (5, count)):
+        compute_view_colours(first, end, 0, packed, direction, np.zeros(5), np.float32(2), tree.degree, bits)
     order, colours = packed.voxel_of[:-1], bits.view(np.float16)
     assert np.array_equal(colours[:-1, 0], (2 * tree.density_values[order]).astype(np.float16))
     away = voxel_coordinates(tree)[order] + 0.5 - centre

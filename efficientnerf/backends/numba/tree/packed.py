@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.tree.packets.lanes import LANES
 from efficientnerf.backends.numba.tree.packets.rows import MOST_SIDE, fill_rows, order_voxels
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 SLOPE_VOXELS = 2**16  # voxels that `colour_slope` is estimated from
 FEWEST_PAIRS = 64  # of neighbours, for what they share to be estimated
 COLUMN_CELLS_PER_CALL = 2**22  # cells that one call of the kernel that orders voxels goes through
+MOST_COORDINATES = 2**16  # numbers of two bytes
 MOST_BITS = 2**32  # numbers of a row's word
 VOXELS_PER_CALL = 2**23  # of bricks that one call of a kernel goes through, so that signals are answered between
 
@@ -38,11 +40,14 @@ class Packed(NamedTuple):
     rows          (B, (b + 2)^2) int32: the first voxel, in the packed order, and the mask of the stored ones of the rows along z of a brick and of the layer
                   around it, in the lowest b + 2 bits; (B, 2 (b + 2)^2), the voxel and then the mask, where the voxels are too many for the other bits
     voxel_of      (N + 1,) int32: which stored voxel is n-th in the packed order; the last is none
+    coordinates   (3, N + 16) uint16, int32 for a grid of more voxels along a side: where it lies in its cascade; the last sixteen are none
+    first_voxel   (L + 1,) int64: the first voxel of each cascade in that order, and N
     cells         (B, 3) int32: the coarse cell of a brick
     brick_index   (C,) int32: those of the cascades
     density       (N + 1,) float32, in the packed order; the last, of what is not stored, is 0
     sh            (N, K, 3) float32: the tree's own
-    base, base_table, codes  as in PaletteHarmonics: the tree's own
+    base, codes   as in PaletteHarmonics, in the packed order
+    base_table    as in PaletteHarmonics: the tree's own
     palette       (K - 1, P, 4) float32: the tree's, with a zero before red
     code_columns  (K - 1,) int64: which of a voxel's codes selects the entry of each harmonic above degree 0
     colour_slope  (L,) float64, view dependence: mean over voxels of the change of colour before the sigmoid, at most of the three channels, per radian of the
@@ -55,6 +60,8 @@ class Packed(NamedTuple):
     has_density: np.ndarray
     rows: np.ndarray
     voxel_of: np.ndarray
+    coordinates: np.ndarray
+    first_voxel: np.ndarray
     cells: np.ndarray
     brick_index: np.ndarray
     density: np.ndarray
@@ -69,7 +76,7 @@ class Packed(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Of the arrays beside the tree's own, but for the smallest."""
-        own = self.leap, self.has_density, self.rows, self.voxel_of, self.cells, self.density, self.palette
+        own = self.leap, self.has_density, self.rows, self.voxel_of, self.coordinates, self.cells, self.density, self.base, self.codes, self.palette
         return sum(array.nbytes for array in own)
 
 
@@ -197,8 +204,8 @@ def _pack_cascade(tree: NerfTree, number: int, cells: np.ndarray, has_density: n
     return leaps(full)
 
 
-def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`Packed.rows` and `Packed.voxel_of`."""
+def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`Packed.rows`, `Packed.voxel_of`, `Packed.coordinates` and `Packed.first_voxel`."""
     from efficientnerf.asset.cascades import cascades_of
 
     if tree.brick + 2 > MOST_SIDE:
@@ -208,15 +215,18 @@ def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"{bricks} bricks of {tree.brick} voxels along a side: more than the CPU's kernels can number")
     begin, stored = np.empty((bricks, tree.brick**2), np.int32), np.empty((bricks, tree.brick**2), np.int32)
     words = 1 if count <= MOST_BITS >> tree.brick + 2 else 2
-    rows, voxel_of, voxel = np.empty((bricks, words * (tree.brick + 2) ** 2), np.int32), np.full(count + 1, -1, np.int32), 0
+    rows, voxel_of = np.empty((bricks, words * (tree.brick + 2) ** 2), np.int32), np.full(count + 1, -1, np.int32)
+    widest = tree.brick * max(max(cascade.shape) for cascade in cascades_of(tree))
+    coordinates, first_voxel = np.zeros((3, count + LANES), np.uint16 if widest <= MOST_COORDINATES else np.int32), [0]
     for cascade, ends in zip(cascades_of(tree), bricks_of(tree), strict=True):
-        columns, each = cascade.shape[0] * cascade.shape[1], max(1, COLUMN_CELLS_PER_CALL // max(1, cascade.shape[2]))
+        columns, each, voxel = cascade.shape[0] * cascade.shape[1], max(1, COLUMN_CELLS_PER_CALL // max(1, cascade.shape[2])), first_voxel[-1]
         for first in range(0, columns, each):
             last = min(columns, first + each)
-            voxel = order_voxels(first, last, voxel, tree.brick, cascade.brick_index, tree.voxel_index, begin, stored, voxel_of)
+            voxel = order_voxels(first, last, voxel, tree.brick, cascade.brick_index, tree.voxel_index, begin, stored, voxel_of, coordinates)
+        first_voxel.append(voxel)
         for first, end in brick_ranges(*ends, tree.brick):
             fill_rows(first, end, cells, tree.brick, cascade.brick_index, begin, stored, rows)
-    return rows, voxel_of
+    return rows, voxel_of, coordinates, np.array(first_voxel, np.int64)
 
 
 def pack(tree: NerfTree) -> Packed:
@@ -232,18 +242,19 @@ def pack(tree: NerfTree) -> Packed:
     has_density = np.zeros((len(cells), ((tree.brick + 2) ** 3 + 63) // 64), np.int64)
     leap = [_pack_cascade(tree, n, cells, has_density).reshape(-1) for n in range(len(bricks))]
     brick_index = [cascade.brick_index.reshape(-1) for cascade in cascades_of(tree)]
-    harmonics = tree.harmonics
+    harmonics, order = tree.harmonics, _rows(tree, cells)
+    voxel_of = order[1]
     if isinstance(harmonics, PaletteHarmonics):
         palette = np.zeros((harmonics.palette.shape[1], harmonics.palette.shape[0], 4), np.float32)
         palette[..., 1:] = harmonics.palette.swapaxes(0, 1)
-        coded = np.empty((0, harmonics.count, 3), np.float32), harmonics.base, harmonics.base_table, harmonics.codes, palette, harmonics.group_of
+        held = harmonics.subset(voxel_of[:-1])
+        coded = np.empty((0, harmonics.count, 3), np.float32), held.base, held.base_table, held.codes, palette, harmonics.group_of
     else:
         none = np.empty((0, 3), np.uint8), np.empty((0, 3), np.float32), np.empty((0, 0), np.uint8), np.empty((0, 0, 4), np.float32), np.empty(0, np.int64)
         coded = np.ascontiguousarray(harmonics, np.float32), *none
-    rows, voxel_of = _rows(tree, cells)
     density = np.zeros(len(voxel_of), np.float32)
     density[:-1] = tree.density_values[voxel_of[:-1]]
     slopes = [_colour_slope(tree, *ends) for ends in bricks]
     joined = (leap[0], brick_index[0]) if len(leap) == 1 else (np.concatenate(leap), np.concatenate(brick_index))
     own = np.ascontiguousarray(joined[1]), density
-    return Packed(*_places(tree), joined[0], has_density, rows, voxel_of, cells, *own, *coded, np.array(slopes))
+    return Packed(*_places(tree), joined[0], has_density, *order, cells, *own, *coded, np.array(slopes))

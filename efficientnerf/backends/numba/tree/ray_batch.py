@@ -1,5 +1,7 @@
 """Rays in rows and columns (numba): of a pinhole camera, of a camera with a table of directions, or given one by one; and how far a tile of them is clear.
 
+The rays of a camera into a tree in normalised device coordinates are warped tile by tile, as they are traced.
+
 The rays of a tile lie in a cone. As long as the ball in which the cone widens meets only empty cells, no ray of the tile can meet density: all start where it
 first may, and a tile that never may is done. That skips samples of density zero and changes no value.
 """
@@ -10,8 +12,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from efficientnerf.backends.numba.rays import warp_ray, world_distance, world_normal
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.simd import pointer
+from efficientnerf.backends.numba.simd import advanced, pointer
+from efficientnerf.backends.numba.tree.packets.layout import (
+    WARPED_BEGIN,
+    WARPED_BEND,
+    WARPED_COSINE,
+    WARPED_DIRECTION,
+    WARPED_ORIGIN,
+    WARPED_SPEED,
+)
 
 MIN_ADVANCE = 2.0  # voxels: a cone that advances by less has arrived; docs/experiments/renderer.md
 MAX_ADVANCES = 64
@@ -25,11 +36,12 @@ class RayBatch(NamedTuple):
     pitch              distance of neighbouring rays, pixels; the first ray lies half of it from the left and upper border of the image
     first_row          row of the first ray
     rotation           (3, 3) world from camera
-    centre             (3,) of the camera, voxel coordinates of cascade 0
+    centre             (3,) of the camera, voxel coordinates of cascade 0; in the world for a tree in normalised device coordinates
     camera_directions  (H, W, 3) float32 unit directions in the camera's frame, or (0, 0, 3)
     origins            (H, W, 3) voxel coordinates of cascade 0, or (0, 0, 3)
     directions         (H, W, 3) unit directions, with `origins`
     sh_directions      (H, W, 3) float32 directions that harmonics are evaluated along, or (0, 0, 3): those of the rays
+    ndc                (19,) for a camera's rays into a tree in normalised device coordinates: `rays.ndc_numbers`, the corner and the voxel of its grid; or (0,)
     """
 
     lens: np.ndarray
@@ -41,10 +53,11 @@ class RayBatch(NamedTuple):
     origins: np.ndarray
     directions: np.ndarray
     sh_directions: np.ndarray
+    ndc: np.ndarray
 
 
 class RayPointers(NamedTuple):
-    """A RayBatch with its arrays as pointers; `kind` is PINHOLE, DIRECTION_TABLE or GIVEN_RAYS."""
+    """A RayBatch with its arrays as pointers; `kind` is PINHOLE, DIRECTION_TABLE or GIVEN_RAYS. `warped` rays go through `tile_rays` before they are traced."""
 
     kind: int
     width: int
@@ -63,6 +76,8 @@ class RayPointers(NamedTuple):
     directions: Any
     has_sh_directions: bool
     sh_directions: Any
+    warped: bool
+    ndc: Any
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -74,6 +89,7 @@ def ray_pointers(batch):  # type: ignore[no-untyped-def]
     return RayPointers(
         kind, width, lens[0], lens[1], lens[2], lens[3], batch.pitch, batch.first_row, pointer(batch.rotation), centre[0], centre[1], centre[2],
         pointer(batch.camera_directions), pointer(batch.origins), pointer(batch.directions), len(batch.sh_directions) > 0, pointer(batch.sh_directions),
+        len(batch.ndc) > 0, pointer(batch.ndc),
     )  # fmt: skip
 
 
@@ -103,6 +119,52 @@ def ray_at(row, column, rays):  # type: ignore[no-untyped-def]
         return rays.x, rays.y, rays.z, dx, dy, dz, np.float64(rays.camera_directions[p + 2])
     dx, dy, dz, cosine = _pinhole_direction((column + 0.5) * rays.pitch, (rays.first_row + row + 0.5) * rays.pitch, rays)
     return rays.x, rays.y, rays.z, dx, dy, dz, cosine
+
+
+@numba.njit(cache=True, error_model="numpy")
+def tile_rays(top, low, left, right, rays, warped, looking):  # type: ignore[no-untyped-def]
+    """The rays of rows top to low and columns left to right in the frame of the tree: these, or for `warped` rays given ones, of this tile alone.
+
+    warped, looking  float64 and float32 scratch for a tile, see `layout`: into it go the rays and what leads back to the world
+    """
+    if not rays.warped:
+        return rays
+    ndc, width = rays.ndc, right - left
+    per_voxel = 1 / ndc[18]
+    for row in range(top, low):
+        for column in range(left, right):
+            x, y, z, dx, dy, dz, cosine = ray_at(row, column, rays)
+            n = (row - top) * width + column - left
+            looking[3 * n], looking[3 * n + 1], looking[3 * n + 2] = dx, dy, dz
+            x, y, z, dx, dy, dz, begin, ds_dt, dlogz_dt = warp_ray(x, y, z, dx, dy, dz, ndc)
+            origin, along = WARPED_ORIGIN + 3 * n, WARPED_DIRECTION + 3 * n
+            warped[origin], warped[origin + 1], warped[origin + 2] = (x - ndc[15]) * per_voxel, (y - ndc[16]) * per_voxel, (z - ndc[17]) * per_voxel
+            warped[along], warped[along + 1], warped[along + 2] = dx, dy, dz
+            warped[WARPED_BEGIN + n], warped[WARPED_SPEED + n], warped[WARPED_BEND + n], warped[WARPED_COSINE + n] = begin, ds_dt, dlogz_dt, cosine
+    first = -3 * (top * width + left)  # as if the tile were a part of the image
+    return RayPointers(
+        np.int64(GIVEN_RAYS),  # type: ignore[arg-type]
+        width, rays.fx, rays.fy, rays.cx, rays.cy, rays.pitch, rays.first_row, rays.rotation, rays.x, rays.y, rays.z,
+        rays.camera_directions, advanced(warped, WARPED_ORIGIN + first), advanced(warped, WARPED_DIRECTION + first), True, advanced(looking, first),
+        True, rays.ndc,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def world_depth(n, along, warped):  # type: ignore[no-untyped-def]
+    """Depth along the view axis, float32, of a point `along` the n-th ray of a tile that `tile_rays` warped, units of the frame."""
+    distance = world_distance(np.float64(along), warped[WARPED_BEGIN + n], warped[WARPED_SPEED + n], warped[WARPED_BEND + n])
+    return np.float32(np.float64(distance) * warped[WARPED_COSINE + n])
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def normal_in_world(n, along, nx, ny, nz, ndc, warped):  # type: ignore[no-untyped-def]
+    """The normal of the frame (nx, ny, nz) at that point as one of the world."""
+    at, s = 3 * n, np.float64(along)
+    x = warped[WARPED_ORIGIN + at] * ndc[18] + ndc[15] + s * warped[WARPED_DIRECTION + at]
+    y = warped[WARPED_ORIGIN + at + 1] * ndc[18] + ndc[16] + s * warped[WARPED_DIRECTION + at + 1]
+    z = warped[WARPED_ORIGIN + at + 2] * ndc[18] + ndc[17] + s * warped[WARPED_DIRECTION + at + 2]
+    return world_normal(x, y, z, np.float64(nx), np.float64(ny), np.float64(nz), ndc)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")

@@ -7,14 +7,16 @@ Images and rays are rendered from the tree's packed form by `tree.image` and `tr
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from efficientnerf.backends.numba.rays import ndc_numbers
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.tree.image import TILE, WORK, downsample, render_batch
 from efficientnerf.backends.numba.tree.march import LOG2E
-from efficientnerf.backends.numba.tree.packed import brick_ranges, bricks_of, packed_of
+from efficientnerf.backends.numba.tree.packed import VOXELS_PER_CALL, packed_of
 from efficientnerf.backends.numba.tree.ray_batch import RayBatch
 from efficientnerf.backends.numba.tree.surroundings import add_environment
 from efficientnerf.backends.numba.tree.view_colours import Views, compute_view_colours
@@ -64,10 +66,10 @@ def _view_colours(tree: NerfTree, view_direction: np.ndarray, cone: np.ndarray =
     colours, before = _colour_buffer(tree)
     if view != before:
         packed = packed_of(tree)
-        for cascade, bricks in enumerate(bricks_of(tree)):
-            for first, end in brick_ranges(*bricks, tree.brick):
-                direction, scale = views.direction[cascade], views.density_scale[cascade]
-                compute_view_colours(first, end, cascade, packed, tree.brick, direction, cone, scale, tree.degree, colours[1:])
+        for cascade, (begin, end) in enumerate(itertools.pairwise(packed.first_voxel.tolist())):
+            for first in range(begin, end, VOXELS_PER_CALL):
+                given = views.direction[cascade], cone, views.density_scale[cascade], tree.degree
+                compute_view_colours(first, min(end, first + VOXELS_PER_CALL), cascade, packed, *given, colours[1:])
     return ViewColours(views, colours, view)
 
 
@@ -161,7 +163,7 @@ def render_rays(
     directions = np.ascontiguousarray(directions, np.float64).reshape(shape)
     along = none if sh_directions is None else np.ascontiguousarray(sh_directions, np.float32).reshape(shape)
     view_direction = np.eye(3, 4) if eye is None else _view_direction(tree, eye)
-    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), none, np.ascontiguousarray(starts), directions, along)
+    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), none, np.ascontiguousarray(starts), directions, along, np.zeros(0))
     out = _allocate(rows, columns, normals=True)
     if len(origins):
         shared = eye is not None and _any_far(tree, view_direction)
@@ -189,7 +191,7 @@ def _any_far(tree: NerfTree, view_direction: np.ndarray) -> bool:
 def _view_direction(tree: NerfTree, eye: np.ndarray) -> np.ndarray:
     """`View.direction` from a point of the world."""
     if tree.ndc is None:
-        return _direction_from((np.asarray(eye, np.float64) - tree.bounds_min) / tree.voxel)
+        return np.concatenate([np.eye(3), (tree.bounds_min - np.asarray(eye, np.float64))[:, None] / tree.voxel], axis=1)
     matrix = tree.ndc.view_direction_matrix(np.asarray(eye, np.float64))
     return np.concatenate([matrix[:, :3] * tree.voxel, (matrix[:, :3] @ tree.bounds_min + matrix[:, 3])[:, None]], axis=1)
 
@@ -204,13 +206,9 @@ def _camera_directions(model: str, params: tuple[float, ...], width: int, height
 
 
 def _camera_centre(tree: NerfTree, camera: Camera) -> np.ndarray:
-    """(3,) voxel coordinates."""
-    return (np.asarray(camera.centre, np.float64) - tree.bounds_min) / tree.voxel
-
-
-def _direction_from(centre: np.ndarray) -> np.ndarray:
-    """`View.direction` from a point (3,), voxel coordinates."""
-    return np.concatenate([np.eye(3), -centre[:, None]], axis=1)
+    """(3,) voxel coordinates, of the world for a tree in normalised device coordinates."""
+    centre = np.array(camera.centre, np.float64)
+    return centre if tree.ndc is not None else (centre - tree.bounds_min) / tree.voxel
 
 
 def _camera_batch(tree: NerfTree, camera: Camera, supersample: int, top: int, low: int) -> RayBatch:
@@ -230,6 +228,7 @@ def _camera_batch(tree: NerfTree, camera: Camera, supersample: int, top: int, lo
         origins=none.astype(np.float64),
         directions=none.astype(np.float64),
         sh_directions=none,
+        ndc=np.zeros(0) if tree.ndc is None else np.concatenate([ndc_numbers(tree.ndc), tree.bounds_min, [tree.voxel]]),
     )
 
 
@@ -250,7 +249,8 @@ def render_image(
     if camera.model not in PINHOLES:
         most = min(most, DIRECTIONS_PER_BAND)
     step = max(1, most // max(1, width * supersample**2))
-    colours = _view_colours(tree, _direction_from(_camera_centre(tree, camera)), _cone(camera))
+    cone = _cone(camera) if tree.ndc is None else EVERYWHERE  # a voxel is not as long along one axis as along another
+    colours = _view_colours(tree, _view_direction(tree, camera.centre), cone)
     for top in range(0, height, step):
         low = min(top + step, height)
         part = tuple(whole[top:low] if len(whole) else whole for whole in image)
@@ -270,5 +270,5 @@ def ray_statistics(tree: NerfTree, camera: Camera) -> np.ndarray:
     statistics = np.zeros((camera.height, camera.width, 4), np.int32)
     out = _allocate(camera.height, camera.width, normals=False)
     batch = _camera_batch(tree, camera, 1, 0, camera.height)
-    _render(tree, batch, _view_colours(tree, _direction_from(batch.centre)), np.zeros(3, np.float32), (TILE, TILE), out, statistics)
+    _render(tree, batch, _view_colours(tree, _view_direction(tree, camera.centre)), np.zeros(3, np.float32), (TILE, TILE), out, statistics)
     return statistics

@@ -61,7 +61,7 @@ def over_environment(environment: np.ndarray, directions: np.ndarray, opacity: n
     """Colours (R, 3) of rays, premultiplied by opacities (R,), over what of a map is seen along their unit directions (R, 3), world frame."""
     none, shape = np.zeros((0, 0, 3), np.float32), (len(directions), 1, 3)
     along = np.ascontiguousarray(directions, np.float64).reshape(shape)
-    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), none, along, along, none)
+    batch = RayBatch(np.zeros(4), 1.0, 0, np.eye(3), np.zeros(3), none, along, along, none, np.zeros(0))
     out = np.array(colour, np.float32).reshape(shape)
     add_environment(environment, batch, np.ascontiguousarray(opacity, np.float32).reshape(shape[:2]), out)
     return out.reshape(-1, 3)

@@ -25,13 +25,14 @@ from efficientnerf.backends.numba.simd import (
     unpack4,
 )
 from efficientnerf.backends.numba.tree.packets.halves import store_halves4
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, prefetch, sqrt16
+from efficientnerf.backends.numba.tree.packets.lanes import bits_of, broadcast16, load16, load_bytes8, sqrt16, to_float16
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
-from efficientnerf.backends.numba.tree.packets.rows import row_at
 from efficientnerf.rendering import harmonics
 
-BRICKS_PER_TASK = 256
-AHEAD = 3  # bricks whose voxels are asked for before they are needed: docs/experiments/renderer.md
+VOXELS_PER_TASK = 2**14
+REACH = 3.0  # voxels from a ray to the voxels around its samples, which is at most the square root of 3, and for rounding
+ROUNDING = np.float32(4e-6)  # of places on the way to a voxel, for its distance
+ALL = 2**16 - 1  # bits of sixteen lanes
 
 _ONE = np.float32(1)
 _C0 = np.float32(harmonics.C0)
@@ -97,7 +98,6 @@ class PackedPointers(NamedTuple):
     narrow: bool
     voxels: int
     voxel_of: Any
-    cells: Any
     brick_index: Any
     density: Any
     terms: int
@@ -120,7 +120,7 @@ def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
     return PackedPointers(
         brick, grids[cascade, 0], grids[cascade, 1], grids[cascade, 2], places[cascade, 0], places[cascade, 1], places[cascade, 2], places[cascade, 3],
         advanced(pointer(packed.leap), first), pointer(packed.has_density.view(np.int32)), packed.has_density.shape[1], pointer(packed.rows),
-        packed.rows.shape[1] == (brick + 2) * (brick + 2), len(packed.voxel_of) - 1, pointer(packed.voxel_of), pointer(packed.cells),
+        packed.rows.shape[1] == (brick + 2) * (brick + 2), len(packed.voxel_of) - 1, pointer(packed.voxel_of),
         advanced(pointer(packed.brick_index), first), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh),
         pointer(packed.base), pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1],
         pointer(packed.code_columns),
@@ -165,7 +165,7 @@ def sh_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
-    """Red, green and blue of stored voxel n before the sigmoid; the harmonics of the direction are basis[lane :: lanes]."""
+    """Red, green and blue of voxel n of the packed order before the sigmoid; the harmonics of the direction are basis[lane :: lanes]."""
     y = basis[lane]
     if grid.coded:
         table, base, code = grid.base_table, 3 * n, n * grid.groups
@@ -178,7 +178,7 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
             _, red, green, blue = unpack4(total)
             r, g, b = r + red, g + green, b + blue
     else:
-        e = 3 * grid.terms * n
+        e = 3 * grid.terms * np.int64(grid.voxel_of[n])
         r, g, b = y * grid.sh[e], y * grid.sh[e + 1], y * grid.sh[e + 2]
         for k in range(1, grid.terms):
             y = basis[k * lanes + lane]
@@ -188,26 +188,19 @@ def sh_colour(n, grid, basis, lane, lanes):  # type: ignore[no-untyped-def]
     return r, g, b
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _add_entries(count, entries, total, code, grid, basis, lane):  # type: ignore[no-untyped-def]
-    """The sum over `count` harmonics, each with a code of its own, of palettes of so many entries: constants, by which the loop is unrolled."""
-    for k in range(count):
-        total = add_scaled4(total, basis[16 * k + 16 + lane], load4(grid.palette, 4 * (k * entries + np.int64(grid.codes[code + k]))))
-    return total
+@numba.njit(cache=True, error_model="numpy")
+def _eight_codes(count, density, scale, base, table, codes, palette, basis, out):  # type: ignore[no-untyped-def]
+    """Density, red, green and blue of `count` voxels, at most sixteen, by eight codes each into 256 entries: numbers that loops are unrolled by.
 
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _palette_colour(n, density, grid, basis, lane):  # type: ignore[no-untyped-def]
-    """Density, red, green and blue of stored voxel n by its codes; `basis` (K, 16) is of sixteen directions, that of `lane` its own."""
-    table, base, code, y = grid.base_table, 3 * n, n * grid.groups, basis[lane]
-    r, g, b = table[3 * np.int64(grid.base[base])], table[3 * np.int64(grid.base[base + 1]) + 1], table[3 * np.int64(grid.base[base + 2]) + 2]
-    total = pack4(density, y * r, y * g, y * b)
-    if grid.terms == 9 and grid.groups == 8 and grid.entries == 256:
-        return _add_entries(8, 256, total, code, grid, basis, lane)
-    for k in range(grid.terms - 1):
-        e = k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])
-        total = add_scaled4(total, basis[16 * k + 16 + lane], load4(grid.palette, 4 * e))
-    return total
+    basis  (9, 16) float32, of the direction of each
+    """
+    for n in range(count):
+        y, eight = basis[n], load_bytes8(codes, 8 * n)
+        r, g, b = table[3 * np.int64(base[3 * n])], table[3 * np.int64(base[3 * n + 1]) + 1], table[3 * np.int64(base[3 * n + 2]) + 2]
+        total = pack4(density[n] * scale, y * r, y * g, y * b)
+        for k in range(8):
+            total = add_scaled4(total, basis[16 * k + 16 + n], load4(palette, 1024 * k + 4 * (eight >> 8 * k & 255)))
+        store_halves4(out, 4 * n, total)
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -220,96 +213,54 @@ def view_direction(x, y, z, direction):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _stored_voxels(owner, grid, stored, place):  # type: ignore[no-untyped-def]
-    """Which voxels of a brick are stored, and their places in the packed order; returns their number."""
-    brick, count = grid.brick, 0
-    side, mask = brick + 2, (np.int64(1) << grid.brick) - 1
-    for i in range(brick):
-        for j in range(brick):
-            first, bits = row_at((owner * side + i + 1) * side + j + 1, grid)
-            local, first, bits = (i * brick + j) * brick, first + (bits & 1), bits >> 1 & mask
-            for k in range(brick):
-                stored[count], place[count] = local + k, first
-                count, first = count + (bits >> k & 1), first + (bits >> k & 1)
-    return count
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _prefetch_voxels(owner, grid, out):  # type: ignore[no-untyped-def]
-    """Asks for what is read and written of a brick's voxels in the packed order, where rows lie too far apart for the processor to see what comes next."""
-    brick = grid.brick
-    side = brick + 2
-    for i in range(brick):
-        for j in range(brick):
-            first, _ = row_at((owner * side + i + 1) * side + j + 1, grid)
-            prefetch(grid.density, first)
-            prefetch(grid.voxel_of, first)
-            prefetch(out, 4 * first)
-
-
 @numba.njit(cache=True, error_model="numpy")
-def _brick_colours(owner, grid, view, steps, stored, place, basis, out):  # type: ignore[no-untyped-def]
-    """Densities and colours of a brick's voxels into their rows of out (N, 4), half floats; directions and harmonics are those of sixteen neighbours at once.
+def _colours(first, end, cascade, packed, direction, cone, density_scale, degree, basis, out):  # type: ignore[no-untyped-def]
+    """`compute_view_colours`, one after the other; directions and harmonics are those of sixteen voxels at once.
 
-    steps   (3, G, 16) float32: see `_voxel_steps`
-    stored  (b^3,) int64, scratch, and place likewise
-    basis   (K, 16) float32, scratch
+    basis  (K, 16) float32, scratch
     """
-    brick, cells = grid.brick, grid.cells
-    cube = brick * brick * brick
-    padded, group = (cube + 15) // 16 * 16, np.int64(-1)
-    count = _stored_voxels(owner, grid, stored, place)
-    x, y, z = view_direction(cells[3 * owner] * brick + 0.5, cells[3 * owner + 1] * brick + 0.5, cells[3 * owner + 2] * brick + 0.5, view.direction)
-    for n in range(count):
-        local, p = stored[n], place[n]
-        if local >> 4 != group:
-            group = local >> 4
-            dx, dy = load16(steps, 16 * group) + np.float32(x), load16(steps, padded + 16 * group) + np.float32(y)
-            dz = load16(steps, 2 * padded + 16 * group) + np.float32(z)
-            inverse = broadcast16(_ONE) / sqrt16(dx * dx + dy * dy + dz * dz)
-            sh_basis(dx * inverse, dy * inverse, dz * inverse, view.degree, basis)
-        voxel, lane, density = np.int64(grid.voxel_of[p]), local & 15, grid.density[p] * view.density_scale
-        if grid.coded:
-            store_halves4(out, 4 * p, _palette_colour(voxel, density, grid, basis, lane))
-        else:
-            r, g, b = sh_colour(voxel, grid, basis, lane, 16)
-            store_halves4(out, 4 * p, pack4(density, r, g, b))
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _voxel_steps(brick, direction, out):  # type: ignore[no-untyped-def]
-    """Difference of the view direction of each voxel of a brick to that of the brick's first, see `View`, into (3, G, 16), of G groups of sixteen voxels."""
-    cube = brick * brick * brick
-    padded = (cube + 15) // 16 * 16
-    for n in range(cube):
-        i, j, k = n // (brick * brick), n // brick % brick, n % brick
-        for m in range(3):
-            out[m * padded + n] = direction[4 * m] * i + direction[4 * m + 1] * j + direction[4 * m + 2] * k
+    grid, d, voxels = packed_pointers(packed, 1, cascade), direction, packed.coordinates.shape[1]
+    at, half = pointer(packed.coordinates), 0.5
+    eight = grid.coded and grid.terms == 9 and grid.groups == 8 and grid.entries == 256 and packed.codes.itemsize == 1
+    # To the middle of the first voxel, and from there by whole voxels.
+    x0, y0, z0 = view_direction(half, half, half, d)
+    reach = np.float32(REACH * np.sqrt(d[0] * d[0] + d[4] * d[4] + d[8] * d[8]))
+    ax, ay, az, cosine, sine = np.float32(cone[0]), np.float32(cone[1]), np.float32(cone[2]), np.float32(cone[3]), np.float32(cone[4])
+    for begin in range(first, end, 16):
+        u, v, w = to_float16(load16(at, begin)), to_float16(load16(at, voxels + begin)), to_float16(load16(at, 2 * voxels + begin))
+        x = u * np.float32(d[0]) + v * np.float32(d[1]) + w * np.float32(d[2]) + np.float32(x0)
+        y = u * np.float32(d[4]) + v * np.float32(d[5]) + w * np.float32(d[6]) + np.float32(y0)
+        z = u * np.float32(d[8]) + v * np.float32(d[9]) + w * np.float32(d[10]) + np.float32(z0)
+        length = sqrt16(x * x + y * y + z * z)
+        along = x * ax + y * ay + z * az
+        p, q, r = x - along * ax, y - along * ay, z - along * az
+        beside = sqrt16(p * p + q * q + r * r)
+        if bits_of(beside * cosine - along * sine > reach + length * ROUNDING) == ALL:
+            continue
+        inverse = broadcast16(_ONE) / length
+        sh_basis(x * inverse, y * inverse, z * inverse, degree, basis)
+        count = min(16, end - begin)
+        if eight:
+            codes, base, rgb = advanced(grid.codes, 8 * begin), advanced(grid.base, 3 * begin), advanced(out, 4 * begin)
+            _eight_codes(count, advanced(grid.density, begin), density_scale, base, grid.base_table, codes, grid.palette, basis, rgb)
+            continue
+        for n in range(begin, begin + count):
+            r, g, b = sh_colour(n, grid, basis, n - begin, 16)
+            store_halves4(out, 4 * n, pack4(grid.density[n] * density_scale, r, g, b))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def compute_view_colours(first, end, cascade, packed, brick, direction, cone, density_scale, degree, out):  # type: ignore[no-untyped-def]
-    """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of the voxels of bricks first <= B < end, all of one cascade,
-    into out (N + 1, 4) uint16, the bits of half floats, in the packed order.
+def compute_view_colours(first, end, cascade, packed, direction, cone, density_scale, degree, out):  # type: ignore[no-untyped-def]
+    """Scaled density, and red, green and blue before the sigmoid, along `direction` (see `View`), of voxels first <= n < end of the packed order, all of one
+    cascade, into out (N + 1, 4) uint16, the bits of half floats.
 
-    cone  (5,) axis, cosine and sine of the half angle of a cone round all that is seen, in the frame of directions: bricks that are farther from it than any
-          whose voxels a ray or its normal may need are left out. Zeros: none are
+    cone  (5,) axis, cosine and sine of the half angle of a cone round all that is seen, in the frame of directions: voxels that are farther from it than any
+          that a sample of a ray may need are left out, sixteen at a time. Zeros: none are
 
     The last row, of voxels that are not stored, is for the caller to fill with zeros.
     """
-    cube = brick * brick * brick
-    for task in numba.prange((end - first + BRICKS_PER_TASK - 1) // BRICKS_PER_TASK):
-        steps, stored, basis = np.zeros(3 * (cube + 15), np.float32), np.empty((2, cube), np.int64), np.empty(16 * MOST_HARMONICS, np.float32)
-        grid, view = packed_pointers(packed, brick, cascade), View(pointer(direction), 0.0, 0.0, density_scale, 0.0, degree)
-        _voxel_steps(brick, view.direction, pointer(steps))
-        # From a ray to a normal's block one voxel, through that block and to the middle of the brick beside it; and one for rounding.
-        half, reach = 0.5 * brick, np.sqrt(3.0) * (1.5 * brick + 1) + 2
-        for owner in range(first + BRICKS_PER_TASK * task, min(end, first + BRICKS_PER_TASK * task + BRICKS_PER_TASK)):
-            a, e, c = grid.cells[3 * owner] * brick + half, grid.cells[3 * owner + 1] * brick + half, grid.cells[3 * owner + 2] * brick + half
-            x, y, z = view_direction(a, e, c, view.direction)
-            along = x * cone[0] + y * cone[1] + z * cone[2]
-            if owner + AHEAD < end:
-                _prefetch_voxels(owner + AHEAD, grid, pointer(out))
-            if np.sqrt(max(x * x + y * y + z * z - along * along, 0.0)) * cone[3] - along * cone[4] <= reach:
-                _brick_colours(owner, grid, view, pointer(steps), pointer(stored[0]), pointer(stored[1]), pointer(basis), pointer(out))
+    for task in numba.prange((end - first + VOXELS_PER_TASK - 1) // VOXELS_PER_TASK):
+        basis, begin = np.empty(16 * MOST_HARMONICS, np.float32), first + VOXELS_PER_TASK * task
+        _colours(
+            begin, min(end, begin + VOXELS_PER_TASK), cascade, packed, pointer(direction), pointer(cone), density_scale, degree, pointer(basis), pointer(out)
+        )  # fmt: skip

@@ -113,16 +113,16 @@ def _evaluate_basis(view, floats, ints):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy")
 def _colours_along(voxel, entry, grid, view, floats):  # type: ignore[no-untyped-def]
     """Density, red, green and blue of a voxel along each of the rays, into an entry of the cache."""
-    n, y = np.int64(grid.voxel_of[voxel]), load16(floats, BASIS)
+    y = load16(floats, BASIS)
     if grid.coded:
-        table, base, code = grid.base_table, 3 * n, n * grid.groups
+        table, base, code = grid.base_table, 3 * voxel, voxel * grid.groups
         red, green = y * table[3 * np.int64(grid.base[base])], y * table[3 * np.int64(grid.base[base + 1]) + 1]
         blue = y * table[3 * np.int64(grid.base[base + 2]) + 2]
         for k in range(grid.terms - 1):
             e, y = 4 * (k * grid.entries + np.int64(grid.codes[code + grid.code_columns[k]])), load16(floats, BASIS + 16 * k + 16)
             red, green, blue = red + y * grid.palette[e + 1], green + y * grid.palette[e + 2], blue + y * grid.palette[e + 3]
     else:
-        e = 3 * grid.terms * n
+        e = 3 * grid.terms * np.int64(grid.voxel_of[voxel])
         red, green, blue = y * grid.sh[e], y * grid.sh[e + 1], y * grid.sh[e + 2]
         for k in range(1, grid.terms):
             y = load16(floats, BASIS + 16 * k)
@@ -164,7 +164,7 @@ def _mix_harmonics(lane, grid, view, floats, batch, voxels):  # type: ignore[no-
         for n in range(8):
             weight = batch[WEIGHT + 32 * (n >> 1) + 2 * lane + (n & 1)]
             if weight != 0:
-                r, g, b = sh_colour(np.int64(grid.voxel_of[np.int64(voxels[16 * (n >> 1) + lane]) + (n & 1)]), grid, advanced(floats, BASIS), lane, 16)
+                r, g, b = sh_colour(np.int64(voxels[16 * (n >> 1) + lane]) + (n & 1), grid, advanced(floats, BASIS), lane, 16)
                 red, green, blue = red + weight * r, green + weight * g, blue + weight * b
     store4(floats, SAMPLE + 4 * lane, pack4(sigma, red, green, blue))
 

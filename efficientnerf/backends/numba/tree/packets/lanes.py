@@ -6,6 +6,7 @@ Operands may be scalars: they are in all lanes. Comparisons give a Bool16. A vec
 from __future__ import annotations
 
 import operator
+import sys
 from typing import Any
 
 from llvmlite import ir
@@ -195,13 +196,26 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
 
 @intrinsic
 def load16(typing_context: Any, address: Any, index: Any) -> Any:
-    """p[index : index + 16] of a pointer to float32 or int32."""
-    vector, kind = (int32x16, _INTS) if address.dtype == types.int32 else (float32x16, _FLOATS)
+    """p[index : index + 16] of a pointer to float32, or to int32 or uint16 as an Int32x16."""
+    vector, kind = (float32x16, _FLOATS) if address.dtype == types.float32 else (int32x16, _INTS)
+    held, align = (ir.VectorType(ir.IntType(16), LANES), 2) if address.dtype == types.uint16 else (kind, 4)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), kind.as_pointer()), align=4)
+        value = builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), held.as_pointer()), align=align)
+        return value if held is kind else builder.zext(value, kind)
 
     return vector(address, types.int64), codegen
+
+
+@intrinsic
+def load_bytes8(typing_context: Any, address: Any, index: Any) -> Any:
+    """The eight bytes from p[index] on as an int64, the first the lowest."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), _I64.as_pointer()), align=1)
+        return value if sys.byteorder == "little" else builder.bswap(value)
+
+    return types.int64(address, types.int64), codegen
 
 
 @intrinsic

@@ -33,3 +33,10 @@ BATCH_VOXELS = 64
 INTS = BATCHES_OF_VOXELS + 2 * BATCH_VOXELS
 
 ORIGIN, DIRECTION, COSINE, BEGIN, ENDS = 0, 48, 96, 112, 128  # float64: x, y, z of sixteen, and so on; then by cascade where they enter and leave it
+
+# The rays of a tile that are warped into normalised device coordinates, float64: origins and directions (n, 3), and what leads back: begin, ds_dt, dlogz_dt of
+# `efficientnerf.geometry.ndc.NdcRays`, cosine to the view axis. Beside them their directions in the world, float32.
+TILE_RAYS = 64
+WARPED_ORIGIN, WARPED_DIRECTION = 0, 3 * TILE_RAYS
+WARPED_BEGIN, WARPED_SPEED, WARPED_BEND, WARPED_COSINE = range(6 * TILE_RAYS, 10 * TILE_RAYS, TILE_RAYS)
+WARPED = 10 * TILE_RAYS

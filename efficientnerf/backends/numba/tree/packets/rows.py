@@ -19,26 +19,29 @@ MOST_SIDE = 32  # voxels of a row whose mask is an int32
 
 
 @numba.njit(cache=True, error_model="numpy")
-def order_voxels(first, end, first_voxel, brick, brick_index, voxel_index, begin, stored, voxel_of):  # type: ignore[no-untyped-def]
+def order_voxels(first, end, first_voxel, brick, brick_index, voxel_index, begin, stored, voxel_of, coordinates):  # type: ignore[no-untyped-def]
     """Orders the voxels of a cascade's columns of cells first <= n < end, from first_voxel on; returns the voxel after them.
 
-    begin     (B, b^2) int32: the first voxel of each row of a brick
-    stored    (B, b^2) int32: which voxels of it are stored, a bit each
-    voxel_of  (N,) int32: which of the tree's voxels each one is
+    begin        (B, b^2) int32: the first voxel of each row of a brick
+    stored       (B, b^2) int32: which voxels of it are stored, a bit each
+    voxel_of     (N,) int32: which of the tree's voxels each one is
+    coordinates  (3, N): where it lies
     """
-    at, owners = first_voxel, np.empty(brick_index.shape[2], np.int64)
+    at, owners, heights = first_voxel, np.empty(brick_index.shape[2], np.int64), np.empty(brick_index.shape[2], np.int64)
     for column in range(first, end):
-        count = 0
-        for owner in brick_index[column // brick_index.shape[1], column % brick_index.shape[1]]:
-            owners[count] = owner
+        a, e, count = column // brick_index.shape[1], column % brick_index.shape[1], 0
+        for c, owner in enumerate(brick_index[a, e]):
+            owners[count], heights[count] = owner, c * brick
             count += owner >= 0
         for row in range(brick * brick if count > 0 else 0):
-            for owner in owners[:count]:
-                begin[owner, row], mask = at, 0
+            for n in range(count):
+                owner, mask = owners[n], 0
+                begin[owner, row] = at
                 for k in range(brick):
                     voxel = voxel_index[owner, row * brick + k]
                     if voxel >= 0:
                         voxel_of[at] = voxel
+                        coordinates[0, at], coordinates[1, at], coordinates[2, at] = a * brick + row // brick, e * brick + row % brick, heights[n] + k
                         at += 1
                         mask |= 1 << k
                 stored[owner, row] = mask

@@ -45,7 +45,7 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     Z,
 )
 from efficientnerf.backends.numba.tree.packets.march import march
-from efficientnerf.backends.numba.tree.ray_batch import clear_distance, in_cascade, ray_at
+from efficientnerf.backends.numba.tree.ray_batch import clear_distance, in_cascade, normal_in_world, ray_at, tile_rays, world_depth
 from efficientnerf.backends.numba.tree.view_colours import PackedPointers, View
 from efficientnerf.backends.numba.tree.walk import most_samples
 
@@ -97,7 +97,8 @@ class Tile(NamedTuple):
 
 class TileScratch(NamedTuple):
     """Working memory for the rays of a tile, arrays as pointers: numbers of sixteen rays as in `layout`, float32, int32 and float64; and by cascade, in its
-    voxels, the distances (L,) up to which the subdivision is clear and up to which the tile is, negative where that is not known yet.
+    voxels, the distances (L,) up to which the subdivision is clear and up to which the tile is, negative where that is not known yet; and what `tile_rays`
+    writes.
     """
 
     floats: Any
@@ -105,6 +106,8 @@ class TileScratch(NamedTuple):
     rays: Any
     clear: Any
     known: Any
+    warped: Any
+    looking: Any
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -144,7 +147,7 @@ def _cascade(n, scene):  # type: ignore[no-untyped-def]
     base, first = scene.base, scene.grids[4 * n + 3]
     grid = PackedPointers(
         base.brick, scene.grids[4 * n], scene.grids[4 * n + 1], scene.grids[4 * n + 2], scene.places[4 * n], scene.places[4 * n + 1], scene.places[4 * n + 2],
-        scene.places[4 * n + 3], advanced(base.leap, first), base.has_density, base.mask_words, base.rows, base.narrow, base.voxels, base.voxel_of, base.cells,
+        scene.places[4 * n + 3], advanced(base.leap, first), base.has_density, base.mask_words, base.rows, base.narrow, base.voxels, base.voxel_of,
         advanced(base.brick_index, first), base.density, base.terms, base.coded, base.sh, base.base, base.base_table, base.codes,
         base.groups, base.palette, base.entries, base.code_columns,
     )  # fmt: skip
@@ -287,9 +290,26 @@ def _render_packet(tile, rays, scene, colours, with_normal, scratch):  # type: i
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _write_packet(tile, clear, background, voxel, floats, outputs):  # type: ignore[no-untyped-def]
+def _unwarp_packet(tile, voxel, rays, scratch, with_normal):  # type: ignore[no-untyped-def]
+    """Depths and normals of the warped rays of a tile's subdivision as those of the world, world units."""
+    lane, floats = 0, scratch.floats
+    for row in range(tile.upper, tile.lower):
+        begin = (row - tile.top) * (tile.right - tile.left) - tile.left
+        for n in range(begin + tile.first, begin + tile.last):
+            if floats[DEPTH + lane] < np.inf:
+                along, x, y, z = floats[DEPTH + lane] * voxel, NORMAL_X + lane, NORMAL_X + 16 + lane, NORMAL_X + 32 + lane
+                floats[DEPTH + lane] = world_depth(n, along, scratch.warped)
+                if with_normal:
+                    floats[x], floats[y], floats[z] = normal_in_world(n, along, floats[x], floats[y], floats[z], rays.ndc, scratch.warped)
+            lane += 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _write_packet(tile, clear, background, voxel, rays, scratch, outputs):  # type: ignore[no-untyped-def]
     """Writes the pixels of a tile's subdivision, of which those that are `clear` met nothing; returns the work that they were."""
-    lane, work = 0, np.int64(0)
+    lane, work, floats = 0, np.int64(0), scratch.floats
+    if rays.warped and not clear:
+        _unwarp_packet(tile, voxel, rays, scratch, outputs.with_normal)
     for row in range(tile.upper, tile.lower):
         for pixel in range(row * outputs.width + tile.first, row * outputs.width + tile.last):
             transmittance = np.float32(1) if clear else floats[TRANSMITTANCE + lane]
@@ -298,7 +318,7 @@ def _write_packet(tile, clear, background, voxel, floats, outputs):  # type: ign
                 if outputs.with_normal:
                     outputs.normal[3 * pixel + c] = np.float32(0) if clear else floats[NORMAL_X + 16 * c + lane]
             outputs.opacity[pixel] = np.float32(1) - transmittance
-            outputs.depth[pixel] = np.float32(np.inf) if clear else floats[DEPTH + lane] * voxel
+            outputs.depth[pixel] = np.float32(np.inf) if clear else floats[DEPTH + lane] * (np.float32(1) if rays.warped else voxel)
             if outputs.with_statistics:
                 for m in range(4):
                     outputs.statistics[4 * pixel + m] = np.int32(0 if clear else floats[VISITED + 16 * m + lane])
@@ -310,13 +330,14 @@ def _write_packet(tile, clear, background, voxel, floats, outputs):  # type: ign
 
 
 @numba.njit(cache=True, error_model="numpy")
-def render_tile(top, low, left, right, rays, background, scene, colours, voxel, scratch, outputs, done, work):  # type: ignore[no-untyped-def]
+def render_tile(top, low, left, right, batch, background, scene, colours, voxel, scratch, outputs, done, work):  # type: ignore[no-untyped-def]
     """Renders rows top to low and columns left to right, but for their first `done` subdivisions; returns how many are done, -1 for all, and the work left.
 
     work  that may be done; ends with the subdivision that it is spent on
     """
     for n in range(scene.cascades):
         scratch.known[n] = -1.0
+    rays = tile_rays(top, low, left, right, batch, scratch.warped, scratch.looking)
     down, across = _packet_size(top, low)
     columns = (right - left + across - 1) // across
     parts = (low - top + down - 1) // down * columns
@@ -328,7 +349,7 @@ def render_tile(top, low, left, right, rays, background, scene, colours, voxel, 
         clear = _all_clear(tile, rays, scene, scratch)
         if not clear:
             _render_packet(tile, rays, scene, colours, outputs.with_normal, scratch)
-        work -= _write_packet(tile, clear, background, voxel, scratch.floats, outputs)
+        work -= _write_packet(tile, clear, background, voxel, rays, scratch, outputs)
         if work <= 0:
             return part + 1 if part + 1 < parts else -1, work
     return -1, work
