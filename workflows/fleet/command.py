@@ -59,6 +59,8 @@ def _placement_options(command: Any) -> Any:
 @click.option("--out", "folder", required=True, type=folder_type, metavar="FLEET", help="The folder of the fleet.")
 @click.option("--preset", metavar="NAME", help="Preset to start from, for all scenes.")
 @set_option
+@click.option("--root", "roots", multiple=True, type=folder_type, metavar="FOLDER",
+              help="A folder beside the manifest's own that its sources may lie in; may be repeated.")  # fmt: skip
 @click.option("--seed", type=int, help="Seed of every stage with random choices.")
 @click.option("--sweep", "sweeps", multiple=True, metavar="STAGE.NAME=A,B,...", help="Run each scene with each of these values; may be repeated.")
 @_placement_options
@@ -66,8 +68,8 @@ def _placement_options(command: Any) -> Any:
 @quiet_option
 @common_options
 def run(
-    scenes: tuple[str, ...], folder: Path, preset: str | None, sets: tuple[str, ...], seed: int | None, sweeps: tuple[str, ...], as_json: bool, quiet: bool,
-    **options: Any,
+    scenes: tuple[str, ...], folder: Path, preset: str | None, sets: tuple[str, ...], seed: int | None, sweeps: tuple[str, ...], roots: tuple[Path, ...],
+    as_json: bool, quiet: bool, **options: Any,
 ) -> int:  # fmt: skip
     """Run SCENES under FLEET: a manifest (.toml, .csv), a folder of scenes, a pattern as 'shoots/*/', or several folders and videos.
 
@@ -85,7 +87,7 @@ def run(
     if preset is not None:
         read_preset(preset, workflow().presets)
     over = Choice(settings_of(sets, workflow()), preset, seed)
-    chosen = swept(read_manifest(scenes, workflow(), folder, over=over), read_sweeps(sweeps, workflow()), workflow().stages)
+    chosen = swept(read_manifest(scenes, workflow(), folder, over=over, roots=roots), read_sweeps(sweeps, workflow()), workflow().stages)
     return _run(folder, chosen, as_json=as_json, quiet=quiet, retry=None, **options)
 
 
@@ -200,12 +202,10 @@ def _run(folder: Path, scenes: Any, *, as_json: bool, quiet: bool, retry: Any, *
 
 
 def _overview(folder: Path, found: FleetState) -> list[str]:
-    from workflows.cli.progress import duration
+    from workflows.fleet.table import overview
 
-    counts = {name: getattr(found.totals, name) for name in ("done", "running", "waiting", "failed", "quarantined")}
-    ahead = "" if not found.forecast_seconds else f", about {duration(found.forecast_seconds)} to go"
-    lines = [f"{folder}: {found.state}; " + ", ".join(f"{count} {name}" for name, count in counts.items() if count) + ahead]
-    if counts["quarantined"]:
+    lines = [f"{folder}: {found.state}; {overview(found)}"]
+    if found.totals.quarantined:
         lines.append(f"To try again what is quarantined: enerf fleet retry {folder}")
     return lines
 

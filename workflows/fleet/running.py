@@ -23,6 +23,7 @@ from pipeline.locks.lease import Lease
 from pipeline.locks.lock import lock
 from pipeline.run import NAME as RUN_NAME
 from workflows.asset import Workflow
+from workflows.fleet.pages.updates import FILES as PAGES
 
 _OWN = (NAME, LOCK, HOLDER, LEASE, requests.FOLDER)
 
@@ -56,7 +57,8 @@ def check_fleet_folder(fleet: Path) -> None:
     names = sorted(os.listdir(fleet))
     if RUN_NAME in names:
         raise BadInput(f"{fleet}: is a run. Give a new folder for the fleet.")
-    others = [name for name in names if name not in _OWN and not files.is_temporary(name, NAME) and not files.is_temporary(name, HOLDER)]
+    others = [name for name in names if name not in (*_OWN, *PAGES) and not files.is_temporary(name, NAME) and not files.is_temporary(name, HOLDER)]
+    others = [name for name in others if not (fleet / name / RUN_NAME).is_file()]  # a fleet.json that was damaged may have been removed
     if NAME not in names and others:
         raise BadInput(f"{fleet}: exists and is not a fleet (no {NAME}; it holds {others[0]!r}). Give a new or an empty folder.")
     for name in _OWN:

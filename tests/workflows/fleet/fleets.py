@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -69,3 +72,11 @@ def with_pictures(folder: Path, state: FleetState) -> None:
             made.folder.mkdir(parents=True)
             Image.new("RGB", (320, 200), (200, 120, 40)).save(made.poster)
             made.video.write_bytes(video)
+
+
+def facts(page: str) -> dict[str, Any]:
+    """What a page's script is handed."""
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    out: dict[str, Any] = json.loads(found[1])
+    return out

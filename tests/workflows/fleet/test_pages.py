@@ -6,12 +6,10 @@ import base64
 import csv
 import hashlib
 import io
-import json
 import os
 import re
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
@@ -20,18 +18,11 @@ from pipeline.fleet.state import FleetState, SceneState
 from stages.figures.pareto import pareto_front, pareto_plot
 from stages.figures.thumbnails import HEIGHT, WIDTH, write_thumbnail
 from stages.io.pictures import UnreadableImage
-from tests.workflows.fleet.fleets import NASTY, done, fleet, mixed, with_pictures
+from tests.workflows.fleet.fleets import NASTY, done, facts, fleet, mixed, with_pictures
 from workflows.fleet.pages.comparison import best, mean_results, results, settings_of, write_comparison
 from workflows.fleet.pages.index import index_page
 from workflows.fleet.pages.spreadsheet import fleet_csv
 from workflows.fleet.pages.updates import Pages
-
-
-def facts(page: str) -> dict[str, Any]:
-    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL)
-    assert found is not None
-    out: dict[str, Any] = json.loads(found[1])
-    return out
 
 
 def test_the_page_has_what_the_state_has() -> None:

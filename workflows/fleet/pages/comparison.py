@@ -21,9 +21,10 @@ from workflows.fleet.pages.index import filled, quality_of, value_text
 from workflows.report.page import NAME as REPORT
 
 NAME = "comparison.html"
+FOLDER = "comparison"
 PLOTS = {
-    "comparison/psnr_over_seconds.png": ("seconds", "time of all stages / s", "PSNR over the time of all stages; the line: best at their time"),
-    "comparison/psnr_over_megabytes.png": ("megabytes", "asset / MB", "PSNR over the size of the asset; the line: best at their size"),
+    f"{FOLDER}/psnr_over_seconds.png": ("seconds", "time of all stages / s", "PSNR over the time of all stages; the line: best at their time"),
+    f"{FOLDER}/psnr_over_megabytes.png": ("megabytes", "asset / MB", "PSNR over the size of the asset; the line: best at their size"),
 }
 _TABLES = 200  # scenes with a table of their own
 
@@ -54,7 +55,7 @@ def write_comparison(fleet: Path, state: FleetState, *, plots: bool = True) -> b
     found = results(state, settings)
     means = mean_results(found)
     if plots:
-        (fleet / "comparison").mkdir(exist_ok=True)
+        (fleet / FOLDER).mkdir(exist_ok=True)
         for name, (cost, label, _) in PLOTS.items():
             pareto_plot(fleet / name, _series(found, means, settings, cost), x_label=label, y_label="PSNR / dB")
     there = [(name, caption) for name, (_, _, caption) in PLOTS.items() if (fleet / name).is_file()]

@@ -42,7 +42,7 @@ def index_page(
         "executor": printable(state.executor),
         "slots": state.slots,
         "totals": {name: getattr(state.totals, name) for name in ("waiting", "running", "done", "failed", "quarantined")},
-        "seconds": sum(scene.seconds for scene in state.scenes),
+        "seconds": sum(stage.seconds for scene in state.scenes for name, stage in scene.stages.items() if name not in scene.shares),
         "bytes": sum(scene.bytes for scene in state.scenes),
         "throughput": throughput,
         "sweep": sorted({setting for scene in state.scenes for setting in scene.sweep or {}}),

@@ -13,6 +13,7 @@ from pipeline.fleet.state import FleetState, SceneState
 from stages.artifacts import PosesOutputs, TurntableOutputs
 from workflows.fleet.pages import comparison, index, spreadsheet
 
+FILES = (index.NAME, index.THUMBNAILS, spreadsheet.NAME, comparison.NAME, comparison.FOLDER)  # what pages consist of
 SECONDS = 5.0  # between two writings, and TIMES as long as one takes
 TIMES = 20.0
 THUMBNAIL_SECONDS = 1.0  # of work on thumbnails in one writing, while the fleet runs
