@@ -19,6 +19,16 @@ from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
+# Adjustments of all that is found so far: each time there are so many times more photographs or points than at the last, with those points that hold the
+# cameras, and not to the last digit, for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
+ADJUSTMENTS: Mapping[str, object] = {
+    "ba_global_frames_ratio": 1.4,
+    "ba_global_points_ratio": 1.4,
+    "ba_global_max_refinements": 2,
+    "ba_local_max_refinements": 1,
+    "ba_global_function_tolerance": 1e-5,
+    "ba_local_function_tolerance": 1e-5,
+}
 # Options of attempts. COLMAP's defaults want an initial pair with a triangulation angle of 16 degrees and 100 inliers. RELAXED is for little texture and
 # little parallax. FORWARD also keeps two-view tracks and points with small triangulation angles, as of forward motion.
 Options = Mapping[str, Mapping[str, object]]
@@ -92,6 +102,8 @@ def _incremental_mapping(
         options.num_threads = options.mapper.num_threads = 1
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
         options.min_model_size = MIN_MODEL_SIZE
+        options.mergedict(dict(ADJUSTMENTS))
+        options.mapper.ba_global_ignore_redundant_points3D = True
         for part, values in options_of_attempt.items():
             getattr(options, part).mergedict(dict(values))
         options.ba_refine_focal_length = options.ba_refine_extra_params = refine_camera
