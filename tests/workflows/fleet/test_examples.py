@@ -1,0 +1,93 @@
+"""Templates in examples/fleet and manifests in docs/fleet.md: as far as can be checked without the machines that they are for."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from pipeline.fleet.state import check_scenes
+from workflows.asset import WORKFLOW
+from workflows.cli.main import enerf
+from workflows.fleet.manifest import read_manifest
+from workflows.fleet.options import read_cluster_options
+
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLES = ROOT / "examples" / "fleet"
+SCRIPTS = sorted(path.name for path in EXAMPLES.glob("*.sh"))
+
+
+def test_both_manifests_say_the_same(tmp_path: Path) -> None:
+    scenes = read_manifest([str(EXAMPLES / "scenes.toml")], WORKFLOW, tmp_path, roots=[ROOT / "examples"])
+    check_scenes(scenes)
+    assert [scene.name for scene in scenes] == ["still-life", "still-life-small"]
+    assert scenes == read_manifest([str(EXAMPLES / "scenes.csv")], WORKFLOW, tmp_path, roots=[ROOT / "examples"])
+
+
+def test_manifests_of_the_documentation(tmp_path: Path) -> None:
+    for name in ("shoots/chair", "shoots/table", "clips"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "clips" / "table.mp4").write_bytes(b"")
+    text = (ROOT / "docs" / "fleet.md").read_text(encoding="utf-8")
+    for kind in ("toml", "csv"):
+        (found,) = re.findall(rf"```{kind}\n(.*?)```", text, re.DOTALL)
+        (tmp_path / f"fleet.{kind}").write_text(found, encoding="utf-8")
+        assert [scene.name for scene in read_manifest([str(tmp_path / f"fleet.{kind}")], WORKFLOW, tmp_path)] == ["chair", "table"]
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_scripts_are_shell_and_their_options_exist(name: str) -> None:
+    assert shutil.which("sh")
+    done = subprocess.run(["sh", "-n", str(EXAMPLES / name)], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    (call,) = re.findall(r"^(?:exec )?enerf fleet (.*)$", (EXAMPLES / name).read_text(encoding="utf-8"), re.MULTILINE)
+    words = shlex.split(call)
+    run = enerf.commands["fleet"].commands["run"]  # type: ignore[attr-defined]
+    options = {option for parameter in run.params for option in parameter.opts}
+    assert {word for word in words if word.startswith("--")} <= options
+    for word in words:
+        if word.endswith((".toml", ".csv")):
+            assert (EXAMPLES / word).is_file()
+
+
+@pytest.mark.parametrize(("name", "module", "kind"), [("ssh.toml", "distributed", "SSHCluster"), ("slurm.toml", "dask_jobqueue", "SLURMCluster")])
+def test_options_of_clusters_are_those_of_their_classes(name: str, module: str, kind: str) -> None:
+    options = read_cluster_options(EXAMPLES / name)
+    assert options
+    options.pop("jobs", None)
+    cluster = getattr(pytest.importorskip(module), kind)
+    known: set[str] = set()
+    for each in (cluster, *getattr(cluster, "__mro__", ())[1:2], *([cluster.job_cls, *cluster.job_cls.__mro__[1:2]] if hasattr(cluster, "job_cls") else [])):
+        known |= set(inspect.signature(each).parameters)
+    assert set(options) <= known
+
+
+def test_snakemake_finds_the_jobs(tmp_path: Path) -> None:
+    snakemake = shutil.which("snakemake")
+    if snakemake is None:
+        pytest.skip("Snakemake is not installed")
+    shutil.copytree(EXAMPLES, tmp_path / "fleet")
+    (tmp_path / "still_life").symlink_to(ROOT / "examples" / "still_life")
+    done = subprocess.run([snakemake, "--dry-run", "--printshellcmds"], cwd=tmp_path / "fleet", capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    calls = re.findall(r"enerf run (.*)", done.stdout + done.stderr)
+    assert sorted(calls) == [
+        "../still_life --out runs/still-life --preset preview --seed 0 --budget 4m --quiet",
+        "../still_life --out runs/still-life-small --preset preview --seed 0 --budget 2m --set bake.max_mib=8 --quiet",
+    ]
+    options = {option for parameter in enerf.commands["run"].params for option in parameter.opts}
+    assert set(re.findall(r"--[a-z-]+", " ".join(calls))) <= options
+
+
+def test_names_of_columns_in_the_snakefile_are_those_of_the_table() -> None:
+    """Where Snakemake is not installed this is what can be told."""
+    text = (EXAMPLES / "Snakefile").read_text(encoding="utf-8")
+    head = (EXAMPLES / "scenes.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
+    (named,) = re.findall(r"for name in \(([^)]*)\)", text)
+    assert set(re.findall(r'"(\w+)"', named)) <= set(head)
+    assert set(re.findall(r'\["(\w+)"\]', text)) <= set(head)
