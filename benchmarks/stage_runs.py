@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 LATER = ("bake", "mesh", "splats", "evaluate", "turntable", "points")
-OWN = (".lock", ".work", ".cache")  # a lock belongs to the file, not to its name
+OWN = (".lock", ".lease", ".work", ".cache")  # a lock belongs to the file, not to its name
 
 
 def linked_copy(run: Path, copy: Path) -> Path:

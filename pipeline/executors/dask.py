@@ -126,8 +126,8 @@ class DaskWorkers:
     def _done(self, number: int, future: Any) -> None:
         try:
             result = future.result()
-        except Exception as error:  # cancelled, lost with its worker, or not to be sent
-            result = {"ok": False, "kind": "lost", "text": f"its worker has gone ({type(error).__name__})."}
+        except Exception as error:  # cancelled: by Dask, whose scheduler has gone
+            result = {"ok": False, "kind": "unheard", "text": f"nothing more is heard of it ({type(error).__name__})."}
         self._finish(number, result)
 
     def _finish(self, number: int, result: dict[str, Any]) -> None:

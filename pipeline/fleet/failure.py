@@ -1,6 +1,8 @@
 """What becomes of a scene whose stage failed: tried again, differently, or given up with the reason.
 
-its worker died, or its process crashed       once more, on another worker if there is one
+its process crashed                           once more, on another worker if there is one
+its worker died                               the same, and then failed: stages run in processes of their own, so that it says little of the scene
+nothing more is heard of it                   again: the scheduler of Dask has gone
 memory ran out                                once more, in half of the memory
 it needs more memory than its share           once more, in what it needs, if a worker has that
 its run is locked                             again, until the lock is given back or the lease expires
@@ -63,23 +65,25 @@ def remedy(what: str, result: Mapping[str, Any], attempts: Attempts, *, worker: 
     kind, text = result.get("kind"), printable(result.get("text") or "no reason was given.", 1500)
     ended_for_memory = kind == "died" and result.get("signal") == signal.SIGKILL
     if kind == "lost" or (kind in ("died", "stopped") and not ended_for_memory):
-        return _crashed(what, text, attempts, worker)
+        return _crashed(what, text, attempts, worker, "failed" if kind == "lost" else "quarantined")
     if kind == "memory" or ended_for_memory:
         return _out_of_memory(what, text, attempts, given)
     if kind == "refused":
         return _refused(text, int(result.get("needed") or 0), attempts, largest)
+    if kind == "unheard":
+        return Remedy("later", text)
     if kind == "locked":
         attempts.locked_since = now if attempts.locked_since is None else attempts.locked_since
         return Remedy("later" if now - attempts.locked_since < LOCKED_SECONDS else "failed", text)
     return Remedy("failed" if kind == "disk" else "quarantined", text)
 
 
-def _crashed(what: str, text: str, attempts: Attempts, worker: str) -> Remedy:
+def _crashed(what: str, text: str, attempts: Attempts, worker: str, then: Literal["failed", "quarantined"]) -> Remedy:
     attempts.crashes += 1
     attempts.lost_on = (*attempts.lost_on, worker)
     if attempts.crashes == 1:
         return Remedy("again", f"{what}: {text} It is tried once more.")
-    return Remedy("quarantined", f"{what}: {text} It was tried on {' and '.join(dict.fromkeys(attempts.lost_on))}.")
+    return Remedy(then, f"{what}: {text} It was tried on {' and '.join(dict.fromkeys(attempts.lost_on))}.")
 
 
 def _out_of_memory(what: str, text: str, attempts: Attempts, given: int | None) -> Remedy:

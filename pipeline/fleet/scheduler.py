@@ -281,7 +281,7 @@ class Scheduler:
         if each.stop_reason is not None:
             self._give_up(each, "failed", each.stop_reason)
             return
-        if self._ending and result.get("kind") in ("stopped", "died", "lost"):
+        if self._ending and result.get("kind") in ("stopped", "died", "lost", "unheard"):
             return
         now = time.monotonic()
         largest = None if any(worker.memory is None for worker in self._alive) else max((worker.memory or 0 for worker in self._alive), default=None)

@@ -65,7 +65,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Message:
-    """An event of a task, or its result: the last that is heard of it. {"ok": False, "kind": "lost"} where its worker has gone."""
+    """An event of a task, or its result: the last that is heard of it. "kind" is "lost" where its worker has gone, "unheard" where nobody knows."""
 
     task: int
     kind: Literal["event", "result"]
