@@ -33,6 +33,7 @@ class Show:
         self._trouble: str | None = None
 
     def __call__(self, event: dict[str, Any]) -> None:
+        self._pages.catch_up()
         if self.as_json:
             if not (self.quiet and event["event"] == "progress"):
                 write_json(event)

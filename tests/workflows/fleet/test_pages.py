@@ -110,6 +110,23 @@ def test_pages_are_written_with_thumbnails_and_at_the_end(tmp_path: Path) -> Non
     assert {path.name for path in tmp_path.iterdir() if path.is_file()} == {"index.html", "fleet.csv"}
 
 
+def test_what_came_too_soon_is_written_once_it_is_time(tmp_path: Path) -> None:
+    state = mixed()
+    pages = Pages(tmp_path)
+    pages(state)
+    state.scenes[0].stage = "bake"
+    pages(state)
+    pages.catch_up()
+    assert facts((tmp_path / "index.html").read_text("utf-8"))["scenes"][0]["stage"] is None
+    pages._next = 0.0
+    pages.catch_up()
+    written = (tmp_path / "index.html").stat().st_mtime_ns
+    assert facts((tmp_path / "index.html").read_text("utf-8"))["scenes"][0]["stage"] == "bake"
+    pages._next = 0.0
+    pages.catch_up()
+    assert (tmp_path / "index.html").stat().st_mtime_ns == written, "nothing has changed"
+
+
 def test_a_thumbnail_is_made_again_of_another_picture_only(tmp_path: Path) -> None:
     state = fleet(done("a"), state="done")
     with_pictures(tmp_path, state)

@@ -239,7 +239,7 @@ function makeFigures() {
     ["failed or quarantined", String(fleet.totals.failed + fleet.totals.quarantined)],
     ["throughput", fleet.throughput === null ? "" : `${fleet.throughput.toFixed(fleet.throughput < 10 ? 1 : 0)} scenes/h`],
     ["end, forecast", fleet.running && fleet.forecast !== null ? `in ${duration(fleet.forecast)}` : ""],
-    ["time of all stages", duration(fleet.seconds)],
+    ["time of all stages", fleet.seconds ? duration(fleet.seconds) : ""],
     ["mean PSNR", measured.length ? `${mean(measured).toFixed(2)} dB of ${measured.length}` : ""],
     ["assets", fleet.bytes ? (fleet.bytes < 1e9 ? `${megabytes(fleet.bytes)} MB` : `${(fleet.bytes / 1e9).toFixed(1)} GB`) : ""],
   ];

@@ -30,6 +30,7 @@ class Pages:
         self.fleet = fleet
         self.trouble: str | None = None
         self._next = 0.0
+        self._pending: FleetState | None = None
         self._pictures: dict[str, tuple[str, int]] = {}  # scene -> what its thumbnail is of, and when it was made
         self._done_before: int | None = None
 
@@ -37,9 +38,15 @@ class Pages:
         """Write the pages if it is time, and in any case once the fleet has ended."""
         if self._done_before is None:
             self._done_before = sum(scene.state == "done" for scene in state.scenes)
-        began = time.monotonic()
-        if state.state == "running" and began < self._next:
+        self._pending = state
+        self.catch_up()
+
+    def catch_up(self) -> None:
+        """Write a state that came too soon after the one before, once it is time: the next change may be long in coming."""
+        state, began = self._pending, time.monotonic()
+        if state is None or (state.state == "running" and began < self._next):
             return
+        self._pending = None
         try:
             self._write(state)
             self.trouble = None
