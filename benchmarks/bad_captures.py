@@ -297,7 +297,8 @@ def main() -> None:
         row = rows[capture.name] = measured(capture, given.photographs, given.work.resolve())
         print(f"{row.capture}: {row.grade or row.exit_code}, {'right' if row.right else 'WRONG'}", flush=True)
         ordered = [rows[each.name] for each in CAPTURES if each.name in rows]
-        document = {"machine": hardware("cpu"), "rows": [{key: value for key, value in vars(row).items() if key != "said"} for row in ordered]}
+        kept = [{key: value for key, value in vars(row).items() if key != "said"} for row in ordered]
+        document = {"machine": hardware("cpu"), "photographs": given.photographs, "rows": kept}
         table.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         table.with_suffix(".md").write_text(in_markdown(ordered), encoding="utf-8")
 

@@ -7,6 +7,7 @@ epipolar geometry that the matches fit. It is coarser than structure from motion
 from __future__ import annotations
 
 import contextlib
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from stages.io.importers.photographs import photographs
 from stages.io.importers.source import MIN_IMAGES, Source, abbreviated
 from stages.io.photo import focal_from_exif, read_photo, working_size
 from stages.io.pictures import UnreadableImage, exif_of, opened
+from stages.masking.turning import masks_of_turning_subject
 from stages.sfm import ladder, pairs
 from stages.verdict import looks
 from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, Problem, Verdict, of_looks, worded
@@ -35,6 +37,12 @@ STILL = 1.0  # px that a feature of a background that stands still moves by, at 
 SMALL = 640  # px; photographs whose longest side is shorter are small
 ZOOM = 1.05  # between focal lengths, from which they differ
 _EXIF = 34665
+TURNING = Problem(
+    "background",
+    "usable",
+    "Part of the picture stands still while the rest moves: probably a subject that turns before a camera on a stand.",
+    "A run leaves the background out where it is certain of it. Else give masks of the subject (a folder masks/), or --mask static.",
+)
 
 # Seconds of a processor that detects the features of a small picture in REFERENCE, by which others are scaled; docs/experiments/sfm.md
 REFERENCE = 0.028
@@ -85,7 +93,9 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
         raise BadInput(f"{folder}: no photograph can be read: {abbreviated([f'{name} {why}' for name, why in unreadable])}.")
     overlaps = _overlaps(list(small.values()), settings.seed)
     posed = importers.IMPORTERS[kind].posed
-    problems = [*of_looks(seen), *_of_files(small, unreadable, len(names)), *([] if posed else _of_overlap(list(small), overlaps))]
+    problems = [*of_looks(seen), *_of_files(small, unreadable, len(names))]
+    if not posed:
+        problems += _with_turning(_of_overlap(list(small), overlaps), {name: files[name] for name in small})
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
     figures = {
         "source": str(folder),
@@ -205,13 +215,20 @@ def _of_overlap(names: Sequence[str], overlaps: Mapping[pairs.Pair, Overlap]) ->
             sentence = "Nothing moves between the photographs: the camera stood still."
             found.append(Problem("stands still", "poor", sentence, "Walk round the subject; one place shows no depth."))
         elif np.mean([0.2 < share < 0.9 for share in still]) > 0.5:
-            sentence = "Part of the picture stands still while the rest moves: probably a subject that turns before a camera on a stand."
-            remedy = "A run leaves the background out where it is certain of it. Else give masks of the subject (a folder masks/), or --mask static."
-            found.append(Problem("background", "usable", sentence, remedy))
+            found.append(TURNING)
         elif float(np.median([overlap.plane for overlap in overlaps.values()])) > 0.95:
             sentence = "Neighbouring photographs differ as if the camera had only turned, or as if all were flat and far away."
             found.append(Problem("parallax", "usable", sentence, "Move sideways between photographs, not only turn."))
     return found
+
+
+def _with_turning(problems: Sequence[Problem], files: Mapping[str, Path]) -> list[Problem]:
+    """The problems; where nothing seems to move, a small subject may turn before so much of a wall that hardly a feature is its own."""
+    if not any(each.what == "stands still" for each in problems):
+        return list(problems)
+    with tempfile.TemporaryDirectory() as folder:
+        turns = masks_of_turning_subject(files, Path(folder), safe_point=lambda: None, progress=lambda *_: None)
+    return [TURNING if turns and each.what == "stands still" else each for each in problems]
 
 
 def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]], count: int) -> list[Problem]:

@@ -27,6 +27,7 @@ FEW_POINTS = 60  # sparse points of a photograph, below which its pose is doubtf
 SHARE = 0.1  # of the photographs, from which a problem of single ones is one of the capture
 LARGE_ERROR = 2.0  # px at LONGEST
 MOST_PLANAR = 0.8  # share of the pairs
+DOUBTFUL = 0.94  # of the matches, that agree with the cameras; docs/experiments/sfm.md
 SMALL_ANGLE = 4.0  # degrees of parallax
 WITHOUT_TEXTURE = "blurred, dark or without texture"
 MOST_PIXELS = 1000  # of a reprojection error, that are told apart
@@ -207,6 +208,9 @@ def _of_geometry(capture: Capture, angle: float | None, counts: np.ndarray | Non
     if isinstance(agreeing, float) and agreeing < 0.8:
         sentence = f"Only {agreeing:.0%} of the matches agree with the cameras: repeated structure may have folded the scene."
         found.append(Problem("folded", "poor", sentence, "Look at cameras.png. Photographs with more of the surroundings tell repeated parts apart."))
+    elif isinstance(agreeing, float) and agreeing < DOUBTFUL:
+        sentence = f"Only {agreeing:.0%} of the matches agree with the cameras, as where photographs were zoomed, cropped or blurred, or where something moved."
+        found.append(Problem("disagreement", "usable", sentence, "Look at cameras.png. Use one lens at one zoom, and photographs as they were taken."))
     if angle is not None and angle < SMALL_ANGLE:
         sentence = f"The photographs were taken from almost one place (parallax {angle:.1f} degrees): depth will be poor."
         found.append(Problem("parallax", "poor" if angle < 2.0 else "usable", sentence, "Move sideways between photographs, not only turn."))

@@ -14,7 +14,7 @@ from stages.poses import PosesSettings
 from stages.verdict import preflight
 from stages.verdict.preflight import Small, check, overlap_of
 from stages.verdict.verdict import Problem, Verdict
-from tests.stages import captures
+from tests.stages import captures, turntables
 
 SIZE = 240, 180
 
@@ -112,6 +112,13 @@ def test_a_subject_that_turns_before_a_standing_background_is_told(tmp_path: Pat
     mask[30:150, 60:180] = True
     found = problems(write(tmp_path / "a", {name: np.where(mask, picture, background) for name, picture in subject.items()}))
     assert found.get("background") == "usable"
+
+
+def test_a_small_subject_that_turns_before_much_of_a_wall_is_told(tmp_path: Path) -> None:
+    pictures = {camera.name: turntables.picture(camera, number) for number, camera in enumerate(turntables.cameras(9, 80.0))}
+    found = problems(write(tmp_path / "a", pictures))
+    assert found.get("background") == "usable"
+    assert "stands still" not in found
 
 
 def test_a_camera_that_only_turns_is_told(tmp_path: Path) -> None:

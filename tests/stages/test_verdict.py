@@ -142,6 +142,7 @@ LOST = tuple((f"lost{k}.jpg", "overlaps no other photograph well enough") for k 
         ({"rejected": LOST[:6]}, "not registered", "usable"),
         ({"rejected": LOST}, "not registered", "poor"),
         ({"facts": {"pairs_agreeing": 0.6}}, "folded", "poor"),
+        ({"facts": {"pairs_agreeing": 0.9}}, "disagreement", "usable"),
         ({"facts": {"components": [24, 7, 1]}}, "components", "usable"),
         ({"facts": {"models": [24, 5]}}, "sub-models", "good"),
         ({"radius": 0.05}, "parallax", "poor"),
