@@ -103,9 +103,10 @@ def find_models(
             else:
                 models = mapping.sub_models(place, images, seed, mapping.RELAXED, **quiet)
             climb.tried(rung, place, models)
+    last = place if place.is_dir() else work  # where all have a camera, and matches disagree, nothing was matched again
     for rung, options in (("another beginning", mapping.RELAXED), ("small angles", mapping.FORWARD)):
         if not climb.is_enough():
-            climb.tried(rung, place, mapping.sub_models(place if place.is_dir() else work, images, seed, options, **quiet))
+            climb.tried(rung, last, mapping.sub_models(last, images, seed, options, **quiet))
     return climb.found
 
 
