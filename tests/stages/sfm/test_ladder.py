@@ -30,11 +30,15 @@ class Rig:
         self._rung = "exhaustive"
         monkeypatch.setattr(mapping, "sub_models", lambda work, images, seed, options, *a, **k: self.model(work, "begin", options))
         monkeypatch.setattr(mapping, "continued", lambda work, images, model, seed, options, *a, **k: self.model(work, "continue", options))
-        monkeypatch.setattr(mapping, "match_agreement", lambda work, images, model: model.agreeing)
+        monkeypatch.setattr(mapping, "match_agreement", self.agreement)
         monkeypatch.setattr(ladder, "match", lambda *a, **k: None)
         monkeypatch.setattr(ladder, "copy_database", lambda *a: None)
         monkeypatch.setattr(ladder, "_detect_more", lambda place, images, weak, **k: self.weak.append(list(weak)))
         monkeypatch.setattr(ladder, "_match_again", self.match_again)
+
+    def agreement(self, work: Path, images: Any, model: Any) -> float:
+        assert work.is_dir(), "there is no database to read"
+        return float(model.agreeing)
 
     def match_again(self, place: Path, images: Any, weak: list[int], rung: str, **_: Any) -> None:
         self._rung = rung
