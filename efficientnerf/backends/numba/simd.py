@@ -26,6 +26,7 @@ EXP2_COEFFICIENTS = (-0.69314442, 0.24018671, -0.05531669, 0.00922838, -0.000954
 
 _VECTOR4 = ir.VectorType(ir.FloatType(), 4)
 _VECTOR16 = ir.VectorType(ir.FloatType(), 16)
+_VECTOR32 = ir.VectorType(ir.FloatType(), 32)
 
 
 class Float32x4(types.Type):
@@ -42,7 +43,14 @@ class Float32x16(types.Type):
         super().__init__(name="Sixteen")
 
 
-float32x4, float32x16 = Float32x4(), Float32x16()
+class Float32x32(types.Type):
+    """Type of a vector of thirty-two float32."""
+
+    def __init__(self) -> None:
+        super().__init__(name="ThirtyTwo")
+
+
+float32x4, float32x16, float32x32 = Float32x4(), Float32x16(), Float32x32()
 
 
 @register_model(Float32x4)
@@ -55,6 +63,12 @@ class _Float32x4Model(models.PrimitiveModel):
 class _Float32x16Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR16)
+
+
+@register_model(Float32x32)
+class _Float32x32Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _VECTOR32)
 
 
 def _overload_arithmetic(operation: Any, name: str) -> None:
@@ -181,7 +195,7 @@ def store4(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
 
 
 def store(out, n, value):  # type: ignore[no-untyped-def]
-    """out[n] = value, for kernels that work on scalars, on Float32x4 and on Float32x16; element n of those lies at 4 n and 16 n."""
+    """out[n] = value, for kernels that work on scalars, on Float32x4, Float32x16 and Float32x32; element n of those lies at 4 n, 16 n and 32 n."""
     raise NotImplementedError("inside kernels only")
 
 
@@ -190,26 +204,26 @@ def _store(out, n, value):  # type: ignore[no-untyped-def]
     def scalar(out, n, value):  # type: ignore[no-untyped-def]
         out[n] = value
 
-    if value == float32x16:
+    if value in (float32x16, float32x32):
         return None  # `lanes` has that
     return (lambda out, n, value: store4(out, 4 * n, value)) if value == float32x4 else scalar
 
 
 def broadcast_like(value, other):  # type: ignore[no-untyped-def]
-    """The scalar `value`, or a Float32x4 or Float32x16 of it where `other` is one."""
+    """The scalar `value`, or a Float32x4, Float32x16 or Float32x32 of it where `other` is one."""
     raise NotImplementedError("inside kernels only")
 
 
 @overload(broadcast_like)
 def _broadcast_like(value, other):  # type: ignore[no-untyped-def]
-    if other == float32x16:
+    if other in (float32x16, float32x32):
         return None
     return (lambda value, other: pack4(value, value, value, value)) if other == float32x4 else (lambda value, other: value)
 
 
 @intrinsic
 def sigmoid(typing_context: Any, value: Any) -> Any:
-    """Logistic function 1 / (1 + exp(-x)) of a Float32x4 or Float32x16, to 3e-6."""
+    """Logistic function 1 / (1 + exp(-x)) of a Float32x4, Float32x16 or Float32x32, to 3e-6."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def constant(x: float) -> Any:

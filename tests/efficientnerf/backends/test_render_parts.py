@@ -14,8 +14,8 @@ from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcoun
 from efficientnerf.backends.numba.tree import march
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.packets import halves, lanes
-from efficientnerf.backends.numba.tree.packets.halves import mix_pairs16, store_halves4
-from efficientnerf.backends.numba.tree.packets.rows import row_at
+from efficientnerf.backends.numba.tree.packets.halves import mix_pairs, store_halves4
+from efficientnerf.backends.numba.tree.packets.layout import LANES
 from efficientnerf.backends.numba.tree.view_colours import compute_view_colours, packed_pointers, sh_basis
 from efficientnerf.rendering.harmonics import basis_numpy
 from tests.efficientnerf.trees import in_codes, random_tree
@@ -87,7 +87,11 @@ def pairs(packed, brick):  # type: ignore[no-untyped-def]
     side, grid = brick + 2, packed_pointers(packed, brick, 0)
     out = np.empty((len(packed.rows), side, side, side - 1, 2), np.int64)
     for row in range(len(packed.rows) * side * side):
-        first, mask = row_at(row, grid)
+        if grid.narrow:
+            word = np.int64(grid.rows[row]) & 0xFFFFFFFF
+            first, mask = word >> side, word & ((np.int64(1) << side) - 1)
+        else:
+            first, mask = np.int64(grid.rows[2 * row]), np.int64(grid.rows[2 * row + 1])
         for k in range(side - 1):
             out[row // (side * side), row // side % side, row % side, k] = first + popcount(mask & ((np.int64(1) << k) - 1)), mask >> k & 3
     return out
@@ -160,8 +164,8 @@ def half_kernels():  # type: ignore[no-untyped-def]
 
     @numba.njit(error_model="numpy")
     def mixed(weights, bits, at, out):  # type: ignore[no-untyped-def]
-        for n, channel in enumerate(mix_pairs16(pointer(weights), pointer(at), pointer(bits))):
-            lanes.store16(pointer(out), 16 * n, channel)
+        for n, channel in enumerate(mix_pairs(pointer(weights), pointer(at), pointer(bits))):
+            lanes.store_lanes(pointer(out), LANES * n, channel)
 
     return rounded, mixed
 
@@ -182,52 +186,80 @@ def test_half_floats_are_numpys(converts: bool, monkeypatch: pytest.MonkeyPatch)
     rounded(values, bits)
     expected = np.clip(np.where(np.isnan(values), -halves.GREATEST, values), -halves.GREATEST, halves.GREATEST).astype(np.float16)
     assert np.array_equal(bits, expected.view(np.uint16))
-    weights, groups, out = rng.random((4, 16, 2)).astype(np.float32), expected.reshape(-1, 4).astype(np.float64), np.zeros((4, 16), np.float32)
-    for at in rng.integers(0, len(bits) // 4 - 1, (20, 4, 16)).astype(np.int32):
+    weights, groups, out = rng.random((4, LANES, 2)).astype(np.float32), expected.reshape(-1, 4).astype(np.float64), np.zeros((4, LANES), np.float32)
+    for at in rng.integers(0, len(bits) // 4 - 1, (20, 4, LANES)).astype(np.int32):
         mixed(weights, bits, at, out)
         eight = np.stack([groups[at], groups[at + 1]], axis=2)
         exact = np.einsum("nlr,nlrc->cl", weights, eight)
         assert (np.abs(out - exact) <= 1e-6 * (np.abs(exact) + np.abs(eight).max(axis=(0, 2, 3)))).all()
 
 
-@numba.njit(error_model="numpy")
-def in_lanes(floats, ints, bytes_, out):  # type: ignore[no-untyped-def]
-    """What operators on sixteen lanes make of two rows of `floats`."""
-    x, y = lanes.load16(pointer(floats), 0), lanes.load16(pointer(floats), 16)
-    less = (x < y) & (x > np.float32(0)) | ~(y >= np.float32(-1))
-    whole = lanes.to_int16(lanes.abs16(x) + lanes.ceil16(lanes.abs16(y)))
-    masked = (whole + 3) * whole - 1 & 255 | whole >> 1
-    values = (
-        lanes.select16(less, x * y + np.float32(2), lanes.floor16(x) - y), lanes.min16(x, y) / lanes.max16(x, np.float32(0.5)),
-        lanes.to_float16(masked + (1 << whole)), lanes.to_float16(lanes.popcount16(masked)), lanes.sqrt16(lanes.abs16(x)),
-        lanes.to_float16(lanes.gather16(pointer(ints), whole & 7)), lanes.to_float16(lanes.gather16(pointer(bytes_), whole & 7)),
-        lanes.gather16(pointer(floats), whole & 31), lanes.exp2_neg16(lanes.abs16(y)),
-    )  # fmt: skip
-    for n in range(9):
-        lanes.store16(pointer(out), 16 * n, values[n])
-    a, b, c, d = lanes.channels16(pointer(floats), 0)
-    lanes.store16(pointer(out), 144, a - b + c * d)
-    lanes.store_channels16(pointer(out), 160, a, b, c, d)
-    return lanes.bits_of(less), lanes.lowest_bit(lanes.bits_of(lanes.mask_of(40)))
+def lane_kernels(load, mask, count):  # type: ignore[no-untyped-def]
+    """What operators on so many lanes make of two rows of `floats`, and which lanes are less, compiled now."""
+
+    @numba.njit(error_model="numpy")
+    def in_lanes(floats, ints, bytes_, words, out):  # type: ignore[no-untyped-def]
+        x, y = load(pointer(floats), 0), load(pointer(floats), count)
+        less = (x < y) & (x > np.float32(0)) | ~(y >= np.float32(-1))
+        whole = lanes.to_ints(lanes.abs_lanes(x) + lanes.ceil_lanes(lanes.abs_lanes(y)))
+        masked = (whole + 3) * whole - 1 & 255 | whole >> 1
+        values = (
+            lanes.select_lanes(less, x * y + np.float32(2), lanes.floor_lanes(x) - y), lanes.min_lanes(x, y) / lanes.max_lanes(x, np.float32(0.5)),
+            lanes.to_floats(masked + (1 << whole)), lanes.to_floats(lanes.popcount_lanes(masked)), lanes.sqrt_lanes(lanes.abs_lanes(x)),
+            lanes.to_floats(lanes.gather_lanes(pointer(ints), whole & 7)), lanes.to_floats(lanes.gather_lanes(pointer(bytes_), whole & 7)),
+            lanes.gather_lanes(pointer(floats), whole & 31), lanes.exp2_neg_lanes(lanes.abs_lanes(y)), lanes.to_floats(load(pointer(words), 1)),
+            lanes.select_lanes(mask(40), x, np.float32(0)),
+        )  # fmt: skip
+        for n in range(11):
+            lanes.store_lanes(pointer(out), count * n, values[n])
+        return lanes.bits_of(less), lanes.lowest_bit(lanes.bits_of(mask(40)))
+
+    return in_lanes
 
 
-def test_operators_on_lanes_are_numpys() -> None:
+@pytest.mark.parametrize("count", [16, 32])
+def test_operators_on_lanes_are_numpys(count: int) -> None:
     rng = np.random.default_rng(0)
-    floats, out = rng.normal(0, 3, 64).astype(np.float32), np.zeros(224, np.float32)
+    floats, out = rng.normal(0, 3, 2 * count).astype(np.float32), np.zeros((11, count), np.float32)
     ints, bytes_ = rng.integers(-(2**20), 2**20, 8).astype(np.int32), rng.integers(0, 256, 8).astype(np.uint8)
-    bits, lowest = in_lanes(floats, ints, bytes_, out)
-    x, y = floats[:16], floats[16:32]
+    words = rng.integers(0, 2**16, count + 1).astype(np.uint16)
+    kernel = lane_kernels(lanes.load16, lanes.mask16, 16) if count == 16 else lane_kernels(lanes.load32, lanes.mask32, 32)
+    bits, lowest = kernel(floats, ints, bytes_, words, out)
+    x, y = floats.reshape(2, count)
     less = (x < y) & (x > 0) | ~(y >= -1)
     whole = (np.abs(x) + np.ceil(np.abs(y))).astype(np.int32)
     masked = (whole + 3) * whole - 1 & 255 | whole >> 1
     expected = [
         np.where(less, x * y + 2, np.floor(x) - y), np.minimum(x, y) / np.maximum(x, 0.5), masked + (1 << whole), [bin(n).count("1") for n in masked],
-        np.sqrt(np.abs(x)), ints[whole & 7], bytes_[whole & 7], floats[whole & 31], np.exp2(-np.abs(y)),
-        floats[::4] - floats[1::4] + floats[2::4] * floats[3::4],
+        np.sqrt(np.abs(x)), ints[whole & 7], bytes_[whole & 7], floats[whole & 31], np.exp2(-np.abs(y)), words[1:], np.where(40 >> np.arange(count) & 1, x, 0),
     ]  # fmt: skip
-    np.testing.assert_allclose(out[:160].reshape(10, 16), np.array(expected, np.float32), rtol=1e-6, atol=1e-6)
-    assert np.array_equal(out[160:], floats)
-    assert (bits, lowest) == (int((less << np.arange(16)).sum()), 3)
+    np.testing.assert_allclose(out, np.array(expected, np.float32), rtol=1e-6, atol=1e-6)
+    assert (bits, lowest) == (int((less.astype(np.int64) << np.arange(count)).sum()), 3)
+
+
+@numba.njit(error_model="numpy")
+def in_groups(floats, ints, at, out):  # type: ignore[no-untyped-def]
+    """What comes of groups of four and of two numbers of a packet."""
+    a, b, c, d = lanes.channels(pointer(floats), 0)
+    lanes.store_lanes(pointer(out), 0, a - b + c * d)
+    lanes.store_pairs(pointer(out), LANES, a, b)
+    lanes.store_channels(pointer(out), 3 * LANES, a, b, c, d)
+    e, f = lanes.gather_pairs(pointer(ints), pointer(at), 0)
+    g, h, i, j = lanes.gather_fours(pointer(ints), pointer(at), 0)
+    for n, value in enumerate((e, f, g, h, i, j)):
+        lanes.store_lanes(pointer(out), (7 + n) * LANES, lanes.to_floats(value))
+
+
+def test_groups_of_numbers_go_into_lanes_and_back() -> None:
+    rng = np.random.default_rng(1)
+    floats, ints, out = rng.normal(size=(LANES, 4)).astype(np.float32), rng.integers(-9999, 9999, 50).astype(np.int32), np.zeros(13 * LANES, np.float32)
+    at = rng.integers(0, 46, LANES).astype(np.int32)
+    in_groups(floats.reshape(-1), ints, at, out)
+    a, b, c, d = floats.T
+    np.testing.assert_allclose(out[:LANES], a - b + c * d, rtol=1e-6, atol=1e-6)
+    assert np.array_equal(out[LANES : 3 * LANES].reshape(-1, 2), floats[:, :2])
+    assert np.array_equal(out[3 * LANES : 7 * LANES], floats.reshape(-1))
+    assert np.array_equal(out[7 * LANES :].reshape(6, -1), [ints[at + n] for n in (0, 1, 0, 1, 2, 3)])
 
 
 def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> None:

@@ -18,7 +18,7 @@ from efficientnerf.backends.numba.simd import pointer, sigmoid
 from efficientnerf.backends.numba.splats.lanes import LANES
 from efficientnerf.backends.numba.splats.projection import HARMONICS, MEAN, OPACITY, ROTATION, SCALE, basis16, colour16, conic16, image16
 from efficientnerf.backends.numba.splats.raster import ERROR, SUMS
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max16, min16, select16, sqrt16, store16
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max_lanes, min_lanes, select_lanes, sqrt_lanes, store_lanes
 
 GROUPS_A_TASK = 64
 PARTS = 6  # mean, scales, rotation, opacity, base colour, other harmonics
@@ -71,17 +71,17 @@ def _geometry_gradients(p, at, lens, total, out):  # type: ignore[no-untyped-def
     ax, ay, _covariance, (a, b, c) = conic16(nx, ny, s)
     v, vx, vy, vxx, vxy, vyy = load16(total, 0), load16(total, 16), load16(total, 32), load16(total, 48), load16(total, 64), load16(total, 80)
     px, py = a * vx + b * vy, b * vx + c * vy
-    store16(out, 16 * MEAN, px * wx[0] + py * wy[0])
-    store16(out, 16 * (MEAN + 1), px * wx[1] + py * wy[1])
-    store16(out, 16 * (MEAN + 2), px * wx[2] + py * wy[2])
+    store_lanes(out, 16 * MEAN, px * wx[0] + py * wy[0])
+    store_lanes(out, 16 * (MEAN + 1), px * wx[1] + py * wy[1])
+    store_lanes(out, 16 * (MEAN + 2), px * wx[2] + py * wy[2])
     # By the covariance in the image: half of Q V Q, Q the conic; by its root A twice that times A.
     qx, qy, rx, ry = a * vxx + b * vxy, a * vxy + b * vyy, b * vxx + c * vxy, b * vxy + c * vyy
     hxx, hxy, hyy = qx * a + qy * b, qx * b + qy * c, rx * b + ry * c
     dx0, dx1, dx2 = hxx * ax[0] + hxy * ay[0], hxx * ax[1] + hxy * ay[1], hxx * ax[2] + hxy * ay[2]
     dy0, dy1, dy2 = hxy * ax[0] + hyy * ay[0], hxy * ax[1] + hyy * ay[1], hxy * ax[2] + hyy * ay[2]
-    store16(out, 16 * SCALE, dx0 * ax[0] + dy0 * ay[0])
-    store16(out, 16 * (SCALE + 1), dx1 * ax[1] + dy1 * ay[1])
-    store16(out, 16 * (SCALE + 2), dx2 * ax[2] + dy2 * ay[2])
+    store_lanes(out, 16 * SCALE, dx0 * ax[0] + dy0 * ay[0])
+    store_lanes(out, 16 * (SCALE + 1), dx1 * ax[1] + dy1 * ay[1])
+    store_lanes(out, 16 * (SCALE + 2), dx2 * ax[2] + dy2 * ay[2])
     dx0, dx1, dx2, dy0, dy1, dy2 = dx0 * s[0], dx1 * s[1], dx2 * s[2], dy0 * s[0], dy1 * s[1], dy2 * s[2]
     (w, x, y, z), length, _matrix = turned
     g00, g01, g02 = wx[0] * dx0 + wy[0] * dy0, wx[0] * dx1 + wy[0] * dy1, wx[0] * dx2 + wy[0] * dy2
@@ -92,12 +92,12 @@ def _geometry_gradients(p, at, lens, total, out):  # type: ignore[no-untyped-def
     by_y = _TWO * (x * (g01 + g10) + z * (g12 + g21) + w * (g02 - g20) - _TWO * y * (g00 + g22))
     by_z = _TWO * (x * (g02 + g20) + y * (g12 + g21) + w * (g10 - g01) - _TWO * z * (g00 + g11))
     along = by_w * w + by_x * x + by_y * y + by_z * z
-    store16(out, 16 * ROTATION, (by_w - along * w) / length)
-    store16(out, 16 * (ROTATION + 1), (by_x - along * x) / length)
-    store16(out, 16 * (ROTATION + 2), (by_y - along * y) / length)
-    store16(out, 16 * (ROTATION + 3), (by_z - along * z) / length)
-    store16(out, 16 * OPACITY, v * (_ONE - sigmoid(load16(p, at + 16 * OPACITY))))
-    return max16(s[0], max16(s[1], s[2]))
+    store_lanes(out, 16 * ROTATION, (by_w - along * w) / length)
+    store_lanes(out, 16 * (ROTATION + 1), (by_x - along * x) / length)
+    store_lanes(out, 16 * (ROTATION + 2), (by_y - along * y) / length)
+    store_lanes(out, 16 * (ROTATION + 3), (by_z - along * z) / length)
+    store_lanes(out, 16 * OPACITY, v * (_ONE - sigmoid(load16(p, at + 16 * OPACITY))))
+    return max_lanes(s[0], max_lanes(s[1], s[2]))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -105,13 +105,13 @@ def _colour_gradients(p, at, lens, degree, total, basis, out):  # type: ignore[n
     """Gradients by the harmonics into rows from HARMONICS on."""
     basis16(p, at, lens, degree, basis)
     red, green, blue = colour16(p, at, degree, basis)
-    red, green = select16(red > _NONE, load16(total, 96), _NONE), select16(green > _NONE, load16(total, 112), _NONE)
-    blue = select16(blue > _NONE, load16(total, 128), _NONE)
+    red, green = select_lanes(red > _NONE, load16(total, 96), _NONE), select_lanes(green > _NONE, load16(total, 112), _NONE)
+    blue = select_lanes(blue > _NONE, load16(total, 128), _NONE)
     for k in range((degree + 1) * (degree + 1)):
         value, row = load16(basis, 16 * k), 16 * (HARMONICS + 3 * k)
-        store16(out, row, value * red)
-        store16(out, row + 16, value * green)
-        store16(out, row + 32, value * blue)
+        store_lanes(out, row, value * red)
+        store_lanes(out, row + 16, value * green)
+        store_lanes(out, row + 32, value * blue)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -123,15 +123,15 @@ def _step_part(p, at, m, to, part, begin, end, rate, ahead, correction, moves, h
         square = square + g * g
     old = load16(m, to + 16 * (SQUARES + part))
     square = old * h.decay + square * ((_ONE - h.decay) / np.float32(end - begin))
-    store16(m, to + 16 * (SQUARES + part), select16(moves, square, old))
-    scale = ahead * rate / (sqrt16(square * correction) + h.epsilon)
+    store_lanes(m, to + 16 * (SQUARES + part), select_lanes(moves, square, old))
+    scale = ahead * rate / (sqrt_lanes(square * correction) + h.epsilon)
     for row in range(begin, end):
         place, before = to + 16 * (GRADIENTS + row), at + 16 * row
         old = load16(m, place)
         mean = old * h.momentum + load16(gradient, 16 * row) * (_ONE - h.momentum)
-        store16(m, place, select16(moves, mean, old))
+        store_lanes(m, place, select_lanes(moves, mean, old))
         value = load16(p, before)
-        store16(p, before, select16(moves, value - scale * mean, value))
+        store_lanes(p, before, select_lanes(moves, value - scale * mean, value))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -146,7 +146,7 @@ def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):
     ahead, correction = load16(correct, 0), load16(correct, 16)
     longest = _geometry_gradients(p, at, lens, total, gradient)
     _colour_gradients(p, at, lens, degree, total, basis, gradient)
-    store16(m, to, select16(moves, visits + _ONE, visits))
+    store_lanes(m, to, select_lanes(moves, visits + _ONE, visits))
     terms = 3 * (degree + 1) * (degree + 1)
     _step_part(p, at, m, to, 0, MEAN, SCALE, longest * h.rates[0], ahead, correction, moves, h, gradient)
     _step_part(p, at, m, to, 1, SCALE, ROTATION, broadcast16(h.rates[1]), ahead, correction, moves, h, gradient)
@@ -157,7 +157,7 @@ def _step_group(p, at, m, to, lens, degree, h, total, basis, gradient, correct):
         _step_part(p, at, m, to, 5, HARMONICS + 3, HARMONICS + terms, broadcast16(h.rates[5]), ahead, correction, moves, h, gradient)
     for n in range(3):
         row = at + 16 * (SCALE + n)
-        store16(p, row, min16(max16(load16(p, row), h.least), h.greatest))
+        store_lanes(p, row, min_lanes(max_lanes(load16(p, row), h.least), h.greatest))
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")

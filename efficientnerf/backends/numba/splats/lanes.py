@@ -10,7 +10,7 @@ from numba.extending import intrinsic
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import float32x16
-from efficientnerf.backends.numba.tree.packets.lanes import exp2_neg16, max16, select16, sqrt16
+from efficientnerf.backends.numba.tree.packets.lanes import exp2_neg_lanes, max_lanes, select_lanes, sqrt_lanes
 
 LANES = 16
 LOG2_E = np.float32(1.4426950408889634)
@@ -47,18 +47,18 @@ def sums16(typing_context: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, 
 def exp16(x):  # type: ignore[no-untyped-def]
     """e^x for x from -80 to 80."""
     y = x * LOG2_E
-    return exp2_neg16(max16(y * np.float32(-1), _NONE)) / exp2_neg16(max16(y, _NONE))
+    return exp2_neg_lanes(max_lanes(y * np.float32(-1), _NONE)) / exp2_neg_lanes(max_lanes(y, _NONE))
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def arctangent16(t):  # type: ignore[no-untyped-def]
     """Arc tangent of t >= 0, to 3e-7."""
     steep = t > _ONE
-    x = select16(steep, _ONE / max16(t, np.float32(1e-30)), t)
+    x = select_lanes(steep, _ONE / max_lanes(t, np.float32(1e-30)), t)
     # Half of the angle lies within an eighth of a turn, where a short series is exact.
-    x = x / (_ONE + sqrt16(_ONE + x * x))
+    x = x / (_ONE + sqrt_lanes(_ONE + x * x))
     y = x * x
     series = np.float32(0.11111111) - y * (np.float32(0.09090909) - y * np.float32(0.07692308))
     series = _ONE - y * (np.float32(0.33333333) - y * (np.float32(0.2) - y * (np.float32(0.14285715) - y * series)))
     angle = np.float32(2) * x * series
-    return select16(steep, np.float32(np.pi / 2) - angle, angle)
+    return select_lanes(steep, np.float32(np.pi / 2) - angle, angle)

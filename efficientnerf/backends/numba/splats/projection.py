@@ -16,7 +16,7 @@ import numpy as np
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer, sigmoid
 from efficientnerf.backends.numba.splats.lanes import LANES, arctangent16, exp16
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max16, min16, select16, sqrt16, store16
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, max_lanes, min_lanes, select_lanes, sqrt_lanes, store_lanes
 from efficientnerf.backends.numba.tree.view_colours import sh_basis
 
 MEAN, SCALE, ROTATION, OPACITY, HARMONICS = 0, 3, 6, 10, 11  # rows of values: logarithms of scales, logit of the opacity
@@ -56,18 +56,18 @@ def _plane(x, y, z, lens):  # type: ignore[no-untyped-def]
     each."""
     if lens.fisheye:
         square = x * x + y * y
-        across, whole = sqrt16(max16(square, np.float32(1e-20))), square + z * z
-        angle = _TWO * arctangent16(across / max16(sqrt16(whole) + z, np.float32(1e-12)))
-        nx, ny, whole = x / across, y / across, max16(whole, np.float32(1e-20))
+        across, whole = sqrt_lanes(max_lanes(square, np.float32(1e-20))), square + z * z
+        angle = _TWO * arctangent16(across / max_lanes(sqrt_lanes(whole) + z, np.float32(1e-12)))
+        nx, ny, whole = x / across, y / across, max_lanes(whole, np.float32(1e-20))
         straight = across < np.float32(1e-5) * z  # angle / across is 1 / z there
-        per, along = select16(straight, _ONE / max16(z, np.float32(1e-12)), angle / across), z / whole
+        per, along = select_lanes(straight, _ONE / max_lanes(z, np.float32(1e-12)), angle / across), z / whole
         cross, back = nx * ny * (along - per), across / whole * np.float32(-1)
         u_x, v_y = nx * nx * along + (_ONE - nx * nx) * per, ny * ny * along + (_ONE - ny * ny) * per
         return x * per, y * per, whole > lens.numbers[13] * lens.numbers[13], u_x, cross, nx * back, cross, v_y, ny * back
     ahead = z > lens.numbers[13]
-    per = _ONE / select16(ahead, z, _ONE)
+    per = _ONE / select_lanes(ahead, z, _ONE)
     u, v = x * per, y * per
-    u_near, v_near = min16(max16(u, lens.limits[0]), lens.limits[1]), min16(max16(v, lens.limits[2]), lens.limits[3])
+    u_near, v_near = min_lanes(max_lanes(u, lens.limits[0]), lens.limits[1]), min_lanes(max_lanes(v, lens.limits[2]), lens.limits[3])
     zero = broadcast16(_NONE)
     return u, v, ahead, per, zero, u_near * per * np.float32(-1), zero, per, v_near * per * np.float32(-1)
 
@@ -97,7 +97,7 @@ def rotation16(p, at):  # type: ignore[no-untyped-def]
     """The unit quaternion of a group and its length, and the matrix by rows."""
     at += 16 * ROTATION
     w, x, y, z = load16(p, at), load16(p, at + 16), load16(p, at + 32), load16(p, at + 48)
-    length = sqrt16(max16(w * w + x * x + y * y + z * z, np.float32(1e-20)))
+    length = sqrt_lanes(max_lanes(w * w + x * x + y * y + z * z, np.float32(1e-20)))
     w, x, y, z = w / length, x / length, y / length, z / length
     matrix = (
         _ONE - _TWO * (y * y + z * z), _TWO * (x * y - w * z), _TWO * (x * z + w * y),
@@ -117,7 +117,7 @@ def image16(p, at, lens):  # type: ignore[no-untyped-def]
     u, v, seen, u_x, u_y, u_z, v_x, v_y, v_z = _plane(x, y, z, lens)
     seen = seen & (u * u + v * v < n[14])
     px, py, _a, _b, _c, _d = _distorted(u, v, lens)
-    at_u, at_v = (u, v) if lens.fisheye else (min16(max16(u, lens.limits[0]), lens.limits[1]), min16(max16(v, lens.limits[2]), lens.limits[3]))
+    at_u, at_v = (u, v) if lens.fisheye else (min_lanes(max_lanes(u, lens.limits[0]), lens.limits[1]), min_lanes(max_lanes(v, lens.limits[2]), lens.limits[3]))
     _x, _y, x_u, x_v, y_u, y_v = _distorted(at_u, at_v, lens)
     jx = (n[0] * (x_u * u_x + x_v * v_x), n[0] * (x_u * u_y + x_v * v_y), n[0] * (x_u * u_z + x_v * v_z))
     jy = (n[1] * (y_u * u_x + y_v * v_x), n[1] * (y_u * u_y + y_v * v_y), n[1] * (y_u * u_z + y_v * v_z))
@@ -129,10 +129,10 @@ def image16(p, at, lens):  # type: ignore[no-untyped-def]
     ny = (wy[0] * r[0] + wy[1] * r[3] + wy[2] * r[6], wy[0] * r[1] + wy[1] * r[4] + wy[2] * r[7], wy[0] * r[2] + wy[1] * r[5] + wy[2] * r[8])
     low, high = -MOST_LOG_SCALE, MOST_LOG_SCALE
     scales = (
-        exp16(min16(max16(load16(p, at + 16 * SCALE), low), high)), exp16(min16(max16(load16(p, at + 16 * (SCALE + 1)), low), high)),
-        exp16(min16(max16(load16(p, at + 16 * (SCALE + 2)), low), high)),
+        exp16(min_lanes(max_lanes(load16(p, at + 16 * SCALE), low), high)), exp16(min_lanes(max_lanes(load16(p, at + 16 * (SCALE + 1)), low), high)),
+        exp16(min_lanes(max_lanes(load16(p, at + 16 * (SCALE + 2)), low), high)),
     )  # fmt: skip
-    depth = sqrt16(x * x + y * y + z * z) if lens.fisheye else z
+    depth = sqrt_lanes(x * x + y * y + z * z) if lens.fisheye else z
     return px * n[0] + n[2], py * n[1] + n[3], depth, seen, wx, wy, nx, ny, scales, turned
 
 
@@ -152,7 +152,7 @@ def conic16(nx, ny, scales):  # type: ignore[no-untyped-def]
 def basis16(p, at, lens, degree, out):  # type: ignore[no-untyped-def]
     """Harmonics of the view directions of a group, `out` (K, 16)."""
     x, y, z = load16(p, at) - lens.centre[0], load16(p, at + 16) - lens.centre[1], load16(p, at + 32) - lens.centre[2]
-    length = sqrt16(max16(x * x + y * y + z * z, np.float32(1e-30)))
+    length = sqrt_lanes(max_lanes(x * x + y * y + z * z, np.float32(1e-30)))
     sh_basis(x / length, y / length, z / length, degree, out)
 
 
@@ -173,25 +173,25 @@ def _project_group(p, at, lens, degree, basis, row, out, first):  # type: ignore
     _ax, _ay, covariance, conic = conic16(nx, ny, scales)
     opacity = sigmoid(load16(p, at + 16 * OPACITY))
     # ln o <= 8 (o^(1/8) - 1): beyond this many squared standard deviations alpha is below LEAST_ALPHA.
-    reach = np.float32(2 * 5.5412637) + np.float32(16) * (sqrt16(sqrt16(sqrt16(opacity))) - _ONE)
-    reach = max16(reach, _NONE)
-    wide, high = sqrt16(reach * covariance[0]), sqrt16(reach * covariance[2])
+    reach = np.float32(2 * 5.5412637) + np.float32(16) * (sqrt_lanes(sqrt_lanes(sqrt_lanes(opacity))) - _ONE)
+    reach = max_lanes(reach, _NONE)
+    wide, high = sqrt_lanes(reach * covariance[0]), sqrt_lanes(reach * covariance[2])
     seen = seen & (opacity >= LEAST_ALPHA) & (x + wide > _NONE) & (y + high > _NONE)
     seen = seen & (x - wide < np.float32(lens.width)) & (y - high < np.float32(lens.height))
     basis16(p, at, lens, degree, basis)
     red, green, blue = colour16(p, at, degree, basis)
-    store16(row, 16 * X, x)
-    store16(row, 16 * Y, y)
-    store16(row, 16 * CONIC_A, conic[0])
-    store16(row, 16 * CONIC_B, conic[1])
-    store16(row, 16 * CONIC_C, conic[2])
-    store16(row, 16 * ALPHA, opacity)
-    store16(row, 16 * RED, max16(red, _NONE))
-    store16(row, 16 * (RED + 1), max16(green, _NONE))
-    store16(row, 16 * (RED + 2), max16(blue, _NONE))
-    store16(row, 16 * WIDTH, select16(seen, wide, _NONE))
-    store16(row, 16 * HEIGHT, select16(seen, high, _NONE))
-    store16(row, 16 * DEPTH, depth)
+    store_lanes(row, 16 * X, x)
+    store_lanes(row, 16 * Y, y)
+    store_lanes(row, 16 * CONIC_A, conic[0])
+    store_lanes(row, 16 * CONIC_B, conic[1])
+    store_lanes(row, 16 * CONIC_C, conic[2])
+    store_lanes(row, 16 * ALPHA, opacity)
+    store_lanes(row, 16 * RED, max_lanes(red, _NONE))
+    store_lanes(row, 16 * (RED + 1), max_lanes(green, _NONE))
+    store_lanes(row, 16 * (RED + 2), max_lanes(blue, _NONE))
+    store_lanes(row, 16 * WIDTH, select_lanes(seen, wide, _NONE))
+    store_lanes(row, 16 * HEIGHT, select_lanes(seen, high, _NONE))
+    store_lanes(row, 16 * DEPTH, depth)
     for lane in range(LANES):
         for n in range(12):
             out[first + lane, n] = row[16 * n + lane]

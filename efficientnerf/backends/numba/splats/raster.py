@@ -32,7 +32,17 @@ from efficientnerf.backends.numba.splats.projection import (
     X,
     Y,
 )
-from efficientnerf.backends.numba.tree.packets.lanes import bits_of, broadcast16, exp2_neg16, load16, mask_of, max16, min16, select16, store16
+from efficientnerf.backends.numba.tree.packets.lanes import (
+    bits_of,
+    broadcast16,
+    exp2_neg_lanes,
+    load16,
+    mask16,
+    max_lanes,
+    min_lanes,
+    select_lanes,
+    store_lanes,
+)
 from efficientnerf.backends.numba.tree_training.tasks import take_next
 
 SUMS = 16  # numbers of a pair
@@ -58,7 +68,7 @@ def _exponent(p, at, x, y):  # type: ignore[no-untyped-def]
     """A Gaussian's distances from pixels, and what it hides before it is capped."""
     dx, dy = x - p[at + X], y - p[at + Y]
     q = dx * (dx * p[at + CONIC_A] + dy * (_TWO * p[at + CONIC_B])) + dy * dy * p[at + CONIC_C]
-    return dx, dy, exp2_neg16(max16(q * (_HALF * LOG2_E), _NONE)) * p[at + ALPHA]
+    return dx, dy, exp2_neg_lanes(max_lanes(q * (_HALF * LOG2_E), _NONE)) * p[at + ALPHA]
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -70,24 +80,24 @@ def _blend(p, bit, first, end, gaussian, mask, x, y, open_, met, place):  # type
         if mask[pair] & bit:
             at = np.int64(gaussian[pair]) * RECORD
             _dx, _dy, strength = _exponent(p, at, x, y)
-            alpha = min16(strength, MOST_ALPHA)
+            alpha = min_lanes(strength, MOST_ALPHA)
             left = light * (_ONE - alpha)
             counts = open_ & (alpha >= LEAST_ALPHA)
             ends = counts & (left < LEAST_TRANSMITTANCE)
             counts = counts & ~ends
             open_ = open_ & ~ends
             if bits_of(counts) != 0:
-                weight = select16(counts, light * alpha, _NONE)
+                weight = select_lanes(counts, light * alpha, _NONE)
                 red, green, blue = red + weight * p[at + RED], green + weight * p[at + RED + 1], blue + weight * p[at + RED + 2]
-                light = select16(counts, left, light)
+                light = select_lanes(counts, left, light)
                 met[count] = pair
                 count += 1
             if bits_of(open_) == 0:
                 break
-    store16(place, 0, red)
-    store16(place, 16, green)
-    store16(place, 32, blue)
-    store16(place, 48, light)
+    store_lanes(place, 0, red)
+    store_lanes(place, 16, green)
+    store_lanes(place, 32, blue)
+    store_lanes(place, 48, light)
     return count
 
 
@@ -109,7 +119,7 @@ def _render_tile(tile, p, pairs, width, height, met, place, xs, ys, colour, tran
     for block in range(16):
         left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
         if left < width and top < height:
-            open_ = mask_of(_pixels(left, top, width, height, xs, ys))
+            open_ = mask16(_pixels(left, top, width, height, xs, ys))
             x, y = load16(pointer(xs), 0), load16(pointer(ys), 0)
             _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, open_, met, pointer(place))
             for lane in range(16):
@@ -175,23 +185,23 @@ def _pull(p, met, count, gaussian, slot, x, y, inside, place, slopes, sums):  # 
         pair = met[n]
         at = np.int64(gaussian[pair]) * RECORD
         dx, dy, strength = _exponent(p, at, x, y)
-        alpha = min16(strength, MOST_ALPHA)
+        alpha = min_lanes(strength, MOST_ALPHA)
         rest = _ONE - alpha
         left = light * rest
         counts = open_ & (alpha >= LEAST_ALPHA)
         ends = counts & (left < LEAST_TRANSMITTANCE)
         counts = counts & ~ends
         open_ = open_ & ~ends
-        weight = select16(counts, light * alpha, _NONE)
+        weight = select_lanes(counts, light * alpha, _NONE)
         gain = by_red * p[at + RED] + by_green * p[at + RED + 1] + by_blue * p[at + RED + 2]
         behind = behind - weight * gain
         v = (light * gain - behind / rest) * alpha
-        v = select16(counts & (strength < MOST_ALPHA), v, _NONE)
-        light = select16(counts, left, light)
+        v = select_lanes(counts & (strength < MOST_ALPHA), v, _NONE)
+        light = select_lanes(counts, left, light)
         vx, vy = v * dx, v * dy
         to = np.int64(slot[pair]) * SUMS
         found = sums16(v, vx, vy, vx * dx, vx * dy, vy * dy, weight * by_red, weight * by_green, weight * by_blue, weight * error)
-        store16(sums, to, load16(sums, to) + found)
+        store_lanes(sums, to, load16(sums, to) + found)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -203,7 +213,7 @@ def _fit_tile(tile, p, pairs, picture, met, place, slopes, xs, ys, sums):  # typ
     for block in range(16):
         left, top = column * TILE + block % 4 * BLOCK, row * TILE + block // 4 * BLOCK
         if left < width and top < height:
-            inside = mask_of(_pixels(left, top, width, height, xs, ys))
+            inside = mask16(_pixels(left, top, width, height, xs, ys))
             x, y = load16(pointer(xs), 0), load16(pointer(ys), 0)
             count = _blend(p, 1 << block, pairs.begin[tile], pairs.begin[tile + 1], pairs.gaussian, pairs.mask, x, y, inside, met, pointer(place))
             total += _residual(left, top, place, picture, slopes)

@@ -6,7 +6,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.packets.layout import ENDS, FLOATS, INTS, TILE_RAYS, WARPED
+from efficientnerf.backends.numba.tree.packets.layout import ENDS, FLOATS, INTS, LANES, TILE_RAYS, WARPED
 from efficientnerf.backends.numba.tree.packets.tiles import Outputs, Scene, TileScratch, render_tile
 from efficientnerf.backends.numba.tree.ray_batch import ray_pointers
 from efficientnerf.backends.numba.tree.view_colours import packed_pointers
@@ -77,11 +77,13 @@ def render_batch(  # type: ignore[no-untyped-def]
     height, width = opacity.shape
     cascades = len(packed.grids)
     floats, ints = np.zeros((threads, FLOATS), np.float32), np.zeros((threads, INTS), np.int32)
-    distances, warped, looking = np.zeros((threads, ENDS + 34 * cascades)), np.zeros((threads, WARPED)), np.zeros((threads, 3 * TILE_RAYS), np.float32)
+    clear = ENDS + 2 * LANES * cascades
+    distances, warped = np.zeros((threads, clear + 2 * cascades)), np.zeros((threads, WARPED))
+    looking = np.zeros((threads, 3 * TILE_RAYS), np.float32)
     for worker in numba.prange(threads):
         mine = distances[worker]
         scratch = TileScratch(
-            pointer(floats[worker]), pointer(ints[worker]), pointer(mine), pointer(mine[ENDS + 32 * cascades :]), pointer(mine[ENDS + 33 * cascades :]),
+            pointer(floats[worker]), pointer(ints[worker]), pointer(mine), pointer(mine[clear:]), pointer(mine[clear + cascades :]),
             pointer(warped[worker]), pointer(looking[worker]),
         )  # fmt: skip
         outputs = Outputs(width, pointer(colour), pointer(opacity), pointer(depth), pointer(normal), pointer(statistics), len(normal) > 0, len(statistics) > 0)

@@ -1,6 +1,6 @@
 """Constants of the marching of rays through trees, and the exponential that all kernels share (numba).
 
-Packed, interpolated trees are marched through by `packets.march`, sixteen rays at a time.
+Packed, interpolated trees are marched through by `packets.march`, packet by packet of rays.
 """
 
 from __future__ import annotations

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
-from efficientnerf.backends.numba.tree.packets.lanes import LANES
 from efficientnerf.backends.numba.tree.packets.rows import MOST_SIDE, fill_rows, order_voxels
 
 if TYPE_CHECKING:
@@ -217,7 +216,7 @@ def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     words = 1 if count <= MOST_BITS >> tree.brick + 2 else 2
     rows, voxel_of = np.empty((bricks, words * (tree.brick + 2) ** 2), np.int32), np.full(count + 1, -1, np.int32)
     widest = tree.brick * max(max(cascade.shape) for cascade in cascades_of(tree))
-    coordinates, first_voxel = np.zeros((3, count + LANES), np.uint16 if widest <= MOST_COORDINATES else np.int32), [0]
+    coordinates, first_voxel = np.zeros((3, count + 16), np.uint16 if widest <= MOST_COORDINATES else np.int32), [0]
     for cascade, ends in zip(cascades_of(tree), bricks_of(tree), strict=True):
         columns, each, voxel = cascade.shape[0] * cascade.shape[1], max(1, COLUMN_CELLS_PER_CALL // max(1, cascade.shape[2])), first_voxel[-1]
         for first in range(0, columns, each):

@@ -25,7 +25,7 @@ from efficientnerf.backends.numba.simd import (
     unpack4,
 )
 from efficientnerf.backends.numba.tree.packets.halves import store_halves4
-from efficientnerf.backends.numba.tree.packets.lanes import bits_of, broadcast16, load16, load_bytes8, sqrt16, to_float16
+from efficientnerf.backends.numba.tree.packets.lanes import bits_of, broadcast16, load16, load_bytes8, sqrt_lanes, to_floats
 from efficientnerf.backends.numba.tree.packets.layout import MOST_HARMONICS
 from efficientnerf.rendering import harmonics
 
@@ -227,14 +227,14 @@ def _colours(first, end, cascade, packed, direction, cone, density_scale, degree
     reach = np.float32(REACH * np.sqrt(d[0] * d[0] + d[4] * d[4] + d[8] * d[8]))
     ax, ay, az, cosine, sine = np.float32(cone[0]), np.float32(cone[1]), np.float32(cone[2]), np.float32(cone[3]), np.float32(cone[4])
     for begin in range(first, end, 16):
-        u, v, w = to_float16(load16(at, begin)), to_float16(load16(at, voxels + begin)), to_float16(load16(at, 2 * voxels + begin))
+        u, v, w = to_floats(load16(at, begin)), to_floats(load16(at, voxels + begin)), to_floats(load16(at, 2 * voxels + begin))
         x = u * np.float32(d[0]) + v * np.float32(d[1]) + w * np.float32(d[2]) + np.float32(x0)
         y = u * np.float32(d[4]) + v * np.float32(d[5]) + w * np.float32(d[6]) + np.float32(y0)
         z = u * np.float32(d[8]) + v * np.float32(d[9]) + w * np.float32(d[10]) + np.float32(z0)
-        length = sqrt16(x * x + y * y + z * z)
+        length = sqrt_lanes(x * x + y * y + z * z)
         along = x * ax + y * ay + z * az
         p, q, r = x - along * ax, y - along * ay, z - along * az
-        beside = sqrt16(p * p + q * q + r * r)
+        beside = sqrt_lanes(p * p + q * q + r * r)
         if bits_of(beside * cosine - along * sine > reach + length * ROUNDING) == ALL:
             continue
         inverse = broadcast16(_ONE) / length

@@ -20,7 +20,7 @@ import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
 from efficientnerf.backends.numba.simd import pointer
-from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, lowest_bit, store16
+from efficientnerf.backends.numba.tree.packets.lanes import broadcast16, load16, lowest_bit, store_lanes
 from efficientnerf.backends.numba.tree_training.cells import Cells, dense_densities, voxel_places
 from efficientnerf.backends.numba.tree_training.gradients import BIN_BITS, Records
 from efficientnerf.backends.numba.tree_training.hyperparameters import Hyperparameters
@@ -179,7 +179,7 @@ def _gather(number, p):  # type: ignore[no-untyped-def]
             total = multiply_add16(basis, channels_from(p.gradient, 4 * at, j), total)
             n = p.following[2 * n + 1]
         squares = multiply_add16(total, total, squares)
-        store16(p.row, j, total)
+        store_lanes(p.row, j, total)
     return by_density, np.float64(sum16(squares))
 
 

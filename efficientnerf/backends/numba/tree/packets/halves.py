@@ -11,7 +11,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from efficientnerf.backends.numba.simd import float32x4, float32x16, multiply_add
+from efficientnerf.backends.numba.simd import float32x4, float32x16, float32x32, multiply_add
+from efficientnerf.backends.numba.tree.packets.layout import LANES
 
 GREATEST = 65504.0  # of half floats that are finite
 _I16, _I32, _I64 = ir.IntType(16), ir.IntType(32), ir.IntType(64)
@@ -84,11 +85,11 @@ def _mix_two(builder: Any, weights: Any, voxels: Any, values: Any, lane: int) ->
 
     sums: list[Any] = [None, None]
     for n in range(4):
-        four = load(weights, ir.Constant(_I64, 32 * n + 2 * lane), _vector(ir.FloatType(), 4), 4)
+        four = load(weights, ir.Constant(_I64, 2 * LANES * n + 2 * lane), _vector(ir.FloatType(), 4), 4)
         weight = _shuffled(builder, four, four, [m // 4 for m in range(16)])
         pairs = []
         for m in range(2):
-            voxel = builder.sext(builder.load(builder.gep(voxels, [ir.Constant(_I64, 16 * n + lane + m)])), _I64)
+            voxel = builder.sext(builder.load(builder.gep(voxels, [ir.Constant(_I64, LANES * n + lane + m)])), _I64)
             pairs.append(load(values, builder.shl(voxel, ir.Constant(_I64, 2)), _vector(_I16, 8), 2))
         value, total = _widen(builder, _shuffled(builder, pairs[0], pairs[1], list(range(16)))), sums[n % 2]
         sums[n % 2] = builder.fmul(weight, value) if total is None else multiply_add(builder, weight, value, total)
@@ -96,23 +97,24 @@ def _mix_two(builder: Any, weights: Any, voxels: Any, values: Any, lane: int) ->
 
 
 @intrinsic
-def mix_pairs16(typing_context: Any, weights: Any, voxels: Any, values: Any) -> Any:
-    """Weighted sums of eight groups of four half floats for each of sixteen rays: of the first numbers of the groups, of the second and so on, as four vectors.
+def mix_pairs(typing_context: Any, weights: Any, voxels: Any, values: Any) -> Any:
+    """Weighted sums of eight groups of four half floats for each of LANES rays: of the first numbers of the groups, of the second and so on, as four vectors.
 
-    weights  (4, 16, 2) float32: of four pairs of neighbouring groups
-    voxels   (4, 16) int32: which group is the first of each pair
+    weights  (4, LANES, 2) float32: of four pairs of neighbouring groups
+    voxels   (4, LANES) int32: which group is the first of each pair
     values   groups of four uint16; all those that `voxels` says must exist
     """
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         fours = []
-        for lane in range(0, 16, 4):
+        for lane in range(0, LANES, 4):
             one, other = (_mix_two(builder, args[0], args[1], args[2], lane + m) for m in (0, 2))
             low, high = (_shuffled(builder, one, other, [8 * (m // 4) + m % 4 + at for m in range(16)]) for at in (0, 4))
             fours.append(builder.fadd(low, high))
-        low, high = (_shuffled(builder, fours[n], fours[n + 1], list(range(32))) for n in (0, 2))
-        whole = _shuffled(builder, low, high, list(range(64)))
-        return context.make_tuple(builder, signature.return_type, [_shuffled(builder, whole, whole, list(range(n, 64, 4))) for n in range(4)])
+        while len(fours) > 1:
+            fours = [_shuffled(builder, low, high, list(range(2 * low.type.count))) for low, high in zip(fours[::2], fours[1::2], strict=True)]
+        channels = [_shuffled(builder, fours[0], fours[0], list(range(n, 4 * LANES, 4))) for n in range(4)]
+        return context.make_tuple(builder, signature.return_type, channels)
 
-    result = types.UniTuple(float32x16, 4)
+    result = types.UniTuple(float32x32 if LANES == 32 else float32x16, 4)
     return result(types.CPointer(types.float32), types.CPointer(types.int32), types.CPointer(types.uint16)), codegen

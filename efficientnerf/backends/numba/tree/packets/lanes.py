@@ -1,6 +1,6 @@
-"""Sixteen float32, int32 or booleans in SIMD lanes, with operators: what `simd` has for four.
+"""Sixteen or thirty-two float32, int32 or booleans in SIMD lanes, with operators: what `simd` has for four.
 
-Operands may be scalars: they are in all lanes. Comparisons give a Bool16. A vector is wider than a register on processors without AVX-512; LLVM divides it.
+Operands may be scalars: they are in all lanes. Comparisons give booleans. A vector that is wider than a register, as thirty-two lanes always are, LLVM divides.
 """
 
 from __future__ import annotations
@@ -13,55 +13,53 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
-from efficientnerf.backends.numba.simd import Float32x16, broadcast_like, float32x16, splat, store
+from efficientnerf.backends.numba.simd import broadcast_like, float32x16, float32x32, splat, store
+from efficientnerf.backends.numba.tree.packets.layout import LANES
 
-LANES = 16
 _I32, _I64 = ir.IntType(32), ir.IntType(64)
-_FLOATS, _INTS, _BITS = (ir.VectorType(kind, LANES) for kind in (ir.FloatType(), _I32, ir.IntType(1)))
 
 
-class Int32x16(types.Type):
-    """Type of a vector of sixteen int32."""
-
-    def __init__(self) -> None:
-        super().__init__(name="SixteenInts")
+class _Ints(types.Type):
+    """Type of a vector of int32."""
 
 
-class Bool16(types.Type):
-    """Type of a vector of sixteen booleans."""
-
-    def __init__(self) -> None:
-        super().__init__(name="SixteenBits")
+class _Bits(types.Type):
+    """Type of a vector of booleans."""
 
 
-int32x16, bool16 = Int32x16(), Bool16()
+int32x16, bool16 = _Ints("SixteenInts"), _Bits("SixteenBits")
+int32x32, bool32 = _Ints("ThirtyTwoInts"), _Bits("ThirtyTwoBits")
+_FLOATS: dict[int, Any] = {16: float32x16, 32: float32x32}
+_INTS: dict[int, Any] = {16: int32x16, 32: int32x32}
+_BITS: dict[int, Any] = {16: bool16, 32: bool32}
+_COUNTS = {kind: count for family in (_FLOATS, _INTS, _BITS) for count, kind in family.items()}
 
 
-@register_model(Int32x16)
-class _Int32x16Model(models.PrimitiveModel):
+def _vector(kind: Any) -> Any:
+    """The LLVM type of a vector."""
+    element = ir.FloatType() if kind in _FLOATS.values() else _I32 if kind in _INTS.values() else ir.IntType(1)
+    return ir.VectorType(element, _COUNTS[kind])
+
+
+@register_model(_Ints)
+@register_model(_Bits)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _INTS)
+        super().__init__(manager, kind, _vector(kind))
 
 
-@register_model(Bool16)
-class _Bool16Model(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _BITS)
-
-
-def _spread(builder: Any, value: Any, kind: Any) -> Any:
+def _spread(builder: Any, value: Any, kind: Any, count: int) -> Any:
     """An operand as a vector."""
-    if isinstance(kind, (Float32x16, Int32x16, Bool16)):
+    if kind in _COUNTS:
         return value
     if isinstance(kind, types.Integer) and value.type != _I32:
         value = builder.trunc(value, _I32) if value.type.width > 32 else builder.sext(value, _I32)
-    return splat(builder, value, LANES)
+    return splat(builder, value, count)
 
 
 def _fits(kind: Any, vector: Any) -> bool:
     """Whether an operand may stand beside a vector."""
-    scalar = types.Integer if vector == int32x16 else types.Float if vector == float32x16 else ()
-    return kind == vector or (isinstance(kind, scalar) and (vector == int32x16 or kind == types.float32))
+    return kind == vector or (isinstance(kind, types.Integer) if vector in _INTS.values() else kind == types.float32 and vector in _FLOATS.values())
 
 
 def _overload_operator(operation: Any, vector: Any, result: Any, emit: Any) -> None:
@@ -70,7 +68,7 @@ def _overload_operator(operation: Any, vector: Any, result: Any, emit: Any) -> N
     @intrinsic
     def elementwise(typing_context: Any, a: Any, b: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return emit(builder, *(_spread(builder, arg, kind) for arg, kind in zip(args, signature.args, strict=True)))
+            return emit(builder, *(_spread(builder, arg, kind, _COUNTS[vector]) for arg, kind in zip(args, signature.args, strict=True)))
 
         return result(a, b), codegen
 
@@ -82,110 +80,130 @@ def _overload_operator(operation: Any, vector: Any, result: Any, emit: Any) -> N
 
 
 _ORDERS = {operator.lt: "<", operator.le: "<=", operator.gt: ">", operator.ge: ">=", operator.eq: "==", operator.ne: "!="}
-for _operation, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
-    _overload_operator(_operation, float32x16, float32x16, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
-for _operation, _name in (
-    (operator.add, "add"), (operator.sub, "sub"), (operator.mul, "mul"), (operator.and_, "and_"), (operator.or_, "or_"), (operator.rshift, "lshr"),
-    (operator.lshift, "shl"),
-):  # fmt: skip
-    _overload_operator(_operation, int32x16, int32x16, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
-for _operation, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
-    _overload_operator(_operation, bool16, bool16, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
-for _operation, _order in _ORDERS.items():
-    _overload_operator(_operation, float32x16, bool16, lambda builder, a, b, order=_order: builder.fcmp_ordered(order, a, b))
-    _overload_operator(_operation, int32x16, bool16, lambda builder, a, b, order=_order: builder.icmp_signed(order, a, b))
+for _float, _int, _bool in zip(_FLOATS.values(), _INTS.values(), _BITS.values(), strict=True):
+    for _operation, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
+        _overload_operator(_operation, _float, _float, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
+    for _operation, _name in (
+        (operator.add, "add"), (operator.sub, "sub"), (operator.mul, "mul"), (operator.and_, "and_"), (operator.or_, "or_"), (operator.rshift, "lshr"),
+        (operator.lshift, "shl"),
+    ):  # fmt: skip
+        _overload_operator(_operation, _int, _int, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
+    for _operation, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
+        _overload_operator(_operation, _bool, _bool, lambda builder, a, b, name=_name: getattr(builder, name)(a, b))
+    for _operation, _order in _ORDERS.items():
+        _overload_operator(_operation, _float, _bool, lambda builder, a, b, order=_order: builder.fcmp_ordered(order, a, b))
+        _overload_operator(_operation, _int, _bool, lambda builder, a, b, order=_order: builder.icmp_signed(order, a, b))
 
 
 @intrinsic
 def _inverted(typing_context: Any, mask: Any) -> Any:
-    return bool16(bool16), lambda context, builder, signature, args: builder.not_(args[0])
+    return mask(mask), lambda context, builder, signature, args: builder.not_(args[0])
 
 
 @overload(operator.invert)
 def _invert(mask):  # type: ignore[no-untyped-def]
-    return (lambda mask: _inverted(mask)) if mask == bool16 else None
+    return (lambda mask: _inverted(mask)) if mask in _BITS.values() else None
 
 
 @intrinsic
-def select16(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
+def select_lanes(typing_context: Any, mask: Any, a: Any, b: Any) -> Any:
     """a where the mask is set, else b; of float32, int32 or booleans, one of which may be a scalar."""
-    vector = next(kind for kind in (a, b) if kind in (float32x16, int32x16, bool16))
+    vector = next(kind for kind in (a, b) if kind in _COUNTS)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kinds = signature.args
-        return builder.select(args[0], _spread(builder, args[1], kinds[1]), _spread(builder, args[2], kinds[2]))
+        kinds, count = signature.args, _COUNTS[vector]
+        return builder.select(args[0], _spread(builder, args[1], kinds[1], count), _spread(builder, args[2], kinds[2], count))
 
-    return vector(bool16, a, b), codegen
+    return vector(mask, a, b), codegen
+
+
+def _call(builder: Any, name: str, value: Any) -> Any:
+    """An LLVM intrinsic of a vector."""
+    kind = value.type
+    letter = "f" if kind.element == ir.FloatType() else "i"
+    return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.v{kind.count}{letter}32", (), ir.FunctionType(kind, [kind])), [value])
 
 
 def _unary(name: str) -> Any:
-    """An LLVM intrinsic of a Float32x16."""
+    """An intrinsic of a vector of float32."""
 
     @intrinsic
     def elementwise(typing_context: Any, value: Any) -> Any:
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            function = builder.module.declare_intrinsic(f"llvm.{name}.v16f32", (), ir.FunctionType(_FLOATS, [_FLOATS]))
-            return builder.call(function, [args[0]])
-
-        return float32x16(float32x16), codegen
+        return value(value), lambda context, builder, signature, args: _call(builder, name, args[0])
 
     return elementwise
 
 
-floor16, ceil16, abs16, sqrt16 = _unary("floor"), _unary("ceil"), _unary("fabs"), _unary("sqrt")
+floor_lanes, ceil_lanes, abs_lanes, sqrt_lanes = _unary("floor"), _unary("ceil"), _unary("fabs"), _unary("sqrt")
+
+
+def _chosen(order: str) -> Any:
+    """An intrinsic of two vectors of float32, or of one and a scalar: of each lane the first if it stands in this order to the second."""
+
+    @intrinsic
+    def elementwise(typing_context: Any, a: Any, b: Any) -> Any:
+        vector = a if a in _COUNTS else b
+
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            left, right = (_spread(builder, arg, kind, _COUNTS[vector]) for arg, kind in zip(args, signature.args, strict=True))
+            return builder.select(builder.fcmp_ordered(order, left, right), left, right)
+
+        return vector(a, b), codegen
+
+    return elementwise
+
+
+min_lanes, max_lanes = _chosen("<"), _chosen(">")  # the second where either is no number
+
+
+def _broadcast(count: int) -> Any:
+    """An intrinsic: a scalar, float32 or an integer, in so many lanes."""
+
+    @intrinsic
+    def broadcast(typing_context: Any, value: Any) -> Any:
+        vector = (_INTS if isinstance(value, types.Integer) else _FLOATS)[count]
+        return vector(value), lambda context, builder, signature, args: _spread(builder, args[0], signature.args[0], count)
+
+    return broadcast
+
+
+broadcast16, broadcast32 = _broadcast(16), _broadcast(32)
 
 
 @intrinsic
-def min16(typing_context: Any, a: Any, b: Any) -> Any:
-    """The lesser; b where either is no number."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        left, right = (_spread(builder, arg, kind) for arg, kind in zip(args, signature.args, strict=True))
-        return builder.select(builder.fcmp_ordered("<", left, right), left, right)
-
-    return float32x16(a, b), codegen
+def to_ints(typing_context: Any, value: Any) -> Any:
+    """Float32 to int32, truncated."""
+    vector = _INTS[_COUNTS[value]]
+    return vector(value), lambda context, builder, signature, args: builder.fptosi(args[0], _vector(vector))
 
 
 @intrinsic
-def max16(typing_context: Any, a: Any, b: Any) -> Any:
-    """The greater; b where either is no number."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        left, right = (_spread(builder, arg, kind) for arg, kind in zip(args, signature.args, strict=True))
-        return builder.select(builder.fcmp_ordered(">", left, right), left, right)
-
-    return float32x16(a, b), codegen
-
-
-@intrinsic
-def broadcast16(typing_context: Any, value: Any) -> Any:
-    """A scalar, float32 or an integer, in all lanes."""
-    vector = int32x16 if isinstance(value, types.Integer) else float32x16
-    return vector(value), lambda context, builder, signature, args: _spread(builder, args[0], signature.args[0])
-
-
-@intrinsic
-def to_int16(typing_context: Any, value: Any) -> Any:
-    """Float32x16 to Int32x16, truncated."""
-    return int32x16(float32x16), lambda context, builder, signature, args: builder.fptosi(args[0], _INTS)
-
-
-@intrinsic
-def to_float16(typing_context: Any, value: Any) -> Any:
-    """Int32x16 to Float32x16."""
-    return float32x16(int32x16), lambda context, builder, signature, args: builder.sitofp(args[0], _FLOATS)
+def to_floats(typing_context: Any, value: Any) -> Any:
+    """Int32 to float32."""
+    vector = _FLOATS[_COUNTS[value]]
+    return vector(value), lambda context, builder, signature, args: builder.sitofp(args[0], _vector(vector))
 
 
 @intrinsic
 def bits_of(typing_context: Any, mask: Any) -> Any:
-    """A Bool16 as an int64, lane 0 the lowest bit."""
-    return types.int64(bool16), lambda context, builder, signature, args: builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), _I64)
+    """Booleans as an int64, lane 0 the lowest bit."""
+    return types.int64(mask), lambda context, builder, signature, args: builder.zext(builder.bitcast(args[0], ir.IntType(_COUNTS[mask])), _I64)
 
 
-@intrinsic
-def mask_of(typing_context: Any, bits: Any) -> Any:
-    """A Bool16 of the lowest 16 bits of an int64."""
-    return bool16(types.int64), lambda context, builder, signature, args: builder.bitcast(builder.trunc(args[0], ir.IntType(LANES)), _BITS)
+def _mask(count: int) -> Any:
+    """An intrinsic: booleans of so many lowest bits of an int64."""
+
+    @intrinsic
+    def mask(typing_context: Any, bits: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return builder.bitcast(builder.trunc(args[0], ir.IntType(count)), _vector(_BITS[count]))
+
+        return _BITS[count](types.int64), codegen
+
+    return mask
+
+
+mask16, mask32 = _mask(16), _mask(32)
 
 
 @intrinsic
@@ -194,17 +212,25 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
     return types.int64(types.int64), lambda context, builder, signature, args: builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
 
 
-@intrinsic
-def load16(typing_context: Any, address: Any, index: Any) -> Any:
-    """p[index : index + 16] of a pointer to float32, or to int32 or uint16 as an Int32x16."""
-    vector, kind = (float32x16, _FLOATS) if address.dtype == types.float32 else (int32x16, _INTS)
-    held, align = (ir.VectorType(ir.IntType(16), LANES), 2) if address.dtype == types.uint16 else (kind, 4)
+def _load(count: int) -> Any:
+    """An intrinsic: p[index : index + count] of a pointer to float32, or to int32 or uint16 as int32."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), held.as_pointer()), align=align)
-        return value if held is kind else builder.zext(value, kind)
+    @intrinsic
+    def load(typing_context: Any, address: Any, index: Any) -> Any:
+        vector = (_FLOATS if address.dtype == types.float32 else _INTS)[count]
+        kind = _vector(vector)
+        held, align = (ir.VectorType(ir.IntType(16), count), 2) if address.dtype == types.uint16 else (kind, 4)
 
-    return vector(address, types.int64), codegen
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            value = builder.load(builder.bitcast(builder.gep(args[0], [args[1]]), held.as_pointer()), align=align)
+            return value if held is kind else builder.zext(value, kind)
+
+        return vector(address, types.int64), codegen
+
+    return load
+
+
+load16, load32 = _load(16), _load(32)
 
 
 @intrinsic
@@ -219,12 +245,11 @@ def load_bytes8(typing_context: Any, address: Any, index: Any) -> Any:
 
 
 @intrinsic
-def store16(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
-    """p[index : index + 16] = value for a pointer to float32 or int32."""
-    kind = _INTS if address.dtype == types.int32 else _FLOATS
+def store_lanes(typing_context: Any, address: Any, index: Any, value: Any) -> Any:
+    """p[index : index + 16 or 32] = value for a pointer to float32 or int32."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], builder.bitcast(builder.gep(args[0], [args[1]]), kind.as_pointer()), align=4)
+        builder.store(args[2], builder.bitcast(builder.gep(args[0], [args[1]]), _vector(value).as_pointer()), align=4)
         return context.get_dummy_value()
 
     return types.void(address, types.int64, value), codegen
@@ -249,35 +274,32 @@ def prefetch(typing_context: Any, address: Any, index: Any) -> Any:
 
 
 @intrinsic
-def popcount16(typing_context: Any, bits: Any) -> Any:
-    """Number of set bits of each lane of an Int32x16."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.call(builder.module.declare_intrinsic("llvm.ctpop.v16i32", (), ir.FunctionType(_INTS, [_INTS])), [args[0]])
-
-    return int32x16(int32x16), codegen
+def popcount_lanes(typing_context: Any, bits: Any) -> Any:
+    """Number of set bits of each lane of int32."""
+    return bits(bits), lambda context, builder, signature, args: _call(builder, "ctpop", args[0])
 
 
 @intrinsic
-def gather16(typing_context: Any, address: Any, index: Any) -> Any:
-    """The elements of a pointer that an Int32x16 says, all of which must exist: float32 as Float32x16, int32 and uint8 as Int32x16."""
-    vector, kind = (float32x16, _FLOATS) if address.dtype == types.float32 else (int32x16, _INTS)
+def gather_lanes(typing_context: Any, address: Any, index: Any) -> Any:
+    """The elements of a pointer that a vector of int32 says, all of which must exist: float32 as such, int32 and uint8 as int32."""
+    count = _COUNTS[index]
+    vector = (_FLOATS if address.dtype == types.float32 else _INTS)[count]
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        out = ir.Constant(kind, ir.Undefined)
-        for n in range(LANES):
-            lane = ir.Constant(_I32, n)
+        out = ir.Constant(_vector(vector), ir.Undefined)
+        for n in range(count):
+            lane = ir.Constant(_I64, n)
             value = builder.load(builder.gep(args[0], [builder.sext(builder.extract_element(args[1], lane), _I64)]))
             out = builder.insert_element(out, builder.zext(value, _I32) if address.dtype == types.uint8 else value, lane)
         return out
 
-    return vector(address, int32x16), codegen
+    return vector(address, index), codegen
 
 
 @intrinsic
-def channels16(typing_context: Any, address: Any, index: Any) -> Any:
-    """Sixteen groups of four float32 or int32 from p[index] on: the first of each, the second, the third and the fourth, as four vectors."""
-    vector, element = (int32x16, _I32) if address.dtype == types.int32 else (float32x16, ir.FloatType())
+def channels(typing_context: Any, address: Any, index: Any) -> Any:
+    """LANES groups of four float32 or int32 from p[index] on: the first of each, the second, the third and the fourth, as four vectors."""
+    vector, element = (_INTS[LANES], _I32) if address.dtype == types.int32 else (_FLOATS[LANES], ir.FloatType())
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         kind = ir.VectorType(element, 4 * LANES)
@@ -289,7 +311,7 @@ def channels16(typing_context: Any, address: Any, index: Any) -> Any:
 
 
 def _gather_groups(size: int) -> Any:
-    """An intrinsic: groups of so many int32 from p[q[at]] on, from p[q[at + 1]] on, and so on for sixteen; the first of each, the second, ... as vectors."""
+    """An intrinsic: groups of so many int32 from p[q[at]] on, from p[q[at + 1]] on, and so on for LANES; the first of each, the second, ... as vectors."""
 
     @intrinsic
     def gather(typing_context: Any, address: Any, places: Any, at: Any) -> Any:
@@ -306,20 +328,20 @@ def _gather_groups(size: int) -> Any:
             lanes = [ir.Constant(ir.VectorType(_I32, LANES), list(range(n, size * LANES, size))) for n in range(size)]
             return context.make_tuple(builder, signature.return_type, [builder.shuffle_vector(parts[0], parts[0], each) for each in lanes])
 
-        return types.UniTuple(int32x16, size)(types.CPointer(types.int32), types.CPointer(types.int32), types.int64), codegen
+        return types.UniTuple(_INTS[LANES], size)(types.CPointer(types.int32), types.CPointer(types.int32), types.int64), codegen
 
     return gather
 
 
-gather_pairs16, gather_fours16 = _gather_groups(2), _gather_groups(4)
+gather_pairs, gather_fours = _gather_groups(2), _gather_groups(4)
 
 
 @intrinsic
 def prefetch_groups(typing_context: Any, address: Any, places: Any) -> Any:
-    """`prefetch` of p[4 n] for each n of 64 int32."""
+    """`prefetch` of p[4 n] for each n of 4 LANES int32."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        for n in range(64):
+        for n in range(4 * LANES):
             place = builder.sext(builder.load(builder.gep(args[1], [ir.Constant(_I64, n)])), _I64)
             _prefetch(builder, builder.gep(args[0], [builder.shl(place, ir.Constant(_I64, 2))]))
         return context.get_dummy_value()
@@ -328,8 +350,8 @@ def prefetch_groups(typing_context: Any, address: Any, places: Any) -> Any:
 
 
 @intrinsic
-def store_pairs16(typing_context: Any, address: Any, index: Any, a: Any, b: Any) -> Any:
-    """p[index : index + 32] = a[0], b[0], a[1], b[1], ... for a pointer to float32."""
+def store_pairs(typing_context: Any, address: Any, index: Any, a: Any, b: Any) -> Any:
+    """p[index : index + 2 LANES] = a[0], b[0], a[1], b[1], ... for a pointer to float32."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         order = [LANES * (n % 2) + n // 2 for n in range(2 * LANES)]
@@ -337,12 +359,12 @@ def store_pairs16(typing_context: Any, address: Any, index: Any, a: Any, b: Any)
         builder.store(whole, builder.bitcast(builder.gep(args[0], [args[1]]), whole.type.as_pointer()), align=4)
         return context.get_dummy_value()
 
-    return types.void(types.CPointer(types.float32), types.int64, float32x16, float32x16), codegen
+    return types.void(types.CPointer(types.float32), types.int64, _FLOATS[LANES], _FLOATS[LANES]), codegen
 
 
 @intrinsic
-def store_channels16(typing_context: Any, address: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """The reverse of `channels16`."""
+def store_channels(typing_context: Any, address: Any, index: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """The reverse of `channels`."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         def joined(left: Any, right: Any) -> Any:
@@ -359,21 +381,25 @@ def store_channels16(typing_context: Any, address: Any, index: Any, a: Any, b: A
 
 @overload(store)
 def _store(out, n, value):  # type: ignore[no-untyped-def]
-    return (lambda out, n, value: store16(out, 16 * n, value)) if value == float32x16 else None
+    if value == float32x16:
+        return lambda out, n, value: store_lanes(out, 16 * n, value)
+    return (lambda out, n, value: store_lanes(out, 32 * n, value)) if value == float32x32 else None
 
 
 @overload(broadcast_like)
 def _broadcast_like(value, other):  # type: ignore[no-untyped-def]
-    return (lambda value, other: broadcast16(value)) if other == float32x16 else None
+    if other == float32x16:
+        return lambda value, other: broadcast16(value)
+    return (lambda value, other: broadcast32(value)) if other == float32x32 else None
 
 
 @intrinsic
-def exp2_neg16(typing_context: Any, value: Any) -> Any:
-    """2^-x of a Float32x16 for x >= 0: `simd.exp2_neg4`."""
+def exp2_neg_lanes(typing_context: Any, value: Any) -> Any:
+    """2^-x of float32 x >= 0: `simd.exp2_neg4`."""
     from efficientnerf.backends.numba.simd import _constant, _exp2
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        bound = _constant(_FLOATS, 126)
+        bound = _constant(_vector(value), 126)
         return _exp2(builder, builder.select(builder.fcmp_ordered(">", args[0], bound), bound, args[0]), 127)
 
-    return float32x16(float32x16), codegen
+    return value(value), codegen

@@ -1,10 +1,10 @@
-"""Where the numbers of sixteen rays lie in the scratch of a thread: sixteen of each, one a ray.
+"""Where the numbers of a packet of rays lie in the scratch of a thread: LANES of each, one a ray.
 
 Floats: where a ray's part in a cascade begins, its direction, the first sample and the one after the last; what it met, see below; the place where it lost half
-of its light; what comes out of the voxels around a sample, (16, 4); the direction that harmonics are evaluated along, and their values, (K, 16); colours of
-some voxels along each ray, (CACHED, 16, 4); two batches of a sample of each ray: the distance, the sum of the weights of the voxels that are stored, and the
-weights, (4, 16, 2), two of each row. Integers: the brick that a ray is in, and its sample's first row; whether the harmonics are evaluated; which voxels have
-those colours, -1 for none; of each batch the first voxel of each row, (4, 16).
+of its light; what comes out of the voxels around a sample, (LANES, 4); the direction that harmonics are evaluated along, and their values, (K, LANES);
+colours of some voxels along each ray, (CACHED, LANES, 4); two batches of a sample of each ray: the distance, the sum of the weights of the voxels that are
+stored, and the weights, (4, LANES, 2), two of each row. Integers: the brick that a ray is in, and its sample's first row; whether the harmonics are evaluated;
+which voxels have those colours, -1 for none; of each batch the first voxel of each row, (4, LANES).
 
 State: transmittance; colour; distance at which the transmittance fell to one half; weight of samples near the camera without a colour yet, and that of the next
 colour; counts of coarse cells visited, of samples tested, of samples interpolated and of colours looked up; depth and normal.
@@ -12,27 +12,30 @@ colour; counts of coarse cells visited, of samples tested, of samples interpolat
 
 from __future__ import annotations
 
-ENTRY_X, ENTRY_Y, ENTRY_Z, ALONG_X, ALONG_Y, ALONG_Z, FIRST, LAST = range(0, 128, 16)
-TRANSMITTANCE, RED, GREEN, BLUE, HALF_DISTANCE, PENDING_WEIGHT, GAIN = range(128, 240, 16)
-VISITED, TESTED, INTERPOLATED, LOOKUPS, DEPTH, NORMAL_X, NORMAL_Y, NORMAL_Z = range(240, 368, 16)
-X, Y, Z = range(368, 416, 16)
-SAMPLE, SH_X, SH_Y, SH_Z, BASIS = 416, 480, 496, 512, 528
+LANES = 32  # rays of a packet; docs/experiments/renderer.md
+ENTRY_X, ENTRY_Y, ENTRY_Z, ALONG_X, ALONG_Y, ALONG_Z, FIRST, LAST = range(0, 8 * LANES, LANES)
+TRANSMITTANCE, RED, GREEN, BLUE, HALF_DISTANCE, PENDING_WEIGHT, GAIN = range(8 * LANES, 15 * LANES, LANES)
+VISITED, TESTED, INTERPOLATED, LOOKUPS, DEPTH, NORMAL_X, NORMAL_Y, NORMAL_Z = range(15 * LANES, 23 * LANES, LANES)
+X, Y, Z = range(23 * LANES, 26 * LANES, LANES)
+SAMPLE = 26 * LANES
+SH_X, SH_Y, SH_Z, BASIS = range(30 * LANES, 34 * LANES, LANES)
 MOST_HARMONICS = 25
 CACHED_BITS = 7
-CACHED = 1 << CACHED_BITS  # colours of voxels near the camera that sixteen rays share
-COLOURS = BASIS + 16 * MOST_HARMONICS
-DISTANCE, TOTAL, WEIGHT = 0, 16, 32
-BATCH_FLOATS = 160
-BATCHES = COLOURS + 64 * CACHED
+CACHED = 1 << CACHED_BITS  # colours of voxels near the camera that the rays of a packet share
+COLOURS = BASIS + MOST_HARMONICS * LANES
+DISTANCE, TOTAL, WEIGHT = range(0, 3 * LANES, LANES)
+BATCH_FLOATS = 10 * LANES
+BATCHES = COLOURS + 4 * LANES * CACHED
 FLOATS = BATCHES + 2 * BATCH_FLOATS
 
-OWNER, ROW, HAS_BASIS = 0, 16, 32
-CACHE = 48
+OWNER, ROW, HAS_BASIS = 0, LANES, 2 * LANES
+CACHE = 3 * LANES
 BATCHES_OF_VOXELS = CACHE + CACHED
-BATCH_VOXELS = 64
+BATCH_VOXELS = 4 * LANES
 INTS = BATCHES_OF_VOXELS + 2 * BATCH_VOXELS
 
-ORIGIN, DIRECTION, COSINE, BEGIN, ENDS = 0, 48, 96, 112, 128  # float64: x, y, z of sixteen, and so on; then by cascade where they enter and leave it
+# float64: x, y, z of all rays, and so on; then by cascade where they enter and leave it
+ORIGIN, DIRECTION, COSINE, BEGIN, ENDS = 0, 3 * LANES, 6 * LANES, 7 * LANES, 8 * LANES
 
 # The rays of a tile that are warped into normalised device coordinates, float64: origins and directions (n, 3), and what leads back: begin, ds_dt, dlogz_dt of
 # `efficientnerf.geometry.ndc.NdcRays`, cosine to the view axis. Beside them their directions in the world, float32.

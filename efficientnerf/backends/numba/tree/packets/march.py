@@ -1,4 +1,4 @@
-"""Marching of sixteen rays, one a lane, through a cascade of a packed, interpolated tree (numba).
+"""Marching of a packet of rays, one a lane, through a cascade of a packed, interpolated tree (numba).
 
 Each ray goes on to its next sample of which one of the eight voxels has density; when half of them are at one, or have none left, the voxels around these are
 looked up together. Were all waited for, the gaps between surfaces that rays cross would be crossed one after the other. They are composited when the next are
@@ -16,22 +16,22 @@ from efficientnerf.backends.numba.simd import advanced, popcount
 from efficientnerf.backends.numba.tree.march import PARALLEL, SKIP_MARGIN
 from efficientnerf.backends.numba.tree.packets.composite import blend, locate
 from efficientnerf.backends.numba.tree.packets.lanes import (
-    abs16,
+    abs_lanes,
     bits_of,
-    broadcast16,
-    ceil16,
-    floor16,
-    gather16,
-    load16,
+    broadcast32,
+    ceil_lanes,
+    floor_lanes,
+    gather_lanes,
+    load32,
     lowest_bit,
-    mask_of,
-    max16,
-    min16,
+    mask32,
+    max_lanes,
+    min_lanes,
     prefetch,
-    select16,
-    store16,
-    to_float16,
-    to_int16,
+    select_lanes,
+    store_lanes,
+    to_floats,
+    to_ints,
 )
 from efficientnerf.backends.numba.tree.packets.layout import (
     ALONG_X,
@@ -63,10 +63,10 @@ def _axis(d):  # type: ignore[no-untyped-def]
 
     Along an axis that a ray hardly moves on it never does; 1 / dx would be infinite, zero times that no number, and the ray would stay where it is.
     """
-    moves, ahead = abs16(d) >= PARALLEL, d > _NONE
+    moves, ahead = abs_lanes(d) >= PARALLEL, d > _NONE
     return (
-        select16(moves, _ONE / d, _NONE), select16(moves, broadcast16(_NONE), _FAR), select16(ahead, broadcast16(_ONE), -_ONE),
-        select16(ahead, broadcast16(_NONE), _ONE),
+        select_lanes(moves, _ONE / d, _NONE), select_lanes(moves, broadcast32(_NONE), _FAR), select_lanes(ahead, broadcast32(_ONE), -_ONE),
+        select_lanes(ahead, broadcast32(_NONE), _ONE),
     )  # fmt: skip
 
 
@@ -96,14 +96,14 @@ def _prefetch_rows(lanes, grid, ints):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped-def]
-    """Adds the samples FIRST <= k < LAST of sixteen rays' parts in a cascade to their states, see `layout`; both below 2^24. The half distance is one from the
+    """Adds the samples FIRST <= k < LAST of a packet's parts in a cascade to their states, see `layout`; both below 2^24. The half distance is one from the
     entry, voxels.
 
     shared  whether rays beside each other are neighbours
     view    see `View`; its density scale is the step, in units of the frame, times log2(e)
     """
-    ex, ey, ez = load16(floats, ENTRY_X), load16(floats, ENTRY_Y), load16(floats, ENTRY_Z)
-    dx, dy, dz = load16(floats, ALONG_X), load16(floats, ALONG_Y), load16(floats, ALONG_Z)
+    ex, ey, ez = load32(floats, ENTRY_X), load32(floats, ENTRY_Y), load32(floats, ENTRY_Z)
+    dx, dy, dz = load32(floats, ALONG_X), load32(floats, ALONG_Y), load32(floats, ALONG_Z)
     side, words = grid.brick + 2, 2 * grid.mask_words
     width, per_brick = np.float32(grid.brick), np.float32(1 / grid.brick)
     row, layer = np.float32(side), np.float32(side * side)
@@ -114,53 +114,53 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
     most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)
     some_near = view.min_distance > -np.inf
     # Integers are kept as float32: conversions would lengthen the dependency chain from step to step.
-    k, last = load16(floats, FIRST), load16(floats, LAST)
-    until, owner, visited, tested = k, broadcast16(np.int32(0)), broadcast16(_NONE), broadcast16(_NONE)
-    bx = by = bz = px = py = pz = distance = broadcast16(_NONE)
+    k, last = load32(floats, FIRST), load32(floats, LAST)
+    until, owner, visited, tested = k, broadcast32(np.int32(0)), broadcast32(_NONE), broadcast32(_NONE)
+    bx = by = bz = px = py = pz = distance = broadcast32(_NONE)
     going, ready, close = bits_of(k < last), np.int64(0), np.int64(0)
     pending, near, at = np.int64(0), np.int64(0), 0  # the batch before, whose colours have been asked for; which of them are near the camera
     batches, voxels = advanced(floats, BATCHES), advanced(ints, BATCHES_OF_VOXELS)
     while going != 0:
-        lanes = mask_of(going)
+        lanes = mask32(going)
         enters = lanes & (k >= until)
         entering = bits_of(enters)
         if entering != 0:
             s = (k + _HALF) * step
-            a = min16(max16(floor16((ex + s * dx) * per_brick), _NONE), most_x)
-            e = min16(max16(floor16((ey + s * dy) * per_brick), _NONE), most_y)
-            c = min16(max16(floor16((ez + s * dz) * per_brick), _NONE), most_z)
-            cell = select16(enters, (to_int16(a) * grid.ny + to_int16(e)) * grid.nz + to_int16(c), 0)
-            leap = gather16(grid.leap, cell)
-            visited = visited + select16(enters, broadcast16(_ONE), _NONE)
+            a = min_lanes(max_lanes(floor_lanes((ex + s * dx) * per_brick), _NONE), most_x)
+            e = min_lanes(max_lanes(floor_lanes((ey + s * dy) * per_brick), _NONE), most_y)
+            c = min_lanes(max_lanes(floor_lanes((ez + s * dz) * per_brick), _NONE), most_z)
+            cell = select_lanes(enters, (to_ints(a) * grid.ny + to_ints(e)) * grid.nz + to_ints(c), 0)
+            leap = gather_lanes(grid.leap, cell)
+            visited = visited + select_lanes(enters, broadcast32(_ONE), _NONE)
             # A ray leaves the cell, or the empty cube of cells around it, at the nearest of three faces.
-            far = max16(to_float16(leap), _ONE)
+            far = max_lanes(to_floats(leap), _ONE)
             tx = ((a + beside_x + far * ahead_x) * width - ex) * slope_x + never_x
             ty = ((e + beside_y + far * ahead_y) * width - ey) * slope_y + never_y
             tz = ((c + beside_z + far * ahead_z) * width - ez) * slope_z + never_z
-            then = min16(max16(ceil16(min16(tx, min16(ty, tz)) * per_step - _SKIP), k + _ONE), last)
+            then = min_lanes(max_lanes(ceil_lanes(min_lanes(tx, min_lanes(ty, tz)) * per_step - _SKIP), k + _ONE), last)
             full = enters & (leap == 0)
-            until = select16(enters, then, until)
-            k = select16(enters & (leap > 0), then, k)
+            until = select_lanes(enters, then, until)
+            k = select_lanes(enters & (leap > 0), then, k)
             filled = bits_of(full)
             if filled != 0:
-                owner = select16(full, gather16(grid.brick_index, select16(full, cell, 0)), owner)
-                store16(ints, OWNER, owner)
+                owner = select_lanes(full, gather_lanes(grid.brick_index, select_lanes(full, cell, 0)), owner)
+                store_lanes(ints, OWNER, owner)
                 _prefetch_rows(filled, grid, ints)
-                bx = select16(full, ex - a * width + _HALF, bx)
-                by = select16(full, ey - e * width + _HALF, by)
-                bz = select16(full, ez - c * width + _HALF, bz)
+                bx = select_lanes(full, ex - a * width + _HALF, bx)
+                by = select_lanes(full, ey - e * width + _HALF, by)
+                bz = select_lanes(full, ez - c * width + _HALF, bz)
                 if some_near:
                     close = (close & ~filled) | (filled & bits_of(_near(a, e, c, grid, view)))
         inside = lanes & (k < until)
         if bits_of(inside) != 0:
             s = (k + _HALF) * step
             x, y, z = bx + s * dx, by + s * dy, bz + s * dz
-            voxel = to_int16(floor16(x) * layer + floor16(y) * row + floor16(z))
-            word = gather16(grid.has_density, select16(inside, owner * words + (voxel >> 5), 0))
+            voxel = to_ints(floor_lanes(x) * layer + floor_lanes(y) * row + floor_lanes(z))
+            word = gather_lanes(grid.has_density, select_lanes(inside, owner * words + (voxel >> 5), 0))
             found = inside & ((word >> (voxel & 31)) & 1 != 0)
-            tested = tested + select16(inside, broadcast16(_ONE), _NONE)
-            k = select16(inside, k + _ONE, k)
-            px, py, pz, distance = select16(found, x, px), select16(found, y, py), select16(found, z, pz), select16(found, s, distance)
+            tested = tested + select_lanes(inside, broadcast32(_ONE), _NONE)
+            k = select_lanes(inside, k + _ONE, k)
+            px, py, pz, distance = select_lanes(found, x, px), select_lanes(found, y, py), select_lanes(found, z, pz), select_lanes(found, s, distance)
             ready |= bits_of(found)
         going = bits_of(k < last) & ~ready & going
         if ready != 0 and popcount(ready) >= popcount(going):
@@ -176,5 +176,5 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
         at = 1 - at
         batch, of_batch = advanced(batches, BATCH_FLOATS * at), advanced(voxels, BATCH_VOXELS * at)
         blend(pending, pending & near, shared, grid, view, colours, floats, ints, batch, of_batch)
-    store16(floats, VISITED, load16(floats, VISITED) + visited)
-    store16(floats, TESTED, load16(floats, TESTED) + tested)
+    store_lanes(floats, VISITED, load32(floats, VISITED) + visited)
+    store_lanes(floats, TESTED, load32(floats, TESTED) + tested)

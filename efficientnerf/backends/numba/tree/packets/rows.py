@@ -90,13 +90,3 @@ def fill_rows(first, end, cells, brick, brick_index, begin, stored, rows):  # ty
                             rows[owner, at] = np.int32(voxel << side | mask)
                         else:
                             rows[owner, 2 * at], rows[owner, 2 * at + 1] = voxel, mask
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def row_at(n, grid):  # type: ignore[no-untyped-def]
-    """First voxel and mask of a row, numbered over all bricks."""
-    side = grid.brick + 2
-    if grid.narrow:
-        word = np.int64(grid.rows[n]) & 0xFFFFFFFF
-        return word >> side, word & ((np.int64(1) << side) - 1)
-    return np.int64(grid.rows[2 * n]), np.int64(grid.rows[2 * n + 1])

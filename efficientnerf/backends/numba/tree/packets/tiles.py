@@ -1,4 +1,4 @@
-"""Tiles of an image, rendered sixteen rays at a time (numba): where rays begin and end in each cascade, and what they bring back."""
+"""Tiles of an image, rendered packet by packet of rays (numba): where rays begin and end in each cascade, and what they bring back."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from efficientnerf.backends.numba.tree.packets.layout import (
     HALF_DISTANCE,
     HAS_BASIS,
     INTERPOLATED,
+    LANES,
     LAST,
     LOOKUPS,
     NORMAL_X,
@@ -49,7 +50,6 @@ from efficientnerf.backends.numba.tree.ray_batch import clear_distance, in_casca
 from efficientnerf.backends.numba.tree.view_colours import PackedPointers, View
 from efficientnerf.backends.numba.tree.walk import most_samples
 
-PACKET = 16  # rays that are traced together: a subdivision of a tile, at most as many columns as it has
 INTERPOLATION, LOOKUP = 8, 32  # work of a sample interpolated and of a colour looked up, in samples tested
 MARGIN = 1 / 16  # voxels that rounding may put the ends of a ray outside of the grid
 
@@ -96,7 +96,7 @@ class Tile(NamedTuple):
 
 
 class TileScratch(NamedTuple):
-    """Working memory for the rays of a tile, arrays as pointers: numbers of sixteen rays as in `layout`, float32, int32 and float64; and by cascade, in its
+    """Working memory for the rays of a tile, arrays as pointers: numbers of a packet of rays as in `layout`, float32, int32 and float64; and by cascade, in its
     voxels, the distances (L,) up to which the subdivision is clear and up to which the tile is, negative where that is not known yet; and what `tile_rays`
     writes.
     """
@@ -178,7 +178,7 @@ def _all_clear(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, inline="always", error_model="numpy")
 def _packet_size(top, low):  # type: ignore[no-untyped-def]
     """Rows and columns of the subdivisions of a tile."""
-    return (1, PACKET) if low - top == 1 else (4, 4)
+    return (1, LANES) if low - top == 1 else (4, LANES // 4)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -194,8 +194,8 @@ def _begin_rays(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
     row, column = tile.upper, tile.first
     for lane in range(count):
         ox, oy, oz, dx, dy, dz, cosine = ray_at(row, column, rays)
-        places[ORIGIN + lane], places[ORIGIN + 16 + lane], places[ORIGIN + 32 + lane], places[COSINE + lane] = ox, oy, oz, cosine
-        places[DIRECTION + lane], places[DIRECTION + 16 + lane], places[DIRECTION + 32 + lane] = dx, dy, dz
+        places[ORIGIN + lane], places[ORIGIN + LANES + lane], places[ORIGIN + 2 * LANES + lane], places[COSINE + lane] = ox, oy, oz, cosine
+        places[DIRECTION + lane], places[DIRECTION + LANES + lane], places[DIRECTION + 2 * LANES + lane] = dx, dy, dz
         floats[ALONG_X + lane], floats[ALONG_Y + lane], floats[ALONG_Z + lane] = np.float32(dx), np.float32(dy), np.float32(dz)
         floats[SH_X + lane], floats[SH_Y + lane], floats[SH_Z + lane] = np.float32(dx), np.float32(dy), np.float32(dz)
         if rays.has_sh_directions:
@@ -205,9 +205,9 @@ def _begin_rays(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
         floats[HALF_DISTANCE + lane] = floats[DEPTH + lane] = np.float32(np.inf)
         for n in range(scene.cascades):
             nx, ny, nz = scene.grids[4 * n] * scene.base.brick, scene.grids[4 * n + 1] * scene.base.brick, scene.grids[4 * n + 2] * scene.base.brick
-            ratio, at = scene.places[4 * n], ENDS + 32 * n + lane
+            ratio, at = scene.places[4 * n], ENDS + 2 * LANES * n + lane
             x, y, z = ox / ratio + scene.places[4 * n + 1], oy / ratio + scene.places[4 * n + 2], oz / ratio + scene.places[4 * n + 3]
-            places[at], places[at + 16] = _intersect_box(x, y, z, dx, dy, dz, nx, ny, nz)
+            places[at], places[at + LANES] = _intersect_box(x, y, z, dx, dy, dz, nx, ny, nz)
         column += 1
         if column == tile.last:
             row, column = row + 1, tile.first
@@ -218,11 +218,11 @@ def _begin_rays(tile, rays, scene, scratch):  # type: ignore[no-untyped-def]
 def _part_of(part, lane, places):  # type: ignore[no-untyped-def]
     """Distances at which a ray's part in a cascade begins and ends, voxels of it: see `efficientnerf.asset.rendering.ray_parts`."""
     n = abs(part)
-    at = ENDS + 32 * n + lane
-    t0, t1 = places[at], places[at + 16]
+    at = ENDS + 2 * LANES * n + lane
+    t0, t1 = places[at], places[at + LANES]
     if n > 0:
         # Voxels of the cascade before are half as large.
-        enter, leave = places[at - 32], places[at - 16]
+        enter, leave = places[at - 2 * LANES], places[at - LANES]
         if part < 0 and leave > enter:
             t1 = enter / 2
         elif part > 0:
@@ -236,7 +236,7 @@ def _begin_part(part, count, clear, grid, step, scratch):  # type: ignore[no-unt
     floats, places, some = scratch.floats, scratch.rays, False
     nx, ny, nz = grid.nx * grid.brick, grid.ny * grid.brick, grid.nz * grid.brick
     most = most_samples(nx, ny, nz, step)
-    for lane in range(PACKET):
+    for lane in range(LANES):
         floats[FIRST + lane] = floats[LAST + lane] = np.float32(0)
         if lane >= count or floats[TRANSMITTANCE + lane] < np.float32(PACKED_EARLY_STOP):
             continue
@@ -244,8 +244,8 @@ def _begin_part(part, count, clear, grid, step, scratch):  # type: ignore[no-unt
         if not t1 > t0:
             continue
         last = int(np.ceil(min((t1 - t0) / step - 0.5, most)))
-        dx, dy, dz = places[DIRECTION + lane], places[DIRECTION + 16 + lane], places[DIRECTION + 32 + lane]
-        ox, oy, oz = in_cascade(places[ORIGIN + lane], places[ORIGIN + 16 + lane], places[ORIGIN + 32 + lane], grid)
+        dx, dy, dz = places[DIRECTION + lane], places[DIRECTION + LANES + lane], places[DIRECTION + 2 * LANES + lane]
+        ox, oy, oz = in_cascade(places[ORIGIN + lane], places[ORIGIN + LANES + lane], places[ORIGIN + 2 * LANES + lane], grid)
         # From so far away that rounding hides the grid nothing is seen: samples, which go on from the first, would lie beside the bricks.
         s = max(last - 0.5, 0.0) * step
         x, y, z = ox + t0 * dx, oy + t0 * dy, oz + t0 * dz
@@ -297,7 +297,7 @@ def _unwarp_packet(tile, voxel, rays, scratch, with_normal):  # type: ignore[no-
         begin = (row - tile.top) * (tile.right - tile.left) - tile.left
         for n in range(begin + tile.first, begin + tile.last):
             if floats[DEPTH + lane] < np.inf:
-                along, x, y, z = floats[DEPTH + lane] * voxel, NORMAL_X + lane, NORMAL_X + 16 + lane, NORMAL_X + 32 + lane
+                along, x, y, z = floats[DEPTH + lane] * voxel, NORMAL_X + lane, NORMAL_X + LANES + lane, NORMAL_X + 2 * LANES + lane
                 floats[DEPTH + lane] = world_depth(n, along, scratch.warped)
                 if with_normal:
                     floats[x], floats[y], floats[z] = normal_in_world(n, along, floats[x], floats[y], floats[z], rays.ndc, scratch.warped)
@@ -314,14 +314,14 @@ def _write_packet(tile, clear, background, voxel, rays, scratch, outputs):  # ty
         for pixel in range(row * outputs.width + tile.first, row * outputs.width + tile.last):
             transmittance = np.float32(1) if clear else floats[TRANSMITTANCE + lane]
             for c in range(3):
-                outputs.colour[3 * pixel + c] = (np.float32(0) if clear else floats[RED + 16 * c + lane]) + transmittance * background[c]
+                outputs.colour[3 * pixel + c] = (np.float32(0) if clear else floats[RED + LANES * c + lane]) + transmittance * background[c]
                 if outputs.with_normal:
-                    outputs.normal[3 * pixel + c] = np.float32(0) if clear else floats[NORMAL_X + 16 * c + lane]
+                    outputs.normal[3 * pixel + c] = np.float32(0) if clear else floats[NORMAL_X + LANES * c + lane]
             outputs.opacity[pixel] = np.float32(1) - transmittance
             outputs.depth[pixel] = np.float32(np.inf) if clear else floats[DEPTH + lane] * (np.float32(1) if rays.warped else voxel)
             if outputs.with_statistics:
                 for m in range(4):
-                    outputs.statistics[4 * pixel + m] = np.int32(0 if clear else floats[VISITED + 16 * m + lane])
+                    outputs.statistics[4 * pixel + m] = np.int32(0 if clear else floats[VISITED + LANES * m + lane])
             if not clear:
                 samples = INTERPOLATION * floats[INTERPOLATED + lane] + LOOKUP * floats[LOOKUPS + lane]
                 work += np.int64(floats[VISITED + lane] + floats[TESTED + lane] + samples)
