@@ -48,7 +48,7 @@ def find_scene_bounds(
 def chosen_photos(photos: Sequence[Photo]) -> list[Photo]:
     """At most `MAX_CAMERAS` of those that training may see, evenly spaced."""
     usable = [photo for photo in photos if photo.split in (None, "train")] or list(photos)
-    return usable[:: -(-len(usable) // MAX_CAMERAS)]
+    return usable[:: max(1, -(-len(usable) // MAX_CAMERAS))]
 
 
 def bounds_of_points(points: SparsePoints, cameras: Sequence[Camera], converging: bool) -> tuple[np.ndarray, np.ndarray] | None:

@@ -145,6 +145,14 @@ def alpha_set(folder: Path, opaque: int = 0, without: int = 0) -> Path:
     return source
 
 
+def test_photographs_none_of_which_can_be_read_are_named(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        (tmp_path / "photos" / name).write_bytes(b"no picture")
+    with pytest.raises(BadInput, match=r"0 readable photographs.*Unreadable: a\.jpg, b\.jpg, c\.jpg"):
+        run(tmp_path / "photos", tmp_path)
+
+
 def test_alpha_of_renders_is_composited(tmp_path: Path) -> None:
     made, _ = run(alpha_set(tmp_path / "source", opaque=1), tmp_path)
     assert made.background == (1.0, 1.0, 1.0)
