@@ -11,6 +11,7 @@ import contextlib
 import hashlib
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from pipeline.errors import StageFailed
 from pipeline.files import remove, rename
 from stages.scratch import Warn, note, noted, once, opened, unusable
 from stages.sfm.colmap import import_pycolmap, quiet_pycolmap
-from stages.sfm.images import WorkImage
+from stages.sfm.images import WorkImage, images_of
 
 # Tables of which a row each belongs to an image, or to a pair of them, and the column that names it.
 FEATURES = ("keypoints", "image_id"), ("descriptors", "image_id")
@@ -77,12 +78,12 @@ def _list_images(aside: Path, work: Path, images: Sequence[WorkImage]) -> None:
                     cameras[image.camera_key] = database.write_camera(_first_guess(image))
             options = pycolmap.ImageReaderOptions()
             options.existing_camera_id = cameras[image.camera_key]
-            pycolmap.import_images(aside, work / "images", pycolmap.CameraMode.SINGLE, [image.file], options)
+            pycolmap.import_images(aside, images_of(work), pycolmap.CameraMode.SINGLE, [image.file], options)
         with pycolmap.Database.open(aside) as database:
             listed = {image.name for image in database.read_all_images()}
     for image in images:
         if image.file not in listed:  # COLMAP leaves out without a word what it cannot read
-            raise StageFailed(f"poses: {work / 'images' / image.file}: could not be read by COLMAP. Run again: what is done is kept.")
+            raise StageFailed(f"poses: {images_of(work) / image.file}: could not be read by COLMAP. Run again: what is done is kept.")
 
 
 def _first_guess(image: WorkImage) -> Any:
@@ -146,6 +147,24 @@ def copy_database(work: Path, place: Path) -> None:
     remove_database(place)
     with contextlib.closing(sqlite3.connect(database_path(work))) as old, contextlib.closing(sqlite3.connect(database_path(place))) as fresh:
         old.backup(fresh)
+
+
+def copy_with_own_cameras(work: Path, place: Path, images: Sequence[WorkImage]) -> None:
+    """A database in another scratch folder, in the place of what is there, of the same images, features and matches; but each image has a camera of its own,
+    of the first guess."""
+    remove_database(place)
+    _list_images(database_path(place), place, [replace(image, camera_key=image.file) for image in images])
+    with contextlib.closing(attached(place, work)) as connection, connection:
+        for table, _ in (*FEATURES, *PAIRS):
+            connection.execute(f"INSERT INTO {table} SELECT * FROM everything.{table}")
+
+
+def attached(work: Path, other: Path) -> sqlite3.Connection:
+    """The database of a scratch folder, with that of another attached as `everything`."""
+    connection = sqlite3.connect(database_path(work), timeout=60.0)
+    connection.execute("PRAGMA synchronous = OFF")
+    connection.execute("ATTACH DATABASE ? AS everything", (str(database_path(other)),))
+    return connection
 
 
 def forget(work: Path, tables: Sequence[tuple[str, str]], keys: Sequence[int]) -> None:

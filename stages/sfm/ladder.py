@@ -5,22 +5,25 @@
     3  photographs without a camera are matched again, with more of the others, and along the geometry of the first matches
     4  more features are detected in them, of less contrast
     5  the mapper begins anew from another pair, with smaller angles
+    6  each photograph gets a focal length of its own, where matches disagree with the cameras, or where single photographs would have another
+    7  else each gets a principal point of its own, where single photographs would have another, as where they were cropped
 
-The rungs 3 and 4 work in a scratch folder of their own that is made anew: what a killed call has left there would change the rungs before.
+The rungs 3, 4, 6 and 7 work in scratch folders of their own that are made anew: what a killed call has left there would change the rungs before.
 docs/experiments/sfm.md
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.files import remove
-from stages.sfm import mapping, matches, pairs
-from stages.sfm.database import FEATURES, PAIRS, copy_database, database_path, forget, inlier_counts, pair_id_of
+from stages.sfm import lenses, mapping, matches, pairs
+from stages.sfm.database import FEATURES, PAIRS, copy_database, copy_with_own_cameras, database_path, forget, inlier_counts, pair_id_of
 from stages.sfm.images import Progress, SafePoint, WorkImage
+from stages.verdict.verdict import DOUBTFUL
 
 MAX_EXHAUSTIVE = 60  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
 OVERLAPPING = 30  # verified matches, from which two photographs are said to overlap
@@ -30,6 +33,11 @@ ENOUGH = 0.9  # of the photographs with a camera, from which the costlier rungs 
 AGREEING = 0.8  # of the verified matches, that agree with the cameras
 BETTER = 1.005  # times the score, from which a later rung is better than an earlier one
 MORE_FEATURES, LESS_CONTRAST = 2, 0.35
+EACH, CROPPED = "a focal length each", "a principal point each"
+SPREAD = 1.08  # between the focal lengths of single photographs, from which they may have been zoomed
+APART = 0.009  # of the longest side, between the principal points of single photographs, from which they may have been cropped
+CLOSER, SAME = 0.85, 0.995  # times the reprojection error, to which principal points of their own must lower it; and the score, which is hardly lower then
+LEFT = 0.5  # of the matches that disagreed, that may disagree with a focal length each: more parameters fit anything a little better
 
 
 @dataclass(frozen=True)
@@ -38,11 +46,13 @@ class Found:
     models  sub-models, largest first
     work    the scratch folder whose database they are of
     rungs   what was tried: its name, the number of photographs that had a camera then, and the share of matches that agreed
+    rung    the name of that which found them
     """
 
     models: list[Any]
     work: Path
     rungs: list[dict[str, object]]
+    rung: str = ""
 
 
 class _Climb:
@@ -52,16 +62,18 @@ class _Climb:
         self.images = images
         self.found = Found([], work, [])
         self._score = 0.0
-        self._agreement = 0.0
+        self.agreement = 0.0
 
-    def tried(self, rung: str, work: Path, models: list[Any]) -> None:
+    def tried(self, rung: str, work: Path, models: list[Any], *, least: float = 0.0, better: float = BETTER) -> None:
+        """Keep what a rung has found where its score is so many times better, and at least such a share of the matches agrees."""
         agreement = mapping.match_agreement(work, self.images, models[0]) if models else 0.0
         rungs = [*self.found.rungs, {"rung": rung, "registered": mapping.num_registered(models), "agreeing": round(agreement, 4)}]
         score = mapping.num_registered(models) * agreement
-        better = score > BETTER * self._score
-        if better:
-            self._score, self._agreement = score, agreement
-        self.found = Found(models, work, rungs) if better else Found(self.found.models, self.found.work, rungs)
+        if score > better * self._score and agreement >= least:
+            self._score, self.agreement = score, agreement
+            self.found = Found(models, work, rungs, rung)
+        else:
+            self.found = replace(self.found, rungs=rungs)
 
     def missing(self) -> list[int]:
         """The positions of the photographs without a camera."""
@@ -69,7 +81,7 @@ class _Climb:
         return [position for position, image in enumerate(self.images) if image.file not in there]
 
     def is_enough(self) -> bool:
-        return mapping.num_registered(self.found.models) >= ENOUGH * len(self.images) and self._agreement >= AGREEING
+        return mapping.num_registered(self.found.models) >= ENOUGH * len(self.images) and self.agreement >= AGREEING
 
 
 def find_models(
@@ -107,7 +119,33 @@ def find_models(
     for rung, options in (("another beginning", mapping.RELAXED), ("small angles", mapping.FORWARD)):
         if not climb.is_enough():
             climb.tried(rung, last, mapping.sub_models(last, images, seed, options, **quiet))
+    if climb.found.models:
+        _try_own_cameras(climb, work / "own_cameras", seed, **quiet)
     return climb.found
+
+
+def _try_own_cameras(climb: _Climb, place: Path, seed: int, **quiet: Any) -> None:
+    """The rungs on which each photograph has a camera of its own, where there is reason to."""
+    remove(place)
+    best = climb.found.models[0]
+    zoomed = climb.agreement < DOUBTFUL or lenses.focal_length_spread(best) > SPREAD
+    cropped = _of_one_lens(climb.images) and lenses.principal_point_spread(best) > APART
+    if not zoomed and not cropped:
+        return
+    place.mkdir()
+    copy_with_own_cameras(climb.found.work, place, climb.images)
+    models = mapping.sub_models(place, climb.images, seed, mapping.DEFAULTS, **quiet)
+    if zoomed:
+        climb.tried(EACH, place, models, least=1 - LEFT * (1 - climb.agreement))
+    if cropped and models and climb.found.rung != EACH:
+        models[0] = lenses.with_principal_points(models[0], quiet["safe_point"])
+        closer = models[0].compute_mean_reprojection_error() < CLOSER * best.compute_mean_reprojection_error()
+        climb.tried(CROPPED, place, models, better=SAME if closer else BETTER)
+
+
+def _of_one_lens(images: Sequence[WorkImage]) -> bool:
+    """Whether nothing says that photographs are of several lenses, or reduced by different factors; of fisheye lenses no principal points are looked for."""
+    return len({(image.focal, round(image.work_width / image.width, 2)) for image in images}) == 1 and not any(image.fisheye for image in images)
 
 
 def _detect_more(place: Path, images: Sequence[WorkImage], weak: Sequence[int], *, features: int, threads: int, **quiet: Any) -> None:

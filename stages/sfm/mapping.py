@@ -152,7 +152,7 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
     with quiet_pycolmap() as pycolmap:
         fixed = {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.mean_focal_length() == prior}
         safe_point()
-        _bundle_adjust(pycolmap, model, fixed)
+        bundle_adjust(pycolmap, model, fixed)
         counts = _images_of_cameras(model)
         simple = {camera_id for camera_id in counts if model.cameras[camera_id].model == pycolmap.CameraModelId.SIMPLE_RADIAL}
         refinable = [camera_id for camera_id in sorted(simple - fixed) if counts[camera_id] >= 10]  # fewer would be overfitted
@@ -164,7 +164,7 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
             f, cx, cy, k = camera.params
             camera.model, camera.params = pycolmap.CameraModelId.OPENCV, [f, f, cx, cy, k, 0.0, 0.0, 0.0]
         safe_point()
-        _bundle_adjust(pycolmap, richer, fixed)
+        bundle_adjust(pycolmap, richer, fixed)
         better = richer.compute_mean_reprojection_error() < 0.99 * model.compute_mean_reprojection_error()
     square = all(abs(richer.cameras[i].focal_length_x / richer.cameras[i].focal_length_y - 1) < 0.02 for i in refinable)
     return richer if better and square and match_agreement(work, images, richer) >= match_agreement(work, images, model) - 0.001 else model
@@ -178,15 +178,23 @@ def _images_of_cameras(model: Any) -> dict[int, int]:
     return counts
 
 
-def _bundle_adjust(pycolmap: Any, model: Any, fixed_cameras: set[int]) -> None:
+def bundle_adjust(
+    pycolmap: Any, model: Any, fixed_cameras: set[int], refined: Mapping[str, bool] | None = None, iterations: int = 50, tolerance: float = 1e-6
+) -> None:
+    """Adjust a model with Cauchy's loss.
+
+    refined    changes of COLMAP's options of what is
+    tolerance  share of the cost, below which an iteration that lowers it is the last
+    """
     options = pycolmap.BundleAdjustmentOptions()
+    options.mergedict(dict(refined or {}))
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = float(np.clip(model.compute_mean_reprojection_error(), 0.1, 2.0))
     solver = options.ceres.solver_options
     solver.num_threads = 1
-    solver.max_num_iterations = 50
-    solver.function_tolerance = 1e-6
+    solver.max_num_iterations = iterations
+    solver.function_tolerance = tolerance
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)

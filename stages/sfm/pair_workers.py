@@ -7,7 +7,6 @@ into its database, matches, and says so; the rows are then copied into the datab
 from __future__ import annotations
 
 import contextlib
-import sqlite3
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 from pipeline.files import remove, write_atomically
 from stages.sfm import process
 from stages.sfm.colmap import quiet_pycolmap
-from stages.sfm.database import FEATURES, PAIRS, copy_rows, database_path, pair_id_of, record
+from stages.sfm.database import FEATURES, PAIRS, attached, copy_rows, database_path, pair_id_of, record
 from stages.sfm.images import SafePoint
 
 GUIDED_RATIO = 0.88  # of the distances of the two best; COLMAP's own is 0.8
@@ -119,7 +118,7 @@ def _make_database(work: Path, scratch: Path) -> dict[int, str]:
     with quiet_pycolmap() as pycolmap:
         pycolmap.Database.open(database_path(scratch)).close()
     own = {table for table, _ in (*FEATURES, *PAIRS)}
-    with contextlib.closing(_both(work, scratch)) as connection, connection:
+    with contextlib.closing(attached(scratch, work)) as connection, connection:
         tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")]
         for table in tables:
             if table not in own:
@@ -131,17 +130,9 @@ def _make_database(work: Path, scratch: Path) -> dict[int, str]:
 def _take_features(work: Path, scratch: Path, images: Sequence[int]) -> None:
     """Put the features of these images in the place of all that is in the database."""
     marks = ", ".join("?" * len(images))
-    with contextlib.closing(_both(work, scratch)) as connection, connection:
+    with contextlib.closing(attached(scratch, work)) as connection, connection:
         for table, _ in PAIRS:
             connection.execute(f"DELETE FROM {table}")
         for table, column in FEATURES:
             connection.execute(f"DELETE FROM {table}")
             connection.execute(f"INSERT INTO {table} SELECT * FROM everything.{table} WHERE {column} IN ({marks})", images)
-
-
-def _both(work: Path, scratch: Path) -> sqlite3.Connection:
-    """The worker's database, with that of all attached as `everything`."""
-    connection = sqlite3.connect(database_path(scratch), timeout=60.0)
-    connection.execute("PRAGMA synchronous = OFF")
-    connection.execute("ATTACH DATABASE ? AS everything", (str(database_path(work)),))
-    return connection

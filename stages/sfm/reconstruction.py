@@ -29,11 +29,12 @@ from stages.sfm.colmap import quiet_pycolmap
 from stages.sfm.database import database_path, inlier_counts, open_database, planar_share, remove_database
 from stages.sfm.images import Callables, Masks, WorkImage, prepare_images
 from stages.verdict.looks import look_at_all
-from stages.verdict.verdict import WITHOUT_TEXTURE, failed, triangulation_angle
+from stages.verdict.verdict import CROPPED, LENS, WITHOUT_TEXTURE, ZOOMED, failed, triangulation_angle
 
 WAIT = 0.05  # seconds between two looks at a lock
 VERDICT = "verdict.json"  # in the scratch folder, where no cameras are found
 FEW_FEATURES = 50  # of a photograph, below which nothing can be told by it
+OWN_LENSES = {ladder.EACH: ZOOMED, ladder.CROPPED: CROPPED}  # by rung
 MAX_NAMES = 8  # photographs that an error lists by name
 
 
@@ -161,7 +162,8 @@ def reconstruct(
     if mapping.num_registered(models) < max(mapping.MIN_MODEL_SIZE, len(images) / 2):
         raise BadInput(_failure(folder, work, images, found, rejected, matching))
     facts = _facts_of_matching(images, found, matching)
-    capture = _capture(folder, place, images, mapping.bundle_adjusted(place, images, models[0], safe_point), masks, rejected, facts)
+    model = models[0] if found.rung == ladder.CROPPED else mapping.bundle_adjusted(place, images, models[0], safe_point)
+    capture = _capture(folder, place, images, model, masks, rejected, facts)
     for sentence in capture.warnings:
         callables["warn"](sentence)
     return capture
@@ -255,6 +257,7 @@ def _facts_of_matching(images: Sequence[WorkImage], found: ladder.Found, how: st
         "models": [int(model.num_reg_images()) for model in found.models],
         "rungs": found.rungs,
         "planar_pairs": planar_share(database_path(found.work)),
+        **({LENS: OWN_LENSES[found.rung]} if found.rung in OWN_LENSES else {}),
     }
 
 

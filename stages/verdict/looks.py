@@ -23,6 +23,9 @@ STEP = 0.75  # stops from the capture's median that are a step of exposure
 DARK = -6.0  # stops below white, of the mean of linear light: little but noise is left
 MOST_CLIPPED = 0.4  # share of pixels without detail
 SAME = 1.5  # of 255, root mean square between two small pictures that are the same
+NOISY = 12.0  # of 255, standard deviation of noise that hides weak features; docs/experiments/sfm.md
+LAPLACIANS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)  # their difference: of edges hardly anything is left
+BLOCK, LEAST_BLOCKS = 16, 9  # px; of a picture of fewer nothing is told
 FLAT = 4.0  # of 255, standard deviation of a small picture that all others of its kind would be the same as
 
 
@@ -33,13 +36,22 @@ class Look:
     sharpness   root of the mean square of differences between neighbouring pixels, over that of pixels COARSE apart; 0 of no texture
     brightness  stops: log2 of the mean of linear light, 0 is white
     clipped     share of pixels that are black or white
+    noise       levels, standard deviation: of a quarter of the blocks there is less
+    longest     px of the longest side, as far as it was looked at
     small       (16, 24) float32 levels
     """
 
     sharpness: float
     brightness: float
     clipped: float
+    noise: float
+    longest: int
     small: np.ndarray
+
+    def figures(self) -> dict[str, float]:
+        """As JSON has them."""
+        rounded = {"sharpness": round(self.sharpness, 3), "brightness": round(self.brightness, 2), "clipped": round(self.clipped, 3)}
+        return {**rounded, "noise": round(self.noise, 1)}
 
 
 def look_at(path: Path) -> Look:
@@ -76,6 +88,8 @@ def look(grey: np.ndarray) -> Look:
         sharpness=_sharpness(picture),
         brightness=float(np.log2(max(float(linear.mean(dtype=np.float64)), 2.0**-12))),
         clipped=float(((picture <= CLIPPED[0]) | (picture >= CLIPPED[1])).mean()),
+        noise=_noise(picture),
+        longest=max(grey.shape),
         small=cv2.resize(picture, SMALL, interpolation=cv2.INTER_AREA),
     )
 
@@ -98,6 +112,18 @@ def _squares(picture: np.ndarray, step: int, axis: int) -> float:
     """Mean square of the differences between pixels `step` apart."""
     difference = picture[step:] - picture[:-step] if axis == 0 else picture[:, step:] - picture[:, :-step]
     return float((difference**2).mean(dtype=np.float64))
+
+
+def _noise(picture: np.ndarray) -> float:
+    """The standard deviation by the median of the difference of two Laplacians (Immerkaer 1996) in each block, whose lower quartile has little texture."""
+    import cv2
+
+    rows, columns = (size // BLOCK for size in picture.shape)
+    if rows * columns < LEAST_BLOCKS:
+        return 0.0
+    response = np.abs(cv2.filter2D(picture, -1, LAPLACIANS))[: rows * BLOCK, : columns * BLOCK]
+    blocks = response.reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK * BLOCK)  # (blocks, pixels)
+    return float(np.percentile(np.median(blocks, axis=1), 25)) / (0.6745 * float(np.linalg.norm(LAPLACIANS)))
 
 
 def look_at_all(paths: Mapping[str, Path]) -> dict[str, Look]:
@@ -130,6 +156,11 @@ def of_other_exposure(looks: Mapping[str, Look]) -> list[str]:
 def dark(looks: Mapping[str, Look]) -> list[str]:
     """The names of those that are too dark to show much, whatever the others are."""
     return sorted(name for name, each in looks.items() if each.brightness < DARK)
+
+
+def noisy(looks: Mapping[str, Look]) -> list[str]:
+    """The names of those with so much noise that weak features are lost in it."""
+    return sorted(name for name, each in looks.items() if each.noise > NOISY)
 
 
 def clipped(looks: Mapping[str, Look]) -> list[str]:

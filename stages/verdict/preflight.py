@@ -25,7 +25,7 @@ from stages.io.pictures import UnreadableImage, exif_of, opened
 from stages.masking.turning import masks_of_turning_subject
 from stages.sfm import ladder, pairs
 from stages.verdict import looks
-from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, Problem, Verdict, of_looks, worded
+from stages.verdict.verdict import FEW, GRADES, MORE_PHOTOGRAPHS, TINY, Problem, Verdict, of_looks, of_sizes, worded, zooms
 
 SIDE = 560  # px, longest side of the pictures that overlap is told on
 FEATURES = 800  # of a picture
@@ -35,7 +35,6 @@ OVERLAP = 14  # matches that fit one geometry, from which two pictures overlap
 RATIO, EPIPOLAR_ERROR = 0.8, 1.5  # of the distances of the two best; px
 STILL = 1.0  # px that a feature of a background that stands still moves by, at most
 SMALL = 640  # px; photographs whose longest side is shorter are small
-ZOOM = 1.05  # between focal lengths, from which they differ
 _EXIF = 34665
 TURNING = Problem(
     "background",
@@ -46,7 +45,9 @@ TURNING = Problem(
 
 # Seconds of a processor that detects the features of a small picture in REFERENCE, by which others are scaled; docs/experiments/sfm.md
 REFERENCE = 0.028
-FEATURES_A_MEGAPIXEL, A_PAIR, AN_IMAGE = 0.4, 0.012, 0.2
+FEATURES_A_MEGAPIXEL, AN_IMAGE = 0.4, 0.2
+A_PAIR, COMPARING, MANY = 0.006, 0.030, 4096  # of verifying a pair, and of comparing so many features of each with each
+CONTRAST = 0.02  # from which SIFT detects about as many features as COLMAP's does
 PAIRS_AN_IMAGE = 20  # of retrieval
 
 
@@ -95,6 +96,7 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
     posed = importers.IMPORTERS[kind].posed
     problems = [*of_looks(seen), *_of_files(small, unreadable, len(names))]
     if not posed:
+        problems += of_sizes(seen)
         problems += _with_turning(_of_overlap(list(small), overlaps), {name: files[name] for name in small})
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
     figures = {
@@ -107,10 +109,7 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
         **_layout(list(small), overlaps),
         "forecast": forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed),
     }
-    rows = {
-        name: {"sharpness": round(each.sharpness, 3), "brightness": round(each.brightness, 2), "clipped": round(each.clipped, 3)} for name, each in seen.items()
-    }
-    return Verdict(ordered[0].grade if ordered else "good", ordered, figures, rows)
+    return Verdict(ordered[0].grade if ordered else "good", ordered, figures, {name: each.figures() for name, each in seen.items()})
 
 
 def _small(path: Path, grey: np.ndarray) -> Small:
@@ -242,44 +241,29 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
         grade = "failed" if count < MIN_IMAGES else "poor" if count < 6 else "usable"
         sentence = f"There {worded(count, 'are', 'is')} only {count} {worded(count, 'photographs', 'photograph')}."
         found.append(Problem("few", grade, sentence, "20 or more all round a subject are better."))
-    tiny = tuple(name for name, each in small.items() if max(each.size) < SMALL)
-    if len(tiny) > 0.5 * len(small):
-        found.append(Problem("small", "usable", f"{len(tiny)} photographs are smaller than {SMALL} px.", "Give the originals, of 1000 px or more.", tiny))
-    zooms = _zooms(small)
-    if len(zooms) > 1:
-        words = ", ".join(f"{len(group)} at {focal:.0f} px" for focal, group in zooms)
-        rest = tuple(name for _, group in zooms[1:] for name in group)
-        grade = "usable" if len(zooms) > max(3, 0.2 * len(small)) else "good"
-        found.append(Problem("zoom", grade, f"The photographs have {len(zooms)} focal lengths: {words}.", "Use one lens at one zoom.", rest))
+    reduced = tuple(name for name, each in small.items() if TINY <= max(each.size) < SMALL)
+    if len(reduced) > 0.5 * len(small):
+        found.append(Problem("small", "usable", f"{len(reduced)} photographs are smaller than {SMALL} px.", "Give the originals, of 1000 px or more.", reduced))
+    groups = zooms({name: 1000.0 * each.focal / max(each.size) for name, each in small.items() if each.focal is not None})
+    if len(groups) > 1:
+        words = ", ".join(f"{len(group)} at {focal:.0f} px" for focal, group in groups)
+        rest = tuple(name for _, group in groups[1:] for name in group)
+        grade = "usable" if len(groups) > max(3, 0.2 * len(small)) else "good"
+        found.append(Problem("zoom", grade, f"The photographs have {len(groups)} focal lengths: {words}.", "Use one lens at one zoom.", rest))
     return found
-
-
-def _zooms(small: Mapping[str, Small]) -> list[tuple[float, list[str]]]:
-    """(focal length for a longest side of 1000 px, names) of each focal length, the commonest first; those that are about the same are one."""
-    groups: list[tuple[float, list[str]]] = []
-    for name, each in sorted(small.items(), key=lambda item: item[1].focal or 0.0):
-        if each.focal is None:
-            continue
-        focal = 1000.0 * each.focal / max(each.size)
-        same = next((group for known, group in groups if 1 / ZOOM < focal / known < ZOOM), None)
-        if same is None:
-            groups.append((focal, [name]))
-        else:
-            same.append(name)
-    return sorted(groups, key=lambda group: (-len(group[1]), group[0]))
 
 
 def forecast(
     first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool
 ) -> dict[str, Any]:
-    """Seconds of the stage poses on a machine that does nothing else, and bytes at its peak; both roughly."""
+    """Seconds of the stage poses on a machine that does nothing else, where the first rung of `stages.sfm.ladder` suffices, and bytes at its peak; roughly."""
     from stages.memory.poses import decoding_needed, features_needed
-    from stages.sfm.matches import MAX_WORKERS, UPSAMPLE_BELOW
+    from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
 
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
-    before = time.thread_time()
+    before, rgb = time.thread_time(), np.zeros((1, 1, 3), np.uint8)
     with contextlib.suppress(UnreadableImage):
-        read_photo(files[first], side)
+        rgb = read_photo(files[first], side).rgb
     reading = 2.5 * (time.thread_time() - before) * count  # for structure from motion, as a working image, and to be looked at
     if posed:
         return {"poses_seconds": round(reading, 1), "poses_bytes": int(decoding_needed(sizes).total), "pairs": 0}
@@ -290,7 +274,23 @@ def forecast(
     how = ladder.matching_for(count) if settings.matching == "auto" else settings.matching
     compared = min(count * (count - 1) // 2, 10**9 if how == "exhaustive" else PAIRS_AN_IMAGE * count)
     finding = count * float(np.mean(pixels)) / 1e6 * FEATURES_A_MEGAPIXEL / threads
-    textured = float(np.mean([len(each.keypoints) for each in small.values()])) / FEATURES
-    matching = compared * A_PAIR * min(1.0, textured) / min(threads, MAX_WORKERS)
+    matching = compared * pair_seconds(min(settings.max_features, count_features(rgb))) / max(1, min(threads, MAX_WORKERS, compared // PAIRS_A_WORKER))
     mapping = AN_IMAGE * count * max(1.0, count / 50) ** 0.4
     return {"poses_seconds": round(reading + slower * (finding + matching + mapping), 1), "poses_bytes": int(memory), "pairs": compared}
+
+
+def count_features(rgb: np.ndarray) -> int:
+    """About as many as structure from motion detects in a photograph's copy, (H, W, 3) uint8, without a limit."""
+    import cv2
+
+    from stages.sfm.matches import UPSAMPLE_BELOW
+
+    grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
+    if max(grey.shape) >= UPSAMPLE_BELOW:  # OpenCV's SIFT doubles any picture
+        grey = cv2.resize(grey, (max(1, grey.shape[1] // 2), max(1, grey.shape[0] // 2)), interpolation=cv2.INTER_AREA)
+    return len(cv2.SIFT_create(0, contrastThreshold=CONTRAST).detect(grey, None))  # type: ignore[attr-defined]
+
+
+def pair_seconds(features: float) -> float:
+    """Of a processor, to match two photographs of so many features: each is compared with each."""
+    return A_PAIR + COMPARING * (features / MANY) ** 2

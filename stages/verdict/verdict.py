@@ -14,12 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.geometry.cameras import Camera
 from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo, SparsePoints
 from stages.io.importers.source import MIN_IMAGES, abbreviated
 from stages.verdict import looks as looks_of
 from stages.verdict.looks import Look
 
-FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", "gps", BACKGROUND)  # of a capture, that stand among the figures
+LENS, ZOOMED, CROPPED = "lens", "zoomed", "cropped"  # fact of a capture whose photographs have focal lengths, or principal points, of their own
+# Facts of a capture that stand among the figures.
+FACTS = ("matching", "components", "models", "pairs_agreeing", "planar_pairs", "rungs", LENS, "gps", BACKGROUND)
 GRADES = ("good", "usable", "poor", "failed")
 NEAREST = 3  # registered photographs that one which is not registered is said to have failed against
 FEW = 12  # views all round a subject
@@ -28,7 +31,10 @@ SHARE = 0.1  # of the photographs, from which a problem of single ones is one of
 LARGE_ERROR = 2.0  # px at LONGEST
 MOST_PLANAR = 0.8  # share of the pairs
 DOUBTFUL = 0.94  # of the matches, that agree with the cameras; docs/experiments/sfm.md
+TINY = 150  # px of the longest side, below which too few features are detected
 SMALL_ANGLE = 4.0  # degrees of parallax
+ZOOM = 1.05  # between focal lengths, from which they differ
+OFF_MIDDLE = 0.03  # of the longest side, from the middle to the principal point of a photograph that was cropped
 WITHOUT_TEXTURE = "blurred, dark or without texture"
 MOST_PIXELS = 1000  # of a reprojection error, that are told apart
 LONGEST = 1600  # px that reprojection errors are stated at
@@ -118,8 +124,10 @@ def verdict_on(capture: Capture, looks: Mapping[str, Look], *, in_folder: int | 
     problems = [
         *_of_registration(capture, len(names), total, in_folder),
         *_of_matches(capture, flat=angle is None or angle < SMALL_ANGLE),
+        *_of_lens(capture),
         *_of_geometry(capture, angle, counts),
         *of_looks(looks),
+        *(of_sizes(looks) if capture.kind == "photographs" else ()),
     ]
     rows = _rows(capture, looks, counts)
     ordered = tuple(sorted(problems, key=lambda each: -GRADES.index(each.grade)))
@@ -137,7 +145,7 @@ def failed(
 ) -> Verdict:
     """The verdict on photographs that no cameras were found of."""
     capture = Capture(kind="photographs", photos=(), background=None, rejected=tuple(rejected), facts=facts, overlaps=overlaps)
-    others = [*_of_matches(capture, flat=True), *_of_parts(capture), *of_looks(looks)]
+    others = [*_of_matches(capture, flat=True), *_of_parts(capture), *of_looks(looks), *of_sizes(looks)]
     problems = (Problem("failed", "failed", sentence, remedy, tuple(name for name, _ in rejected)), *others)
     return Verdict("failed", problems, {"photographs": len(looks), "registered": registered, **facts}, _rows(capture, looks, None))
 
@@ -178,6 +186,42 @@ def _of_matches(capture: Capture, *, flat: bool) -> list[Problem]:
     if BACKGROUND in capture.facts:
         found.append(_of_background(capture.facts[BACKGROUND] == LEFT_OUT))
     return found
+
+
+def _of_lens(capture: Capture) -> list[Problem]:
+    """Of photographs that were found to have focal lengths or principal points of their own, which no EXIF data told of."""
+    cameras = [photo.camera for photo in capture.photos]
+    if capture.facts.get(LENS) == ZOOMED:
+        groups = zooms({camera.name: 1000.0 * camera.intrinsics["fx"] / max(camera.width, camera.height) for camera in cameras})
+        rest = tuple(sorted(name for _, names in groups[1:] for name in names))
+        words = ", ".join(f"{len(names)} at {focal:.0f} px" for focal, names in groups)
+        sentence = f"The zoom changed between photographs (of a longest side of 1000 px {words}); another than most {worded(len(rest), 'have', 'has')}"
+        found = Problem("zoom", "good", f"{sentence} {abbreviated(list(rest))}.", "Use one lens at one zoom, and keep EXIF data.", rest)
+    elif capture.facts.get(LENS) == CROPPED:
+        rest = tuple(camera.name for camera in cameras if _off_middle(camera) > OFF_MIDDLE)
+        sentence = f"{len(rest)} {worded(len(rest), 'photographs were', 'photograph was')} cropped: what the lens looks at is not in the middle of"
+        found = Problem("cropped", "good", f"{sentence} {abbreviated(list(rest))}.", "Give the photographs as they were taken.", rest)
+    else:
+        return []
+    return [found] if found.images else []
+
+
+def _off_middle(camera: Camera) -> float:
+    """How far the principal point is from the middle, over the longest side."""
+    off = camera.intrinsics["cx"] - camera.width / 2, camera.intrinsics["cy"] - camera.height / 2
+    return float(np.hypot(*off)) / max(camera.width, camera.height)
+
+
+def zooms(focal_lengths: Mapping[str, float]) -> list[tuple[float, list[str]]]:
+    """(smallest focal length, names) of each focal length, the commonest first; those that are about the same are one."""
+    groups: list[tuple[float, list[str]]] = []
+    for name, focal in sorted(focal_lengths.items(), key=lambda item: (item[1], item[0])):
+        same = next((names for known, names in groups if focal / known < ZOOM), None)
+        if same is None:
+            groups.append((focal, [name]))
+        else:
+            same.append(name)
+    return sorted(groups, key=lambda group: (-len(group[1]), group[0]))
 
 
 def _of_background(left_out: bool) -> Problem:
@@ -237,6 +281,7 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
         ("blurred", looks_of.blurred(looks), "blurred", "Move slower, give more light, or film at a faster shutter speed."),
         ("exposure", looks_of.of_other_exposure(looks), "brighter or darker than the others by more than 0.75 stops", "Lock exposure and white balance."),
         ("dark", looks_of.dark(looks), "so dark that little but noise is left", "Give more light, or expose longer with the camera on a stand."),
+        ("noise", looks_of.noisy(looks), "so noisy that weak features are lost", "Give more light, or expose longer at a lower ISO, with a stand."),
         ("clipped", looks_of.clipped(looks), "black or white in more than 40 % of their pixels", "Expose for the subject; black and white hold no detail."),
     ):
         if names:
@@ -250,6 +295,18 @@ def of_looks(looks: Mapping[str, Look]) -> list[Problem]:
         grade = "poor" if len(looks) - len(same) < 3 else "usable" if len(same) > 0.4 * len(looks) else "good"
         found.append(Problem("duplicates", grade, sentence, "They add nothing; photographs from other places would.", tuple(same)))
     return found
+
+
+def of_sizes(looks: Mapping[str, Look]) -> list[Problem]:
+    """Photographs that are too small for features to be found in."""
+    tiny = {name: each.longest for name, each in sorted(looks.items()) if each.longest < TINY}
+    if not tiny:
+        return []
+    low, high = min(tiny.values()), max(tiny.values())
+    side = f"{low} px" if low == high else f"{low} to {high} px"
+    sentence = f"{len(tiny)} of {len(looks)} photographs {worded(len(tiny), 'are', 'is')} too small, {side} on the longest side: {abbreviated(list(tiny))}."
+    share = len(tiny) / len(looks)
+    return [Problem("tiny", "poor" if share > 0.5 else "usable" if share > SHARE else "good", sentence, "Give the originals, of 1000 px or more.", tuple(tiny))]
 
 
 def _rows(capture: Capture, looks: Mapping[str, Look], counts: np.ndarray | None) -> dict[str, dict[str, Any]]:
@@ -266,7 +323,7 @@ def _rows(capture: Capture, looks: Mapping[str, Look], counts: np.ndarray | None
     for name, row in rows.items():
         if name in looks:
             each = looks[name]
-            row |= {"sharpness": round(each.sharpness, 3), "brightness": round(each.brightness, 2), "clipped": round(each.clipped, 3)}
+            row |= each.figures()
             if name in same:
                 row["same_as"] = same[name]
     return dict(sorted(rows.items()))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -10,7 +12,12 @@ import pytest
 from PIL import Image
 
 from pipeline.errors import BadInput
+from stages.io.photo import read_photo
 from stages.poses import PosesSettings
+from stages.sfm import matches
+from stages.sfm.colmap import quiet_pycolmap
+from stages.sfm.database import database_path, open_database
+from stages.sfm.images import prepare_images
 from stages.verdict import preflight
 from stages.verdict.preflight import Small, check, overlap_of
 from stages.verdict.verdict import Problem, Verdict
@@ -125,6 +132,56 @@ def test_a_camera_that_only_turns_is_told(tmp_path: Path) -> None:
     scene = panorama(0)
     turned = {f"{k:02d}.png": np.ascontiguousarray(scene[60 + 3 * k : 240 + 3 * k, 24 * k : 24 * k + 240]) for k in range(12)}
     assert problems(write(tmp_path / "a", turned)) == {"parallax": "usable"}
+
+
+def test_noise_and_tiny_pictures_are_told(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    noisy = {name: np.clip(picture + rng.normal(0, 35, picture.shape), 0, 255).astype(np.uint8) for name, picture in along(0, 6).items()}
+    assert problems(write(tmp_path / "a", noisy))["noise"] == "usable"
+    tiny = {name: cv2.resize(picture, (96, 72), interpolation=cv2.INTER_AREA) for name, picture in along(0, 6).items()}
+    found = {problem.what: problem for problem in check(write(tmp_path / "b", tiny), PosesSettings(), 2).problems}
+    assert found["tiny"].grade == "poor"
+    assert "96 px" in found["tiny"].sentence
+    assert "small" not in found
+    assert "noise" not in found
+
+
+def test_time_of_matching_follows_the_number_of_features(tmp_path: Path) -> None:
+    """Against COLMAP's own detector, on one side of the size below which it looks at twice the size and on the other."""
+    still_life = Path(__file__).resolve().parents[2] / "examples" / "still_life"
+    names = sorted(path.name for path in still_life.glob("*.jpg"))[:2]
+    if not names:
+        pytest.skip("examples/still_life is not there")
+    for width in (480, 1040):
+        folder, work = tmp_path / str(width), tmp_path / f"work{width}"
+        folder.mkdir()
+        for name in names:
+            with Image.open(still_life / name) as image:
+                image.resize((width, 3 * width // 4), Image.Resampling.BICUBIC).save(folder / name, quality=95)
+        quiet = {"progress": lambda *a, **k: None, "safe_point": lambda: None}
+        images, _ = prepare_images(folder, names, max_side=1600, features=20000, seed=0, masks={}, work=work, warn=print, **quiet)
+        open_database(work, images, print)
+        matches.extract_features(work, images, features=20000, **quiet)
+        with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database_path(work)) as database:
+            counts = [database.num_keypoints_for_image(k + 1) for k in range(len(names))]
+        for name, count in zip(names, counts, strict=True):
+            assert preflight.count_features(read_photo(folder / name, 1600).rgb) == pytest.approx(count, rel=0.25)
+
+
+def test_fewer_features_are_forecast_to_match_sooner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert preflight.pair_seconds(4096) == pytest.approx(0.036)
+    assert preflight.pair_seconds(2048) - preflight.pair_seconds(0) == pytest.approx((preflight.pair_seconds(4096) - preflight.pair_seconds(0)) / 4)
+    ticks = itertools.count()  # a clock of which each look takes as long
+    monkeypatch.setattr(preflight, "time", SimpleNamespace(thread_time=lambda: preflight.REFERENCE * next(ticks)))
+    monkeypatch.setattr(preflight, "count_features", lambda rgb: 1500)
+    folder = write(tmp_path / "a", along(0, 14))
+
+    def seconds(limit: int) -> float:
+        return float(check(folder, PosesSettings(max_features=limit), 1).figures["forecast"]["poses_seconds"])
+
+    pairs = 14 * 13 // 2
+    assert seconds(1500) - seconds(500) == pytest.approx(pairs * (preflight.pair_seconds(1500) - preflight.pair_seconds(500)), abs=0.11)
+    assert seconds(4096) == seconds(1500)
 
 
 def test_zooms_and_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:

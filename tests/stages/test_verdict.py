@@ -99,7 +99,7 @@ def capture(count: int = 24, radius: float = 4.0, **changes: object) -> Capture:
 
 
 def sharp(names: list[str], **changes: dict[str, object]) -> dict[str, Look]:
-    base = {"sharpness": 0.25, "brightness": -2.0, "clipped": 0.0}
+    base = {"sharpness": 0.25, "brightness": -2.0, "clipped": 0.0, "noise": 0.5, "longest": 640}
     return {
         name: Look(**(base | changes.get(name, {})), small=np.random.default_rng(k).uniform(0, 255, (16, 24)).astype(np.float32))  # type: ignore[arg-type]
         for k, name in enumerate(names)
@@ -160,13 +160,64 @@ def test_each_problem_has_its_grade_words_and_remedy(changes: dict[str, object],
 
 
 @pytest.mark.parametrize(
-    ("change", "what"), [({"sharpness": 0.1}, "blurred"), ({"sharpness": 0.18}, "blurred"), ({"brightness": -3.0}, "exposure"), ({"clipped": 0.5}, "clipped")]
+    ("change", "what"),
+    [
+        ({"sharpness": 0.1}, "blurred"),
+        ({"sharpness": 0.18}, "blurred"),
+        ({"brightness": -3.0}, "exposure"),
+        ({"clipped": 0.5}, "clipped"),
+        ({"noise": 20.0}, "noise"),
+    ],
 )
 def test_pictures_that_differ_are_named_and_count_where_they_are_many(change: dict[str, object], what: str) -> None:
     one = verdict_on(capture(), sharp(NAMES, **{"05.jpg": change}))
     assert [(problem.what, problem.grade, problem.images) for problem in one.problems] == [(what, "good", ("05.jpg",))]
     many = verdict_on(capture(), sharp(NAMES, **dict.fromkeys(NAMES[:8], change)))
     assert (many.grade, many.problems[0].images) == ("usable", tuple(NAMES[:8]))
+
+
+@pytest.mark.parametrize("deviation", [0.0, 5.0, 15.0, 30.0])
+def test_noise_is_measured_whatever_the_picture_shows(deviation: float) -> None:
+    noise = np.random.default_rng(2).normal(0, deviation, PICTURE.shape)
+    for picture in (PICTURE, np.full(PICTURE.shape, 120, np.uint8), cv2.GaussianBlur(PICTURE, (0, 0), 4.0)):
+        seen = look(np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8))
+        assert seen.noise == pytest.approx(deviation, rel=0.12, abs=1.5)
+        assert bool(looks.noisy({"a": seen})) == (deviation > looks.NOISY)
+
+
+def test_a_picture_of_few_pixels_says_nothing_of_noise() -> None:
+    assert look(np.random.default_rng(0).integers(0, 255, (24, 32), np.uint8)).noise == 0.0
+
+
+@pytest.mark.parametrize(("tiny", "grade"), [(1, "good"), (8, "usable"), (24, "poor")])
+def test_tiny_photographs_are_named_with_their_size(tiny: int, grade: str) -> None:
+    seen = sharp(NAMES, **{name: {"longest": 96} for name in NAMES[:tiny]})
+    found = verdict_on(capture(), seen)
+    assert [(problem.what, problem.grade, problem.images) for problem in found.problems] == [("tiny", grade, tuple(NAMES[:tiny]))]
+    assert "96 px" in found.problems[0].sentence
+    assert "tiny" in [problem.what for problem in failed("none.", "try.", 0, LOST, seen, {}, ()).problems]
+    assert verdict_on(replace(capture(), kind="colmap"), seen).grade == "good"  # its cameras are known
+
+
+def lens(**changes: float) -> tuple[float, ...]:
+    return tuple(({"f": 500.0, "x": 320.0, "y": 240.0} | changes).values())
+
+
+def test_photographs_that_were_zoomed_or_cropped_are_named() -> None:
+    def with_lenses(fact: str | None, others: dict[int, tuple[float, ...]]) -> Verdict:
+        made = capture(facts={"pairs_agreeing": 0.98} | ({"lens": fact} if fact else {}))
+        photos = [replace(photo, camera=replace(photo.camera, params=others.get(k, photo.camera.params))) for k, photo in enumerate(made.photos)]
+        return verdict_on(replace(made, photos=tuple(photos)), sharp(NAMES))
+
+    zoomed = {3: lens(f=700.0), 7: lens(f=690.0), 9: lens(f=510.0)}
+    found = with_lenses("zoomed", zoomed)
+    assert [(problem.what, problem.grade, problem.images) for problem in found.problems] == [("zoom", "good", ("03.jpg", "07.jpg"))]
+    assert "22 at 781 px, 2 at 1078 px" in found.problems[0].sentence
+    assert found.figures["lens"] == "zoomed"
+    found = with_lenses("cropped", {3: lens(x=350.0), 7: lens(y=200.0), 9: lens(x=325.0)})
+    assert [(problem.what, problem.images) for problem in found.problems] == [("cropped", ("03.jpg", "07.jpg"))]
+    assert with_lenses(None, zoomed).problems == ()  # of EXIF groups, which are told apart as they should be
+    assert with_lenses("zoomed", {}).problems == ()
 
 
 def test_a_model_of_few_of_the_photographs_says_how_to_start_afresh() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ from PIL import Image, ImageFilter
 
 from benchmarks.poses import aligned_errors, true_centres
 from pipeline.errors import BadInput
-from stages.sfm import ladder, mapping, matches, pairs
+from stages.sfm import ladder, lenses, mapping, matches, pairs
 from stages.sfm.images import WorkImage
 from stages.sfm.reconstruction import find_cameras
 
@@ -27,12 +28,16 @@ class Rig:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, outcomes: dict[str, tuple[int, float]]) -> None:
         self.outcomes, self.tried, self.weak = outcomes, list[str](), list[list[int]]()
-        self._rung = "exhaustive"
+        self._rung, self.spread, self.apart = "exhaustive", 1.0, 0.001
         monkeypatch.setattr(mapping, "sub_models", lambda work, images, seed, options, *a, **k: self.model(work, "begin", options))
         monkeypatch.setattr(mapping, "continued", lambda work, images, model, seed, options, *a, **k: self.model(work, "continue", options))
         monkeypatch.setattr(mapping, "match_agreement", self.agreement)
+        monkeypatch.setattr(lenses, "focal_length_spread", lambda model: self.spread)
+        monkeypatch.setattr(lenses, "principal_point_spread", lambda model: self.apart)
+        monkeypatch.setattr(lenses, "with_principal_points", lambda model, safe_point: self.model(Path("own_cameras"), "adjust", None)[0])
         monkeypatch.setattr(ladder, "match", lambda *a, **k: None)
         monkeypatch.setattr(ladder, "copy_database", lambda *a: None)
+        monkeypatch.setattr(ladder, "copy_with_own_cameras", lambda *a: None)
         monkeypatch.setattr(ladder, "_detect_more", lambda place, images, weak, **k: self.weak.append(list(weak)))
         monkeypatch.setattr(ladder, "_match_again", self.match_again)
 
@@ -45,7 +50,9 @@ class Rig:
         self.weak.append(list(weak))
 
     def model(self, work: Path, how: str, options: Any) -> list[Any]:
-        if work.name == "rungs" and how == "begin" and self._rung == "beyond":
+        if work.name == "own_cameras":
+            name = ladder.CROPPED if how == "adjust" else ladder.EACH
+        elif work.name == "rungs" and how == "begin" and self._rung == "beyond":
             name = "small angles" if options is mapping.FORWARD else "another beginning"
         elif how == "continue" and work.name != "rungs":
             name = "fewer matches"
@@ -58,7 +65,8 @@ class Rig:
         if not count:
             return []
         images = {k: SimpleNamespace(name=IMAGES[k].file, has_pose=True) for k in range(count)}
-        return [SimpleNamespace(images=images, num_reg_images=lambda: count, agreeing=agreeing, rung=name)]
+        error = 0.3 if name == ladder.CROPPED else 0.5
+        return [SimpleNamespace(images=images, num_reg_images=lambda: count, agreeing=agreeing, rung=name, compute_mean_reprojection_error=lambda: error)]
 
 
 def climbed(rig: Rig, tmp_path: Path) -> ladder.Found:
@@ -86,8 +94,8 @@ def test_one_lost_photograph_is_worth_the_cheap_rungs_alone(monkeypatch: pytest.
 def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (8, 0.95), "fewer matches": (9, 0.95), "wider matching": (11, 0.94), "more features": (19, 0.93)})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features"]
-    assert [rung["registered"] for rung in found.rungs] == [8, 9, 11, 19]
+    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", ladder.EACH]
+    assert [rung["registered"] for rung in found.rungs] == [8, 9, 11, 19, 0]
     assert rig.weak == [list(range(9, 20)), list(range(11, 20)), list(range(11, 20))]
     assert (found.models[0].rung, found.work) == ("more features", tmp_path / "rungs")
 
@@ -95,8 +103,8 @@ def test_rungs_go_on_until_enough_have_a_camera_and_the_best_is_kept(monkeypatch
 def test_more_photographs_that_contradict_their_matches_are_not_better(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     rig = Rig(monkeypatch, {"exhaustive": (12, 0.95), "more features": (20, 0.4), "another beginning": (14, 0.9)})
     found = climbed(rig, tmp_path)
-    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles"]
-    assert found.models[0].rung == "another beginning"
+    assert rig.tried == ["exhaustive", "fewer matches", "wider matching", "more features", "another beginning", "small angles", ladder.EACH]
+    assert found.models[0].rung == found.rung == "another beginning"
 
 
 def test_a_folded_scene_is_begun_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -104,6 +112,45 @@ def test_a_folded_scene_is_begun_anew(monkeypatch: pytest.MonkeyPatch, tmp_path:
     found = climbed(rig, tmp_path)
     assert rig.tried == ["exhaustive", "another beginning"]
     assert found.models[0].rung == "another beginning"
+
+
+@pytest.mark.parametrize(("each", "kept"), [((20, 0.97), True), ((20, 0.92), False), ((10, 0.99), False), ((0, 0.0), False)])
+def test_focal_lengths_of_their_own_are_kept_where_they_explain_what_disagreed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, each: tuple[int, float], kept: bool
+) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.9), ladder.EACH: each})
+    found = climbed(rig, tmp_path)
+    assert rig.tried == ["exhaustive", ladder.EACH]
+    assert found.rungs[-1] == {"rung": ladder.EACH, "registered": each[0], "agreeing": each[1]}
+    assert (found.rung, found.work) == ((ladder.EACH, tmp_path / "own_cameras") if kept else ("exhaustive", tmp_path))
+
+
+def test_focal_lengths_that_differ_are_looked_at_though_the_matches_agree(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), ladder.EACH: (20, 0.999)})
+    assert climbed(rig, tmp_path).rung == "exhaustive"
+    rig.spread = 1.2
+    assert climbed(rig, tmp_path).rung == ladder.EACH
+    rig.outcomes[ladder.EACH] = (20, 0.984)  # not worth so many more parameters
+    assert climbed(rig, tmp_path).rung == "exhaustive"
+
+
+@pytest.mark.parametrize(("cropped", "kept"), [((20, 0.979), True), ((20, 0.96), False), ((19, 0.98), False)])
+def test_principal_points_of_their_own_are_kept_where_points_lie_closer_and_as_many_matches_agree(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cropped: tuple[int, float], kept: bool
+) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), ladder.EACH: (20, 0.98), ladder.CROPPED: cropped})
+    rig.apart = 0.01
+    found = climbed(rig, tmp_path)
+    assert [rung["rung"] for rung in found.rungs] == ["exhaustive", ladder.CROPPED]
+    assert found.rung == (ladder.CROPPED if kept else "exhaustive")
+
+
+def test_cropped_photographs_of_several_lenses_stay_as_they_are(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    rig = Rig(monkeypatch, {"exhaustive": (20, 0.98), ladder.EACH: (20, 0.98), ladder.CROPPED: (20, 0.99)})
+    rig.apart = 0.01
+    for other in (replace(IMAGES[0], focal=50.0), replace(IMAGES[0], fisheye=True), replace(IMAGES[0], work_width=32, work_height=24)):
+        found = ladder.find_models(tmp_path, [other, *IMAGES[1:]], "exhaustive", features=100, seed=0, threads=1, **QUIET)
+        assert [rung["rung"] for rung in found.rungs] == ["exhaustive"]
 
 
 def test_nothing_at_all_is_no_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
