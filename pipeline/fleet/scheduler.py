@@ -129,7 +129,7 @@ class Scheduler:
         self.state.slots = sum(worker.capacity for worker in self._alive)
         self._workerless_since = None if self._alive else self._workerless_since or now
         if self._workerless_since is not None and now - self._workerless_since > WORKERLESS_SECONDS:
-            for each in list(self._open):
+            for each in [each for each in self._open if each.task is None]:  # one that takes no more tasks may still end those that it has
                 self._give_up(each, "failed", f"no worker was there for {WORKERLESS_SECONDS / 60:.0f} minutes.")
         for request in requests.take(self.fleet):
             self._obey(request)
@@ -177,8 +177,16 @@ class Scheduler:
         return not (uses and self.device == "cuda"), each.todo is None, each.number
 
     def _demand(self, each: _Progress) -> Demand:
-        stage = self.stages.get(each.what)
-        return Demand(uses_gpu=self.device == "cuda" and stage is not None and stage.uses_device, memory=each.attempts.memory)
+        stage, memory, largest = self.stages.get(each.what), each.attempts.memory, self._largest()
+        if memory is not None and largest is not None:  # the worker that had more may have gone: what the stage needs it says itself
+            memory = min(memory, largest)
+        return Demand(uses_gpu=self.device == "cuda" and stage is not None and stage.uses_device, memory=memory)
+
+    def _largest(self) -> int | None:
+        """Bytes of the largest worker; None where no limit is known."""
+        if any(worker.memory is None for worker in self._alive):
+            return None
+        return max((worker.memory or 0 for worker in self._alive), default=None)
 
     def _has_its_share(self, each: _Progress) -> bool:
         """Whether the scene that makes the next artifact for this one, too, has done so, or never will."""
@@ -284,10 +292,9 @@ class Scheduler:
         if self._ending and result.get("kind") in ("stopped", "died", "lost", "unheard"):
             return
         now = time.monotonic()
-        largest = None if any(worker.memory is None for worker in self._alive) else max((worker.memory or 0 for worker in self._alive), default=None)
         judged = remedy(
             stage or task.request["kind"], result, each.attempts, worker=task.worker,
-            given=each.attempts.memory if each.attempts.memory is not None else task.memory, largest=largest, now=now,
+            given=task.memory, largest=self._largest(), now=now,
         )  # fmt: skip
         each.state.attempts = each.attempts.count
         if judged.action in ("failed", "quarantined"):

@@ -276,6 +276,45 @@ def test_without_a_worker_it_waits_and_then_gives_up(tmp_path: Path, monkeypatch
     assert "no worker was there" in (found.scenes[0].reason or "")
 
 
+def test_a_worker_that_takes_no_more_ends_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler, "WORKERLESS_SECONDS", 0.0)
+    calls = itertools.count()
+
+    def answer(task: Task) -> dict[str, Any] | None:
+        if what(task.request) != "finish":
+            return done(task)
+        workers.workers = []
+        return done(task) if next(calls) > 5 else None
+
+    workers = Simulated([Worker("a", 1)], answer)
+    found = run(tmp_path, workers, scenes(2))
+    assert [scene.state for scene in found.scenes] == ["done", "failed"]
+    assert "no worker was there" in (found.scenes[1].reason or "")
+
+
+def test_what_needs_more_memory_than_is_left_holds_up_nobody(tmp_path: Path) -> None:
+    """The only worker that had as much has gone."""
+    calls = itertools.count()
+    asked: list[int | None] = []
+
+    def answer(task: Task) -> dict[str, Any]:
+        if (scene_of(task), what(task.request)) != ("s0", "train"):
+            return done(task)
+        asked.append(task.memory)
+        return {"ok": False, "kind": "refused", "text": "train: needs 6.0 GiB.", "needed": 6 * GIB}
+
+    def between() -> None:
+        assert next(calls) < 1000, "it goes on for ever"
+        if asked:
+            workers.lose("large")
+
+    workers = Simulated([Worker("large", 2, 8 * GIB, slots=2), Worker("small", 2, 4 * GIB, slots=2)], answer, between=between)
+    found = run(tmp_path, workers, scenes(6))
+    assert found.totals.done == 5
+    assert (state_of(found, "s0").state, state_of(found, "s0").reason) == ("quarantined", "train: needs 6.0 GiB.")
+    assert asked[-1] == 4 * GIB
+
+
 def test_whatever_happens_every_scene_comes_to_an_end(tmp_path: Path) -> None:
     """Random failures of every kind and workers that come and go: no scene is lost, no run has two writers, no worker has more than it holds."""
     for seed in range(30):
