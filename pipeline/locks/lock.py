@@ -6,6 +6,7 @@ The lock ends with its process: a killed process never blocks a run on its own m
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shlex
 import socket
@@ -25,6 +26,8 @@ from pipeline.failures import cannot_write
 from pipeline.links import HOLDER, LOCK
 from pipeline.locks.lease import EXPIRY, Held, Lease, acquire
 from pipeline.text import printable
+
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
 @dataclass(frozen=True)
@@ -67,16 +70,17 @@ def lock(folder: Path) -> Iterator[Lease]:
     """Hold the lock of a run or a fleet. Raises RunLocked at once if another holds it, BadInput if the folder cannot be written."""
     import filelock  # not needed by the commands that only read
 
-    guard = filelock.FileLock(folder / LOCK, timeout=0, thread_local=False)
+    # A soft lock would be a file that stays when its process is killed.
+    guard = filelock.FileLock(folder / LOCK, timeout=0, thread_local=False, fallback_to_soft=False)
     try:
         guard.acquire()
         decisive = True
     except filelock.Timeout:
         raise RunLocked(f"{folder}: being written by {_who(folder)}. Wait until it is done, or stop it.") from None
-    except NotImplementedError:  # a file system without such locks
-        decisive = False
     except OSError as error:
-        raise _cannot_lock(folder, error) from None
+        if error.errno not in _NO_LOCKS:
+            raise _cannot_lock(folder, error) from None
+        decisive = False  # a file system without such locks: the lease alone says who writes
     try:
         with _leased(folder, decisive) as lease:
             yield lease

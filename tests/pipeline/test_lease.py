@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import os
 import random
 import subprocess
@@ -188,6 +190,24 @@ def test_a_run_says_who_holds_it_and_since_when_its_lease_was_renewed(tmp_path: 
         (run.path / ".lock").unlink()
         with on("b"), pytest.raises(RunLocked, match=rf"being written by process {os.getpid()} on .* its lease was renewed \d s ago"), other.locked():
             pass
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_without_locks_of_the_system_the_lease_alone_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    def refused(*arguments: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refused)
+    for _ in range(2):
+        with lock(tmp_path), pytest.raises(RunLocked, match=r"its lease was renewed \d s ago"), lock(tmp_path):
+            pass
+    killed = acquire(tmp_path, decisive=False)
+    killed._done.set()
+    with pytest.raises(RunLocked), lock(tmp_path):
+        pass
+    age(tmp_path, EXPIRY + 1)
+    with lock(tmp_path) as held:
+        assert held.lost() is None
 
 
 def test_who_lost_the_lease_publishes_nothing(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def tries(run: Path) -> list[PipelineError]:
 WORKPLACES = [WORK, f"{WORK}/count", f"{WORK}/count/REQUEST", f"{WORK}/count/REQUEST/out", f"{WORK}/count/REQUEST/scratch"]
 
 
-@pytest.mark.parametrize("name", [*WORKPLACES, f"{WORK}/trash-1-2", f"{WORK}/old-count", "count", "list/images", ".cache"])
+@pytest.mark.parametrize("name", [*WORKPLACES, f"{WORK}/trash-1-2", f"{WORK}/old-count", "count", "list/images", ".cache", ".lease"])
 def test_a_folder_behind_a_link_is_not_emptied(done: Run, outside: Path, name: str) -> None:
     request = next(iter(path.name for path in (done.path / WORK / "count").iterdir()))
     link = done.path / name.replace("REQUEST", request)
