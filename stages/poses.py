@@ -72,7 +72,7 @@ class PosesSettings:
         " colour (green, white, #rrggbb), or none (off); auto: static where cameras found by the object alone show that it turned.",
         advanced=True,
     )
-    mask_model: str = setting(
+    mask_model: Annotated[str, Meta(pattern=r"^(off|/.+)$", description="off or an absolute path")] = setting(
         "off", "ONNX file of a network that tells a subject from its background (as rembg has them), by which silhouettes are made; off: none.", advanced=True
     )
     mask_polarity: Literal["auto", "white", "black"] = setting(

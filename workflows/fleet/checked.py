@@ -17,7 +17,7 @@ Table = dict[str, dict[str, Any]]
 
 MOST_SHOWN = 50  # mistakes
 OPTIONS = ("preset", "as", "seed", "budget")  # what a manifest says beside settings, by the names of the options of `enerf run`
-GIVEN_BY_HAND = ("poses.allow_outside",)  # settings that no manifest decides: the operator does, on the command line
+GIVEN_BY_HAND = ("poses.allow_outside", "poses.mask_model")  # settings that no manifest decides, for they lead out of its folder: the operator does
 
 
 class Text(str):
@@ -97,7 +97,7 @@ class Checker:
         key = (stage, name, f"{type(value).__name__} {value!r}")
         if key not in self._known:
             if f"{stage}.{name}" in GIVEN_BY_HAND and not by_hand:
-                raise UsageError(f"{stage}.{name}: found in a manifest, expected on the command line alone (--allow-outside).")
+                raise UsageError(f"{stage}.{name}: found in a manifest, expected on the command line alone (--set {stage}.{name}=VALUE).")
             self._settings.put(stage, name, parse_value(str(value).strip()) if isinstance(value, Text) else [value], "")
             self._known[key] = _plain(self._settings.values[stage][name])
         return self._known[key]

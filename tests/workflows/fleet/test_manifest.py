@@ -207,9 +207,18 @@ def test_sources_stay_in_the_manifests_folder(place: Path) -> None:
     assert len(read("shoots/a", place.parent / "elsewhere")) == 2, "the operator named both"
 
 
-def test_a_manifest_does_not_let_data_sets_out(place: Path) -> None:
-    (found,) = details("[scenes.a]\nsource = 'shoots/a'\nposes.allow_outside = true\n")
-    assert "on the command line alone" in found
+@pytest.mark.parametrize("setting", ["allow_outside = true", "mask_model = '/net.onnx'"])
+def test_a_manifest_leads_nowhere_else(place: Path, setting: str) -> None:
+    (found,) = details(f"[scenes.a]\nsource = 'shoots/a'\nposes.{setting}\n")
+    assert f"on the command line alone (--set poses.{setting.split()[0]}=VALUE)" in found
+
+
+def test_a_network_is_found_from_every_folder(place: Path) -> None:
+    scene = written("[scenes.a]\nsource = 'shoots/a'\n")
+    with pytest.raises(UsageError, match="absolute path"):
+        read(scene, over=Choice({"poses": {"mask_model": Text("net.onnx")}}))
+    (found,) = read(scene, over=Choice({"poses": {"mask_model": Text("/net.onnx")}}))
+    assert found.settings["poses"]["mask_model"] == "/net.onnx"
 
 
 def test_what_was_begun_may_have_lost_its_source(place: Path) -> None:
