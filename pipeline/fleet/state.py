@@ -31,7 +31,8 @@ LONGEST_LINE = 500  # characters of a reason, a warning or a last line
 MOST_LINES = 20  # of warnings, and of last lines
 
 # Names that the fleet's own files and folders have.
-_RESERVED = frozenset({"index.html", "fleet.json", "fleet.csv", "thumbnails", "comparison", "comparison.html", "pages"})
+_RESERVED = frozenset({"index.html", "fleet.json", "fleet.csv", "run.json", "thumbnails", "comparison", "comparison.html", "pages"})
+_MOST_BYTES = 200  # of a name: file systems have 255, less what is put behind it
 _NAME = re.compile(r"[^\W_][\w.-]{0,99}")
 
 FleetWord = Literal["running", "done", "failed", "cancelled", "interrupted"]
@@ -48,7 +49,7 @@ _Table = dict[_Name, dict[_Name, Any]]
 
 def is_scene_name(name: str) -> bool:
     """Whether a scene may have this name: it names a folder of the fleet, in pages and on command lines. Letters, digits, ".", "_" and "-"."""
-    return _NAME.fullmatch(name) is not None and name.casefold() not in _RESERVED
+    return _NAME.fullmatch(name) is not None and len(name.encode("utf-8", "replace")) <= _MOST_BYTES and name.casefold() not in _RESERVED
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def pareto_plot(path: Path, series: Mapping[str, Sequence[Point]], *, x_label: s
         front = [points[place] for place in pareto_front([(x, y) for x, y, _ in points])]
         axes.plot([x for x, _, _ in front], [y for _, y, _ in front], color=colour, label=name, linewidth=1.4)
         for x, y, label in front if len(front) <= _LABELS and len(series) <= 3 else []:
-            axes.annotate(label, (x, y), xytext=(5, -11), textcoords="offset points", fontsize=7.5, color="0.25")
+            axes.annotate(label, (x, y), xytext=(5, -11), textcoords="offset points", fontsize=7.5, color="0.25", parse_math=False)
     costs = [x for points in series.values() for x, _, _ in points]
     if costs and min(costs) > 0 and max(costs) > 10 * min(costs):
         axes.set_xscale("log")

@@ -10,7 +10,7 @@ import hashlib
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -56,7 +56,7 @@ def read_sweeps(texts: Sequence[str], workflow: Workflow) -> list[Sweep]:
         checked = []
         for value in values:
             try:
-                checked.append(checker.value(stage, name, Text(value)))
+                checked.append(checker.value(stage, name, Text(value), by_hand=True))
             except UsageError as error:
                 checker.mistake(str(error).removeprefix(": "))
         once = {canonical_json(value): value for value in checked}
@@ -96,20 +96,30 @@ def swept(scenes: Sequence[Scene], sweeps: Sequence[Sweep], stages: Sequence[Sta
 
 
 def _variants(scene: Scene, sweeps: Sequence[Sweep]) -> list[Scene]:
-    names = [sweep.name for sweep in sweeps]
-    short = [sweep.name if names.count(sweep.name) == 1 else sweep.setting for sweep in sweeps]
     made: list[Scene] = []
     for values in itertools.product(*(sweep.values for sweep in sweeps)):
         settings = {stage: dict(table) for stage, table in scene.settings.items()}
         for sweep, value in zip(sweeps, values, strict=True):
             settings.setdefault(sweep.stage, {})[sweep.name] = value
-        name = "--".join([scene.name, *(f"{what}-{_shown(value)}" for what, value in zip(short, values, strict=True))])
         sweep_of = {sweep.setting: value for sweep, value in zip(sweeps, values, strict=True)}
-        made.append(replace(scene, name=name, settings=settings, sweep=sweep_of))
+        made.append(replace(scene, name=scene.name + _suffix(sweep_of), settings=settings, sweep=sweep_of))
     folders = {each.name.casefold() for each in made}
     if len(folders) == len(made) and all(is_scene_name(each.name) for each in made):
         return made
-    return [replace(each, name=f"{scene.name[:90]}--{number:04d}") for number, each in enumerate(made, 1)]  # too long, or alike without signs
+    begin = scene.name[:90].encode("utf-8")[:190].decode("utf-8", "ignore")
+    return [replace(each, name=f"{begin}--{number:04d}") for number, each in enumerate(made, 1)]  # too long, or alike without signs
+
+
+def unswept(name: str, sweep: Mapping[str, Any]) -> str:
+    """The name of the scene that a sweep made the scene `name` of, with these values; names may hold "--" themselves."""
+    suffix = _suffix(sweep)
+    return name.removesuffix(suffix) if name.endswith(suffix) else re.sub(r"--\d{4,}$", "", name)
+
+
+def _suffix(sweep: Mapping[str, Any]) -> str:
+    names = [setting.partition(".")[2] for setting in sweep]
+    short = [name if names.count(name) == 1 else setting for name, setting in zip(names, sweep, strict=True)]
+    return "".join(f"--{what}-{_shown(value)}" for what, value in zip(short, sweep.values(), strict=True))
 
 
 def _shown(value: Any) -> str:

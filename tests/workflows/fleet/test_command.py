@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,21 @@ def test_a_folder_of_something_else_is_left_alone(enerf: Enerf, scenes: Path, tm
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
     assert enerf("run", scenes / "s1", "--out", tmp_path / "run", "--preset", "tiny").code == 0
     assert enerf("fleet", scenes, "--out", tmp_path / "run").code == 2
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "index.html").write_text("mine")
+    assert enerf("fleet", scenes, "--out", tmp_path / "site").code == 2
+    assert (tmp_path / "site" / "index.html").read_text() == "mine"
+
+
+def test_pages_are_not_written_through_links(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
+    fleet = tmp_path / "fleet"
+    assert enerf("fleet", scenes / "s1", scenes / "s2", "--out", fleet, "--preset", "tiny").code == 0
+    (tmp_path / "pictures").mkdir()
+    shutil.rmtree(fleet / "thumbnails")
+    (fleet / "thumbnails").symlink_to(tmp_path / "pictures")
+    told = enerf("fleet", scenes / "s1", scenes / "s2", "--out", fleet, "--preset", "tiny")
+    assert (told.code, "thumbnails is a link" in told.err) == (4, True)
+    assert list((tmp_path / "pictures").iterdir()) == []
 
 
 def test_a_sweep_computes_shared_stages_once(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:

@@ -261,5 +261,5 @@ def test_the_front_is_what_no_other_beats() -> None:
 
 def test_a_plot_of_nothing_and_of_wide_costs(tmp_path: Path) -> None:
     pareto_plot(tmp_path / "a.png", {}, x_label="x", y_label="y")
-    pareto_plot(tmp_path / "b.png", {"a": [(1, 20, "one"), (100, 30, "two")], "b": [(0.0, 1, "")]}, x_label="x", y_label="y")
+    pareto_plot(tmp_path / "b.png", {"a": [(1, 20, r"$\frac{$"), (100, 30, "two")], "b": [(0.0, 1, "")]}, x_label="x", y_label="y")
     assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()

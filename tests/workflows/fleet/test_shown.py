@@ -78,7 +78,12 @@ def test_a_source_elsewhere_needs_the_operators_word(enerf: Enerf, toys: Path, m
 
 
 def test_pages_are_no_names_of_scenes() -> None:
-    assert not any(map(is_scene_name, updates.FILES))
+    assert not any(map(is_scene_name, [*updates.FILES, *map(str.upper, updates.FILES), "fleet.json", "run.json"]))
+
+
+def test_names_are_those_that_a_file_system_has() -> None:
+    assert is_scene_name("é" * 100)
+    assert not is_scene_name("椅" * 100)
 
 
 def test_a_terminal_has_the_table_and_what_goes_wrong_above_it(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from pipeline.sharing import take_over
 from tests.workflows.toys import TOYS
 from workflows.asset import STAGES, WORKFLOW, Workflow
 from workflows.cli.request import Options, plan_run
-from workflows.fleet.sweeps import Sweep, read_sweeps, shared, split_values, swept
+from workflows.fleet.sweeps import Sweep, read_sweeps, shared, split_values, swept, unswept
 
 CHAIR, TABLE = Scene("chair", ("/chair",)), Scene("table", ("/table",))
 
@@ -34,6 +34,7 @@ def test_all_mistakes_of_sweeps_at_once() -> None:
     with pytest.raises(Mistakes) as caught:
         read_sweeps(["train.iterations", "train.iterations=5,many", "bake.max_mb=8", "=1", "train.iterations=1", "train.seed=1,"], WORKFLOW)
     assert len(caught.value.details) == 6
+    assert read_sweeps(["poses.mask_model=off,/net.onnx"], WORKFLOW) == [Sweep("poses", "mask_model", ("off", "/net.onnx"))], "it is given by hand"
 
 
 def test_each_scene_with_each_combination() -> None:
@@ -72,6 +73,15 @@ def test_long_names_are_numbered() -> None:
     check_scenes(made)
     assert [scene.name[-6:] for scene in made] == ["--0001", "--0002"]
     check_scenes(swept([CHAIR], [Sweep("bake", "licence", ("a b", "a_b", "", "é/../"))], STAGES))
+    check_scenes(swept([Scene("椅" * 66, ("/c",))], [Sweep("bake", "licence", ("a", "b"))], STAGES))
+
+
+def test_the_scene_that_was_swept_is_known_whatever_its_name() -> None:
+    sweeps = [Sweep("train", "iterations", (1, 2)), Sweep("bake", "seed", (-1, 0)), Sweep("train", "seed", (5,))]
+    for name in ("a--b", "a--c", "a--0001x", "chair"):
+        assert {unswept(each.name, each.sweep or {}) for each in swept([Scene(name, ("/a",))], sweeps, STAGES)} == {name}
+    numbered = swept([Scene("a--" + "c" * 80, ("/c",))], [Sweep("bake", "licence", ("x" * 50, "x" * 51))], STAGES)
+    assert {unswept(each.name, each.sweep or {}) for each in numbered} == {"a--" + "c" * 80}
 
 
 def test_a_sweep_is_bounded() -> None:

@@ -18,6 +18,7 @@ from pipeline.text import printable
 from stages.figures.pareto import pareto_front, pareto_plot
 from workflows.cli.progress import duration
 from workflows.fleet.pages.index import filled, quality_of, value_text
+from workflows.fleet.sweeps import unswept
 from workflows.report.page import NAME as REPORT
 
 NAME = "comparison.html"
@@ -75,7 +76,7 @@ def results(state: FleetState, settings: Sequence[str]) -> list[Result]:
 
 
 def _result(scene: SceneState, known: dict[str, SceneState], settings: Sequence[str]) -> Result:
-    name, values = scene.name.partition("--")[0], tuple((scene.sweep or {}).get(setting) for setting in settings)
+    name, values = unswept(scene.name, scene.sweep or {}), tuple((scene.sweep or {}).get(setting) for setting in settings)
     if scene.state != "done":
         return Result(name, values, state=scene.state)
     seconds = 0.0
