@@ -25,7 +25,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 from pipeline.text import printable
@@ -279,14 +278,4 @@ def _environment(cores: int, gpus: tuple[int, ...]) -> dict[str, str]:
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     names = [name for name in visible.split(",") if name]
     found["CUDA_VISIBLE_DEVICES"] = ",".join(names[gpu] if gpu < len(names) else str(gpu) for gpu in gpus)
-    return found
-
-
-def folder_bytes(folder: Path) -> int:
-    """Of all files in a folder that are there while it is looked at."""
-    found = 0
-    for parent, _, names in os.walk(folder):
-        for name in names:
-            with contextlib.suppress(OSError):
-                found += os.lstat(Path(parent, name)).st_size
     return found

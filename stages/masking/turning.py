@@ -89,6 +89,8 @@ def _correlation(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def turn(photos: Sequence[Photo]) -> float:
-    """The largest angle between two view directions, degrees."""
+    """The largest angle between two view directions, degrees; 0 of no photographs."""
+    if not photos:
+        return 0.0
     forward: Any = np.array([photo.camera.forward for photo in photos])
     return float(np.degrees(np.arccos(np.clip((forward @ forward.T).min(), -1, 1))))

@@ -1,6 +1,6 @@
 """Features that were detected before, in this run or another, by content: of the copy of the photograph, of its mask, and by what was asked of COLMAP.
 
-One file an image, in `$ENERF_CACHE_DIR/features`, else in `features` of the user's cache folder, in a folder for the version of pycolmap: the SHA-256 of the
+One file an image, in `$ENERF_CACHE_DIR/features`, else in `features` of the user's cache folder, in a folder for the build of pycolmap: the SHA-256 of the
 rest, and the rows of COLMAP's database without the image's number, as MessagePack. The least recently used are removed beyond $ENERF_FEATURE_CACHE_MIB, 1024
 without; 0 keeps none. Where there can be no such folder, or a file of it is not as it was written, features are detected.
 """
@@ -11,7 +11,6 @@ import functools
 import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import msgspec
 
 from efficientnerf.backends.kernel_cache import first_private
 from pipeline.files import open_plain, remove, write_atomically
+from stages.sfm.colmap import import_pycolmap
 from stages.sfm.database import FEATURES, Row, insert_features, rows_of
 
 LAYOUT = 1  # of the files; raise it when what is written there, or how features are detected, changes meaning
@@ -40,9 +40,10 @@ def folder() -> Path | None:
 
     if not max_bytes():
         return None
+    pycolmap = import_pycolmap()
     chosen = os.environ.get("ENERF_CACHE_DIR") or platformdirs.user_cache_dir("efficientnerf", appauthor=False)
     try:
-        return first_private([Path(chosen).absolute() / "features"], _sha256(f"{LAYOUT} {version('pycolmap')}".encode())[:16])[0]
+        return first_private([Path(chosen).absolute() / "features"], _sha256(f"{LAYOUT} {pycolmap.__version__} {pycolmap.COLMAP_build}".encode())[:16])[0]
     except RuntimeError:  # no home
         return None
 

@@ -226,6 +226,7 @@ HOSTILE: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "sparse": (".glb", glb_with(lambda d: d["accessors"][0].update(sparse={})), "row by row"),
     "matrices": (".glb", glb_with(lambda d: d["accessors"][0].update(type="MAT4")), "MAT4"),
     "a lying stride": (".glb", glb_with(lambda d: d["bufferViews"][0].update(byteStride=1)), "beyond the binary part"),
+    "rows far apart": (".glb", glb_with(lambda d: d["bufferViews"][0].update(byteStride=256)), "at most 252"),
     "compressed": (
         ".glb",
         glb_with(lambda d: d["meshes"][0]["primitives"][0]["extensions"][PREFIX].update(extensions={f"{PREFIX}_compression_spz_2": {}})),

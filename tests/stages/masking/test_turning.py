@@ -90,3 +90,4 @@ def test_turn_is_the_largest_angle_between_view_directions() -> None:
     assert turn(photos[:1]) == pytest.approx(0.0, abs=1e-5)
     assert 40 < turn(photos[:2]) < 50
     assert turn(photos) > 120
+    assert turn([]) == 0.0

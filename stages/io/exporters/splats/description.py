@@ -25,6 +25,7 @@ from stages.io.exporters.splats import gltf, spz
 
 AT_ONCE = 2**16  # Gaussians
 MAX_PLY_HEADER = 2**16  # bytes
+MAX_GLTF_STRIDE = 252  # bytes; glTF 2.0, bufferView.byteStride
 MAX_GLTF_JSON = 2**24  # bytes; of Gaussians it takes a few thousand
 DENSEST = 1032  # bytes that one byte of deflate, or of a zstd frame as SPZ writes them, can stand for
 SPZ_DEGREES = range(5)
@@ -308,6 +309,8 @@ def _accessor(document: Any, number: int, count: int, width: int, file: BinaryIO
         raise _Damaged(f"an attribute of {entry['count']} {printable(entry['type'], 20)}; expected {count} rows of {width} numbers")
     row = width * np.dtype(kind).itemsize
     stride, first = numbers[5] or row, start + numbers[2] + numbers[3]
+    if stride > MAX_GLTF_STRIDE:
+        raise _Damaged(f"rows that lie {stride} bytes apart; expected at most {MAX_GLTF_STRIDE}")
     if stride < row or first + stride * (count - 1) + row > min(end, start + numbers[2] + numbers[4]):
         raise _Damaged("an attribute that goes on beyond the binary part")
     scale = np.iinfo(kind).max if np.dtype(kind).kind in "iu" else 1
