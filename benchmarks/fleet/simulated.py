@@ -21,6 +21,7 @@ class Sleeping:
     """Workers whose stages take some milliseconds of the clock and write a byte."""
 
     executor = "simulated"
+    queued = False
 
     def __init__(self, folder: Path, workers: int, slots: int, seconds: float) -> None:
         self.folder, self.seconds = folder, seconds

@@ -57,6 +57,7 @@ class DaskWorkers:
         for name in ("distributed", "distributed.client"):  # what becomes of workers is reported by the fleet
             logging.getLogger(name).setLevel(logging.CRITICAL)
         self.module, self.slots = module, slots
+        self.queued = address is None and CLUSTERS[kind][0] == "dask_jobqueue"
         self._cluster = None if address is not None else _started(kind, dict(options or {}))
         try:
             self._client = distributed.Client(address or self._cluster, timeout=CONNECT_SECONDS, set_as_default=False)

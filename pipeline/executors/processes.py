@@ -21,6 +21,7 @@ class Processes:
     """
 
     executor = "local"
+    queued = False
 
     def __init__(self, module: str, worker: Worker) -> None:
         self.worker = worker

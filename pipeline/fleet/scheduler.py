@@ -24,7 +24,7 @@ Report = Callable[[dict[str, Any]], None]
 WRITE_SECONDS = 1.0  # between two writings of fleet.json, and TIMES as long as one takes
 TIMES = 20.0
 LOOK_SECONDS = 1.0  # between two looks for requests, and for workers that came or went
-WORKERLESS_SECONDS = 300.0  # that a fleet waits while it has no worker
+WORKERLESS_SECONDS = 300.0  # that a fleet waits while it has no worker; for the first job of a queue as long as it takes
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,7 @@ class Scheduler:
         self._next_number = 0
         self._next_write = self._next_look = 0.0
         self._workerless_since: float | None = None
+        self._awaiting_first = workers.queued
         self._changed = True
         self._cancelled = self._ending = False
         for each in self._open:
@@ -127,7 +128,8 @@ class Scheduler:
             raise RunLocked(why)
         self._alive = self.workers.alive()
         self.state.slots = sum(worker.capacity for worker in self._alive)
-        self._workerless_since = None if self._alive else self._workerless_since or now
+        self._awaiting_first = self._awaiting_first and not self._alive
+        self._workerless_since = None if self._alive or self._awaiting_first else self._workerless_since or now
         if self._workerless_since is not None and now - self._workerless_since > WORKERLESS_SECONDS:
             for each in [each for each in self._open if each.task is None]:  # one that takes no more tasks may still end those that it has
                 self._give_up(each, "failed", f"no worker was there for {WORKERLESS_SECONDS / 60:.0f} minutes.")

@@ -73,9 +73,13 @@ class Message:
 
 
 class Workers(Protocol):
-    """An executor of fleets. Its methods are called by one thread."""
+    """An executor of fleets. Its methods are called by one thread.
+
+    queued  whether its workers are jobs of a queue: the first may be hours in coming
+    """
 
     executor: str
+    queued: bool
 
     def alive(self) -> Sequence[Worker]:
         """Those that take tasks now."""

@@ -40,6 +40,7 @@ class Simulated:
     most: dict[str, tuple[int, int]] = field(default_factory=dict)
     between: Callable[[], None] = lambda: None
     closed: bool = False
+    queued: bool = False
 
     def alive(self) -> list[Worker]:
         return list(self.workers)

@@ -276,6 +276,24 @@ def test_without_a_worker_it_waits_and_then_gives_up(tmp_path: Path, monkeypatch
     assert "no worker was there" in (found.scenes[0].reason or "")
 
 
+def test_the_first_job_of_a_queue_is_waited_for_but_none_that_has_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler, "WORKERLESS_SECONDS", 0.0)
+    calls = itertools.count()
+
+    def between() -> None:
+        call = next(calls)
+        if call == 20:
+            workers.workers = [Worker("job", 1)]
+        if call == 40:
+            workers.lose("job")
+
+    workers = Simulated([], between=between, queued=True)
+    found = run(tmp_path, workers, scenes(6))
+    assert {scene.state for scene in found.scenes[:3]} == {"done"}
+    assert found.scenes[-1].state == "failed"
+    assert next(calls) > 40
+
+
 def test_a_worker_that_takes_no_more_ends_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduler, "WORKERLESS_SECONDS", 0.0)
     calls = itertools.count()
