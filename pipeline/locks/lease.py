@@ -120,6 +120,15 @@ def acquire(folder: Path, *, decisive: bool) -> Lease:
     raise Held(0.0)
 
 
+def age_of(folder: Path) -> float | None:
+    """Seconds since the lease on `folder` was renewed, by the clock of this machine, which may go differently; None where there is none. Writes nothing."""
+    place = folder / LEASE
+    try:
+        return time.time() - os.stat(place / str(max(_numbers(place))), follow_symlinks=False).st_mtime
+    except (OSError, ValueError):
+        return None
+
+
 @cache
 def machine() -> str:
     """What no other machine has while this one runs."""

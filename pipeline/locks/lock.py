@@ -24,9 +24,10 @@ from pipeline import files
 from pipeline.errors import BadInput, PipelineError, RunLocked
 from pipeline.failures import cannot_write
 from pipeline.links import HOLDER, LOCK
-from pipeline.locks.lease import EXPIRY, Held, Lease, acquire
+from pipeline.locks.lease import EXPIRY, Held, Lease, acquire, age_of
 from pipeline.text import printable
 
+_GONE = 10 * EXPIRY  # seconds without a renewed lease, from which a process of another machine has ended, though clocks differ
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 
@@ -50,7 +51,10 @@ def holder_of(run: Path) -> Holder | None:
         holder = msgspec.convert(files.read_json(run / HOLDER, limit=2**16, follow=False), Holder)
     except (OSError, ValueError):  # of msgspec, too
         return None
-    return holder if holder.host != socket.gethostname() or _is_alive(holder.pid) else None
+    if holder.host == socket.gethostname():
+        return holder if _is_alive(holder.pid) else None
+    age = age_of(run)
+    return holder if age is None or age < _GONE else None
 
 
 def _is_alive(pid: int) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import json
 import os
 import random
 import subprocess
@@ -19,7 +20,7 @@ import pytest
 from pipeline.errors import CorruptArtifact, RunLocked
 from pipeline.locks import lease
 from pipeline.locks.lease import EXPIRY, Held, Lease, acquire
-from pipeline.locks.lock import lock
+from pipeline.locks.lock import holder_of, lock
 from pipeline.run import Run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -190,6 +191,18 @@ def test_a_run_says_who_holds_it_and_since_when_its_lease_was_renewed(tmp_path: 
         (run.path / ".lock").unlink()
         with on("b"), pytest.raises(RunLocked, match=rf"being written by process {os.getpid()} on .* its lease was renewed \d s ago"), other.locked():
             pass
+
+
+def test_a_process_of_another_machine_that_renews_nothing_has_ended(tmp_path: Path) -> None:
+    note = {"pid": 1, "host": "elsewhere", "since": 1.0, "command": "enerf"}
+    (tmp_path / ".lock.json").write_text(json.dumps(note))
+    assert holder_of(tmp_path) is not None, "of a version without leases"
+    with on("a"):
+        held = acquire(tmp_path, decisive=True)
+    assert holder_of(tmp_path) is not None
+    held._done.set()
+    age(tmp_path, 11 * EXPIRY)
+    assert holder_of(tmp_path) is None
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
