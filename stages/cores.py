@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+from pipeline.executors.local import cores
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -20,8 +22,9 @@ def use_all_cores() -> None:
 
 
 def count_cores() -> int:
-    """`OMP_NUM_THREADS`, or the cores of this process's affinity."""
-    return int(os.environ.get("OMP_NUM_THREADS", 0)) or len(os.sched_getaffinity(0))
+    """`OMP_NUM_THREADS`, of a list of levels the first; where it is no number above 0, the cores of this process's affinity."""
+    first = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    return (int(first) if first.isascii() and first.isdigit() else 0) or cores()
 
 
 def in_order(work: Callable[[T], R], items: Sequence[T], threads: int, safe_point: Callable[[], None]) -> Iterator[R]:
