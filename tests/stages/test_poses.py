@@ -283,7 +283,8 @@ def test_photographs_get_their_cameras_found(tmp_path: Path, monkeypatch: pytest
     assert (asked["features"], asked["matching"], asked["max_side"], asked["seed"]) == (1000, "sequential", 800, 3)
     assert [*asked["names"]] == [camera.name for camera in made]
     assert asked["work"].is_relative_to(tmp_path / "a/work")
-    assert [warning for warning in warnings if "too small" not in warning] == ["one was not registered"]
+    assert warnings[0] == "one was not registered"
+    assert [warning.partition(":")[0] for warning in warnings[1:]] == ["6 of 6 photographs are too small, 32 px on the longest side"]
     assert len(whole.views) == 5
     assert whole.views[1].mask == "masks/img_1.png"
     assert json.loads((tmp_path / "a/poses/report.json").read_text())["rejected"] == [{"name": "img_5.png", "reason": "overlaps no other"}]

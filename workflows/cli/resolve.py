@@ -88,17 +88,7 @@ def _read_preset(name: str, folder: Path, heirs: tuple[str, ...]) -> Preset:
 
 def read_config(path: Path) -> Config:
     """A configuration file. Raises UsageError, BadInput and UnknownSetting."""
-    try:
-        with open(files.open_plain(path), "rb") as file:
-            data = file.read(MAX_TOML + 1)
-    except OSError as error:
-        raise UsageError(f"--config {path}: cannot be read ({error.strerror}).") from None
-    try:
-        content = parse_toml(data.decode("utf-8"))
-    except UnicodeDecodeError:
-        raise BadInput(f"--config {path}: not a text file; expected TOML in UTF-8.") from None
-    except ValueError as error:
-        raise BadInput(f"--config {path}: not valid TOML: {printable(error, 300)}.") from None
+    content = read_toml("--config", path)
     options = {name: content.pop(name) for name in CONFIG_OPTIONS if name in content}
     for name, kind in (("preset", str), ("device", str), ("seed", int)):
         if name in options and type(options[name]) is not kind:
@@ -110,6 +100,21 @@ def read_config(path: Path) -> Config:
                 f"--config {path}: {printable(name, MAX_SHOWN)} stands outside a table; expected [stage] tables and {', '.join(CONFIG_OPTIONS)}."
             )
     return Config(content, options)
+
+
+def read_toml(option: str, path: Path) -> dict[str, Any]:
+    """The TOML file that an option names. Raises UsageError and BadInput."""
+    try:
+        with open(files.open_plain(path), "rb") as file:
+            data = file.read(MAX_TOML + 1)
+    except OSError as error:
+        raise UsageError(f"{option} {path}: cannot be read ({error.strerror}).") from None
+    try:
+        return parse_toml(data.decode("utf-8"))
+    except UnicodeDecodeError:
+        raise BadInput(f"{option} {path}: not a text file; expected TOML in UTF-8.") from None
+    except ValueError as error:
+        raise BadInput(f"{option} {path}: not valid TOML: {printable(error, 300)}.") from None
 
 
 def parse_toml(text: str, limit: int = MAX_TOML) -> dict[str, Any]:

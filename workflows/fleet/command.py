@@ -162,7 +162,7 @@ def _placement(jobs: int, scheduler: str | None, cluster: str | None, cluster_op
     from pipeline.errors import UsageError
     from workflows.cli.device import resolve_device
     from workflows.cli.options import memory_limit
-    from workflows.fleet.options import read_cluster_options
+    from workflows.cli.resolve import read_toml
     from workflows.fleet.running import Placement
 
     if scheduler is not None and cluster is not None:
@@ -174,7 +174,7 @@ def _placement(jobs: int, scheduler: str | None, cluster: str | None, cluster_op
         raise UsageError("--memory is of this machine; Dask's workers have limits of their own (dask worker --memory-limit).")
     # Other machines may have devices that this one has not.
     resolved = ("cuda" if device == "cuda" else "cpu") if remote else resolve_device(device or "auto")
-    given = {} if cluster_options is None else read_cluster_options(cluster_options)
+    given = {} if cluster_options is None else read_toml("--cluster-options", cluster_options)
     return Placement(jobs, scheduler, cluster, given, resolved, memory_limit(memory))
 
 

@@ -14,8 +14,8 @@ import pytest
 from pipeline.fleet.state import check_scenes
 from workflows.asset import WORKFLOW
 from workflows.cli.main import enerf
+from workflows.cli.resolve import read_toml
 from workflows.fleet.manifest import read_manifest
-from workflows.fleet.options import read_cluster_options
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES = ROOT / "examples" / "fleet"
@@ -57,7 +57,7 @@ def test_scripts_are_shell_and_their_options_exist(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "module", "kind"), [("ssh.toml", "distributed", "SSHCluster"), ("slurm.toml", "dask_jobqueue", "SLURMCluster")])
 def test_options_of_clusters_are_those_of_their_classes(name: str, module: str, kind: str) -> None:
-    options = read_cluster_options(EXAMPLES / name)
+    options = read_toml("--cluster-options", EXAMPLES / name)
     assert options
     options.pop("jobs", None)
     cluster = getattr(pytest.importorskip(module), kind)
