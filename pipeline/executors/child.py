@@ -122,10 +122,19 @@ class _Child:
     def _ended(self, seconds: float) -> bool:
         """Whether it has ended, or does within this time; it is not reaped yet, so that its group's number is still its own."""
         deadline = time.monotonic() + seconds
-        while os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+        while not self._has_ended():
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.005)
+        return True
+
+    def _has_ended(self) -> bool:
+        if hasattr(os, "waitid"):
+            return os.waitid(os.P_PID, self.process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        if self.process.poll() is None:  # macOS, before Python 3.13: looking reaps, and what it left behind is killed before its group's number is another's
+            return False
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)
         return True
 
     def _reap(self) -> None:
