@@ -38,6 +38,7 @@ from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES, evaluate_v
 from stages.evaluation.findings import findings
 from stages.evaluation.lpips_weights import load_lpips
 from stages.evaluation.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
+from stages.evaluation.refinement import refinement_of
 from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
 from stages.evaluation.splats import EvaluatedSplats, load_splats
 from stages.evaluation.strips import STRIP_RAYS, strip_views, write_strips
@@ -100,7 +101,7 @@ def run(job: Job) -> None:
     tree = format.load(inputs.bake.asset).to(job.device)
     _refuse_large_views(tree, inputs, job)
     region = read_json(inputs.mesh.report).get("region", "foreground")
-    evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree))
+    evaluate(evaluated(tree), tree, load_field, job, load_mesh(inputs.mesh, tree, region), load_splats(inputs.splats, tree), refinement_of(inputs.bake))
 
 
 def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> None:
@@ -119,13 +120,17 @@ def _refuse_large_views(tree: NerfTree, inputs: EvaluateInputs, job: Job) -> Non
     refuse_what_does_not_fit(job, need, "Lower poses.max_image_size or bake.max_mib.")
 
 
-def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job, mesh: EvaluatedMesh, splats: EvaluatedSplats | None = None) -> None:
+def evaluate(
+    asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], job: Job, mesh: EvaluatedMesh, splats: EvaluatedSplats | None = None,
+    refinement: Mapping[str, int] | None = None,
+) -> None:
     """Write metrics, pictures and video. Metrics and thumbnails of each view are kept in job.work, so that a kill costs at most one view.
 
     tree        the asset's
     load_field  returns a FieldRenderer; called only where one is needed
     mesh        made of the asset
     splats      the same
+    refinement  of the asset, `refinement_of`
     """
     from stages.io.refined_cameras import load_scene
 
@@ -160,14 +165,14 @@ def evaluate(asset: EvaluatedAsset, tree: Any, load_field: Callable[[], Any], jo
     job.progress(len(views), len(views))
     strips = write_strips(asset, mesh, load_field, scene, views, strip_views(figures), job, warn) if settings.strips == "on" else []
     metrics = summary(figures, split=split, stride=stride, background=rest, perceptual=tuple(perceptual), strips=strips, mesh=mesh.facts,
-                      splats=None if splats is None else splats.facts)  # fmt: skip
+                      splats=None if splats is None else splats.facts, refinement=refinement)  # fmt: skip
     write_json(EvaluateOutputs(job.out).metrics, metrics)
     _write_sheet(metrics, drawn, job)
     frames = given(settings.captured_path_frames)
     if frames is not None:
         write_captured_path(asset, tree, scene, frames, job)
     job.say(in_words(metrics))
-    for text in findings(metrics["gap"]["psnr"], metrics["holes"], metrics["floaters"], metrics["network"]["floaters"]):
+    for text in findings(metrics["gap"]["psnr"], metrics["holes"], metrics["floaters"], metrics["network"]["floaters"], **(refinement or {})):
         job.warn(text)
 
 
@@ -237,4 +242,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=5, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True)
+STAGE = Stage(name="evaluate", version=6, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True)

@@ -324,5 +324,9 @@ def refinement_steps(settings: BakeSettings, voxels: int, *, whole: bool) -> int
     """Steps of the refinement of so many voxels, of a whole scene or of another."""
     if (stated := given(settings.refine_steps)) is not None:
         return stated
-    per_voxel = SCENE_STEP_RAYS_PER_VOXEL if whole else STEP_RAYS_PER_VOXEL
-    return max(MIN_STEPS, math.ceil(per_voxel * voxels / settings.refine_rays_per_batch))
+    return usual_steps(voxels, settings.refine_rays_per_batch, whole=whole)
+
+
+def usual_steps(voxels: int, rays: int, *, whole: bool) -> int:
+    """Steps of so many rays where nothing is stated."""
+    return max(MIN_STEPS, math.ceil((SCENE_STEP_RAYS_PER_VOXEL if whole else STEP_RAYS_PER_VOXEL) * voxels / rays))

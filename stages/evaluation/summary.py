@@ -6,6 +6,7 @@ asset_with_network_background  cascade 0 of a whole scene's asset between what t
 mesh            means over the views of what `stages.evaluation.mesh` measures, and how many faces and texels the mesh has
 splats          the same of the 3D Gaussians (`stages.evaluation.splats`); null where there are none
 gap, holes, floaters           means over the views that the network was rendered for (`stages.evaluation.comparison`)
+refinement      of the asset: its steps, and how many are usual; null where that is not known
 strips          the views whose pictures stand beside, with the figures of these
 views           the metrics of each view
 """
@@ -26,6 +27,7 @@ FORMAT = 1
 def summary(
     figures: Sequence[dict[str, Any]], *, split: str, stride: int, background: int | None, mesh: Mapping[str, Any], perceptual: Sequence[str] = (),
     strips: Sequence[dict[str, Any]] = (), splats: Mapping[str, Any] | None = None,
+    refinement: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """The document of metrics.json.
 
@@ -35,6 +37,7 @@ def summary(
     mesh        facts about the mesh
     splats      facts about the Gaussians, if there are any
     perceptual  names of LPIPS metrics
+    refinement  the asset's, see `stages.evaluation.refinement`
     """
     drawn = [view for view in figures if view["network"] is not None]
     networks, assets = [view["network"] for view in drawn], [view["asset"] for view in figures]
@@ -54,6 +57,7 @@ def summary(
         "asset_with_network_background": {**means(composited), "views": len(composited), "background_scale": 1.0 / stride} if composited else None,
         "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
         **means(drawn, ("holes", "floaters")),
+        "refinement": None if refinement is None else dict(refinement),
         "strips": list(strips),
         "views": list(figures),
     }

@@ -66,6 +66,13 @@ class Strip(msgspec.Struct):
     mesh: Quality | None = None
 
 
+class Refinement(msgspec.Struct):
+    """Steps that an asset was refined in, and how many are usual."""
+
+    steps: int | None = None
+    usual_steps: int | None = None
+
+
 class Metrics(msgspec.Struct):
     """metrics.json, as far as it is shown; see `stages.evaluation.summary`."""
 
@@ -78,6 +85,7 @@ class Metrics(msgspec.Struct):
     gap: Quality | None = None
     holes: float | None = None
     floaters: float | None = None
+    refinement: Refinement | None = None
     strips: list[Strip] = []
     views: list[ViewQuality] = []
 

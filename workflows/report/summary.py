@@ -120,7 +120,8 @@ def findings_of(found: Metrics | None) -> list[str]:
     if found is None:
         return []
     gap = None if found.gap is None else found.gap.psnr
-    return findings(gap, found.holes, found.floaters, None if found.network is None else found.network.floaters)
+    floaters = None if found.network is None else found.network.floaters
+    return findings(gap, found.holes, found.floaters, floaters, **({} if found.refinement is None else msgspec.structs.asdict(found.refinement)))
 
 
 def split_of(found: Metrics | None) -> str:

@@ -162,6 +162,20 @@ def test_the_closing_summary_says_so_too(tmp_path: Path) -> None:
     assert lines[-1].strip() == "gap -0.10 dB; holes 0.00 %; floaters 1.20 %"
 
 
+def test_where_the_refinement_was_short_that_is_the_advice(tmp_path: Path) -> None:
+    short = "refinement had 2 steps, where 827 are usual"
+    lines = in_words(a_run(tmp_path / "short", POOR | {"refinement": {"steps": 2, "usual_steps": 827}}).path, [])
+    assert sum(short in line for line in lines) == 1
+    assert any("the asset has holes: 3.4 %" in line for line in lines)
+    assert any("the asset has floaters: 5.1 %" in line for line in lines)
+    assert not any(setting in line for line in lines for setting in ("bake.weight_threshold", "bake.min_component"))
+    usual = in_words(a_run(tmp_path / "usual", POOR | {"refinement": {"steps": 800, "usual_steps": 827}}).path, [])
+    assert not any("are usual" in line for line in usual)
+    assert any("bake.min_component" in line for line in usual)
+    good = in_words(a_run(tmp_path / "good", {"gap": {"psnr": -0.1}, "refinement": {"steps": 2, "usual_steps": 827}}).path, [])
+    assert not any(short in line for line in good)
+
+
 def write(run: Run, name: str, text: str) -> None:
     (run.path / name).parent.mkdir(exist_ok=True)
     (run.path / name).write_text(text, encoding="utf-8")
