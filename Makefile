@@ -1,6 +1,7 @@
 # make demo      install, then turn examples/still_life into a baked asset, turntable, mesh and point cloud under runs/demo
 # make test      install, then run the tests on all cores, but those marked slow
 # make test-slow install, then run the tests marked slow
+# make test-all  both in one go, as .ci/run does: the long ones first, and what one of them compiles is there for the others
 # make torture   kill runs at N moments (30; by night 1000: make torture N=1000 JOBS=2) and compare their artifacts with those of undisturbed runs
 # make faults    let each file operation of a run fail, by five errors: half an hour on two cores (make faults JOBS=2)
 # make fuzz      100,000 damaged inputs to each reader; FUZZ_OPTIONS go to benchmarks/fuzz; `pip install -e '.[fuzz]'` guides it by coverage
@@ -13,17 +14,22 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+# In the order of tests/conftest.py: by itself xdist begins with the files that have most tests, and a worker ends alone with a long one.
+PYTEST := $(BIN)/python -m pytest -q -n auto --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow torture faults gpu gpu-packages docs lint install clean
+.PHONY: demo test test-slow test-all torture faults gpu gpu-packages docs lint install clean
 
 demo: $(INSTALLED)
 	$(BIN)/enerf run examples/still_life --out runs/demo
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-slow: $(INSTALLED)
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m slow
+	$(PYTEST) -m slow
+
+test-all: $(INSTALLED)
+	$(PYTEST) --durations 15
 
 N ?= 30
 JOBS ?= 1

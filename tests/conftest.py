@@ -38,5 +38,5 @@ def _old_objects_are_left_alone() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that may take long begin first, so that no worker is left alone with one at the end."""
-    items.sort(key=lambda item: -max((mark.args[0] for mark in item.iter_markers("timeout")), default=0))
+    """Tests that may take long begin first, so that no worker is left alone with one at the end; before them those that compile what others load."""
+    items.sort(key=lambda item: (item.get_closest_marker("first") is None, -max((mark.args[0] for mark in item.iter_markers("timeout")), default=0)))

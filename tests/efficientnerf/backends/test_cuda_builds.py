@@ -15,6 +15,7 @@ pytest.importorskip("triton", reason="Triton is not installed: pip install trito
 
 
 @pytest.mark.slow
+@pytest.mark.first
 @pytest.mark.timeout(900)  # two minutes of one core, on a machine that may be busy
 def test_all_kernels_build_without_spilling(tmp_path: Path) -> None:
     """In a process of its own: kernels that were defined for the interpreter cannot be compiled."""
