@@ -2,9 +2,9 @@
 
 The first steps, in which the learning rate is held, do not depend on the number of iterations: they are timed, and the number that fits into the
 rest of the budget follows. Steps become cheaper or dearer while a scene takes shape, and other work comes and goes, so the number is set again at
-some fractions of the budget, by the time of the steps since the last time. The schedule goes on from where it is. It is written down each time: a resumed
-run reads it, and the schedule that a run ended with (`report.json`, field.safetensors) gives the same bytes again when `efficientnerf.training.loop.train` is
-given it, on any machine with the same number of threads.
+some fractions of the budget, by the time of the steps since the last time, and steps end where the budget does. The schedule goes on from where it is. It is
+written down each time: a resumed run reads it, and the schedule that a run ended with (`report.json`, field.safetensors) gives the same bytes again when
+`efficientnerf.training.loop.train` is given it, on any machine with the same number of threads.
 """
 
 from __future__ import annotations
@@ -119,8 +119,9 @@ class Budget:
         if not self.known:
             due = step >= self.schedule.hold or now >= self.budget
         else:  # a resumed run takes steps again for which the schedule was made
-            enough = self.timed is not None and step - self.timed[0] >= MIN_TIMED
-            due = bool(passed) and enough and self.schedule.revised_at < step < self.schedule.iterations
+            enough = bool(passed) and self.timed is not None and step - self.timed[0] >= MIN_TIMED
+            # After the last mark other work may slow the steps that are left: none is taken once the budget is over.
+            due = (enough or now >= self.budget) and self.schedule.revised_at < step < self.schedule.iterations
         if due:
             self.marks = self.marks[len(passed) :]
         return due

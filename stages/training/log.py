@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 EVERY = 10  # steps
 SMOOTHING = 0.95  # of the running mean of the loss
+RECENT = 50  # lines whose steps say how long those to come take, previews and checkpoints between them included
 
 
 class _Line(msgspec.Struct):
@@ -50,6 +52,7 @@ class TrainLog:
         self.logged, self.working = step, 0.0
         self.loss, self.fraction = 0.0, 0.0
         self.rates: dict[str, Any] = {}
+        self.recent: deque[tuple[int, float]] = deque(maxlen=RECENT + 1)  # steps, and the seconds up to each
         self.unwritten: list[str] = []
         continue_log(path, step)
 
@@ -78,13 +81,18 @@ class TrainLog:
             self.unwritten.append(json.dumps(self._line(done, seconds, psnr), sort_keys=True))
             self.working, self.logged = 0.0, done.step
         if due or not self.rates:
-            each = max((seconds - self.spent) / max(done.step - self.first, 1), 1e-9)
-            self.rates = {
-                "samples_per_s": round((done.valid + done.fine) / each),
-                "occupied": round(self.fraction, 4),
-                "left": round(each * max(0, goal - done.step), 1),
-            }
+            self.rates = self._rates(done, goal, seconds)
         return {"loss": self.loss, "psnr": round(psnr_of(self.loss), 2), **self.rates}
+
+    def _rates(self, done: Progress, goal: int, seconds: float) -> dict[str, Any]:
+        """By the last steps of this attempt. Its first step says nothing of those to come: kernels are loaded in it."""
+        self.recent.append((done.step, seconds))
+        step, began = self.recent[0]
+        rates: dict[str, Any] = {"occupied": round(self.fraction, 4)}
+        if done.step > step:
+            each = max((seconds - began) / (done.step - step), 1e-9)
+            rates |= {"samples_per_s": round((done.valid + done.fine) / each), "left": round(each * max(0, goal - done.step), 1)}
+        return rates
 
     def _line(self, done: Progress, seconds: float, psnr: float | None) -> dict[str, Any]:
         return {

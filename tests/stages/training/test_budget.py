@@ -152,3 +152,19 @@ def test_steps_that_change_their_pace_end_on_time(tmp_path: Path, pace: Callable
         assert budget.schedule.fraction(step) == pytest.approx(before, abs=1e-6)  # a revision changes nothing that has been done
     assert 0.97 * 120 < spent + times[-1] - began <= 120 * 1.005
     assert budget.schedule.fraction(step) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_work_that_comes_after_the_last_mark_does_not_overdraw_the_budget(tmp_path: Path, stopped: bool) -> None:
+    """Steps take eight times as long from 96 % of the budget on; an attempt that is stopped after that plans nothing anew either."""
+    given, times, step = settings(occupancy_warmup_steps=10, time_budget=120.0), [0.0], 0
+    budget = training_budget(given, tmp_path, 0.0, lambda: times[-1])
+    while step < budget.schedule.iterations:
+        times.append(times[-1] + (0.2 if times[-1] < 0.96 * 120 else 1.6))
+        step += 1
+        budget.after(step)
+        if stopped and times[-1] > 0.98 * 120:
+            stopped = False
+            budget = training_budget(given, tmp_path, times[-1], lambda: times[-1])
+    assert 0.97 * 120 < times[-1] <= 120 + 1.6
+    assert training_budget(given, tmp_path).schedule == budget.schedule  # what the field's bytes follow from
