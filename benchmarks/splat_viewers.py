@@ -41,7 +41,9 @@ WAIT = 600_000  # milliseconds, on a machine that may be busy
 HEAD = """<!doctype html><meta charset=utf-8><style>body{margin:0;background:#000}canvas{display:block}</style>
 <script type=importmap>{"imports":{"three":"/npm/three/build/%(three)s.js","three/webgpu":"/npm/three/build/three.webgpu.js",
 "three/tsl":"/npm/three/build/three.tsl.js","three/addons/":"/npm/three/examples/jsm/","playcanvas":"/npm/playcanvas/build/playcanvas.mjs",
-"@sparkjsdev/spark":"/npm/@sparkjsdev/spark/dist/spark.module.js"}}</script><body><script type=module>
+"@sparkjsdev/spark":"/npm/@sparkjsdev/spark/dist/spark.module.js"}}</script><body><script>
+for (const kind of ["error", "unhandledrejection"]) addEventListener(kind, (e) => { window.done = "failed: " + (e.message || e.reason); });
+</script><script type=module>
 const [width, height, fov, matrix, url] = [%(width)d, %(height)d, %(fov).9f, %(matrix)s, "/%(file)s"];
 const frames = async (draw, count) => { for (let n = 0; n < count; n++) { await new Promise(requestAnimationFrame); await draw(); } };
 """
@@ -96,6 +98,7 @@ import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { GLTFGaussianSplatLoaderExtension } from "three/addons/loaders/GLTFGaussianSplatLoaderExtension.js";
 const renderer = new THREE.WebGPURenderer({ forceWebGL: true });
 await renderer.init();
+renderer.outputColorSpace = THREE.LinearSRGBColorSpace;  // it heeds no colorSpace of the extension, and would encode sRGB again
 """ + THREE + """
 const loader = new GLTFLoader();
 loader.register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
