@@ -19,6 +19,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--longest", type=float, default=1800.0, help="seconds of a fleet that is killed again and again")
+    parser.add_argument("--ways", nargs="+", choices=["one_by_one", "one_worker", "two_workers"], help="of real: measure these now, and compare with those before")
     parser.add_argument("--scheduler")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
@@ -36,9 +37,9 @@ def main() -> int:
 
         found = {"kills": kill(given.folder, given.kills, given.scenes or 12, given.seed, given.longest)}
     else:
-        from benchmarks.fleet.real import compare
+        from benchmarks.fleet.real import WAYS, compare
 
-        found = {"real": compare(given.folder, given.scenes or 24)}
+        found = {"real": compare(given.folder, given.scenes or 24, given.ways or WAYS)}
     found |= {"processor": processor(), "cores": len(os.sched_getaffinity(0)), "load": [load, os.getloadavg()[0]]}
     print(json.dumps(found, indent=1))
     if given.json is not None:

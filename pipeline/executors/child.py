@@ -2,7 +2,7 @@
 a failed stage and not the end of those that run beside it.
 
 A child works for one run (`pipeline.executors.serving` is its side) and is kept for the run's next stage: what it has imported and compiled is used again.
-One that prepares runs, which imports little, goes on to the next run.
+One that prepares runs goes on to the next run, until a run whose stages begin takes it over.
 Parent and child speak lines of JSON:
 
     to the child    {"kind": "prepare" | "stage" | "finish" | "end", ...}, see `Children.work`
@@ -199,7 +199,7 @@ class Children:
                 answer["kind"] = "stopped"
             elif child.stopping and not answer["ok"]:
                 answer = {**_stopped_result(), "lines": answer["lines"]}
-            if child.stopping or child.process.returncode is not None:
+            if child.stopping or child.process.returncode is not None or answer.get("kind") == "memory":  # a new one has all of its memory
                 self._drop(run)
             return answer
         except OSError as error:  # no process could be started
@@ -208,9 +208,10 @@ class Children:
             with self._lock:
                 self._working.discard(run)
                 self._stopped.discard(run)
+                kept = 0.0 if request["kind"] == "finish" else IDLE  # a run that is done needs its memory no more
                 if run in self._children:
-                    self._children[run][1].idle_since = time.monotonic()
-            timer = threading.Timer(IDLE, self.tidy)
+                    self._children[run][1].idle_since = time.monotonic() - (IDLE - kept)
+            timer = threading.Timer(kept, self.tidy)
             timer.daemon = True
             timer.start()
 
@@ -254,21 +255,39 @@ class Children:
     def _child(self, run: str, kind: tuple[int, tuple[int, ...]]) -> _Child | None:
         """The child of the run, with these cores and devices; None where it was asked to stop meanwhile."""
         with self._lock:
-            former = self._children.get(run)
-            if former is not None and former[0] == kind:
-                former[1].idle_since = None
-                return None if run in self._stopped or self._closed else former[1]
-            if former is not None:
-                del self._children[run]
-            kept = [each for each in self._children if not each.startswith(PREPARES)]
-            idle = sorted((each for each in kept if each not in self._working), key=lambda each: self._children[each][1].idle_since or 0.0)
-            excess = [self._children.pop(each)[1] for each in idle[: max(0, len(kept) + 1 - self.most)]]
-        for child in [*excess, *([former[1]] if former is not None else [])]:
+            found = self._children.pop(run, None)
+            doomed: list[_Child] = []
+            if found is not None and found[0] != kind:
+                doomed.append(found[1])
+                found = None
+            if found is None:
+                doomed += self._excess()
+                found = self._spare(run, kind)
+            if found is not None:
+                found[1].idle_since = None
+                self._children[run] = found
+        for child in doomed:
             child.end()
-        new = self._starter.submit(_Child, self.module, _environment(*kind)).result()
+        if found is None:
+            found = kind, self._starter.submit(_Child, self.module, _environment(*kind)).result()
+            with self._lock:
+                self._children[run] = found
         with self._lock:
-            self._children[run] = (kind, new)
-            return None if run in self._stopped or self._closed else new
+            return None if run in self._stopped or self._closed else found[1]
+
+    def _excess(self) -> list[_Child]:
+        """Those without work that are too many beside one more, longest idle first; they are no longer kept."""
+        kept = [each for each in self._children if not each.startswith(PREPARES)]
+        idle = sorted((each for each in kept if each not in self._working), key=lambda each: self._children[each][1].idle_since or 0.0)
+        return [self._children.pop(each)[1] for each in idle[: max(0, len(kept) + 1 - self.most)]]
+
+    def _spare(self, run: str, kind: tuple[int, tuple[int, ...]]) -> tuple[tuple[int, tuple[int, ...]], _Child] | None:
+        """A child that prepared runs and has nothing to do becomes this run's: starting another costs a second."""
+        if run.startswith(PREPARES):
+            return None
+        spare = (each for each, (what, _) in self._children.items() if each.startswith(PREPARES) and each not in self._working and what == kind)
+        name = next(spare, None)
+        return None if name is None else self._children.pop(name)
 
     def _drop(self, run: str) -> None:
         with self._lock:
@@ -283,7 +302,7 @@ def _stopped_result() -> Event:
 
 def _environment(cores: int, gpus: tuple[int, ...]) -> dict[str, str]:
     """That of a child: numerical libraries compute on its cores, CUDA sees its devices."""
-    found = {**os.environ, "OMP_NUM_THREADS": str(cores), "NUMBA_NUM_THREADS": str(cores)}
+    found = {**os.environ, "OMP_NUM_THREADS": str(cores), "NUMBA_NUM_THREADS": str(cores), "OPENCV_FOR_THREADS_NUM": str(cores)}
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     names = [name for name in visible.split(",") if name]
     found["CUDA_VISIBLE_DEVICES"] = ",".join(names[gpu] if gpu < len(names) else str(gpu) for gpu in gpus)
