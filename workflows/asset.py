@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from pipeline.stage import Stage
+from stages.memory.disk import space_needed
 
 
 @dataclass(frozen=True)
@@ -16,11 +19,13 @@ class Workflow:
     stages   in order
     presets  the folder of its presets, TOML files
     child    the module that runs its stages in processes of their own; see `pipeline.executors.serving`
+    space    (stage, run, its sources, settings by stage, bytes of memory or None) -> bytes that the stage writes
     """
 
     stages: tuple[Stage, ...]
     presets: Path
     child: str = "workflows.fleet.child"
+    space: Callable[[str, Path, Sequence[Path], Mapping[str, Any], int | None], int] = lambda *_: 0
 
 
 # Modules of `stages`, in order.
@@ -35,4 +40,4 @@ NAMES = (
     "points",  # bake -> PLY
 )
 STAGES: tuple[Stage, ...] = tuple(import_module(f"stages.{name}").STAGE for name in NAMES)
-WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets")
+WORKFLOW = Workflow(STAGES, Path(__file__).parent / "presets", space=space_needed)

@@ -19,7 +19,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--longest", type=float, default=1800.0, help="seconds of a fleet that is killed again and again")
-    parser.add_argument("--ways", nargs="+", choices=["one_by_one", "one_worker", "two_workers"], help="of real: measure these now, and compare with those before")
+    parser.add_argument("--ways", nargs="+", choices=["one_by_one", "one_worker", "two_workers"], help="of real: measured now; the others were before")
     parser.add_argument("--scheduler")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

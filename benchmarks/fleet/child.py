@@ -65,6 +65,9 @@ class Sleepers:
     def describe(self, run: Path) -> dict[str, Any]:
         return {"metrics": {}, "bytes": 0, "verdict": None}
 
+    def space(self, run: Path, stage: str, memory: int | None) -> int:
+        return 1
+
     def is_finished(self, run: Path) -> bool:
         return (run / "finished").exists()
 

@@ -36,6 +36,7 @@ GPU = "GPU"
 ABSENT_SECONDS = 2.0  # that a worker may be missing before its tasks are lost
 GONE_SECONDS = 60.0  # that the connection to Dask's scheduler may be cut
 CONNECT_SECONDS = 60.0
+SUBMIT_SECONDS = 120.0  # without a worker before jobs are asked of a queue again: those before have ended, by their time limit
 LOOK_SECONDS = 1.0  # between a worker's looks whether its task is still wanted
 PROGRESS_SECONDS = 2.0  # between two reports of a task's progress: they pass through Dask's scheduler
 
@@ -58,7 +59,9 @@ class DaskWorkers:
             logging.getLogger(name).setLevel(logging.CRITICAL)
         self.module, self.slots = module, slots
         self.queued = address is None and CLUSTERS[kind][0] == "dask_jobqueue"
-        self._cluster = None if address is not None else _started(kind, dict(options or {}))
+        options = dict(options or {})
+        self._jobs = options.pop("jobs", 1)
+        self._cluster = None if address is not None else _started(kind, options, self._jobs)
         try:
             self._client = distributed.Client(address or self._cluster, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -67,7 +70,7 @@ class DaskWorkers:
         self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
         self._futures: dict[int, tuple[Task, Any]] = {}
         self._absent: dict[str, float] = {}
-        self._heard = time.monotonic()
+        self._heard = self._manned = time.monotonic()
         self._client.subscribe_topic(self._topic, self._event)
 
     def alive(self) -> Sequence[Worker]:
@@ -83,6 +86,10 @@ class DaskWorkers:
                 raise StageFailed("the scheduler of Dask has gone. Start it, and give the fleet's command again: what is done is kept.")
             return ()
         self._heard = now
+        self._manned = now if found else self._manned
+        if self.queued and self._cluster is not None and now - self._manned > SUBMIT_SECONDS:
+            self._cluster.scale(jobs=self._jobs)  # those that still wait in the queue are not asked for twice
+            self._manned = now
         for number, (task, future) in list(self._futures.items()):
             if task.worker in found:
                 self._absent.pop(task.worker, None)
@@ -144,11 +151,10 @@ def _imported(name: str) -> Any:
         raise UsageError(f"{name} is not installed, which a fleet on Dask needs. Install it: pip install {extra}") from None
 
 
-def _started(kind: str, options: dict[str, Any]) -> Any:
+def _started(kind: str, options: dict[str, Any], jobs: int) -> Any:
     """A cluster of this kind, with its workers asked for."""
     module, name = CLUSTERS[kind]
     cluster_type = getattr(_imported(module), name)
-    jobs = options.pop("jobs", 1)
     if kind == "local":
         options = {"threads_per_worker": 1, "dashboard_address": None, **options}
     try:

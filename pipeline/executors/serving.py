@@ -39,6 +39,9 @@ class Program(Protocol):
     def describe(self, run: Path) -> dict[str, Any]:
         """What fleet.json shows of a run as it is now: "metrics", "bytes", "verdict"."""
 
+    def space(self, run: Path, stage: str, memory: int | None) -> int:
+        """Bytes that a stage which has to run writes at its peak, in this much memory."""
+
     def is_finished(self, run: Path) -> bool:
         """Whether the pages about a run are there and newer than its stages."""
 
@@ -99,7 +102,8 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
     if request["kind"] == "prepare":
         for text in program.prepare(path, request["scene"]):
             channel.send({"event": "warning", "stage": "", "text": text, "time": time.time()})
-        return {"stages": _survey(program, path), "finished": program.is_finished(path), **program.describe(path)}
+        found = _survey(program, path)
+        return {"stages": found, "finished": program.is_finished(path), **_space(program, path, found, request["memory"]), **program.describe(path)}
     if request["kind"] == "finish":
         program.finish(path)
         return program.describe(path)
@@ -109,8 +113,14 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
         channel.send({"event": "message", "stage": name, "text": f"{name}: taken over from {Path(request['donor']).name}", "time": time.time()})
     memory = None if request["memory"] is None else Limit(request["memory"], "its share of the worker's memory")
     outcome = run_stages(Run.open(path), program.stages, only=name, device=request["device"], memory=memory, report=channel.send)[0]
-    found = next(each for each in _survey(program, path) if each["name"] == name)
-    return {**found, "action": outcome.action, **program.describe(path)}
+    surveyed = _survey(program, path)
+    made = next(each for each in surveyed if each["name"] == name)
+    return {**made, "action": outcome.action, **_space(program, path, surveyed, request["memory"]), **program.describe(path)}
+
+
+def _space(program: Program, path: Path, surveyed: Sequence[dict[str, Any]], memory: int | None) -> dict[str, Any]:
+    """What the stages that are left write; the next one's is known best, for what it reads is there."""
+    return {"space": {found["name"]: program.space(path, found["name"], memory) for found in surveyed if not found["fresh"]}}
 
 
 def _survey(program: Program, path: Path) -> list[dict[str, Any]]:

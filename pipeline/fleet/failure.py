@@ -91,7 +91,7 @@ def _out_of_memory(what: str, text: str, attempts: Attempts, given: int | None) 
     shown = "" if given is None else f" in {size_text(given)}"
     if attempts.out_of_memory == 1 and (given is None or given >= 2 * _LEAST):
         attempts.memory = None if given is None else given // 2
-        return Remedy("again", f"{what}: memory ran out{shown} ({text.rstrip('.')}). It is tried once more, in less.")
+        return Remedy("again", f"{what}: memory ran out{shown} ({text.rstrip('.')}). It is tried once more{'' if given is None else ', in half of that'}.")
     return Remedy("quarantined", f"{what}: memory ran out{' again' if attempts.out_of_memory > 1 else ''}{shown} ({text.rstrip('.')}).")
 
 

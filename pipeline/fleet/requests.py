@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,6 +16,7 @@ from pipeline.fleet.state import MOST_SCENES
 
 FOLDER = ".requests"
 MOST = 100  # that are taken at a time
+ANSWER_SECONDS = 30.0  # that who asks waits for the process that runs the fleet, which looks every second
 _LIMIT = 4 * 2**20  # bytes of one
 
 
@@ -27,12 +28,34 @@ class Request:
     scenes: Annotated[list[Annotated[str, msgspec.Meta(max_length=200)]], msgspec.Meta(max_length=MOST_SCENES)] | None = None
 
 
-def ask(fleet: Path, do: Literal["cancel", "retry"], scenes: Sequence[str] | None) -> None:
-    """Leave a request for the process that runs the fleet. Raises OSError."""
+def ask(fleet: Path, do: Literal["cancel", "retry"], scenes: Sequence[str] | None) -> Path:
+    """Leave a request for the process that runs the fleet, in the file that is returned: gone once it is taken. Raises OSError."""
     folder = fleet / FOLDER
     folder.mkdir(exist_ok=True)
     value = {"do": do, "scenes": None if scenes is None else list(scenes)}
-    files.write_json(folder / f"{time.time_ns():020d}.json", value)
+    path = folder / f"{time.time_ns():020d}.json"
+    files.write_json(path, value)
+    return path
+
+
+def outcome(path: Path, is_running: Callable[[], bool], seconds: float | None = None) -> Literal["taken", "ended", "left"]:
+    """What becomes of a request: taken; ended: the fleet did first, and it is withdrawn; or left: nobody answered in this time, by default ANSWER_SECONDS."""
+    deadline = time.monotonic() + (ANSWER_SECONDS if seconds is None else seconds)
+    look = time.monotonic() + 2.0
+    while files.exists(path):
+        now = time.monotonic()
+        if now >= look:
+            look = now + 2.0
+            if not is_running():
+                try:
+                    path.unlink()
+                except FileNotFoundError:
+                    break  # it was taken at last
+                return "ended"
+        if now >= deadline:
+            return "left"
+        time.sleep(0.1)
+    return "taken"
 
 
 def take(fleet: Path) -> list[Request]:
@@ -48,7 +71,9 @@ def take(fleet: Path) -> list[Request]:
     return found
 
 
-def clear(fleet: Path) -> None:
-    """Remove requests to a process that has ended without taking them."""
-    while take(fleet):
-        pass
+def left(fleet: Path) -> list[str]:
+    """Take the requests to a process that has ended: the scenes to try again. That one was to be cancelled concerns nobody any more."""
+    names: list[str] = []
+    while found := take(fleet):
+        names += [name for request in found if request.do == "retry" for name in request.scenes or ()]
+    return names

@@ -5,14 +5,17 @@ The truth about a scene is its run: what a stage has published is never done aga
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import Interrupted, RunLocked
-from pipeline.fleet import requests
+from pipeline.errors import Interrupted, RunLocked, StageFailed
+from pipeline.executors.memory import size_text
+from pipeline.fleet import disk, requests
+from pipeline.fleet.absence import Absence
 from pipeline.fleet.failure import LOCKED_PAUSE, Attempts, remedy
 from pipeline.fleet.forecast import forecast_seconds
 from pipeline.fleet.state import LONGEST_LINE, MOST_LINES, FleetState, FleetWord, Scene, SceneState, StageState, Totals, Verdict, write_fleet
@@ -24,7 +27,6 @@ Report = Callable[[dict[str, Any]], None]
 WRITE_SECONDS = 1.0  # between two writings of fleet.json, and TIMES as long as one takes
 TIMES = 20.0
 LOOK_SECONDS = 1.0  # between two looks for requests, and for workers that came or went
-WORKERLESS_SECONDS = 300.0  # that a fleet waits while it has no worker; for the first job of a queue as long as it takes
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class _Progress:
 
     todo      stages that are not up to date, in order; None before its run is prepared
     finished  whether its pages are written
+    space     bytes that its stages write, by name
     """
 
     state: SceneState
@@ -53,6 +56,7 @@ class _Progress:
     last_worker: str | None = None
     attempts: Attempts = field(default_factory=Attempts)
     lines: list[str] = field(default_factory=list)
+    space: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def what(self) -> str:
@@ -90,30 +94,44 @@ class Scheduler:
         self._alive: Sequence[Worker] = ()
         self._next_number = 0
         self._next_write = self._next_look = 0.0
-        self._workerless_since: float | None = None
-        self._awaiting_first = workers.queued
+        self._absence = Absence(queued=workers.queued)
         self._changed = True
         self._cancelled = self._ending = False
         for each in self._open:
             each.state.state, each.state.reason, each.state.stage, each.state.worker, each.state.attempts = "waiting", None, None, None, 0
 
     def run(self) -> FleetState:
-        """Until every scene is done, failed or quarantined. Raises Interrupted; RunLocked where another took the fleet over."""
+        """Until every scene is done, failed or quarantined.
+
+        Raises Interrupted; RunLocked where another took the fleet over; StageFailed where there are no workers: open scenes are left waiting.
+        """
         number: int | None = None
         try:
-            while self._open and (number := self._stop()) is None and not self._cancelled:
+            while self._left() and (number := self._stop()) is None and not self._cancelled:
                 self._look()
                 self._admit()
                 for message in self.workers.receive(0.5):
                     self._heed(message)
                 self._write()
             self._wind_down()
+        except StageFailed as error:  # nothing is heard of the tasks any more
+            self._tasks.clear()
+            self._wait_all()
+            self.state.note = printable(str(error), 4 * LONGEST_LINE)
+            self._write("interrupted")
+            raise
         finally:
             self.workers.close()
         self._write("interrupted" if number is not None and self._open else "cancelled" if self._cancelled else "done" if self._all_done() else "failed")
         if number is not None and self._open:
             raise Interrupted(number)
         return self.state
+
+    def _left(self) -> bool:
+        """Whether scenes are open. What was requested at the last moment counts."""
+        if not self._open:
+            self._take_requests()
+        return bool(self._open)
 
     def _all_done(self) -> bool:
         return all(each.state.state == "done" for each in self._all.values())
@@ -128,17 +146,26 @@ class Scheduler:
             raise RunLocked(why)
         self._alive = self.workers.alive()
         self.state.slots = sum(worker.capacity for worker in self._alive)
-        self._awaiting_first = self._awaiting_first and not self._alive
-        self._workerless_since = None if self._alive or self._awaiting_first else self._workerless_since or now
-        if self._workerless_since is not None and now - self._workerless_since > WORKERLESS_SECONDS:
-            for each in [each for each in self._open if each.task is None]:  # one that takes no more tasks may still end those that it has
-                self._give_up(each, "failed", f"no worker was there for {WORKERLESS_SECONDS / 60:.0f} minutes.")
+        self._look_for_workers(now)
+        self._take_requests()
+
+    def _look_for_workers(self, now: float) -> None:
+        """Say it where there are none. Raises StageFailed where that has lasted too long."""
+        note = self._absence.note(anyone=bool(self._alive), now=now)
+        if (why := self._absence.ends(now)) is not None and not self._tasks:  # one that takes no more tasks may still end those that it has
+            raise StageFailed(f"{self.fleet}: {why} {len(self._open)} scenes wait. Start workers, and give the fleet's command again: what is done is kept.")
+        if note != self.state.note:
+            self.state.note, self._changed = note, True
+            if note is not None and self._report is not None:
+                self._report({"time": time.time(), "event": "warning", "scene": "", "text": note})
+
+    def _take_requests(self) -> None:
         for request in requests.take(self.fleet):
             self._obey(request)
 
     def _obey(self, request: requests.Request) -> None:
         if request.do == "cancel" and request.scenes is None:
-            self._cancelled = True
+            self._cancelled = bool(self._open)
             return
         for name in request.scenes if request.scenes is not None else self._all:
             each = self._all.get(name)
@@ -159,6 +186,8 @@ class Scheduler:
         """Start what there is room for: stages that use a device first, then scenes that have begun, then in the manifest's order."""
         now = time.monotonic()
         full: set[Demand] = set()
+        cramped: list[_Progress] = []
+        too_much = math.inf  # bytes to write for which the disk has no room
         open_to_all = list(self._alive)
         for each in sorted((each for each in self._open if each.task is None and each.not_before <= now), key=self._order):
             demand = self._demand(each)
@@ -166,13 +195,27 @@ class Scheduler:
                 continue
             others = [worker for worker in open_to_all if worker.name not in each.attempts.lost_on]
             place = self._room.place(demand, others or open_to_all, each.last_worker)
-            if place is not None:
+            need = each.space.get(each.what, 0)
+            if place is not None and (need >= too_much or not self._has_disk(each, need)):
+                too_much = min(too_much, need)
+                cramped.append(each)
+            elif place is not None:
                 self._start(each, *place)
             elif demand.memory is not None and open_to_all:
                 # What needs more than a share would wait for ever beside those that do not: the largest worker is left to it.
                 open_to_all.remove(max(open_to_all, key=lambda worker: worker.memory or 0))
             elif len(others) == len(open_to_all):
                 full.add(demand)
+        for each in cramped if not self._tasks else ():  # nothing that runs will give any of it back
+            shown = f"{each.what}: writes about {size_text(each.space[each.what])}; {size_text(disk.free_space(self.fleet))} are free in {self.fleet}."
+            self._give_up(each, "failed", f"{shown} Make room, and go on.")
+
+    def _has_disk(self, each: _Progress, need: int) -> bool:
+        """Whether the disk has room for so many bytes of its stage, beside what those that run will write."""
+        if not need:
+            return True
+        running = [(self.fleet / other.state.run, other.space.get(str(other.task.request.get("stage")), 0)) for other in self._tasks.values() if other.task]
+        return disk.has_room(disk.free_space(self.fleet), (self.fleet / each.state.run, need), running)
 
     def _order(self, each: _Progress) -> tuple[bool, bool, int]:
         uses = each.what in self.stages and self.stages[each.what].uses_device
@@ -203,7 +246,7 @@ class Scheduler:
         if each.what == "prepare":
             scene = each.state.scene()
             plain = {"name": scene.name, "sources": list(scene.sources), "settings": scene.settings, "preset": scene.preset, "seed": scene.seed}
-            request["scene"] = plain
+            request |= {"scene": plain, "memory": memory}
         elif each.what in self.stages:
             donor = self._donor(each)
             facts = {"stage": each.what, "device": self.device if self.stages[each.what].uses_device else "cpu", "memory": memory}
@@ -255,6 +298,7 @@ class Scheduler:
             numbers = {name: found.get(name) or 0 for name in ("seconds", "cpu_seconds", "peak_memory")}
             each.state.stages[found["name"]] = StageState("done", worker=worker, **numbers)
         each.state.seconds = sum(stage.seconds for stage in each.state.stages.values() if stage.state == "done")
+        each.space = result.get("space") or each.space
         if "metrics" in result:
             each.state.metrics = dict(result["metrics"] or {})
             each.state.bytes = int(result.get("bytes") or 0)
@@ -327,6 +371,10 @@ class Scheduler:
             for message in self.workers.receive(0.5):
                 self._heed(message)
             self._write()
+        self._wait_all()
+
+    def _wait_all(self) -> None:
+        """Leave the open scenes to the next call."""
         for each in self._open:
             each.state.state, each.state.stage, each.state.worker = "waiting", None, None
             for stage in each.state.stages.values():
@@ -337,6 +385,7 @@ class Scheduler:
         if ending is None and (not self._changed or now < self._next_write):
             return
         self.state.state = ending or "running"
+        self.state.note = self.state.note if ending in (None, "interrupted") else None
         self.state.updated, self.state.totals = _now(), Totals.of(self.state.scenes)
         self.state.forecast_seconds = 0.0 if ending is not None else forecast_seconds(self.state.scenes, list(self.stages), self.state.slots)
         write_fleet(self.fleet, self.state)

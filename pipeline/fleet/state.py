@@ -170,6 +170,7 @@ class FleetState:
     forecast_seconds  until its end, None where nothing is known yet
     executor          "local" or "dask"
     slots             stages that may run at a time
+    note              what it waits for, or why it ended with scenes that wait
     """
 
     state: FleetWord = "running"
@@ -178,6 +179,7 @@ class FleetState:
     forecast_seconds: _Seconds | None = None
     executor: _Name = "local"
     slots: _Count = 1
+    note: _Text | None = None
     totals: Totals = field(default_factory=Totals)
     scenes: Annotated[list[SceneState], msgspec.Meta(max_length=MOST_SCENES)] = field(default_factory=list)
 

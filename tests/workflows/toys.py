@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -25,7 +29,7 @@ class TrainSettings:
     iterations: PositiveInt = setting(4, "Steps.")
     rate: float = setting(0.5, "Speed.")
     seed: int = setting(0, "Of the random numbers.")
-    fail: Literal["", "bad", "error", "disk", "memory"] = setting("", "How to fail.")
+    fail: Literal["", "bad", "error", "disk", "memory", "greedy", "ended", "slow"] = setting("", "How to fail.")
 
 
 @dataclass(frozen=True)
@@ -51,11 +55,40 @@ def _train(job: Job) -> None:
             raise OSError(28, "No space left on device", str(job.out / "field"))
         case "memory":
             raise MemoryError
+        case "greedy" | "ended":
+            _take_all_memory(job)
+        case "slow":
+            _wait_for(job.out.parents[5] / "go on", job)
     for step in range(job.settings.iterations):
         job.progress(step + 1, job.settings.iterations, "training", loss=1.0 / (step + 1))
         job.safe_point()
     text = (job.inputs["poses"] / "text.txt").read_text(encoding="utf-8")
     (job.out / "field.txt").write_text(f"{text} {job.settings.iterations} {job.settings.rate} {job.settings.seed}", encoding="utf-8")
+
+
+def _take_all_memory(job: Job) -> None:
+    """Touch half of what may be taken, where the system allows 384 MiB more; or be ended by it."""
+    import resource  # not on Windows
+
+    assert job.memory is not None
+    job.say(f"{job.memory.bytes} {os.getpid()}")
+    if job.settings.fail == "ended" and job.memory.bytes > 2**29:
+        os.kill(os.getpid(), signal.SIGKILL)
+    taken = next(int(line.split()[1]) for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmSize:"))
+    former = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (1024 * taken + 384 * 2**20, former[1]))
+    try:
+        bytearray(job.memory.bytes // 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, former)
+
+
+def _wait_for(path: Path, job: Job) -> None:
+    """Until the test says so; of which process that is, it learns beside it."""
+    path.with_name(f"{job.stage} in {os.getpid()}").touch()
+    while not path.exists():
+        job.safe_point()
+        time.sleep(0.02)
 
 
 def _points(job: Job) -> None:

@@ -130,9 +130,11 @@ def retry(folder: Path, names: tuple[str, ...], as_json: bool, quiet: bool, **op
 
     chosen = scenes_to_retry(read_fleet(folder).scenes, names)
     if is_running(folder):
-        requests.ask(folder, "retry", chosen)
-        closing(f"{folder}: {len(chosen)} scenes are tried again by the process that runs it")
-        return 0
+        outcome = requests.outcome(requests.ask(folder, "retry", chosen), lambda: is_running(folder))
+        if outcome != "ended":  # else it is for this process to do
+            when = "are tried again by the process that runs it" if outcome == "taken" else "will be tried again, once the process that runs it answers"
+            closing(f"{folder}: {len(chosen)} scenes {when}")
+            return 0
     return _run(folder, None, as_json=as_json, quiet=quiet, retry=chosen, **options)
 
 
@@ -154,8 +156,10 @@ def cancel(folder: Path, names: tuple[str, ...]) -> None:
         raise BadInput(f"{unknown[0]}: the fleet has no such scene. 'enerf fleet status {folder}' lists them.")
     if not is_running(folder):
         raise BadInput(f"{folder}: nobody runs it; there is nothing to cancel.")
-    requests.ask(folder, "cancel", names or None)
-    closing(f"{folder}: {'all of it' if not names else f'{len(names)} scenes'} will stop at the next safe point")
+    outcome = requests.outcome(requests.ask(folder, "cancel", names or None), lambda: is_running(folder))
+    what = "all of it" if not names else f"{len(names)} scenes"
+    later = "will stop at the next safe point" if outcome == "taken" else "will stop once the process that runs it answers"
+    closing(f"{folder}: has ended meanwhile; there is nothing to cancel" if outcome == "ended" else f"{folder}: {what} {later}")
 
 
 def _placement(jobs: int, scheduler: str | None, cluster: str | None, cluster_options: Path | None, device: str | None, memory: str | None) -> Placement:

@@ -71,7 +71,7 @@ def sentence(event: dict[str, Any]) -> str | None:
         case "scene_failed" | "scene_quarantined":
             return f"{scene}: {event['event'].removeprefix('scene_')}: {printable(event['text'], 1000)}"
         case "retry" | "warning":
-            return f"{scene}: {printable(event['text'], 1000)}"
+            return f"{scene}: {printable(event['text'], 1000)}" if scene else printable(event["text"], 1000)
     return None
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.run import NAME, Run
-from pipeline.stage import Stage
+from pipeline.stage import Stage, settings_from
 from stages.artifacts import BakeOutputs
 from workflows.asset import Workflow
 
@@ -49,6 +49,16 @@ class WorkflowProgram:
         except OSError:
             size = 0
         return {"metrics": shown, "bytes": size, "verdict": camera_verdict(run)}
+
+    def space(self, run: Path, stage: str, memory: int | None) -> int:
+        """0 where it cannot be known: the stage is admitted as if it wrote nothing, and tells what is wrong."""
+        opened = Run.open(run)
+        kinds = {each.name: each.settings for each in self.stages}
+        settings: dict[str, Any] = {name: settings_from(kind, opened.settings.get(name, {}), where=name) for name, kind in kinds.items()}
+        try:
+            return self.workflow.space(stage, run, tuple(opened.sources.values()), settings, memory)
+        except OSError:
+            return 0
 
     def is_finished(self, run: Path) -> bool:
         from workflows.report.pages import has_pages

@@ -108,10 +108,10 @@ def run_fleet(
         former = read_fleet(fleet) if files.exists(fleet / NAME) else None
         chosen = scenes if scenes is not None else [state.scene() for state in (former or read_fleet(fleet)).scenes]
         check_scenes(chosen)
-        requests.clear(fleet)
+        again = {*(retry or ()), *requests.left(fleet)}
         states = states_for(chosen, former)
         for state in states:
-            if retry is not None and state.name in retry and state.state in ("failed", "quarantined"):
+            if state.name in again and state.state in ("failed", "quarantined"):
                 state.state = "waiting"
         stages = [StageOf(stage.name, stage.uses_device) for stage in workflow.stages]
         lost = _lost(fleet, lease)

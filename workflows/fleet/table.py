@@ -102,4 +102,4 @@ def overview(state: FleetState) -> str:
     counts = ((word, getattr(totals, word)) for word in ("done", "running", "waiting", "failed", "quarantined"))
     parts = [f"{count} {word}" for word, count in counts if count]
     ahead = "" if not state.forecast_seconds else f"; about {duration(state.forecast_seconds)} to go"
-    return (", ".join(parts) or "no scenes") + ahead
+    return (", ".join(parts) or "no scenes") + ahead + (f"; {printable(state.note, 300)}" if state.note else "")

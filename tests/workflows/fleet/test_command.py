@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,23 @@ def test_a_full_disk_is_no_fault_of_the_scene(enerf: Enerf, scenes: Path, tmp_pa
     assert [each["stage"] for each in again.objects if each["event"] == "stage_started"] == ["train"]
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits on addresses are Linux's")
+def test_what_runs_out_of_memory_is_done_in_half_by_a_new_process(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
+    """The limit is the system's, the MemoryError the allocator's; and where the system ends the process, the same is done."""
+    fleet = tmp_path / "fleet"
+    result = enerf("fleet", manifest(scenes, s0="greedy", s2="ended"), "--out", fleet, "--memory", "1g", "--json")
+    assert result.code == 0, fleet_json(fleet)
+    told = {each["scene"]: each["text"] for each in result.objects if each["event"] == "retry"}
+    assert told["s0"].startswith("train: memory ran out in 1.0 GiB")
+    assert "SIGKILL" in told["s2"]
+    assert "It is tried once more, in half of that." in told["s0"]
+    started = [(each["scene"], each["text"]) for each in result.objects if each["event"] == "message" and each["stage"] == "train"]
+    assert [text.split()[0] for scene, text in started if scene == "s0"] == ["1073741824", "536870912"]
+    processes = [text.split()[1] for scene, text in started if scene == "s0"]
+    assert len(set(processes)) == 2
+    assert (fleet / "s0" / "points" / "points.ply").is_file()
+
+
 def test_retry_tries_what_was_given_up(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
     fleet = tmp_path / "fleet"
     assert enerf("fleet", manifest(scenes, s1="bad", s2="error"), "--out", fleet).code == 3
@@ -126,16 +144,18 @@ def test_a_source_that_has_gone_is_named(enerf: Enerf, scenes: Path, tmp_path: P
     assert str(scenes / "s2") in result.err + json.dumps(fleet_json(fleet) if fleet.exists() else "")
 
 
-def test_a_second_fleet_says_who_holds_it(enerf: Enerf, scenes: Path, tmp_path: Path) -> None:
+def test_a_second_fleet_says_who_holds_it(enerf: Enerf, scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pipeline.fleet import requests
     from workflows.fleet.running import held
 
+    monkeypatch.setattr(requests, "ANSWER_SECONDS", 0.0)
     fleet = tmp_path / "fleet"
     assert enerf("fleet", scenes, "--out", fleet, "--preset", "tiny").code == 0
     with held(fleet):
         result = enerf("fleet", scenes, "--out", fleet, "--preset", "tiny")
         assert result.code == 5
         assert f"process {os.getpid()} on" in result.err
-        assert enerf("fleet", "cancel", fleet, "s1").code == 0
+        assert "once the process that runs it answers" in enerf("fleet", "cancel", fleet, "s1").out
         assert len(list((fleet / ".requests").iterdir())) == 1
     assert enerf("fleet", "cancel", fleet).code == 2
     assert enerf("fleet", scenes, "--out", fleet, "--preset", "tiny").code == 0  # requests to a process that has ended are not heeded

@@ -67,6 +67,24 @@ def test_options_of_clusters_are_those_of_their_classes(name: str, module: str, 
     assert set(options) <= known
 
 
+def test_slurm_is_asked_for_what_the_template_says() -> None:
+    """The script that dask-jobqueue would hand to sbatch, which is not needed for it."""
+    jobqueue = pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed")
+    options = read_toml("--cluster-options", EXAMPLES / "slurm.toml")
+    assert options.pop("jobs") == 8
+    cluster = jobqueue.SLURMCluster(**options, scheduler_options={"dashboard_address": None, "host": "127.0.0.1"})
+    try:
+        script = cluster.job_script()
+    finally:
+        cluster.close()
+    for line in ("#SBATCH --cpus-per-task=8", "#SBATCH --mem=30G", "#SBATCH -t 08:00:00", "#SBATCH -n 1"):
+        assert line in script.splitlines()
+    command = script.splitlines()[-1]
+    assert "-m distributed.cli.dask_worker tcp://127.0.0.1:" in command
+    assert " --nthreads 8 " in command
+    assert " --memory-limit " in command
+
+
 def test_snakemake_finds_the_jobs(tmp_path: Path) -> None:
     snakemake = shutil.which("snakemake")
     if snakemake is None:

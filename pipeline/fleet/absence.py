@@ -1,0 +1,27 @@
+"""A fleet without workers: how long that lasts, and what is said of it."""
+
+from __future__ import annotations
+
+LONGEST = 300.0  # seconds that a fleet waits while it has no worker; for jobs of a queue as long as it takes
+SAID = 30.0  # seconds before that is said
+
+
+class Absence:
+    """queued: whether workers are jobs of a queue, which may be hours in coming."""
+
+    def __init__(self, *, queued: bool) -> None:
+        self.queued = queued
+        self._since: float | None = None
+
+    def note(self, *, anyone: bool, now: float) -> str | None:
+        """What to say now, if anything. now: seconds, of any clock."""
+        self._since = None if anyone else now if self._since is None else self._since
+        if self._since is None or now - self._since < SAID:
+            return None
+        return f"no worker is there; one is waited for, {'as long as it takes' if self.queued else f'{LONGEST / 60:.0f} minutes'}"
+
+    def ends(self, now: float) -> str | None:
+        """Why the fleet is to end, a sentence; None where it goes on."""
+        if self.queued or self._since is None or now - self._since <= LONGEST:
+            return None
+        return f"no worker was there for {LONGEST / 60:.0f} minutes."

@@ -1,0 +1,72 @@
+"""What each stage writes at its peak, its scratch and what is replaced included: by settings, and by what the stages before it made.
+
+Larger than what was measured on purpose (docs/experiments/fleet.md): a fleet admits stages by it, and what is too large only waits.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from efficientnerf.settings import given
+from stages.artifacts import BakeOutputs, PosesOutputs
+from stages.memory.need import MIB
+
+LEAST = 16 * MIB  # logs, plots, manifests, previews
+# Bytes. Of a pixel of a working image; of a feature with its matches; of a parameter: the field, and two checkpoints with Adam's moments.
+PIXEL, FEATURE, PARAMETER = 2, 400, 4 * (1 + 2 * 3)
+DECODED = 8  # times a photograph's file: what it takes as PNG
+ASPECT = 0.75  # of the longer side: the shorter
+BAKED = 6  # times the asset: its arrays while they are refined
+ASSET_MIB = 64.0  # where the size of the asset is automatic
+SURFACE = 3  # times the asset: mesh files, textures, 3D Gaussians
+FRAME_PIXEL = 24  # of a pixel of a rendered frame: PNG, EXR and the video
+
+
+def space_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mapping[str, Any], memory: int | None = None) -> int:
+    """Bytes that a stage of this name writes.
+
+    settings  of each stage by its name, dataclasses
+    memory    bytes that the stage may take: what does not fit there is written; None: no limit
+    """
+    own = settings[stage]
+    asset = BakeOutputs.of_run(run).asset
+    if stage == "poses":
+        return LEAST + _working_images(own, sources)
+    if stage == "train":
+        return LEAST + _training(own, run, memory)
+    if stage == "bake":
+        return LEAST + int(BAKED * (given(own.max_mib) or ASSET_MIB) * MIB)
+    if stage in ("mesh", "splats", "points"):
+        return LEAST + SURFACE * (asset.stat().st_size if asset.exists() else int(ASSET_MIB * MIB))
+    if stage == "turntable":
+        return LEAST + FRAME_PIXEL * own.frames * own.width * own.height
+    return LEAST + 2 * _bytes_below([PosesOutputs.of_run(run).images])
+
+
+def _working_images(own: Any, sources: Sequence[Path]) -> int:
+    files = [path for source in sources for path in _files(source)]
+    stored = sum(os.stat(path).st_size for path in files)
+    count = len(files) if len(files) > 2 * len(sources) else own.frames * len(sources)  # of videos
+    images = count * int(PIXEL * ASPECT * own.max_image_size**2)
+    return (min(images, DECODED * stored) if len(files) > 2 * len(sources) else images) + FEATURE * own.max_features * count
+
+
+def _training(own: Any, run: Path, memory: int | None) -> int:
+    from stages.memory.training import parameters
+
+    pixels = 4 * DECODED * _bytes_below([PosesOutputs.of_run(run).images])
+    return PARAMETER * parameters(own) + (pixels if memory is not None and pixels > memory // 2 else 0)
+
+
+def _bytes_below(folders: Sequence[Path]) -> int:
+    return sum(os.stat(path).st_size for folder in folders for path in _files(folder))
+
+
+def _files(place: Path) -> list[Path]:
+    """The plain files below a folder, links left out; of a file itself."""
+    if place.is_file():
+        return [place]
+    return [path for parent, _, names in os.walk(place) for name in names if not (path := Path(parent, name)).is_symlink()]

@@ -1,0 +1,108 @@
+"""Fleets on Dask's own local cluster: in this process, and with worker processes of which one is killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.workflows.command import Enerf
+
+pytest.importorskip("distributed", reason="Dask distributed (the extra fleet) is not installed")
+
+
+@pytest.fixture
+def scenes(toys: Path, tmp_path: Path) -> Callable[..., Path]:
+    """scenes(s1="bad") writes a manifest of three scenes, of which s1 fails so."""
+
+    def write(**fails: str) -> Path:
+        lines = ['preset = "tiny"']
+        for number in range(3):
+            source = tmp_path / "shoots" / f"s{number}"
+            source.mkdir(parents=True)
+            (source / "a.txt").write_text(f"scene {number}", encoding="utf-8")
+            lines += [f"[scenes.s{number}]", f'source = "{source}"', f'train.fail = "{fails.get(f"s{number}", "")}"']
+        path = tmp_path / "scenes.toml"
+        path.write_text("\n".join(lines), encoding="utf-8")
+        return path
+
+    return write
+
+
+def cluster(folder: Path, *, processes: bool) -> list[Any]:
+    path = folder / "cluster.toml"
+    path.write_text(f"n_workers = 2\nprocesses = {str(processes).lower()}\n", encoding="utf-8")
+    return ["--cluster", "local", "--cluster-options", path, "--json"]
+
+
+def fleet_json(fleet: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((fleet / "fleet.json").read_text(encoding="utf-8"))
+    return found
+
+
+def digests(run: Path) -> dict[str, str]:
+    return {path.parent.name: json.loads(path.read_bytes())["digest"] for path in run.glob("*/manifest.json")}
+
+
+def test_scenes_on_dask_are_as_one_by_one(enerf: Enerf, scenes: Callable[..., Path], tmp_path: Path) -> None:
+    fleet = tmp_path / "fleet"
+    result = enerf("fleet", scenes(s1="bad"), "--out", fleet, *cluster(tmp_path, processes=False))
+    assert result.code == 3, result.err
+    found = {scene["name"]: scene for scene in fleet_json(fleet)["scenes"]}
+    assert {name: scene["state"] for name, scene in found.items()} == {"s0": "done", "s1": "quarantined", "s2": "done"}
+    assert "found nothing, expected something" in found["s1"]["reason"]
+    assert fleet_json(fleet)["executor"] == "dask"
+    assert len({stage["worker"] for scene in found.values() for stage in scene["stages"].values()} - {None}) == 2
+    assert {each["event"] for each in result.objects} >= {"stage_started", "stage_done", "scene_done", "scene_quarantined"}
+    alone = tmp_path / "alone"
+    assert enerf("run", tmp_path / "shoots" / "s0", "--out", alone, "--preset", "tiny", "--quiet").code == 0
+    assert digests(fleet / "s0") == digests(alone)
+
+
+def _facts(process: int) -> list[str]:
+    """State, parent and so on."""
+    return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+
+
+def _runs(process: int) -> bool:
+    try:
+        return _facts(process)[0] not in "ZX"
+    except OSError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="who runs a stage is read from /proc")
+def test_a_killed_workers_stage_goes_on_elsewhere(enerf: Enerf, scenes: Callable[..., Path], tmp_path: Path) -> None:
+    fleet, killed = tmp_path / "fleet", []
+
+    def attempts() -> list[int]:
+        return [int(path.name.split()[-1]) for path in tmp_path.glob("train in *")]
+
+    def kill() -> None:
+        deadline = time.monotonic() + 120.0
+        while time.monotonic() < deadline and len(attempts()) < 2:
+            for child in attempts():
+                if child not in killed:
+                    killed.append(child)
+                    os.kill(int(_facts(child)[1]), signal.SIGKILL)
+            time.sleep(0.05)
+        (tmp_path / "go on").touch()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    result = enerf("fleet", scenes(s0="slow"), "--out", fleet, *cluster(tmp_path, processes=True))
+    killer.join()
+    assert result.code == 0, fleet_json(fleet)
+    retries = [each["text"] for each in result.objects if each["event"] == "retry" and each["scene"] == "s0"]
+    assert len(killed) == 1
+    assert "has gone. It is tried once more." in retries[0]
+    assert fleet_json(fleet)["scenes"][0]["stages"]["train"]["worker"] not in retries[0]
+    assert not any(_runs(child) for child in killed), "a stage outlives its worker"
