@@ -1,9 +1,9 @@
 """Accuracy and speed of finding cameras from the sample photographs.
 
-    python benchmarks/poses.py [--photographs FOLDER] [--truth FILE.json] [--out RESULT.json]
+    python benchmarks/poses.py [--photographs FOLDER] [--truth FILE.json | --no-truth] [--out benchmarks/results/poses_cpu.json]
 
-Prints and saves: photographs registered, RMS and largest error of the camera centres after a similarity alignment, in per cent of
-their mean distance to the centroid, the camera model, seconds, processor seconds and the load average before and after.
+Prints, and saves as the row of the folder's name: photographs registered, RMS and largest error of the camera centres after a similarity
+alignment, in per cent of their mean distance to the centroid, the camera model, seconds, processor seconds and the load average before and after.
 """
 
 from __future__ import annotations
@@ -51,10 +51,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--photographs", type=Path, default=ROOT / "examples" / "still_life")
     parser.add_argument("--truth", type=Path, default=ROOT / "tests" / "data" / "still_life_cameras.json")
+    parser.add_argument("--no-truth", action="store_true", help="of photographs whose true cameras are not known")
     parser.add_argument("--out", type=Path, default=None)
     arguments = parser.parse_args()
-    truth = true_centres(arguments.truth)
-    names = sorted(path.name for path in arguments.photographs.iterdir() if path.name in truth)
+    truth = {} if arguments.no_truth else true_centres(arguments.truth)
+    found = sorted(path.name for path in arguments.photographs.iterdir())
+    names = [name for name in found if name in truth] if truth else [name for name in found if name.lower().endswith((".jpg", ".jpeg", ".png"))]
     load_before, started, used = os.getloadavg()[0], time.perf_counter(), processor_seconds()
     phases: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as work:
@@ -67,12 +69,10 @@ def main() -> None:
             warn=lambda text, **facts: print(text),
         )
     seconds, used = time.perf_counter() - started, processor_seconds() - used
-    errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))
-    result = {
+    result: dict[str, object] = {
         "photographs": len(names),
         "registered": len(capture.photos),
-        "centre_rms_percent": round(100 * float(np.sqrt((errors**2).mean())), 4),
-        "centre_max_percent": round(100 * float(errors.max()), 4),
+        "matches_that_agree": capture.facts["pairs_agreeing"],
         "reprojection_error_px": round(float(capture.reprojection_error or 0), 4),
         "lens": {capture.photos[0].camera.model: capture.photos[0].camera.params},
         "seconds": round(seconds, 2),
@@ -82,10 +82,14 @@ def main() -> None:
         "load_after": os.getloadavg()[0],
         "machine": {"cores": len(os.sched_getaffinity(0)), "processor": platform.machine(), "pycolmap": version("pycolmap")},
     }
-    text = json.dumps(result, indent=1)
-    print(text)
+    if truth:
+        errors = aligned_errors(np.array([photo.camera.centre for photo in capture.photos]), np.array([truth[photo.camera.name] for photo in capture.photos]))
+        result |= {"centre_rms_percent": round(100 * float(np.sqrt((errors**2).mean())), 4), "centre_max_percent": round(100 * float(errors.max()), 4)}
+    print(json.dumps(result, indent=1))
     if arguments.out:
-        arguments.out.write_text(text + "\n")
+        rows = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else {}
+        rows[arguments.photographs.name] = result
+        arguments.out.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -100,7 +100,9 @@ class PosesSettings:
         "Which photographs are matched: all pairs (exhaustive), each with those that look most like it (retrieval), or with those that follow (sequential);"
         " auto: exhaustive for up to 60, else retrieval.",
     )
-    max_features: Annotated[int, Meta(ge=256, le=65536)] = setting(4096, "Most features detected in a photograph.", advanced=True)
+    max_features: Annotated[int, Meta(ge=256, le=65536)] | Auto = setting(
+        "auto", "Most features detected in a photograph; auto: 4096, of more than 60 photographs 2048.", advanced=True
+    )
     feature_image_size: Annotated[int, Meta(ge=320, le=8192)] = setting(
         1600, "Longest side of the photographs in which features are detected.", unit="pixels", advanced=True
     )
@@ -174,7 +176,7 @@ def files(source: Path, settings: PosesSettings) -> list[Path]:
     return [*importers.files(source, settings), *network]
 
 
-STAGE = Stage(name="poses", version=6, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
+STAGE = Stage(name="poses", version=7, settings=PosesSettings, needs=(), run=run, reads_source=True, source_files=files)
 
 
 def read(job: Job, settings: PosesSettings, warn: Any) -> Capture:

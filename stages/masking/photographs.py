@@ -92,14 +92,16 @@ def mask_choice(settings: Any, facts: Mapping[str, object]) -> str:
 
 def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
     """Structure from motion on photographs, with a scratch folder of its own for each name."""
+    from efficientnerf.settings import given
     from stages.cores import count_cores
     from stages.io.pictures import UnreadableImage, read_header
     from stages.memory.poses import feature_threads
+    from stages.sfm.ladder import features_for
     from stages.sfm.reconstruction import find_cameras
 
     source, settings = job.source, job.settings
     assert source is not None
-    sizes = []
+    features, sizes = given(settings.max_features) or features_for(len(paths)), []
     for path in paths.values():
         job.safe_point()
         with contextlib.suppress(UnreadableImage):  # said where it is read
@@ -110,10 +112,10 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
             source,
             paths,
             max_side=settings.feature_image_size,
-            features=settings.max_features,
+            features=features,
             matching=settings.matching,
             seed=settings.seed,
-            threads=feature_threads(job, sizes, settings.feature_image_size, settings.max_features, count_cores()),
+            threads=feature_threads(job, sizes, settings.feature_image_size, features, count_cores()),
             masks=masks,
             lens="perspective" if settings.lens == "equirectangular" else settings.lens,
             work=job.work / name,
@@ -126,21 +128,39 @@ def _search(job: Job, paths: Mapping[str, Path], warn: Any) -> Find:
 
 
 def _of_turning_subject(job: Job, find: Find, paths: Mapping[str, Path]) -> tuple[Capture | None, bool]:
-    """The capture of a subject that turned before a background that stands still, or None; and whether it looks as if one did."""
+    """The capture of photographs of which it looks as if a subject turned before a background that stands still, or None where all of the picture is to be
+    used without it; and whether that looks so for certain.
+
+    Cameras by the subject alone are taken where they have nearly all photographs, or where all of the picture does not explain more.
+    """
     from stages.masking.turning import LEAST_TURN, masks_of_turning_subject, turn
+    from stages.sfm.ladder import ENOUGH
 
     masks = masks_of_turning_subject(paths, job.work / "masks", safe_point=job.safe_point, progress=job.progress)
     if not masks:
         return None, False
     job.say("the background stands still from photograph to photograph: cameras are looked for by the subject alone; --mask off uses all of the picture")
-    with contextlib.suppress(BadInput):
-        capture = find("cameras_of_subject", masks)
-        if turn([photo for photo in capture.photos if photo.mask is not None]) >= LEAST_TURN:
-            return replace(capture, facts={**capture.facts, BACKGROUND: LEFT_OUT}), False
+    try:
+        alone = find("cameras_of_subject", masks)
+    except BadInput:
+        job.say("the subject alone shows too little; cameras are looked for by all of the picture")
+        return None, True
+    if turn([photo for photo in alone.photos if photo.mask is not None]) < LEAST_TURN:
         job.say("the cameras all look the same way; the background may be far away, and all of the picture is used")
         return None, False
-    job.say("the subject alone shows too little; cameras are looked for by all of the picture")
-    return None, True
+    if len(alone.photos) < ENOUGH * len(paths):
+        job.say("the subject alone shows too little for some photographs; cameras are looked for by all of the picture, too")
+        with contextlib.suppress(BadInput):
+            whole = find("cameras", {})
+            if turn(whole.photos) >= LEAST_TURN and _explained(whole) > _explained(alone):
+                job.say("all of the picture explains more than the subject alone, and is used")
+                return whole, False
+    return replace(alone, facts={**alone.facts, BACKGROUND: LEFT_OUT}), False
+
+
+def _explained(capture: Capture) -> float:
+    """Photographs with a camera, times the share of the matches that agree: a background that stands still contradicts cameras that move."""
+    return len(capture.photos) * float(capture.facts["pairs_agreeing"])  # type: ignore[arg-type]
 
 
 def _fit(capture: Capture) -> bool:

@@ -26,6 +26,7 @@ from stages.sfm.images import Progress, SafePoint, WorkImage
 from stages.verdict.verdict import DOUBTFUL
 
 MAX_EXHAUSTIVE = 60  # photographs; of more, not every pair is matched: that would take longer than the rest of the stage
+OF_FEW, OF_MANY = 4096, 2048  # features of a photograph, at most: OF_MANY of more than MAX_EXHAUSTIVE photographs
 OVERLAPPING = 30  # verified matches, from which two photographs are said to overlap
 FEW_NEIGHBOURS = 3  # photographs that one overlaps with; of fewer, more are looked for
 WIDER = 48  # photographs that are most like one, which it is compared with then
@@ -167,6 +168,11 @@ def _match_again(place: Path, images: Sequence[WorkImage], weak: Sequence[int], 
     wanted = {(i, j) for i, j in wanted if j not in near[i]}
     forget(place, PAIRS, [pair_id_of(i + 1, j + 1) for i, j in sorted(wanted)])
     matches.match_pairs(place, images, wanted, seed=seed, workers=workers, name=f"{rung.split()[0]}_", guided=True, **quiet)
+
+
+def features_for(count: int) -> int:
+    """Of each of so many photographs, at most, where nothing else is asked for."""
+    return OF_FEW if count <= MAX_EXHAUSTIVE else OF_MANY
 
 
 def matching_for(count: int) -> str:

@@ -43,7 +43,7 @@ def find_cameras(
     names: Sequence[str] | Mapping[str, Path],
     *,
     max_side: int = 1600,
-    features: int = 4096,
+    features: int | None = None,
     matching: str = "auto",
     seed: int = 0,
     threads: int | None = None,
@@ -56,7 +56,7 @@ def find_cameras(
 
     folder, names   the photographs, paths relative to the folder, any order; or for each the file that is read
     max_side        longest side of the photographs in which features are detected, pixels
-    features        most features of a photograph
+    features        most features of a photograph; None: as `ladder.features_for` has it
     threads         on which features are detected, and processes in which pairs are matched; None: as many as the process may use. Changes no bit
     matching        "exhaustive", "retrieval", "sequential" (the sorted names follow a path; `stages.sfm.pairs`), or "auto": exhaustive up to 60 photographs
     masks           of some or all names: no features where the mask is black, nor where a photograph is transparent; None: features everywhere
@@ -70,6 +70,7 @@ def find_cameras(
     """
     masks, paths = masks or {}, _paths(folder, names)
     arguments: dict[str, Any] = {"folder": os.path.abspath(folder), "names": {name: os.path.abspath(path) for name, path in paths.items()}}
+    features = features or ladder.features_for(len(paths))
     arguments |= {"max_side": max_side, "features": features, "matching": matching, "seed": seed, "threads": threads, "lens": lens}
     arguments |= {"masks": {name: mask and os.path.abspath(mask) for name, mask in masks.items()}, "work": os.path.abspath(work)}
     resumed = database_path(work).exists()

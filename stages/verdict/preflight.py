@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.settings import given
 from pipeline.errors import BadInput
 from stages.io import importers
 from stages.io.importers.photographs import photographs
@@ -49,6 +50,7 @@ FEATURES_A_MEGAPIXEL, AN_IMAGE = 0.4, 0.2
 A_PAIR, COMPARING, MANY = 0.006, 0.030, 4096  # of verifying a pair, and of comparing so many features of each with each
 CONTRAST = 0.02  # from which SIFT detects about as many features as COLMAP's does
 PAIRS_AN_IMAGE = 20  # of retrieval
+MAPPED_AGAIN, LEAST_WEAK = 4, 0.1  # of the later rungs: times that all is mapped again, and share of the photographs that are matched again, at least
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
         "sizes": sorted({f"{a}x{b}" for a, b in (each.size for each in small.values())}),
         "overlapping": round(_share_in_largest(len(small), overlaps), 3),
         **_layout(list(small), overlaps),
-        "forecast": forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed),
+        "forecast": forecast(next(iter(small)), files, small, len(names), settings, threads, posed=posed, joined=_share_in_largest(len(small), overlaps)),
     }
     return Verdict(ordered[0].grade if ordered else "good", ordered, figures, {name: each.figures() for name, each in seen.items()})
 
@@ -254,29 +256,44 @@ def _of_files(small: Mapping[str, Small], unreadable: Sequence[tuple[str, str]],
 
 
 def forecast(
-    first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool
+    first: str, files: Mapping[str, Path], small: Mapping[str, Small], count: int, settings: Any, threads: int, *, posed: bool, joined: float
 ) -> dict[str, Any]:
-    """Seconds of the stage poses on a machine that does nothing else, where the first rung of `stages.sfm.ladder` suffices, and bytes at its peak; roughly."""
+    """Seconds of the stage poses on a machine that does nothing else, where the first rung of `stages.sfm.ladder` suffices and where all are tried, and bytes
+    at its peak; roughly.
+
+    joined  share of the photographs that overlap, in the largest component
+    """
     from stages.memory.poses import decoding_needed, features_needed
     from stages.sfm.matches import MAX_WORKERS, PAIRS_A_WORKER, UPSAMPLE_BELOW
 
     sizes, side = [each.size for each in small.values()], settings.feature_image_size
+    features = given(settings.max_features) or ladder.features_for(count)
     before, rgb = time.thread_time(), np.zeros((1, 1, 3), np.uint8)
     with contextlib.suppress(UnreadableImage):
         rgb = read_photo(files[first], side).rgb
     reading = 2.5 * (time.thread_time() - before) * count  # for structure from motion, as a working image, and to be looked at
     if posed:
-        return {"poses_seconds": round(reading, 1), "poses_bytes": int(decoding_needed(sizes).total), "pairs": 0}
-    memory = features_needed(sizes * -(-count // len(sizes)), side, settings.max_features, threads).total
+        seconds = {"poses_seconds": round(reading, 1), "poses_seconds_all_rungs": round(reading, 1)}
+        return {**seconds, "poses_bytes": int(decoding_needed(sizes).total), "pairs": 0}
+    memory = features_needed(sizes * -(-count // len(sizes)), side, features, threads).total
     slower = float(np.median([each.seconds for each in small.values()])) / REFERENCE
     reduced = [working_size(*size, side) for size in sizes]
     pixels = [width * height * (4 if max(width, height) < UPSAMPLE_BELOW else 1) for width, height in reduced]
     how = ladder.matching_for(count) if settings.matching == "auto" else settings.matching
     compared = min(count * (count - 1) // 2, 10**9 if how == "exhaustive" else PAIRS_AN_IMAGE * count)
     finding = count * float(np.mean(pixels)) / 1e6 * FEATURES_A_MEGAPIXEL / threads
-    matching = compared * pair_seconds(min(settings.max_features, count_features(rgb))) / max(1, min(threads, MAX_WORKERS, compared // PAIRS_A_WORKER))
+    detected, workers = min(features, count_features(rgb)), max(1, min(threads, MAX_WORKERS, compared // PAIRS_A_WORKER))
     mapping = AN_IMAGE * count * max(1.0, count / 50) ** 0.4
-    return {"poses_seconds": round(reading + slower * (finding + matching + mapping), 1), "poses_bytes": int(memory), "pairs": compared}
+    seconds = finding + compared * pair_seconds(detected) / workers + mapping
+    weak = max(LEAST_WEAK, 1 - joined)  # matched once more with what they have, and once with more features
+    again = min(compared, weak * count * min(ladder.WIDER, count - 1)) * (pair_seconds(detected) + pair_seconds(ladder.MORE_FEATURES * detected))
+    most = seconds + ladder.MORE_FEATURES * weak * finding + again / workers + MAPPED_AGAIN * mapping
+    return {
+        "poses_seconds": round(reading + slower * seconds, 1),
+        "poses_seconds_all_rungs": round(reading + slower * most, 1),
+        "poses_bytes": int(memory),
+        "pairs": compared,
+    }
 
 
 def count_features(rgb: np.ndarray) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import pytest
 
 from benchmarks.poses import aligned_errors
 from efficientnerf.geometry.cameras import Camera
+from pipeline.errors import BadInput
 from pipeline.stage import Job
-from stages.io.capture import BACKGROUND, LEFT_OUT
+from stages.io.capture import BACKGROUND, LEFT_OUT, Capture, Photo
 from stages.io.png import write_png
-from stages.masking.photographs import mask_choice
+from stages.masking.photographs import _of_turning_subject, mask_choice
 from stages.masking.turning import border_stands_still, masks_of_turning_subject, turn
 from stages.poses import PosesSettings, read
 from stages.verdict.verdict import verdict_on
@@ -91,3 +93,40 @@ def test_turn_is_the_largest_angle_between_view_directions() -> None:
     assert 40 < turn(photos[:2]) < 50
     assert turn(photos) > 120
     assert turn([]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("alone", "whole", "used"),
+    [
+        ((20, 0.9, 90.0), None, "cameras_of_subject"),  # all of the picture is not looked at
+        ((10, 0.9, 90.0), (20, 0.97, 90.0), "cameras"),
+        ((10, 0.9, 90.0), (20, 0.4, 90.0), "cameras_of_subject"),  # what stands still contradicts what turns
+        ((10, 0.9, 90.0), (20, 0.97, 2.0), "cameras_of_subject"),  # what stands still is all that was found
+        ((10, 0.9, 90.0), "nothing", "cameras_of_subject"),
+    ],
+)
+def test_few_photographs_by_the_subject_alone_are_no_reason_to_leave_the_rest_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, alone: tuple[int, float, float], whole: Any, used: str
+) -> None:
+    """Photographs with a camera, share of the matches that agree, and the angle between the first and the last camera's view."""
+    paths = {f"{n:02d}.png": tmp_path / f"{n:02d}.png" for n in range(20)}
+    monkeypatch.setattr("stages.masking.turning.masks_of_turning_subject", lambda *_, **__: paths)
+    searched = []
+
+    def find(name: str, masks: Mapping[str, Path | None]) -> Capture:
+        searched.append(name)
+        wanted = alone if name == "cameras_of_subject" else whole
+        if wanted == "nothing":
+            raise BadInput("no cameras")
+        count, agreeing, degrees = wanted
+        round_it = turntables.cameras(count, degrees * count / (count - 1))
+        photos = tuple(Photo(camera, tmp_path / camera.name, masks.get(camera.name)) for camera in round_it)
+        return Capture(kind="photographs", photos=photos, background=None, facts={"pairs_agreeing": agreeing})
+
+    job = Job(settings=PosesSettings(), out=tmp_path / "poses", work=tmp_path / "work", source=tmp_path, stage="poses")
+    capture, seen = _of_turning_subject(job, find, paths)
+    assert capture is not None
+    assert not seen
+    assert len(capture.photos) == (alone[0] if used == "cameras_of_subject" else whole[0])
+    assert (capture.facts.get(BACKGROUND) == LEFT_OUT) == (used == "cameras_of_subject")
+    assert searched == (["cameras_of_subject"] if whole is None else ["cameras_of_subject", "cameras"])
