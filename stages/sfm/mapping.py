@@ -19,6 +19,7 @@ from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
+MANY_OBSERVATIONS = 150_000  # of points in images; of more, an even choice holds the cameras as well
 # Adjustments of all that is found so far: each time there are so many times more photographs or points than at the last, with those points that hold the
 # cameras, and not to the last digit, for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
 ADJUSTMENTS: Mapping[str, object] = {
@@ -147,8 +148,37 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
 
     Cameras get OPENCV's eight parameters in place of SIMPLE_RADIAL where these lower the mean reprojection error by 1 %, after adjusting all
     parameters; unless the focal lengths then differ by 2 %, or fewer matches agree, which shows that the motion does not determine the intrinsics.
-    Intrinsics fixed at the EXIF data stay.
+    Intrinsics fixed at the EXIF data stay. Of a model with MANY_OBSERVATIONS an even choice of points tells the cameras; the others follow.
     """
+    some = _thinned(model)
+    if some is None:
+        return _with_adjusted_cameras(work, images, model, safe_point)
+    some = _with_adjusted_cameras(work, images, some, safe_point)
+    for camera_id, camera in some.cameras.items():
+        model.cameras[camera_id].model, model.cameras[camera_id].params = camera.model, camera.params
+    for frame_id in some.reg_frame_ids():
+        model.frames[frame_id].rig_from_world = some.frames[frame_id].rig_from_world
+    safe_point()
+    with quiet_pycolmap() as pycolmap:
+        model.update_point_3d_errors()
+        bundle_adjust(pycolmap, model, {*model.cameras}, {"refine_rig_from_world": False})
+    return model
+
+
+def _thinned(model: Any) -> Any:
+    """A copy with an even choice of the points, of about MANY_OBSERVATIONS; None where there are no more."""
+    every = -(-int(model.compute_num_observations()) // MANY_OBSERVATIONS)
+    if every < 2:
+        return None
+    some = model.__deepcopy__({})
+    for number, point_id in enumerate(sorted(model.point3D_ids())):
+        if number % every:
+            some.delete_point3D(point_id)
+    return some
+
+
+def _with_adjusted_cameras(work: Path, images: Sequence[WorkImage], model: Any, safe_point: SafePoint) -> Any:
+    """`bundle_adjusted` of all points of a model."""
     with quiet_pycolmap() as pycolmap:
         fixed = {camera.camera_id for camera, prior in _cameras_with_exif_focal(images, model) if camera.mean_focal_length() == prior}
         safe_point()

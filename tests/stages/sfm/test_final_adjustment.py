@@ -1,0 +1,56 @@
+"""The last adjustment of all cameras and points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.poses import aligned_errors
+from stages.sfm import mapping
+from stages.sfm.colmap import import_pycolmap
+from stages.sfm.images import WorkImage
+
+
+def made_model() -> tuple[Any, list[WorkImage], np.ndarray]:
+    """Twelve cameras round 800 points that all of them see, pixels off by 0.4 px and points by a hundredth of a unit; and the true centres."""
+    pycolmap = import_pycolmap()
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 12, 800
+    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.SIMPLE_RADIAL, [1280, 512, 384, -0.04]
+    model = pycolmap.synthesize_dataset(options)
+    centres = np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
+    rng = np.random.default_rng(0)
+    for _, image in sorted(model.images.items()):
+        for point in image.points2D:
+            point.xy = point.xy + rng.normal(0, 0.4, 2)
+    for _, point in sorted(model.points3D.items()):
+        point.xyz = point.xyz + rng.normal(0, 0.01, 3)
+    model.update_point_3d_errors()
+    images = [WorkImage(image.name, image.name, 1024, 768, 1024, 768, None, "") for image in model.images.values()]
+    return model, images, centres
+
+
+def test_an_even_choice_of_points_gives_the_cameras_of_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(mapping, "match_agreement", lambda *_: 1.0)
+    start, images, centres = made_model()
+    errors, points = {}, {}
+    for most in (10**9, start.compute_num_observations() // 4):
+        monkeypatch.setattr(mapping, "MANY_OBSERVATIONS", most)
+        model = mapping.bundle_adjusted(tmp_path, images, start.__deepcopy__({}), lambda: None)
+        found = np.array([model.images[i].projection_center() for i in sorted(model.reg_image_ids())])
+        errors[most] = float(np.sqrt((aligned_errors(found, centres) ** 2).mean()))
+        points[most] = model.compute_mean_reprojection_error()
+        assert model.num_points3D() == start.num_points3D()
+        assert model.cameras[1].mean_focal_length() == pytest.approx(1280, rel=0.01)
+    every, some = errors
+    assert errors[every] < errors[some] < 3 * errors[every] < 0.003
+    assert points[some] == pytest.approx(points[every], rel=0.03)
+
+
+def test_few_observations_are_all_used() -> None:
+    model, _, _ = made_model()
+    assert mapping._thinned(model) is None
