@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from pipeline.fleet.state import FleetState, SceneState
+from pipeline.text import printable
 from stages.figures.pareto import pareto_front, pareto_plot
 from stages.figures.thumbnails import HEIGHT, WIDTH, write_thumbnail
 from stages.io.pictures import UnreadableImage
@@ -27,7 +28,9 @@ from workflows.fleet.pages.updates import Pages
 
 def test_the_page_has_what_the_state_has() -> None:
     state = mixed()
+    state.note = f"no worker is there {NASTY}"
     found = facts(index_page(state, title="t", pictures={"scene-000": 7}))
+    assert found["note"] == printable(state.note)
     assert [scene["name"] for scene in found["scenes"]] == [scene.name for scene in state.scenes]
     first, broken = found["scenes"][0], found["scenes"][3]
     assert (first["psnr"], first["ssim"], first["seconds"], first["bytes"], first["grade"]) == (20, 0.9, 10, 1_000_000, "good")

@@ -250,7 +250,7 @@ function makeFigures() {
     at("figures").append(box);
   }
   const time = (text) => { const date = new Date(text); return isNaN(date) ? text : date.toLocaleString(); };
-  at("now").textContent = `${fleet.state}; ${fleet.executor}, ${fleet.slots} at a time; begun ${time(fleet.started)}, as of ${time(fleet.updated)}`;
+  at("now").textContent = `${fleet.state}; ${fleet.executor}, ${fleet.slots} at a time; begun ${time(fleet.started)}, as of ${time(fleet.updated)}${fleet.note ? `; ${fleet.note}` : ""}`;
 }
 
 function move(step) {

@@ -40,6 +40,7 @@ def index_page(
         "updated": printable(state.updated),
         "forecast": state.forecast_seconds,
         "executor": printable(state.executor),
+        "note": printable(state.note or "", LONGEST),
         "slots": state.slots,
         "totals": {name: getattr(state.totals, name) for name in ("waiting", "running", "done", "failed", "quarantined")},
         "seconds": sum(stage.seconds for scene in state.scenes for name, stage in scene.stages.items() if name not in scene.shares),
