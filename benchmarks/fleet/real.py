@@ -24,7 +24,7 @@ from workflows.asset import NAMES
 WAYS = ("one_by_one", "one_worker", "two_workers")
 # As small as every stage can bear, and then as much training, refinement and frames as make a scene of about 15 seconds on one core.
 SIZES = {
-    "train.iterations": 2500, "train.checkpoint_every": 500, "train.preview_every": 500, "train.max_rays_per_batch": 512, "bake.refine_steps": 60,
+    "train.iterations": 1000, "train.checkpoint_every": 500, "train.preview_every": 500, "train.max_rays_per_batch": 512, "bake.refine_steps": 60,
     "bake.refine_rays_per_batch": 1024, "turntable.frames": 16,
 }  # fmt: skip
 _SMALL = dict(setting.split("=", 1) for setting in sources.SETTINGS if not setting.startswith("splats."))
