@@ -12,6 +12,7 @@ from efficientnerf.asset.queries import normal_at
 from efficientnerf.asset.rendering import render, render_rays, render_reference
 from efficientnerf.asset.tree import NerfTree, tree_from_voxels
 from efficientnerf.backends.numba.tree.packed import packed_of
+from efficientnerf.backends.numba.tree.rendering import ray_statistics
 from efficientnerf.geometry.cameras import Camera, rays, resized
 from tests.efficientnerf.balls import pose
 from tests.efficientnerf.trees import in_codes, random_tree, rays_at, uniform_tree
@@ -141,8 +142,6 @@ def test_images_without_normals_are_otherwise_the_same(kind: str) -> None:
 
 
 def test_ray_statistics_are_consistent() -> None:
-    from efficientnerf.backends.numba.tree.rendering import ray_statistics
-
     tree = uniform_tree(sigma=0.5)
     camera = camera_of(tree)
     visited, tested, interpolated, lookups = np.moveaxis(ray_statistics(tree, camera), -1, 0)
@@ -208,11 +207,28 @@ def test_images_of_every_camera_model_match_single_rays(model: str, supersample:
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=share)
     timid = replace(tree)
-    timid.derived["packed"] = packed_of(tree)._replace(leap=np.minimum(packed_of(tree).leap, 1))
+    packed = packed_of(tree)
+    timid.derived["packed"] = packed._replace(leap=np.minimum(packed.leap, 1), octants=np.minimum(packed.octants, 1))
     camera = camera_of(tree, model, distance)
     usual, other = render(tree, camera), render(timid, camera)
     for name in FIELDS:
         assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+
+
+def test_leaps_in_every_direction_alike_change_no_value(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a grid of more cells than leaps of eight directions are held for."""
+    tree = random_tree(11, shape=(12, 10, 9), brick=4, degree=1, share=0.05)
+    camera = camera_of(tree, "OPENCV", 1.5)
+    usual, work = render(tree, camera), ray_statistics(tree, camera)
+    assert len(packed_of(tree).octants) == 8 * 12 * 10 * 9
+    tree.derived.clear()
+    monkeypatch.setattr("efficientnerf.backends.numba.tree.packed.MOST_OCTANT_BYTES", 0)
+    other, more = render(tree, camera), ray_statistics(tree, camera)
+    assert len(packed_of(tree).octants) == 0
+    for name in FIELDS:
+        assert np.array_equal(getattr(usual, name), getattr(other, name)), name
+    assert work[..., 0].sum() < more[..., 0].sum()
+    assert np.array_equal(work[..., 2:], more[..., 2:])
 
 
 def test_given_rays_may_come_in_any_order() -> None:

@@ -12,6 +12,7 @@ from efficientnerf.asset.queries import density_block
 from efficientnerf.asset.tree import voxel_coordinates
 from efficientnerf.backends.numba.simd import exp2_neg4, pack4, pointer, popcount, sigmoid, split16, trilinear4, unpack4
 from efficientnerf.backends.numba.tree import march
+from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packed import packed_of
 from efficientnerf.backends.numba.tree.packets import halves, lanes
 from efficientnerf.backends.numba.tree.packets.halves import mix_pairs, store_halves4
@@ -260,6 +261,19 @@ def test_groups_of_numbers_go_into_lanes_and_back() -> None:
     assert np.array_equal(out[LANES : 3 * LANES].reshape(-1, 2), floats[:, :2])
     assert np.array_equal(out[3 * LANES : 7 * LANES], floats.reshape(-1))
     assert np.array_equal(out[7 * LANES :].reshape(6, -1), [ints[at + n] for n in (0, 1, 0, 1, 2, 3)])
+
+
+@pytest.mark.parametrize("shape", [(7, 5, 6), (1, 9, 2), (270, 1, 1)])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
+def test_leaps_in_eight_directions_are_the_sides_of_empty_cubes(shape: tuple[int, int, int], share: float) -> None:
+    occupied = np.random.default_rng(5).random(shape) < share
+    leap, at = octant_leaps(occupied), np.argwhere(occupied)
+    for octant in range(8):
+        signs = np.array([1 if octant >> axis & 1 else -1 for axis in range(3)])
+        for cell in np.ndindex(shape):
+            ahead = (at - cell) * signs
+            ahead = ahead[(ahead >= 0).all(axis=1)]
+            assert leap[(octant, *cell)] == min(ahead.max(axis=1).min() if len(ahead) else 255, 255)
 
 
 def test_bricks_without_density_in_or_around_them_are_empty_to_the_kernel() -> None:

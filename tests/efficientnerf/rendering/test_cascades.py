@@ -273,7 +273,8 @@ def test_images_depend_neither_on_threads_nor_on_pieces(monkeypatch: pytest.Monk
 def test_tiles_that_skip_empty_space_change_no_value(model: str, share: float, distance: float) -> None:
     tree = random_cascades(11, count=4, cells=6, brick=3, share=share)
     timid = replace(tree)
-    timid.derived["packed"] = packed_of(tree)._replace(leap=np.minimum(packed_of(tree).leap, 1))
+    packed = packed_of(tree)
+    timid.derived["packed"] = packed._replace(leap=np.minimum(packed.leap, 1), octants=np.minimum(packed.octants, 1))
     camera = camera_of(tree, model, distance)
     usual, other = render(tree, camera), render(timid, camera)
     for name in FIELDS:

@@ -1,4 +1,4 @@
-"""Distances of coarse cells to the nearest occupied one (numba): `NerfTree.leap`, in as many bytes as there are cells."""
+"""Distances of coarse cells to the nearest occupied one (numba): `NerfTree.leap`, in as many bytes as there are cells, and the same in eight directions."""
 
 from __future__ import annotations
 
@@ -59,4 +59,40 @@ def leaps(occupied: np.ndarray) -> np.ndarray:
         _sweep(out, begin, min(len(out), begin + layers), 1)
     for begin in range(len(out) - 1, -1, -layers):
         _sweep(out, begin, max(-1, begin - layers), -1)
+    return out
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _sweep_octants(occupied, out):  # type: ignore[no-untyped-def]
+    nx, ny, nz = occupied.shape
+    for octant in numba.prange(8):
+        sx, sy, sz = 1 if octant & 1 else -1, 1 if octant & 2 else -1, 1 if octant & 4 else -1
+        for p in range(nx):
+            x = nx - 1 - p if sx > 0 else p
+            for q in range(ny):
+                y = ny - 1 - q if sy > 0 else q
+                # Least of the three lines beside this one, at the cell before; and of the cell before.
+                beside, before = 255, 255
+                for r in range(nz):
+                    z = nz - 1 - r if sz > 0 else r
+                    least = 255
+                    if p > 0 and out[octant, x + sx, y, z] < least:
+                        least = out[octant, x + sx, y, z]
+                    if q > 0 and out[octant, x, y + sy, z] < least:
+                        least = out[octant, x, y + sy, z]
+                    if p > 0 and q > 0 and out[octant, x + sx, y + sy, z] < least:
+                        least = out[octant, x + sx, y + sy, z]
+                    before = 0 if occupied[x, y, z] else min(min(before, min(least, beside)) + 1, 255)
+                    out[octant, x, y, z], beside = before, least
+
+
+def octant_leaps(occupied: np.ndarray) -> np.ndarray:
+    """Sides, in cells, of the largest cubes without an occupied cell of (X, Y, Z) bool that extend from each cell in each of eight directions: (8, X, Y, Z)
+    uint8, at most 255, 0 for an occupied cell.
+
+    Of direction n the cube extends to greater x where n & 1 is set, else to less; n & 2 is of y, and n & 4 of z. What is outside of the grid is empty. A ray
+    that leaves a surface behind it crosses what is empty ahead in one leap: docs/experiments/renderer.md
+    """
+    out = np.empty((8, *occupied.shape), np.uint8)
+    _sweep_octants(np.ascontiguousarray(occupied), out)
     return out

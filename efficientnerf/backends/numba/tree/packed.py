@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from efficientnerf.backends.numba.runtime import numba
+from efficientnerf.backends.numba.tree.leaps import octant_leaps
 from efficientnerf.backends.numba.tree.packets.rows import MOST_SIDE, fill_rows, order_voxels
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ SLOPE_VOXELS = 2**16  # voxels that `colour_slope` is estimated from
 FEWEST_PAIRS = 64  # of neighbours, for what they share to be estimated
 COLUMN_CELLS_PER_CALL = 2**22  # cells that one call of the kernel that orders voxels goes through
 MOST_COORDINATES = 2**16  # numbers of two bytes
+MOST_OCTANT_BYTES = 2**27
 MOST_BITS = 2**32  # numbers of a row's word
 VOXELS_PER_CALL = 2**23  # of bricks that one call of a kernel goes through, so that signals are answered between
 
@@ -34,6 +36,7 @@ class Packed(NamedTuple):
     places        (L, 4) float64: side of its voxels and that of cascade 0's, divided; and what is added to voxel coordinates of cascade 0, so divided, to have
                   those of the cascade
     leap          (C,) uint8: as `NerfTree.leap`, but bricks without density in or around them count as empty, and so do those in the box of the cascade before
+    octants       (8 C,) uint8: of each cascade `leaps.octant_leaps` of the same cells; empty where that would be more than MOST_OCTANT_BYTES
     has_density   (B, W) int64 bit masks: bit n % 64 of word n // 64 is set where any of the eight voxels has density that begin at voxel
                   (i - 1, j - 1, k - 1) of the brick; n = (i (b + 2) + j) (b + 2) + k
     rows          (B, (b + 2)^2) int32: the first voxel, in the packed order, and the mask of the stored ones of the rows along z of a brick and of the layer
@@ -56,6 +59,7 @@ class Packed(NamedTuple):
     grids: np.ndarray
     places: np.ndarray
     leap: np.ndarray
+    octants: np.ndarray
     has_density: np.ndarray
     rows: np.ndarray
     voxel_of: np.ndarray
@@ -75,8 +79,8 @@ class Packed(NamedTuple):
     @property
     def nbytes(self) -> int:
         """Of the arrays beside the tree's own, but for the smallest."""
-        own = self.leap, self.has_density, self.rows, self.voxel_of, self.coordinates, self.cells, self.density, self.base, self.codes, self.palette
-        return sum(array.nbytes for array in own)
+        own = self.leap, self.octants, self.has_density, self.rows, self.voxel_of, self.coordinates, self.cells, self.density
+        return sum(array.nbytes for array in (*own, self.base, self.codes, self.palette))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -185,9 +189,8 @@ def _places(tree: NerfTree) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pack_cascade(tree: NerfTree, number: int, cells: np.ndarray, has_density: np.ndarray) -> np.ndarray:
-    """Fills in a cascade's rows of `Packed.cells` and `Packed.has_density`, the latter zero before; returns its part of `Packed.leap`, (X, Y, Z)."""
+    """Fills in a cascade's rows of `Packed.cells` and `Packed.has_density`, the latter zero before; returns which of its cells are not empty, (X, Y, Z)."""
     from efficientnerf.asset.cascades import cascades_of
-    from efficientnerf.asset.tree import leaps
 
     cascades, (first, end) = cascades_of(tree), bricks_of(tree)[number]
     cascade = cascades[number]
@@ -200,7 +203,7 @@ def _pack_cascade(tree: NerfTree, number: int, cells: np.ndarray, has_density: n
     if number:  # no sample lies in the box of the cascade before
         inner = np.round((cascades[number - 1].bounds(tree.brick) - cascade.bounds_min) / (cascade.voxel * tree.brick)).astype(int)
         full[tuple(slice(*side) for side in inner.T)] = False
-    return leaps(full)
+    return full
 
 
 def _rows(tree: NerfTree, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -232,6 +235,7 @@ def pack(tree: NerfTree) -> Packed:
     """The packed form of a tree; ValueError for nearest lookup, since the kernel that reads it interpolates."""
     from efficientnerf.asset.cascades import cascades_of
     from efficientnerf.asset.palettes import PaletteHarmonics
+    from efficientnerf.asset.tree import leaps
 
     if tree.lookup != "trilinear":
         raise ValueError(f"a tree of lookup {tree.lookup} has no packed form, whose kernel interpolates; render it by `backends.numba.tree.nearest`")
@@ -239,7 +243,9 @@ def pack(tree: NerfTree) -> Packed:
     bricks = bricks_of(tree)
     cells = np.empty((len(tree.voxel_index), 3), np.int32)
     has_density = np.zeros((len(cells), ((tree.brick + 2) ** 3 + 63) // 64), np.int64)
-    leap = [_pack_cascade(tree, n, cells, has_density).reshape(-1) for n in range(len(bricks))]
+    full = [_pack_cascade(tree, n, cells, has_density) for n in range(len(bricks))]
+    leap, directed = [leaps(cells).reshape(-1) for cells in full], 8 * sum(cells.size for cells in full) <= MOST_OCTANT_BYTES
+    octants = np.concatenate([octant_leaps(cells).reshape(-1) for cells in full]) if directed else np.empty(0, np.uint8)
     brick_index = [cascade.brick_index.reshape(-1) for cascade in cascades_of(tree)]
     harmonics, order = tree.harmonics, _rows(tree, cells)
     voxel_of = order[1]
@@ -256,4 +262,4 @@ def pack(tree: NerfTree) -> Packed:
     slopes = [_colour_slope(tree, *ends) for ends in bricks]
     joined = (leap[0], brick_index[0]) if len(leap) == 1 else (np.concatenate(leap), np.concatenate(brick_index))
     own = np.ascontiguousarray(joined[1]), density
-    return Packed(*_places(tree), joined[0], has_density, *order, cells, *own, *coded, np.array(slopes))
+    return Packed(*_places(tree), joined[0], octants, has_density, *order, cells, *own, *coded, np.array(slopes))

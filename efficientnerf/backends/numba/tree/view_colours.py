@@ -77,7 +77,8 @@ class Views(NamedTuple):
 
 class PackedPointers(NamedTuple):
     """One cascade of a `Packed`, with its arrays as pointers, and its sizes: cells along each axis, mask words of a block, stored voxels of all
-    cascades, harmonics, code groups and palette entries; `coded` is whether there are codes, `narrow` whether a row is one number.
+    cascades, harmonics, code groups and palette entries; `coded` is whether there are codes, `narrow` whether a row is one number,
+    `directed` whether `octants` differ from one another; else they all are `leap`.
 
     ratio  of its voxels' side to that of cascade 0
     shift  x, y, z: a point of cascade 0 is here at p / ratio + shift, voxel coordinates
@@ -92,6 +93,8 @@ class PackedPointers(NamedTuple):
     shift_y: float
     shift_z: float
     leap: Any
+    octants: Any
+    directed: bool
     has_density: Any
     mask_words: int
     rows: Any
@@ -119,7 +122,9 @@ def packed_pointers(packed, brick, cascade):  # type: ignore[no-untyped-def]
     first = grids[cascade, 3]
     return PackedPointers(
         brick, grids[cascade, 0], grids[cascade, 1], grids[cascade, 2], places[cascade, 0], places[cascade, 1], places[cascade, 2], places[cascade, 3],
-        advanced(pointer(packed.leap), first), pointer(packed.has_density.view(np.int32)), packed.has_density.shape[1], pointer(packed.rows),
+        advanced(pointer(packed.leap), first),
+        advanced(pointer(packed.octants), 8 * first) if len(packed.octants) > 0 else advanced(pointer(packed.leap), first), len(packed.octants) > 0,
+        pointer(packed.has_density.view(np.int32)), packed.has_density.shape[1], pointer(packed.rows),
         packed.rows.shape[1] == (brick + 2) * (brick + 2), len(packed.voxel_of) - 1, pointer(packed.voxel_of),
         advanced(pointer(packed.brick_index), first), pointer(packed.density), packed.sh.shape[1], len(packed.codes) > 0, pointer(packed.sh),
         pointer(packed.base), pointer(packed.base_table), pointer(packed.codes), packed.codes.shape[1], pointer(packed.palette), packed.palette.shape[1],

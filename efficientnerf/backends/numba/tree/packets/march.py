@@ -89,8 +89,11 @@ def _prefetch_rows(lanes, grid, ints):  # type: ignore[no-untyped-def]
     while lanes != 0:
         owner = np.int64(ints[OWNER + lowest_bit(lanes)])
         if owner != before:
-            for n in range(owner * size, owner * size + size, _LINE):
-                prefetch(grid.rows, n)
+            prefetch(grid.rows, owner * size)
+            prefetch(grid.rows, owner * size + _LINE)
+            prefetch(grid.rows, owner * size + 2 * _LINE)
+            for n in range(3 * _LINE, size, _LINE):
+                prefetch(grid.rows, owner * size + n)
         lanes, before = lanes & (lanes - 1), owner
 
 
@@ -113,6 +116,9 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
     step, per_step = np.float32(view.step), np.float32(1 / view.step)
     most_x, most_y, most_z = np.float32(grid.nx - 1), np.float32(grid.ny - 1), np.float32(grid.nz - 1)
     some_near = view.min_distance > -np.inf
+    cells = np.int32(grid.nx * grid.ny * grid.nz if grid.directed else 0)
+    octant = select_lanes(dx > _NONE, broadcast32(cells), 0) + select_lanes(dy > _NONE, broadcast32(2 * cells), 0)
+    octant = octant + select_lanes(dz > _NONE, broadcast32(4 * cells), 0)
     # Integers are kept as float32: conversions would lengthen the dependency chain from step to step.
     k, last = load32(floats, FIRST), load32(floats, LAST)
     until, owner, visited, tested = k, broadcast32(np.int32(0)), broadcast32(_NONE), broadcast32(_NONE)
@@ -130,7 +136,7 @@ def march(shared, grid, view, colours, floats, ints):  # type: ignore[no-untyped
             e = min_lanes(max_lanes(floor_lanes((ey + s * dy) * per_brick), _NONE), most_y)
             c = min_lanes(max_lanes(floor_lanes((ez + s * dz) * per_brick), _NONE), most_z)
             cell = select_lanes(enters, (to_ints(a) * grid.ny + to_ints(e)) * grid.nz + to_ints(c), 0)
-            leap = gather_lanes(grid.leap, cell)
+            leap = gather_lanes(grid.octants, cell + octant)
             visited = visited + select_lanes(enters, broadcast32(_ONE), _NONE)
             # A ray leaves the cell, or the empty cube of cells around it, at the nearest of three faces.
             far = max_lanes(to_floats(leap), _ONE)

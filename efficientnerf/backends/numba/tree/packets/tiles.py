@@ -147,9 +147,9 @@ def _cascade(n, scene):  # type: ignore[no-untyped-def]
     base, first = scene.base, scene.grids[4 * n + 3]
     grid = PackedPointers(
         base.brick, scene.grids[4 * n], scene.grids[4 * n + 1], scene.grids[4 * n + 2], scene.places[4 * n], scene.places[4 * n + 1], scene.places[4 * n + 2],
-        scene.places[4 * n + 3], advanced(base.leap, first), base.has_density, base.mask_words, base.rows, base.narrow, base.voxels, base.voxel_of,
-        advanced(base.brick_index, first), base.density, base.terms, base.coded, base.sh, base.base, base.base_table, base.codes,
-        base.groups, base.palette, base.entries, base.code_columns,
+        scene.places[4 * n + 3], advanced(base.leap, first), advanced(base.octants, first * 8 if base.directed else first), base.directed, base.has_density,
+        base.mask_words, base.rows, base.narrow, base.voxels, base.voxel_of, advanced(base.brick_index, first), base.density, base.terms, base.coded,
+        base.sh, base.base, base.base_table, base.codes, base.groups, base.palette, base.entries, base.code_columns,
     )  # fmt: skip
     return grid, View(advanced(scene.direction, 12 * n), scene.direction_rate, scene.min_distance[n], scene.density_scale[n], scene.step, scene.degree)
 
