@@ -3,7 +3,8 @@
     python benchmarks/size_quality.py RUN [--sizes 1,2,5,10,20,40] [--layouts compact,packed] [--out benchmarks/results] [--set STAGE.NAME=VALUE]
 
 RUN has to be trained; it is not changed. Each budget, in MB of 10^6 bytes (bake.max_mib is in MiB), is baked and evaluated in a copy beside it by the stages
-themselves, with the run's other settings. Writes size_quality_NAME.json, .md and .png; the network's PSNR is of the views that the evaluate stage rendered.
+themselves, with the run's other settings. Writes size_quality_NAME.json, .md and .png after each row, and keeps rows that the file has of other sizes; the
+network's PSNR is of the views that the evaluate stage rendered.
 """
 
 from __future__ import annotations
@@ -83,21 +84,23 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], dest="sets", metavar="STAGE.NAME=VALUE")
     given = parser.parse_args()
     settings = dict(text.split("=", 1) for text in given.sets)
-    rows = []
+    name = given.run.resolve().name
+    given.out.mkdir(parents=True, exist_ok=True)
+    file = given.out / f"size_quality_{name}.json"
+    rows = read_json(file)["rows"] if file.exists() else []
     with tempfile.TemporaryDirectory(prefix="sizes-", dir=given.run.resolve().parent) as folder:
         work = linked_copy(given.run, Path(folder) / "run")
         sizes = sorted(float(word) for word in given.sizes.split(","))
         for layout, size in ((layout, size) for layout in given.layouts.split(",") for size in sizes):
-            rows.append(row_of(work, layout, size, settings))
-            print(f"{layout} {size:5g} MB: {rows[-1]['mb']:.2f} MB, {rows[-1]['voxels']:,} voxels, {rows[-1]['psnr']:.2f} dB", flush=True)
-        measured = EvaluateOutputs.of_run(given.run).metrics  # of more than one view, where the run has been evaluated
-        network = read_json(measured if measured.exists() else EvaluateOutputs.of_run(work).metrics)["network"]
-    name = given.run.resolve().name
-    document = {"run": name, "settings": settings, "rows": rows, "network": network, "hardware": hardware("cpu"), "versions": versions()}
-    given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / f"size_quality_{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    (given.out / f"size_quality_{name}.md").write_text(in_markdown(name, rows, network["psnr"]), encoding="utf-8")
-    plot(given.out / f"size_quality_{name}.png", rows, network["psnr"], name)
+            row = {**row_of(work, layout, size, settings), "settings": settings}
+            rows = sorted([*(old for old in rows if (old["layout"], old["max_mb"]) != (layout, size)), row], key=lambda each: (each["layout"], each["max_mb"]))
+            print(f"{layout} {size:5g} MB: {row['mb']:.2f} MB, {row['voxels']:,} voxels, {row['psnr']:.2f} dB", flush=True)
+            measured = EvaluateOutputs.of_run(given.run).metrics  # of more than one view, where the run has been evaluated
+            network = read_json(measured if measured.exists() else EvaluateOutputs.of_run(work).metrics)["network"]
+            document = {"run": name, "rows": rows, "network": network, "hardware": hardware("cpu"), "versions": versions()}
+            file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+            (given.out / f"size_quality_{name}.md").write_text(in_markdown(name, rows, network["psnr"]), encoding="utf-8")
+            plot(given.out / f"size_quality_{name}.png", rows, network["psnr"], name)
 
 
 if __name__ == "__main__":
