@@ -47,11 +47,13 @@ def space_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mappi
 
 
 def _working_images(own: Any, sources: Sequence[Path]) -> int:
+    from stages.sfm.ladder import features_for
+
     files = [path for source in sources for path in _files(source)]
     stored = sum(os.stat(path).st_size for path in files)
     count = len(files) if len(files) > 2 * len(sources) else own.frames * len(sources)  # of videos
     images = count * int(PIXEL * ASPECT * own.max_image_size**2)
-    return (min(images, DECODED * stored) if len(files) > 2 * len(sources) else images) + FEATURE * own.max_features * count
+    return (min(images, DECODED * stored) if len(files) > 2 * len(sources) else images) + FEATURE * (given(own.max_features) or features_for(count)) * count
 
 
 def _training(own: Any, run: Path, memory: int | None) -> int:

@@ -20,6 +20,7 @@ from stages.sfm.images import Progress, SafePoint, WorkImage, images_of
 MIN_MODEL_SIZE = 3  # registered photographs
 MIN_MATCHES = 30  # verified ones of a pair, from which it says something about cameras
 MANY_OBSERVATIONS = 150_000  # of points in images; of more, an even choice holds the cameras as well
+ALL_OF = 300  # points: a photograph with no more keeps all of them
 # Adjustments of all that is found so far: each time there are so many times more photographs or points than at the last, with those points that hold the
 # cameras, and not to the last digit, for `bundle_adjusted` follows. COLMAP's own options take twice the time. docs/experiments/sfm.md
 ADJUSTMENTS: Mapping[str, object] = {
@@ -166,13 +167,15 @@ def bundle_adjusted(work: Path, images: Sequence[WorkImage], model: Any, safe_po
 
 
 def _thinned(model: Any) -> Any:
-    """A copy with an even choice of the points, of about MANY_OBSERVATIONS; None where there are no more."""
+    """A copy with an even choice of the points, of about MANY_OBSERVATIONS, and all of the photographs that have few; None where there are no more."""
     every = -(-int(model.compute_num_observations()) // MANY_OBSERVATIONS)
     if every < 2:
         return None
+    poor = [image for image in model.images.values() if image.num_points3D <= ALL_OF]
+    needed = {point.point3D_id for image in poor for point in image.points2D if point.has_point3D()}
     some = model.__deepcopy__({})
     for number, point_id in enumerate(sorted(model.point3D_ids())):
-        if number % every:
+        if number % every and point_id not in needed:
             some.delete_point3D(point_id)
     return some
 
