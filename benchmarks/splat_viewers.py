@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import functools
 import http.server
-import io
 import json
 import math
 import tempfile
@@ -33,6 +32,7 @@ from stages.io.exporters import SPLAT_EXPORTERS
 from stages.io.exporters.glb import gltf_from_capture
 from stages.io.exporters.splats.ply import read_splats
 from stages.io.exporters.writing import source_frame
+from stages.io.pictures import opened, rgb_and_alpha
 from tests.stages.viewer import browser
 from workflows.cli.target import asset_of
 
@@ -118,18 +118,19 @@ def camera_of(run: Path, number: int, width: int) -> Camera:
     return Camera(camera.name, width, height, "PINHOLE", (lens, lens, width / 2, height / 2), camera.world_from_camera)
 
 
-def seen(chromium: Any, address: str, camera: Camera) -> tuple[np.ndarray, str, list[str]]:
-    """(H, W, 3) uint8 of a page, what it says of itself, lines of errors on its console."""
+def seen(chromium: Any, address: str, camera: Camera, shot: Path) -> tuple[np.ndarray, str, list[str]]:
+    """(H, W, 3) uint8 of a page, also as the file `shot` (PNG); what it says of itself, lines of errors on its console."""
     page = chromium.new_page(viewport={"width": camera.width, "height": camera.height})
     console: list[str] = []
     page.on("console", lambda each: console.append(each.text) if each.type == "error" else None)
     page.on("pageerror", lambda error: console.append(str(error)))
     page.goto(address)
     page.wait_for_function("window.done", timeout=WAIT)
-    found = np.asarray(Image.open(io.BytesIO(page.screenshot(timeout=WAIT)), formats=["PNG"]).convert("RGB"))
+    page.screenshot(path=shot, timeout=WAIT)
     about = page.evaluate("String(window.done)")
     page.close()
-    return found, about, console
+    with opened(shot, ("PNG",)) as image:
+        return rgb_and_alpha(image)[0], about, console
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -170,9 +171,8 @@ def main() -> None:
             facts |= {"three": "three.webgpu" if viewer == "three" else "three.module"}
             facts |= {"fov": math.degrees(2 * math.atan(camera.height / 2 / camera.intrinsics["fy"]))}
             (Path(folder) / f"{case}.html").write_text(HEAD % facts + PAGES[viewer] + "</script>", encoding="utf-8")
-            picture, about, console = seen(chromium, f"http://127.0.0.1:{server.server_port}/{case}.html", camera)
-            if given.shots:
-                Image.fromarray(picture).save(given.shots / f"{case}.png")
+            shot = (given.shots or Path(folder)) / f"{case}.png"
+            picture, about, console = seen(chromium, f"http://127.0.0.1:{server.server_port}/{case}.html", camera, shot)
             facts = {"viewer": viewer, "version": about, "file": kind, "bytes": file.stat().st_size}
             rows.append({**facts, "psnr": round(decibels(picture, own), 1), "console": console})
             print(json.dumps(rows[-1]), flush=True)
