@@ -92,12 +92,12 @@ def main() -> None:
         work = linked_copy(given.run, Path(folder) / "run")
         sizes = sorted(float(word) for word in given.sizes.split(","))
         for layout, size in ((layout, size) for layout in given.layouts.split(",") for size in sizes):
-            row = {**row_of(work, layout, size, settings), "settings": settings}
+            row = {**row_of(work, layout, size, settings), "settings": settings, "hardware": hardware("cpu"), "versions": versions()}
             rows = sorted([*(old for old in rows if (old["layout"], old["max_mb"]) != (layout, size)), row], key=lambda each: (each["layout"], each["max_mb"]))
             print(f"{layout} {size:5g} MB: {row['mb']:.2f} MB, {row['voxels']:,} voxels, {row['psnr']:.2f} dB", flush=True)
             measured = EvaluateOutputs.of_run(given.run).metrics  # of more than one view, where the run has been evaluated
             network = read_json(measured if measured.exists() else EvaluateOutputs.of_run(work).metrics)["network"]
-            document = {"run": name, "rows": rows, "network": network, "hardware": hardware("cpu"), "versions": versions()}
+            document = {"run": name, "rows": rows, "network": network}
             file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
             (given.out / f"size_quality_{name}.md").write_text(in_markdown(name, rows, network["psnr"]), encoding="utf-8")
             plot(given.out / f"size_quality_{name}.png", rows, network["psnr"], name)

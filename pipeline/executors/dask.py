@@ -157,6 +157,10 @@ def _started(kind: str, options: dict[str, Any], jobs: int) -> Any:
     cluster_type = getattr(_imported(module), name)
     if kind == "local":
         options = {"threads_per_worker": 1, "dashboard_address": None, **options}
+    if module == "dask_jobqueue":
+        options = {"processes": 1, **options}
+        if options["processes"] != 1:  # dask_jobqueue forgets no job of several, and asks for no other when they have ended
+            raise UsageError(f"--cluster {kind}: processes: found {options['processes']!r}, expected 1. Ask for more jobs instead (jobs).")
     try:
         cluster = cluster_type(**options)
         if module == "dask_jobqueue":

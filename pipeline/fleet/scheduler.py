@@ -196,8 +196,8 @@ class Scheduler:
             others = [worker for worker in open_to_all if worker.name not in each.attempts.lost_on]
             place = self._room.place(demand, others or open_to_all, each.last_worker)
             need = each.space.get(each.what, 0)
-            if place is not None and (need >= too_much or not self._has_disk(each, need)):
-                too_much = min(too_much, need)
+            if place is not None and ((self._tasks and need >= too_much) or not self._has_disk(each, need)):
+                too_much = min(too_much, need)  # where nothing runs each is looked at: what it has written already counts
                 cramped.append(each)
             elif place is not None:
                 self._start(each, *place)

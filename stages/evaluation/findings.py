@@ -42,7 +42,7 @@ def findings(
     if not found or not short:
         return [f"{fact} {remedy}" for fact, remedy in found]
     cause = (
-        f"the asset's refinement had {steps:,} step{'' if steps == 1 else 's'}, where {usual_steps:,} are usual, which explains this: before other settings, "
-        "give it more time (--budget, bake.time_budget) or steps (bake.refine_steps), fewer voxels (bake.max_mib), or a machine that does nothing else."
+        f"the asset's refinement had {steps:,} step{'' if steps == 1 else 's'}, where {usual_steps:,} are usual, which may explain this: before other "
+        "settings, give it more time (--budget, bake.time_budget) or steps (bake.refine_steps), fewer voxels (bake.max_mib), or a machine without other work."
     )
     return [*(fact for fact, _ in found), cause]

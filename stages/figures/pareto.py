@@ -39,16 +39,18 @@ def pareto_plot(path: Path, series: Mapping[str, Sequence[Point]], *, x_label: s
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     costs = [x for points in series.values() for x, _, _ in points]
+    logarithmic = bool(costs) and min(costs) > 0 and max(costs) > 10 * min(costs)
     for number, (name, points) in enumerate(series.items()):
         colour = f"C{number % 10}"
         axes.scatter([x for x, _, _ in points], [y for _, y, _ in points], color=colour, alpha=0.55, marker=_MARKS[number // 10 % len(_MARKS)], s=30)
         front = [points[place] for place in pareto_front([(x, y) for x, y, _ in points])]
         axes.plot([x for x, _, _ in front], [y for _, y, _ in front], color=colour, label=name, linewidth=1.4)
         for x, y, label in front if len(front) <= _LABELS and len(series) <= 3 else []:
-            right = 2 * x > min(costs) + max(costs)  # a label to the right would leave the axes; above, for the line rises
+            # A label to the right of a point there would leave the axes; it stands above, for the line rises.
+            right = x * x > min(costs) * max(costs) if logarithmic else 2 * x > min(costs) + max(costs)
             place: dict[str, Any] = {"xytext": (-5, 7) if right else (5, -11), "horizontalalignment": "right" if right else "left"}
             axes.annotate(label, (x, y), textcoords="offset points", fontsize=7.5, color="0.25", parse_math=False, **place)
-    if costs and min(costs) > 0 and max(costs) > 10 * min(costs):
+    if logarithmic:
         axes.set_xscale("log")
     axes.margins(x=0.12, y=0.1)
     axes.set(xlabel=x_label, ylabel=y_label)

@@ -1,6 +1,7 @@
 """What each stage writes at its peak, its scratch and what is replaced included: by settings, and by what the stages before it made.
 
-Larger than what was measured on purpose (docs/experiments/fleet.md): a fleet admits stages by it, and what is too large only waits.
+Estimates, on the large side: only finished artifacts were compared (docs/experiments/fleet.md). A fleet admits stages by them; one for which the disk has no
+room although nothing else runs fails.
 """
 
 from __future__ import annotations
@@ -47,13 +48,17 @@ def space_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mappi
 
 
 def _working_images(own: Any, sources: Sequence[Path]) -> int:
+    """Working images, and what structure from motion reads: copies of photographs, or the frames of videos. Videos count where there are no images."""
+    from stages.io.importers.source import IMAGE_SUFFIXES
     from stages.sfm.ladder import features_for
+    from stages.video.panorama import VIEWS
 
-    files = [path for source in sources for path in _files(source)]
-    stored = sum(os.stat(path).st_size for path in files)
-    count = len(files) if len(files) > 2 * len(sources) else own.frames * len(sources)  # of videos
-    images = count * int(PIXEL * ASPECT * own.max_image_size**2)
-    return (min(images, DECODED * stored) if len(files) > 2 * len(sources) else images) + FEATURE * (given(own.max_features) or features_for(count)) * count
+    pictures = [path for source in sources for path in _files(source) if path.suffix.lower() in IMAGE_SUFFIXES]
+    count = (len(pictures) or own.frames) * (VIEWS if own.lens == "equirectangular" else 1)
+    images = count * int(PIXEL * ASPECT * (own.max_image_size**2 + own.feature_image_size**2))
+    if pictures:
+        images = min(images, 2 * DECODED * sum(os.stat(path).st_size for path in pictures))
+    return images + FEATURE * (given(own.max_features) or features_for(count)) * count
 
 
 def _training(own: Any, run: Path, memory: int | None) -> int:

@@ -273,7 +273,7 @@ def forecast(
         rgb = read_photo(files[first], side).rgb
     reading = 2.5 * (time.thread_time() - before) * count  # for structure from motion, as a working image, and to be looked at
     if posed:
-        seconds = {"poses_seconds": round(reading, 1), "poses_seconds_all_rungs": round(reading, 1)}
+        seconds = {"poses_seconds": round(reading, 1), "poses_seconds_at_most": round(reading, 1)}
         return {**seconds, "poses_bytes": int(decoding_needed(sizes).total), "pairs": 0}
     memory = features_needed(sizes * -(-count // len(sizes)), side, features, threads).total
     slower = float(np.median([each.seconds for each in small.values()])) / REFERENCE
@@ -290,7 +290,7 @@ def forecast(
     most = seconds + ladder.MORE_FEATURES * weak * finding + again / workers + MAPPED_AGAIN * mapping
     return {
         "poses_seconds": round(reading + slower * seconds, 1),
-        "poses_seconds_all_rungs": round(reading + slower * most, 1),
+        "poses_seconds_at_most": round(reading + slower * most, 1),
         "poses_bytes": int(memory),
         "pairs": compared,
     }

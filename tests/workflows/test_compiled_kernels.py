@@ -25,7 +25,7 @@ def hand_on(compiled: Path, place: Path) -> None:
     for index in sorted(compiled.rglob("*.nbi")):
         folder = place / index.parent.relative_to(compiled)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not list(folder.glob(f"{index.stem}.*")):
+        if not (folder / index.name).exists():
             for file in (*index.parent.glob(f"{index.stem}.*.nbc"), index):
                 shutil.copyfile(file, folder / f"{file.name}.new")
                 os.replace(folder / f"{file.name}.new", folder / file.name)

@@ -79,7 +79,7 @@ def in_words(found: dict[str, Any]) -> list[str]:
     if not found["problems"]:
         lines.append("  Nothing stands against them.")
     compared = f", {about['pairs']} pairs compared" if about["pairs"] else ""
-    longer = f", up to {duration(about['poses_seconds_all_rungs'])} where photographs match badly" if about["pairs"] else ""
+    longer = f", up to {duration(about['poses_seconds_at_most'])} where photographs match badly" if about["pairs"] else ""
     room = "" if about["fits"] else f", more than the {size(about['memory_limit'])} there are"
     seconds, memory = duration(about["poses_seconds"]), size(about["poses_bytes"])
     lines.append(f"  Cameras: about {seconds} on this machine if nothing else runs{compared}{longer}, and {memory} of memory{room}.")

@@ -395,6 +395,13 @@ def test_stages_are_admitted_by_what_they_write(tmp_path: Path, monkeypatch: pyt
     assert run(tmp_path, Simulated([Worker("a", 2)], answer), scenes(5), former=found).state == "done"
 
 
+def test_a_scene_that_has_written_most_of_it_goes_on_behind_one_that_does_not_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(disk, "free_space", lambda fleet: disk.RESERVE + 2 * GIB)
+    monkeypatch.setattr(disk, "written_in", lambda run: 5 * GIB if run.name == "s1" else 0)
+    found = run(tmp_path, Simulated([Worker("a", 2)], lambda task: done(task, space={"poses": 1, "train": 6 * GIB, "bake": 1})), scenes(3))
+    assert [scene.state for scene in found.scenes] == ["failed", "done", "failed"]
+
+
 def test_what_was_written_already_is_not_asked_for_twice(tmp_path: Path) -> None:
     """Free space has shrunk by it."""
     (tmp_path / "s0" / ".work" / "train").mkdir(parents=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +38,12 @@ def test_a_video_needs_the_room_of_its_frames(tmp_path: Path) -> None:
     clip = tmp_path / "clip.mp4"
     clip.write_bytes(bytes(1000))
     one = space_needed("poses", tmp_path / "run", (clip,), DEFAULTS)
-    both = space_needed("poses", tmp_path / "run", (clip, clip), DEFAULTS)
     assert one > 50 * 2**20
-    assert one < both < 2 * one
+    assert space_needed("poses", tmp_path / "run", (clip, clip), DEFAULTS) == one, "poses.frames are of all videos together"
+    for name in ("notes.txt", "imu.csv", "times.json"):
+        (tmp_path / name).write_bytes(bytes(10))
+    assert space_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS) == one, "a folder with a video and its notes"
+    assert space_needed("poses", tmp_path / "run", (clip,), {**DEFAULTS, "poses": dataclasses.replace(DEFAULTS["poses"], lens="equirectangular")}) > 6 * one
 
 
 def test_pixels_that_do_not_fit_into_memory_are_written(tmp_path: Path) -> None:
