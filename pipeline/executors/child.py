@@ -2,7 +2,7 @@
 a failed stage and not the end of those that run beside it.
 
 A child works for one run (`pipeline.executors.serving` is its side) and is kept for the run's next stage: what it has imported and compiled is used again.
-One that prepares runs goes on to the next run, until a run whose stages begin takes it over.
+One that prepares runs goes on to the next run, until a run whose stages begin takes it over; so does one whose run is done, unless it holds much memory.
 Parent and child speak lines of JSON:
 
     to the child    {"kind": "prepare" | "stage" | "finish" | "end", ...}, see `Children.work`
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import json
 import os
 import signal
@@ -35,6 +36,7 @@ Report = Callable[[Event], None]
 LAST_LINES = 20  # of standard error that are kept
 LONGEST_LINE = 500
 IDLE = 5.0  # seconds that a child without work is kept
+LITTLE = 2**30  # bytes that the child of a run which is done may hold to go on with another: small scenes, to which starting one is a part worth saving
 GRACE = 20.0  # seconds that a child has to reach a safe point once it is asked to stop
 PREPARES = "prepares runs "
 _PR_SET_PDEATHSIG = 1  # prctl(2), Linux alone
@@ -73,6 +75,8 @@ class _Child:
 
     def work(self, request: Mapping[str, Any], report: Report) -> Event:
         assert self.process.stdout is not None
+        if request["kind"] == "prepare":
+            self._lines.clear()  # of the run before
         self._write(request)
         while line := self.process.stdout.readline():
             try:
@@ -199,8 +203,11 @@ class Children:
                 answer["kind"] = "stopped"
             elif child.stopping and not answer["ok"]:
                 answer = {**_stopped_result(), "lines": answer["lines"]}
+            held = answer.pop("resident", None)
             if child.stopping or child.process.returncode is not None or answer.get("kind") == "memory":  # a new one has all of its memory
                 self._drop(run)
+            elif held is not None and held <= LITTLE and not gpus:
+                self._release(run)
             return answer
         except OSError as error:  # no process could be started
             return {"event": "result", "ok": False, "kind": "died", "signal": None, "text": f"no process could be started: {error.strerror}.", "lines": []}
@@ -208,10 +215,10 @@ class Children:
             with self._lock:
                 self._working.discard(run)
                 self._stopped.discard(run)
-                kept = 0.0 if request["kind"] == "finish" else IDLE  # a run that is done needs its memory no more
+                finished = request["kind"] == "finish" and run in self._children  # with much memory, which it needs no more
                 if run in self._children:
-                    self._children[run][1].idle_since = time.monotonic() - (IDLE - kept)
-            timer = threading.Timer(kept, self.tidy)
+                    self._children[run][1].idle_since = time.monotonic() - (IDLE if finished else 0.0)
+            timer = threading.Timer(0.0 if finished else IDLE, self.tidy)
             timer.daemon = True
             timer.start()
 
@@ -288,6 +295,15 @@ class Children:
         spare = (each for each, (what, _) in self._children.items() if each.startswith(PREPARES) and each not in self._working and what == kind)
         name = next(spare, None)
         return None if name is None else self._children.pop(name)
+
+    def _release(self, run: str) -> None:
+        """The child of a run that is done is free for others."""
+        with self._lock:
+            if run in self._children:
+                taken = {*self._children, *self._working}
+                name = next(name for number in itertools.count() if (name := f"{PREPARES}{number}") not in taken)
+                self._children[name] = self._children.pop(run)
+                self._children[name][1].idle_since = time.monotonic()
 
     def _drop(self, run: str) -> None:
         with self._lock:

@@ -93,6 +93,12 @@ def available_now(root: Path = Path("/")) -> int | None:
     return found
 
 
+def resident() -> int | None:
+    """Bytes of this process in memory, what it has freed given back before; None where the system does not say."""
+    give_back_freed()
+    return _field(Path("/proc/self/status"), "VmRSS")
+
+
 def give_back_freed() -> None:
     """Give back to the system what this process has freed: the C library keeps it, and each stage would begin with what those before it took."""
     gc.collect()

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from pipeline.decide import survey
 from pipeline.errors import BadInput, CorruptArtifact, DiskFull, Interrupted, PipelineError, RunLocked, TooLittleMemory, UsageError
 from pipeline.executors.child import Event, end_with
-from pipeline.executors.memory import Limit
+from pipeline.executors.memory import Limit, resident
 from pipeline.failures import history
 from pipeline.run import Run
 from pipeline.runner import run_stages
@@ -106,7 +106,7 @@ def _answer(program: Program, request: dict[str, Any], channel: _Channel) -> dic
         return {"stages": found, "finished": program.is_finished(path), **_space(program, path, found, request["memory"]), **program.describe(path)}
     if request["kind"] == "finish":
         program.finish(path)
-        return program.describe(path)
+        return {"resident": resident(), **program.describe(path)}
     name = request["stage"]
     stage = next(each for each in program.stages if each.name == name)
     if request.get("donor") and take_over(Run.open(path), stage, Path(request["donor"])):
