@@ -337,13 +337,13 @@ def _write_mesh(export: Export, mesh: Mesh, frame: SourceFrame) -> list[Written]
 
 # What has no table: extension, of what, command, what it keeps and loses, who opens it.
 _OTHERS = (
-    (CAMERAS, "cameras", "enerf export", "cameras and their lenses, of a run", "the surface", "nerfstudio, instant-ngp, gsplat"),
+    (CAMERAS, "cameras", "enerf export", "cameras and their lenses, of a run", "the surface", "should: nerfstudio"),
     (VIEWER, "viewer", "enerf export", "all: the asset itself, and photographs of a run's cameras", "nothing, or what --region and --crop say",
-     "browsers with WebGL2, from disk and offline"),
-    (".png", "pictures", "enerf render", "colour, 8 bits sRGB, and opacity over a transparent background", "depth", "everything"),
+     "Chromium, from disk and offline; should: every browser with WebGL2"),
+    (".png", "pictures", "enerf render", "colour, 8 bits sRGB, and opacity over a transparent background", "depth", "OpenCV; should: everything"),
     (".exr", "pictures", "enerf render --exr all", "linear colour, opacity, depth, normals and positions, 32 bits; the capture's frame", "nothing",
-     "Nuke, Blender, Fusion, Natron, DJV"),
-    (".mp4", "pictures", "enerf render --video", "colour, as video (H.264)", "opacity, depth", "everything"),
+     "FFmpeg, OpenEXR; should: Nuke, Blender, Fusion, Natron, DJV"),
+    (".mp4", "pictures", "enerf render --video", "colour, as video (H.264)", "opacity, depth", "OpenCV, FFmpeg; should: everything"),
     (".nerftree", "asset", "enerf convert", "all: voxels, view-dependent colours, surroundings", "nothing, or what --resolution and --sh-degree say", "enerf"),
 )  # fmt: skip
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 HTML, JSON, PNG = "text/html; charset=utf-8", "application/json", "image/png"
 LIVE = {"/": ("live.html", HTML), "/live.js": ("live.js", "text/javascript; charset=utf-8"), "/live.css": ("live.css", "text/css; charset=utf-8")}
 LIVE_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; frame-src 'self'; "
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; frame-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 VIEWER_POLICY = "frame-ancestors 'self'"  # the page has a policy of its own, of the hashes of its scripts

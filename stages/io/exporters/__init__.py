@@ -20,7 +20,7 @@ class Format:
     extension  with its dot
     keeps      of a mesh, of points or of an asset
     loses      what it has no place for
-    opened_by  programs
+    opened_by  programs that were tried; after "should", others that were not
     module     of this package, and its function: write
     textures   whether it keeps textures, and takes `picture`
     coloured   whether it keeps colours at all: of vertices, which a mesh with a texture takes from that
@@ -58,37 +58,42 @@ class Format:
 
 
 _MESHES = (
-    Format(".ply", "shape, normals, colours of vertices; the capture's frame", "the texture", "MeshLab, CloudCompare, Blender", "ply", "write_mesh"),
+    Format(".ply", "shape, normals, colours of vertices; the capture's frame", "the texture",
+           "trimesh; should: MeshLab, CloudCompare, Blender", "ply", "write_mesh"),
     Format(".glb", "shape, normals, texture or colours of vertices; y up; unlit", "the capture's axes (kept as a matrix in its extras)",
-           "Blender, Unity, Unreal, Godot, three.js, Windows", "glb", "write_mesh", textures=True),
+           "Blender, trimesh; should: Unity, Unreal, Godot, three.js, Windows", "glb", "write_mesh", textures=True),
     Format(".obj", "shape, normals, texture (a .mtl and a picture beside it) or colours of vertices; the capture's frame", "that it is unlit",
-           "nearly everything", "obj", "write_mesh", textures=True, beside=True),
+           "Blender, trimesh; should: nearly everything", "obj", "write_mesh", textures=True, beside=True),
     Format(".usdz", "shape, normals, texture or colours of vertices, in one file; y up; unlit", "the capture's axes (kept as a matrix)",
-           "iOS and macOS, Blender, Houdini, Omniverse", "usd", "write_usdz", textures=True, extra="usd"),
-    Format(".usdc", "the same, its picture beside it", "the capture's axes (kept as a matrix)", "Blender, Houdini, Omniverse, Maya", "usd", "write_usdc",
-           textures=True, extra="usd", beside=True),
-    Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices, the unit", "slicers for 3D printing, CAD", "stl", "write_mesh",
-           coloured=False),
+           "Blender, OpenUSD; should: iOS and macOS, Houdini, Omniverse", "usd", "write_usdz", textures=True, extra="usd"),
+    Format(".usdc", "the same, its picture beside it", "the capture's axes (kept as a matrix)",
+           "OpenUSD; should: Blender, Houdini, Omniverse, Maya", "usd", "write_usdc", textures=True, extra="usd", beside=True),
+    Format(".stl", "shape; the capture's frame", "colours, texture, shared vertices, the unit", "trimesh; should: slicers for 3D printing, CAD",
+           "stl", "write_mesh", coloured=False),
 )  # fmt: skip
 _POINTS = (
-    Format(".ply", "places, normals, colours; the capture's frame", "nothing", "MeshLab, CloudCompare, Blender", "ply", "write_points"),
-    Format(".xyz", "places, colours, normals, as text; the capture's frame", "nothing", "CloudCompare, spreadsheets", "xyz", "write_points"),
+    Format(".ply", "places, normals, colours; the capture's frame", "nothing",
+           "trimesh; should: MeshLab, CloudCompare, Blender", "ply", "write_points"),
+    Format(".xyz", "places, colours, normals, as text; the capture's frame", "nothing",
+           "numpy; should: CloudCompare, spreadsheets", "xyz", "write_points"),
     Format(".las", "places to a millionth of their reach, normals as extra dimensions, colours; the capture's frame", "nothing",
-           "CloudCompare, PDAL, QGIS, ArcGIS, Potree", "las", "write_points", extra="las"),
-    Format(".laz", "the same, compressed", "nothing", "CloudCompare, PDAL, QGIS, ArcGIS, Potree", "las", "write_points", extra="las"),
+           "copc.js; should: CloudCompare, PDAL, QGIS, ArcGIS, Potree", "las", "write_points", extra="las"),
+    Format(".laz", "the same, compressed", "nothing", "copc.js; should: CloudCompare, PDAL, QGIS, ArcGIS, Potree", "las", "write_points", extra="las"),
 )  # fmt: skip
 _VOLUMES = (
     Format(".vdb", "density and colour of each voxel, linear, sparse; the capture's frame",
-           "the colours' change with the view; what lies beyond all voxels; forward-facing scenes", "Blender, Houdini, Omniverse", "vdb", "write_volume"),
+           "the colours' change with the view; what lies beyond all voxels; forward-facing scenes", "OpenVDB of Blender; should: Houdini, Omniverse",
+           "vdb", "write_volume"),
 )  # fmt: skip
 
 _SPLATS = (
     Format(".ply", "3D Gaussians with view-dependent colours, as 3DGS writes them; the capture's frame", "what fewer Gaussians than voxels cannot show",
-           "SuperSplat, Spark, PlayCanvas, Babylon.js, Unity, Unreal, Blender (add-ons), nerfstudio", "splats.ply", "write_splats"),
+           "PlayCanvas, Spark, three.js, splat-transform; should: whatever reads 3DGS", "splats.ply", "write_splats"),
     Format(".spz", "the same in an eighth of the bytes; y up", "precision: colours, sizes and opacities of 8 bits; the capture's axes",
-           "Scaniverse, SuperSplat, Spark, Babylon.js, Cesium", "splats.spz", "write_splats"),
+           "Spark, three.js, splat-transform; should: others of SPZ 3", "splats.spz", "write_splats"),
     Format(".glb", "the same, in single precision (KHR_gaussian_splatting); y up; points where the extension is unknown",
-           "the capture's axes (kept as a matrix in its extras)", "Cesium, Babylon.js, PlayCanvas", "splats.gltf", "write_splats"),
+           "the capture's axes (kept as a matrix in its extras)", "PlayCanvas, three.js (set its output to linear); should: others of the extension",
+           "splats.gltf", "write_splats"),
 )  # fmt: skip
 
 MESH_EXPORTERS: dict[str, Format] = {each.extension: each for each in _MESHES}

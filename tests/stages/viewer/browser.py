@@ -23,6 +23,11 @@ RENDER = """async ([pose, lens, width, height, options]) => {
   return btoa(Array.from(found, (x) => String.fromCharCode(x)).join(""));
 }"""
 
+RESTED = """async () => {
+  const { viewer } = await enerf.ready, frame = () => new Promise((done) => requestAnimationFrame(done));
+  for (let still = 0; still < 3; await frame()) still = viewer.state === "done" ? still + 1 : 0;
+}"""
+
 
 def missing() -> str | None:
     """Why no browser can be driven here; None where one can."""
@@ -57,6 +62,11 @@ class Page:
         raw = base64.b64decode(self.page.evaluate(RENDER, arguments))
         return np.frombuffer(raw, np.uint8).reshape(camera.height, camera.width, 4)[..., :3]
 
+    def shown(self) -> bytes:
+        """The canvas as it is once it rests."""
+        self.page.evaluate(RESTED)
+        return bytes(self.page.locator("#scene").screenshot())
+
 
 @contextmanager
 def chromium() -> Iterator[Any]:
@@ -72,14 +82,14 @@ def chromium() -> Iterator[Any]:
 
 
 @contextmanager
-def opened(browser: Any, path: Path, **options: Any) -> Iterator[Page]:
-    """A page from a file, in a context of its own."""
+def opened(browser: Any, place: Path | str, **options: Any) -> Iterator[Page]:
+    """A page from a file or an address, in a context of its own."""
     context = browser.new_context(**{"viewport": {"width": 320, "height": 300}, **options})
     page = Page(context.new_page())
     page.page.on("console", lambda each: page.console.append(each.text) if each.type in ("error", "warning") and "ReadPixels" not in each.text else None)
     page.page.on("pageerror", lambda error: page.console.append(str(error)))
     page.page.on("request", lambda request: page.requests.append(request.url))
-    page.page.goto(path.as_uri())
+    page.page.goto(place if isinstance(place, str) else place.as_uri())
     try:
         yield page
     finally:

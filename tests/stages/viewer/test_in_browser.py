@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,76 +11,15 @@ import numpy as np
 import pytest
 
 from efficientnerf.asset.format import serialize
-from efficientnerf.asset.region import Region, foreground
+from efficientnerf.asset.region import foreground
 from efficientnerf.asset.rendering import render
-from efficientnerf.asset.tree import NerfTree
-from efficientnerf.geometry.cameras import Camera
-from efficientnerf.geometry.ndc import Ndc
 from stages.viewer.page import viewer_page
 from tests.efficientnerf.hostile import HOSTILE
-from tests.efficientnerf.trees import looking, random_cascades, random_tree
+from tests.efficientnerf.trees import random_tree
 from tests.stages.viewer import browser
+from tests.stages.viewer.scenes import ORBIT, TREES, cameras_at, decibels, written
 
 pytestmark = pytest.mark.skipif(browser.missing() is not None, reason=str(browser.missing()))
-SIDE = 64
-ORBIT = {"centre": [0.0, 1.0, -0.4], "radius": 3.0, "elevation": 20.0, "heading": 40.0, "forward_facing": False}
-REGION = Region(np.array([[-0.55, 0.35, -0.95], [0.1, 0.9, 0.2]]), 0.3, 0.15)
-
-
-def forward_facing() -> NerfTree:
-    ndc = Ndc(np.eye(4), 60.0, 64.0, 64.0, 1.0)
-    return replace(random_tree(7, shape=(6, 6, 6), brick=4, degree=2, sigma=20.0, ndc=ndc), bounds_min=np.full(3, -1.0), voxel=2 / 24)
-
-
-TREES = {
-    "bounded": lambda: random_tree(1, degree=2, step_size=1.0, background=(1.0, 1.0, 1.0)),
-    "nearest": lambda: random_tree(2, degree=0, lookup="nearest", background=(1.0, 1.0, 1.0)),
-    "degree 4": lambda: random_tree(5, degree=4, brick=2, background=(1.0, 1.0, 1.0)),
-    "whole": lambda: random_cascades(3, degree=1, region=REGION),
-    "forward facing": forward_facing,
-}
-
-
-RESTED = """async () => {
-  const { viewer } = await enerf.ready, frame = () => new Promise((done) => requestAnimationFrame(done));
-  for (let still = 0; still < 3; await frame()) still = viewer.state === "done" ? still + 1 : 0;
-}"""
-
-
-def cameras_at(tree: NerfTree) -> list[Camera]:
-    """Five, around the tree or before it."""
-    if tree.ndc is not None:
-        poses = [np.eye(4) for _ in range(5)]
-        for n, pose in enumerate(poses):
-            pose[:3, 3] = 0.1 * np.sin([n, 2 * n, 3 * n])
-        return [Camera(str(n), SIDE, SIDE, "SIMPLE_PINHOLE", (60.0, 32.0, 32.0), pose) for n, pose in enumerate(poses)]
-    first = looking(tree)
-    centre = (tree.bounds_min + tree.bounds_max) / 2
-    out = []
-    for n in range(5):
-        angle = 1.3 * n
-        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        pose = first.world_from_camera.copy()
-        pose[:3, :3], pose[:3, 3] = turn @ pose[:3, :3], centre + turn @ (pose[:3, 3] - centre) * (1 - 0.15 * n)
-        out.append(Camera(str(n), SIDE, SIDE, "PINHOLE", (80.0, 84.0, 30.0, 33.0), pose))
-    return out
-
-
-def decibels(found: np.ndarray, expected: np.ndarray) -> float:
-    error = np.mean((found.astype(np.float64) / 255 - np.clip(expected, 0, 1)) ** 2)
-    return float(-10 * np.log10(max(error, 1e-12)))
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    with browser.chromium() as found:
-        yield found
-
-
-def written(folder: Path, asset: bytes, **options: Any) -> Path:
-    path = folder / "viewer.html"
-    path.write_bytes(viewer_page(asset, **options))
-    return path
 
 
 @pytest.mark.parametrize("kind", TREES)
@@ -126,12 +63,6 @@ def test_the_subject_alone_is_what_the_region_says(chromium: Any, tmp_path: Path
         assert decibels(page.rendered(camera, background=(1, 1, 1), surroundings=False), expected) > 45
 
 
-def picture(page: browser.Page) -> bytes:
-    """The canvas as it is shown once it rests."""
-    page.page.evaluate(RESTED)
-    return bytes(page.page.locator("#scene").screenshot())
-
-
 def test_hands_on_the_page_move_the_picture(chromium: Any, tmp_path: Path) -> None:
     tree = TREES["bounded"]().with_metadata(orbit=ORBIT)
     poses = cameras_at(tree)
@@ -139,10 +70,10 @@ def test_hands_on_the_page_move_the_picture(chromium: Any, tmp_path: Path) -> No
     with browser.opened(chromium, path, has_touch=True) as page:
         page.ready()
         mouse, keyboard = page.page.mouse, page.page.keyboard
-        seen = [picture(page)]
+        seen = [page.shown()]
 
         def changed(after: str) -> None:
-            seen.append(picture(page))
+            seen.append(page.shown())
             assert seen[-1] != seen[-2], after
 
         mouse.move(150, 120)
@@ -173,7 +104,7 @@ def test_hands_on_the_page_move_the_picture(chromium: Any, tmp_path: Path) -> No
         assert page.page.eval_on_selector("#photograph", "each => each.style.clipPath") == "inset(0px 50% 0px 0px)"
         page.page.click("#home")
         page.page.select_option("#background", "scene")
-        assert picture(page) == seen[0]
+        assert page.shown() == seen[0]
         with page.page.expect_download() as saved:
             page.page.click("#save")
         assert saved.value.suggested_filename == "a_scene.png"

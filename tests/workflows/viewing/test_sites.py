@@ -14,12 +14,9 @@ import pytest
 
 from efficientnerf.asset import format
 from efficientnerf.asset.tree import tree_from_voxels
-from pipeline.artifact import workplace
-from pipeline.decide import decide
 from pipeline.run import Run
-from pipeline.stage import Stage
 from stages.artifacts import BakeOutputs
-from tests.workflows.toys import TrainSettings
+from tests.workflows.viewing.growing import PNG, TRAIN, put, scratch
 from workflows.cli.main import main
 from workflows.viewing import progress, sites
 from workflows.viewing.page import present_page
@@ -27,29 +24,10 @@ from workflows.viewing.progress import MOST_POINTS, MOST_PREVIEWS, Progress
 from workflows.viewing.server import Answer
 from workflows.viewing.sites import LIVE_POLICY, AssetSite, RunSite
 
-TRAIN = Stage("train", 1, TrainSettings, (), lambda job: None)
-PNG = b"\x89PNG\r\n\x1a\n"
-
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     return Run.create(tmp_path / "run", Path("/photographs"), {})
-
-
-def scratch(run: Run) -> Path:
-    """The scratch folder of the stage that is being made."""
-    request = decide(TRAIN, run).request
-    assert request is not None
-    folder = workplace(run.path, "train", request).scratch
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-def put(folder: Path, steps: int, previews: list[int]) -> None:
-    lines = [{"step": k, "seconds": k / 10, "psnr": 10 + k / 100, "preview_psnr": 9.5 if k in previews else None, "more": [1]} for k in range(steps)]
-    (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
-    for step in previews:
-        (folder / f"preview_{step:06d}.png").write_bytes(PNG + bytes([step % 256]))
 
 
 def site_of(run: Run, tmp_path: Path) -> RunSite:

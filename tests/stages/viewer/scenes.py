@@ -1,0 +1,64 @@
+"""Scenes for the tests of the viewer's page, and what they are looked at from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from efficientnerf.asset.region import Region
+from efficientnerf.asset.tree import NerfTree
+from efficientnerf.geometry.cameras import Camera
+from efficientnerf.geometry.ndc import Ndc
+from stages.viewer.page import viewer_page
+from tests.efficientnerf.trees import looking, random_cascades, random_tree
+
+SIDE = 64
+ORBIT = {"centre": [0.0, 1.0, -0.4], "radius": 3.0, "elevation": 20.0, "heading": 40.0, "forward_facing": False}
+REGION = Region(np.array([[-0.55, 0.35, -0.95], [0.1, 0.9, 0.2]]), 0.3, 0.15)
+
+
+def forward_facing() -> NerfTree:
+    ndc = Ndc(np.eye(4), 60.0, 64.0, 64.0, 1.0)
+    return replace(random_tree(7, shape=(6, 6, 6), brick=4, degree=2, sigma=20.0, ndc=ndc), bounds_min=np.full(3, -1.0), voxel=2 / 24)
+
+
+TREES = {
+    "bounded": lambda: random_tree(1, degree=2, step_size=1.0, background=(1.0, 1.0, 1.0)),
+    "nearest": lambda: random_tree(2, degree=0, lookup="nearest", background=(1.0, 1.0, 1.0)),
+    "degree 4": lambda: random_tree(5, degree=4, brick=2, background=(1.0, 1.0, 1.0)),
+    "whole": lambda: random_cascades(3, degree=1, region=REGION),
+    "forward facing": forward_facing,
+}
+
+
+def cameras_at(tree: NerfTree) -> list[Camera]:
+    """Five, around the tree or before it."""
+    if tree.ndc is not None:
+        poses = [np.eye(4) for _ in range(5)]
+        for n, pose in enumerate(poses):
+            pose[:3, 3] = 0.1 * np.sin([n, 2 * n, 3 * n])
+        return [Camera(str(n), SIDE, SIDE, "SIMPLE_PINHOLE", (60.0, 32.0, 32.0), pose) for n, pose in enumerate(poses)]
+    first = looking(tree)
+    centre = (tree.bounds_min + tree.bounds_max) / 2
+    out = []
+    for n in range(5):
+        angle = 1.3 * n
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pose = first.world_from_camera.copy()
+        pose[:3, :3], pose[:3, 3] = turn @ pose[:3, :3], centre + turn @ (pose[:3, 3] - centre) * (1 - 0.15 * n)
+        out.append(Camera(str(n), SIDE, SIDE, "PINHOLE", (80.0, 84.0, 30.0, 33.0), pose))
+    return out
+
+
+def decibels(found: np.ndarray, expected: np.ndarray) -> float:
+    error = np.mean((found.astype(np.float64) / 255 - np.clip(expected, 0, 1)) ** 2)
+    return float(-10 * np.log10(max(error, 1e-12)))
+
+
+def written(folder: Path, asset: bytes, **options: Any) -> Path:
+    path = folder / "viewer.html"
+    path.write_bytes(viewer_page(asset, **options))
+    return path

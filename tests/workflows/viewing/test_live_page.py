@@ -1,0 +1,142 @@
+"""The page of `enerf view RUN --serve` in a real browser: it shows a run as it is made, and follows it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from efficientnerf.asset.format import save
+from pipeline.run import Run
+from stages.artifacts import BakeOutputs
+from stages.io.png import write_png
+from tests.efficientnerf.trees import random_tree
+from tests.stages.viewer.browser import Page, chromium, missing, opened
+from tests.workflows.viewing.growing import TRAIN, put, scratch
+from workflows.viewing.server import LOOPBACK, Server
+from workflows.viewing.sites import RunSite
+
+pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return Run.create(tmp_path / "a <b>run", Path("/photographs"), {})
+
+
+@pytest.fixture
+def server(run: Run, tmp_path: Path) -> Iterator[Server]:
+    (tmp_path / "pages").mkdir()
+    with Server(RunSite(run.path, (TRAIN,), tmp_path / "pages"), LOOPBACK, 0) as made:
+        threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield made
+        made.shutdown()
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> bytes:
+    """A PNG of 12 x 8."""
+    write_png(np.full((8, 12, 3), 90, np.uint8), tmp_path / "preview.png")
+    return (tmp_path / "preview.png").read_bytes()
+
+
+def until(page: Page, what: str) -> None:
+    """Wait for it; a function of the page's own that waited would be refused by its policy."""
+    end = time.monotonic() + 60
+    while not page.page.evaluate(what):
+        assert time.monotonic() < end, what
+        page.page.wait_for_timeout(50)
+
+
+def points(page: Page, line: str) -> int:
+    return len((page.page.get_attribute(f"svg polyline.{line}", "points") or "").split())
+
+
+def test_it_follows_a_run(browser: Any, run: Run, server: Server, picture: bytes) -> None:
+    with opened(browser, server.url, viewport={"width": 900, "height": 700}) as live:
+        page = live.page
+        until(live, "document.querySelectorAll('#stages li').length === 1")
+        assert page.inner_text("#stages li") == "train\nmissing"
+        assert page.inner_text("#name") == "a <b>run", "names are text"
+        assert page.inner_text("#facts") == "from /photographs"
+        assert page.query_selector("section.training") is None
+        assert not page.is_visible("#asset")
+
+        put(scratch(run), 7, [3, 5], picture)
+        until(live, "document.querySelector('svg polyline.first')")
+        assert page.get_attribute("#stages li", "class") == "partial"
+        assert page.inner_text("section.training h2") == "Training of the field"
+        assert page.inner_text(".now").split(" · ") == ["now", "step 6", "0.6 s", "training 10.06 dB", "preview 9.50 dB"]
+        assert (points(live, "first"), points(live, "second"), page.locator("svg circle").count()) == (7, 2, 2)
+        until(live, "document.querySelector('.preview img').naturalWidth === 12")
+        assert page.inner_text(".preview label span") == "step 5"
+
+        put(scratch(run), 12, [3, 5, 9], picture)
+        until(live, "document.querySelector('.preview label span').textContent === 'step 9'")
+        assert (points(live, "first"), points(live, "second")) == (12, 3)
+        page.locator(".preview input").fill("0")
+        assert page.inner_text(".preview label span") == "step 3"
+        put(scratch(run), 20, [3, 5, 9, 15], picture)
+        until(live, "document.querySelector('svg polyline.first').getAttribute('points').split(' ').length === 20")
+        assert page.inner_text(".preview label span") == "step 3", "who looks at an earlier one is left there"
+        assert live.console == []
+        assert {url.removeprefix(server.url).partition("?")[0] for url in live.requests if url != "data:,"} == {
+            "", "live.css", "live.js", "status.json", *(f"previews/train/preview_{step:06d}.png" for step in (3, 5, 9)),
+        }  # fmt: skip
+
+
+def test_it_shows_the_asset_once_there_is_one_and_another_when_asked(browser: Any, run: Run, server: Server) -> None:
+    with opened(browser, server.url, viewport={"width": 900, "height": 900}) as live:
+        until(live, "document.querySelectorAll('#stages li').length === 1")
+        asset = BakeOutputs.of_run(run.path).asset
+        asset.parent.mkdir()
+        first, other = random_tree(1), random_tree(2, shape=(6, 6, 6))
+        save(first, asset)
+        live.page.wait_for_selector("#asset", state="visible", timeout=60_000)
+        shown = live.page.frame_locator("#viewer")
+        shown.locator("body.ready").wait_for(timeout=60_000)
+        said = shown.locator("#facts-line").inner_text()
+        assert said.startswith(f"{len(first.density_values):,} voxels")
+        assert not live.page.is_visible("#again")
+        asset.unlink()
+        save(other, asset)
+        live.page.wait_for_selector("#again", state="visible", timeout=60_000)
+        assert shown.locator("#facts-line").inner_text() == said, "nothing is taken away from whoever looks at it"
+        live.page.click("#again")
+        said = f"{len(other.density_values):,} voxels"
+        until(live, f"document.getElementById('viewer').contentDocument.getElementById('facts-line')?.textContent.startsWith('{said}')")
+        assert live.console == []
+
+
+def test_it_says_so_when_nobody_answers_any_more(browser: Any, run: Run, server: Server) -> None:
+    with opened(browser, server.url) as live:
+        until(live, "document.querySelectorAll('#stages li').length === 1")
+        assert not live.page.is_visible("#trouble")
+        server.shutdown()
+        server.server_close()
+        live.page.wait_for_selector("#trouble", state="visible", timeout=60_000)
+        assert "does not answer" in live.page.inner_text("#trouble")
+        assert live.page.locator("#stages li").count() == 1, "what was seen last stays"
+
+
+def test_nothing_runs_over_a_narrow_page(browser: Any, run: Run, server: Server, picture: bytes) -> None:
+    put(scratch(run), 7, [3, 5], picture)
+    for width in (340, 700, 1200):
+        for scheme in ("light", "dark"):
+            with opened(browser, server.url, viewport={"width": width, "height": 700}, color_scheme=scheme) as live:
+                until(live, "document.querySelector('.preview img')?.naturalWidth === 12")
+                assert live.page.evaluate("document.documentElement.scrollWidth") <= width
+                paper = live.page.evaluate("getComputedStyle(document.body).backgroundColor")
+                assert (int(paper[4:-1].split(",")[0]) > 200) == (scheme == "light")
+                assert live.console == []
