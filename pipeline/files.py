@@ -263,6 +263,16 @@ def rename(source: Path, target: Path) -> None:
     os.replace(source, target)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """A second name for a file that is never written in place, or a copy of it."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except FileNotFoundError:
+        raise
+    except OSError:  # of another file system, of one that has no links, of a file with too many
+        shutil.copyfile(source, target, follow_symlinks=False)
+
+
 def sync_folder(folder: Path) -> None:
     """Make renames within the folder, which may be given by a link, survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -7,11 +7,9 @@ links between the two, files are copied.
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
 from pathlib import Path
 
-from pipeline import artifact, manifest
+from pipeline import artifact, files, manifest
 from pipeline.artifact import Workplace
 from pipeline.decide import decide
 from pipeline.errors import CorruptArtifact
@@ -64,23 +62,13 @@ def _linked(source: Path, made: Manifest, place: Workplace) -> bool:
         for name in made.outputs:
             target = place.out / name
             target.parent.mkdir(parents=True, exist_ok=True)
-            _link(source / name, target)
+            files.link_or_copy(source / name, target)
     except FileNotFoundError:
         return False  # damaged, or replaced meanwhile
     if artifact.differences(place.out, made.outputs).damaged:
         return False
     artifact.seal(place.out, made)
     return True
-
-
-def _link(source: Path, target: Path) -> None:
-    """A second name for a file, or a copy of it."""
-    try:
-        os.link(source, target, follow_symlinks=False)
-    except FileNotFoundError:
-        raise
-    except OSError:  # of another file system, of one that has no links, of a file with too many
-        shutil.copyfile(source, target, follow_symlinks=False)
 
 
 def _forget(run: Run, stage: Stage) -> None:

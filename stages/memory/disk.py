@@ -1,7 +1,7 @@
 """What each stage writes at its peak, its scratch and what is replaced included: by settings, and by what the stages before it made.
 
-Estimates, on the large side: only finished artifacts were compared (docs/experiments/fleet.md). A fleet admits stages by them; one for which the disk has no
-room although nothing else runs fails.
+Estimates, on the large side: only finished artifacts were compared (docs/experiments/fleet.md); a turntable's is a bound. A fleet admits stages by them: what
+does not fit beside the stages that run waits, and what does not fit although nothing else runs fails its scene.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ ASPECT = 0.75  # of the longer side: the shorter
 BAKED = 6  # times the asset: its arrays while they are refined
 ASSET_MIB = 64.0  # where the size of the asset is automatic
 SURFACE = 3  # times the asset: mesh files, textures, 3D Gaussians
-FRAME_PIXEL = 24  # of a pixel of a rendered frame: PNG, EXR and the video
+VIDEO_PIXEL = 1  # of a pixel of a rendered frame, beside a byte for each of its channels as PNG
+EXR_PIXEL = 4 * (4 + 1 + 3 + 3)  # float32: colour with alpha, depth, normal, position
 
 
 def space_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mapping[str, Any], memory: int | None = None) -> int:
@@ -43,8 +44,15 @@ def space_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mappi
     if stage in ("mesh", "splats", "points"):
         return LEAST + SURFACE * (asset.stat().st_size if asset.exists() else int(ASSET_MIB * MIB))
     if stage == "turntable":
-        return LEAST + FRAME_PIXEL * own.frames * own.width * own.height
+        return LEAST + own.width * own.height * _frames(own)
     return LEAST + 2 * _bytes_below([PosesOutputs.of_run(run).images])
+
+
+def _frames(own: Any) -> int:
+    """Bytes of a turntable for each pixel of a frame; its artifact's frames are those of its scratch, linked."""
+    channels = 4 if own.background == "transparent" else 3
+    deep = {"off": 0, "first": 1, "all": own.frames}[own.exr]
+    return (channels + VIDEO_PIXEL) * own.frames + EXR_PIXEL * deep
 
 
 def _working_images(own: Any, sources: Sequence[Path]) -> int:

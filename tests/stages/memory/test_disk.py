@@ -6,8 +6,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from efficientnerf.geometry.cameras import Camera
+from stages.io.exporters.exr import write_exr
+from stages.io.png import write_png
 from stages.memory.disk import LEAST, space_needed
 from workflows.asset import STAGES
 
@@ -44,6 +48,25 @@ def test_a_video_needs_the_room_of_its_frames(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(bytes(10))
     assert space_needed("poses", tmp_path / "run", (tmp_path,), DEFAULTS) == one, "a folder with a video and its notes"
     assert space_needed("poses", tmp_path / "run", (clip,), {**DEFAULTS, "poses": dataclasses.replace(DEFAULTS["poses"], lens="equirectangular")}) > 6 * one
+
+
+@pytest.mark.parametrize(("background", "channels"), [("auto", 3), ("transparent", 4)])
+@pytest.mark.parametrize(("exr", "deep"), [("off", 0), ("first", 1), ("all", 3)])
+def test_a_turntables_frames_of_noise_fit_into_what_was_foretold(background: str, channels: int, exr: str, deep: int, tmp_path: Path) -> None:
+    """Nothing is harder to compress; and what is foretold is no more than a third above."""
+    own = dataclasses.replace(DEFAULTS["turntable"], frames=3, width=512, height=384, background=background, exr=exr)
+    random = np.random.default_rng(0)
+    pose = np.eye(4)
+    camera = Camera("noise", own.width, own.height, "SIMPLE_PINHOLE", (400.0, own.width / 2, own.height / 2), pose)
+    for number in range(own.frames):
+        write_png(random.integers(0, 256, (own.height, own.width, channels), np.uint8), tmp_path / f"{number}.png")
+        if number < deep:
+            colour, normal = random.random((2, own.height, own.width, 3), np.float32)
+            opacity, depth = random.random((2, own.height, own.width), np.float32)
+            write_exr(tmp_path / f"{number}.exr", colour=colour, opacity=opacity, depth=depth, normal=normal, camera=camera)
+    written = sum(path.stat().st_size for path in tmp_path.iterdir())
+    needed = space_needed("turntable", tmp_path / "run", (), {"turntable": own}) - LEAST
+    assert written < needed < 4 / 3 * written * 1.001
 
 
 def test_pixels_that_do_not_fit_into_memory_are_written(tmp_path: Path) -> None:
