@@ -64,7 +64,7 @@ def short_video(path: Path) -> bytes:
 
 
 def with_pictures(folder: Path, state: FleetState) -> None:
-    """Posters and a turntable's file in the runs of scenes that are done."""
+    """Posters, a turntable's file and a report in the runs of scenes that are done."""
     video = short_video(folder / "short.mp4")
     for scene in state.scenes:
         if scene.state == "done":
@@ -72,6 +72,7 @@ def with_pictures(folder: Path, state: FleetState) -> None:
             made.folder.mkdir(parents=True)
             Image.new("RGB", (320, 200), (200, 120, 40)).save(made.poster)
             made.video.write_bytes(video)
+            (folder / scene.name / "report.html").write_text("the report")
 
 
 def facts(page: str) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from workflows.fleet.pages.updates import Pages
 def test_the_page_has_what_the_state_has() -> None:
     state = mixed()
     state.note = f"no worker is there {NASTY}"
-    found = facts(index_page(state, title="t", pictures={"scene-000": 7}))
+    found = facts(index_page(state, title="t", pictures={"scene-000": 7}, reports={"scene-000"}))
     assert found["note"] == printable(state.note)
     assert [scene["name"] for scene in found["scenes"]] == [scene.name for scene in state.scenes]
     first, broken = found["scenes"][0], found["scenes"][3]
@@ -157,6 +157,16 @@ def test_pictures_that_are_none_end_nothing(tmp_path: Path) -> None:
     pages(state)
     assert pages.trouble is None
     assert [scene["picture"] for scene in facts((tmp_path / "index.html").read_text("utf-8"))["scenes"]] == [None, None]
+
+
+def test_a_report_is_linked_wherever_it_is(tmp_path: Path) -> None:
+    """A scene that failed may have one of an earlier call; one that is done may have lost it."""
+    state = fleet(done("a"), done("b"), done("c"))
+    with_pictures(tmp_path, state)
+    (tmp_path / "b" / "report.html").unlink()
+    state.scenes[2].state, state.scenes[2].stages["turntable"].state = "failed", "failed"
+    Pages(tmp_path)(state)
+    assert [scene["report"] for scene in facts((tmp_path / "index.html").read_text("utf-8"))["scenes"]] == ["a/report.html", None, "c/report.html"]
 
 
 def test_a_folder_that_cannot_be_written_is_told_not_raised(tmp_path: Path) -> None:

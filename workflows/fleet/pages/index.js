@@ -67,19 +67,20 @@ function thumbnail(scene) {
     frame.append(image);
   }
   if (scene.video) {
-    const play = () => {
-      if (frame.querySelector("video")) return;
-      const video = element("video");
-      Object.assign(video, { preload: "none", muted: true, loop: true, playsInline: true, src: scene.video });
-      frame.append(video);
-      video.play().catch(() => video.remove());
-    };
-    frame.addEventListener("pointerenter", play);
-    frame.addEventListener("pointerleave", () => frame.querySelector("video")?.remove());
-    frame.play = play;
+    frame.addEventListener("pointerenter", (event) => event.pointerType !== "touch" && play(scene, frame));
+    frame.addEventListener("pointerleave", (event) => event.pointerType !== "touch" && stop(frame));
+    frame.addEventListener("click", () => { frame.closest("tr").focus(); play(scene, frame); }); // a tap; what is tapped next takes the focus, and stops it
   }
   return cell;
 }
+function play(scene, frame) {
+  if (frame.querySelector("video")) return;
+  const video = element("video");
+  Object.assign(video, { preload: "none", muted: true, loop: true, playsInline: true, src: scene.video });
+  frame.append(video);
+  video.play().catch(() => video.remove());
+}
+const stop = (frame) => frame.querySelector("video")?.remove();
 
 function nameCell(scene) {
   const cell = element("td", null, "scene");
@@ -112,6 +113,11 @@ function row(scene) {
   cell.append(button);
   made.append(cell);
   made.scene = scene;
+  if (scene.video) {
+    const frame = made.querySelector(".thumb div"), still = matchMedia("(prefers-reduced-motion: reduce)");
+    made.addEventListener("focusin", () => made.matches(":has(:focus-visible), :focus-visible") && !still.matches && play(scene, frame));
+    made.addEventListener("focusout", (event) => made.contains(event.relatedTarget) || stop(frame));
+  }
   return made;
 }
 

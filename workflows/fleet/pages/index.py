@@ -1,13 +1,13 @@
 """FLEET/index.html: all scenes of a fleet on one page, rewritten as the fleet goes on.
 
 The page is one file with its script, and asks for nothing but the thumbnails in FLEET/thumbnails/, which a browser loads as they come into sight, and the
-turntable of the scene that is pointed at. Names and messages are text, whatever they hold.
+turntable of the scene that is pointed at or has the focus. Names and messages are text, whatever they hold.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -25,11 +25,13 @@ LONGEST = 300  # characters of a value that is shown
 
 
 def index_page(
-    state: FleetState, *, title: str, pictures: Mapping[str, int] | None = None, throughput: float | None = None, comparison: str | None = None
-) -> str:
+    state: FleetState, *, title: str, pictures: Mapping[str, int] | None = None, reports: Container[str] = (), throughput: float | None = None,
+    comparison: str | None = None,
+) -> str:  # fmt: skip
     """The page as text.
 
     pictures    scene -> when its thumbnail was made, nanoseconds; others have none
+    reports     scenes whose report is there
     throughput  scenes an hour, where it is known
     comparison  the page of a sweep, where there is one
     """
@@ -47,7 +49,7 @@ def index_page(
         "bytes": sum(scene.bytes for scene in state.scenes),
         "throughput": throughput,
         "sweep": sorted({setting for scene in state.scenes for setting in scene.sweep or {}}),
-        "scenes": [_scene(scene, (pictures or {}).get(scene.name)) for scene in state.scenes],
+        "scenes": [_scene(scene, (pictures or {}).get(scene.name), reported=scene.name in reports) for scene in state.scenes],
     }
     return filled("index.html.j2", "index.js", title=title, facts=facts, comparison=comparison)
 
@@ -67,7 +69,7 @@ def filled(template: str, script: str | None = None, *, title: str, facts: Any =
     return environment.get_template(template).render(title=printable(title, 200), style=Markup(style), style_hash=policy_hash(style), **more)
 
 
-def _scene(scene: SceneState, picture: int | None) -> dict[str, Any]:
+def _scene(scene: SceneState, picture: int | None, *, reported: bool) -> dict[str, Any]:
     """What the page's script knows of a scene."""
     quality, place = quality_of(scene), quote(scene.run)
     made = {name for name, stage in scene.stages.items() if stage.state == "done"}
@@ -92,7 +94,7 @@ def _scene(scene: SceneState, picture: int | None) -> dict[str, Any]:
         "sweep": scene.sweep and {setting: _plain(value) for setting, value in scene.sweep.items()},
         "picture": None if picture is None else f"{THUMBNAILS}/{quote(scene.name)}.webp?{picture}",
         "video": f"{place}/{TurntableOutputs.of_run(Path()).video.as_posix()}" if TurntableOutputs.stage in made else None,
-        "report": f"{place}/{REPORT}" if scene.state == "done" else None,
+        "report": f"{place}/{REPORT}" if reported else None,
     }
 
 
