@@ -13,7 +13,7 @@ from benchmarks.machine import processor
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.fleet")
-    parser.add_argument("what", choices=["simulated", "kills", "real", "client"])
+    parser.add_argument("what", choices=["simulated", "kills", "real", "page", "client"])
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--scenes", type=int)
     parser.add_argument("--kills", type=int, default=20)
@@ -36,6 +36,10 @@ def main() -> int:
         from benchmarks.fleet.kills import kill
 
         found = {"kills": kill(given.folder, given.kills, given.scenes or 12, given.seed, given.longest)}
+    elif given.what == "page":
+        from benchmarks.fleet.page import look
+
+        found = {"page": look(given.folder)}
     else:
         from benchmarks.fleet.real import WAYS, compare
 

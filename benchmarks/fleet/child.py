@@ -12,11 +12,13 @@ from typing import Any
 from pipeline.errors import Interrupted
 from pipeline.executors.serving import serve
 from pipeline.files import write_atomically
+from pipeline.links import WORK
 from pipeline.run import NAME, Run
 from pipeline.stage import Job, Stage, settings_dict
 from workflows.asset import Workflow
 
 CHILD = "benchmarks.fleet.child"
+JOURNAL = "journal"  # in a run: a line for each step that was done, each stage that was begun or ended
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class SleepSettings:
 
 def _run(job: Job) -> None:
     """Each step hashes the one before; what is made of them is the same whether it was interrupted or not."""
+    _note(job, "begun")
     checkpoint = job.work / "steps"
     lines = checkpoint.read_text().splitlines() if checkpoint.exists() else []
     before = "".join((folder / "made").read_text() for folder in job.inputs.values())
@@ -35,9 +38,19 @@ def _run(job: Job) -> None:
         time.sleep(job.settings.seconds)
         lines.append(hashlib.sha256(f"{job.stage} {job.settings.word} {before} {lines} {step}".encode()).hexdigest())
         write_atomically(checkpoint, "\n".join(lines).encode())
+        _note(job, f"step {step}")
         job.progress(step + 1, job.settings.steps)
         job.safe_point()
     (job.out / "made").write_text("\n".join(lines))
+    _note(job, "ended")
+
+
+def _note(job: Job, what: str) -> None:
+    """One write, appended: whoever is killed, the line is there or it is not."""
+    run = next(folder for folder in job.work.parents if folder.name == WORK).parent
+    published = "published" if (run / job.stage / "manifest.json").exists() else "-"
+    with (run / JOURNAL).open("ab", buffering=0) as journal:
+        journal.write(f"{job.stage} {published} {what}\n".encode())
 
 
 STAGES = (

@@ -9,11 +9,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fleet.child import STAGES, WORKFLOW
+from benchmarks.fleet.child import JOURNAL, STAGES, WORKFLOW
 from pipeline.fleet.state import Scene, read_fleet
 from workflows.fleet.running import Placement, run_fleet
 
@@ -34,6 +35,21 @@ def digests(fleet: Path, count: int) -> dict[str, str]:
     """Of each artifact."""
     paths = [fleet / scene.name / stage.name / "manifest.json" for scene in scenes(count) for stage in STAGES]
     return {str(path.relative_to(fleet)): json.loads(path.read_bytes())["digest"] for path in paths}
+
+
+def repeated(fleet: Path, count: int) -> dict[str, int]:
+    """What was done more than once: stages that ended twice or were begun when they were published, and steps (a kill costs the one since the checkpoint)."""
+    lines = [f"{scene.name} {line}" for scene in scenes(count) for line in (fleet / scene.name / JOURNAL).read_text().splitlines()]
+    done = Counter((scene, stage, what) for scene, stage, _, what in (line.split(" ", 3) for line in lines))
+    ends = {key: number for key, number in done.items() if key[2] == "ended"}
+    steps = [number for key, number in done.items() if key[2].startswith("step")]
+    assert len(ends) == count * len(STAGES), "a stage has never ended"
+    return {
+        "stages": len(ends), "stages_ended_more_than_once": sum(number > 1 for number in ends.values()),
+        "stages_begun_when_published": sum(" published begun" in line for line in lines),
+        "stages_gone_on_with": sum(number - 1 for key, number in done.items() if key[2] == "begun"),
+        "steps": len(steps), "steps_done_again": sum(steps) - len(steps),
+    }  # fmt: skip
 
 
 class _Cast:
@@ -98,6 +114,7 @@ def kill(folder: Path, kills: int, count: int, seed: int, longest: float) -> dic
         "kills": done, "scenes": count, "seconds": time.monotonic() - began, "client_exit_code": code, "exit_code_after_the_same_command": again,
         "quarantined": [scene.reason for scene in state.scenes if scene.state == "quarantined"],
         "digests_equal": again == 0 and digests(fleet, count) == digests(plain, count),
+        "repeated": repeated(fleet, count) if again == 0 else None,
     }  # fmt: skip
 
 

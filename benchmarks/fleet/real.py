@@ -69,7 +69,7 @@ def make(folder: Path, count: int) -> None:
 
 
 def broken(count: int) -> dict[str, tuple[Callable[[Path], None], str]]:
-    """Which scenes are broken: a tenth, at least one."""
+    """Which scenes are broken: an eighth, at least one."""
     return {f"s{8 * number % count:02d}": BREAKS[number % len(BREAKS)] for number in range(max(1, round(count / 8)))}
 
 

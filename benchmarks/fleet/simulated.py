@@ -15,6 +15,7 @@ from pipeline.fleet.state import NAME, Scene
 from pipeline.fleet.workers import Message, Task, Worker
 
 TASKS = len(STAGES) + 2  # of a scene: also prepare and finish
+SPACE = 2**20  # bytes that each stage says it writes: every start looks at the disk
 
 
 class Sleeping:
@@ -50,11 +51,13 @@ class Sleeping:
 
     def _answer(self, task: Task) -> dict[str, Any]:
         if task.request["kind"] == "prepare":
-            return {"ok": True, "stages": [{"name": stage.name, "fresh": False} for stage in STAGES], "finished": False}
+            stages = [{"name": stage.name, "fresh": False} for stage in STAGES]
+            return {"ok": True, "stages": stages, "finished": False, "space": {stage.name: SPACE for stage in STAGES}}
         if task.request["kind"] == "finish":
             return {"ok": True}
         (self.folder / f"{task.number}").write_bytes(b"x")
-        return {"ok": True, "name": task.request["stage"], "fresh": True, "seconds": self.seconds, "cpu_seconds": 0.0, "peak_memory": 1}
+        left = {stage.name: SPACE for stage in STAGES[1 + [each.name for each in STAGES].index(task.request["stage"]) :]}
+        return {"ok": True, "name": task.request["stage"], "fresh": True, "seconds": self.seconds, "cpu_seconds": 0.0, "peak_memory": 1, "space": left}
 
 
 def simulate(scenes: int, workers: int, slots: int = 2, seconds: float = 0.005) -> dict[str, Any]:

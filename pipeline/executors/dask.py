@@ -147,14 +147,15 @@ def _imported(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        extra = "dask-jobqueue" if name == "dask_jobqueue" else "'efficientnerf[fleet]'"
-        raise UsageError(f"{name} is not installed, which a fleet on Dask needs. Install it: pip install {extra}") from None
+        raise UsageError(f"{name} is not installed, which a fleet on Dask needs. Install it: pip install 'efficientnerf[fleet]'") from None
 
 
 def _started(kind: str, options: dict[str, Any], jobs: int) -> Any:
     """A cluster of this kind, with its workers asked for."""
     module, name = CLUSTERS[kind]
     cluster_type = getattr(_imported(module), name)
+    if kind == "ssh":
+        _imported("asyncssh")  # Dask says so late
     if kind == "local":
         options = {"threads_per_worker": 1, "dashboard_address": None, **options}
     if module == "dask_jobqueue":
