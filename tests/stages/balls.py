@@ -19,11 +19,11 @@ SIMILARITY = Similarity(0.5, np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.
 ORBIT = Orbit((0.0, 0.0, 0.1), 3.0, 20.0, False, 40.0)
 
 
-def poses(folder: Path, *, count: int = 8, photographs: bool = False, **changes: Any) -> Path:
-    """A scene of `count` views of 16 x 16, the last a test view."""
+def poses(folder: Path, *, count: int = 8, side: int = 16, photographs: bool = False, **changes: Any) -> Path:
+    """A scene of `count` square views, the last a test view."""
     (folder / "images").mkdir(parents=True)
     views = []
-    for n, camera in enumerate(balls.cameras(count)):
+    for n, camera in enumerate(balls.cameras(count, side)):
         write_png(balls.photograph(camera) if photographs else balls.picture(camera), folder / "images" / camera.name)
         split = "test" if n == count - 1 else "train"
         views.append(View(f"images/{camera.name}", None, split, camera, SIMILARITY.inverse().camera(camera), 1.0, 50.0 if photographs else 5.0))
