@@ -40,10 +40,6 @@ SECONDS = """async ([width, height]) => {
   await enerf.render(width, height);
   return (performance.now() - begin) / 1000;
 }"""
-RESTED = """async () => {
-  const { viewer } = await enerf.ready, frame = () => new Promise((done) => requestAnimationFrame(done));
-  for (let still = 0; still < 3; await frame()) still = viewer.state === "done" ? still + 1 : 0;
-}"""
 
 
 def cameras_of(tree: Any, count: int) -> list[Camera]:
@@ -100,7 +96,7 @@ def measured(chromium: Any, page: bytes, tree: Any, given: argparse.Namespace, f
     with browser.opened(chromium, path, viewport={"width": 640, "height": 480}) as shown:
         shown.ready()
         ready = time.perf_counter() - begin
-        shown.page.evaluate(RESTED)
+        shown.page.evaluate(browser.RESTED)
         first, after = time.perf_counter() - begin, processes()
         pictures = []
         for camera in cameras_of(tree, given.views):
@@ -120,7 +116,7 @@ def measured(chromium: Any, page: bytes, tree: Any, given: argparse.Namespace, f
             for scheme in ("light", "dark"):
                 with browser.opened(chromium, path, viewport={"width": across, "height": down}, color_scheme=scheme) as shown:
                     shown.ready()
-                    shown.page.evaluate(RESTED)
+                    shown.page.evaluate(browser.RESTED)
                     shown.page.screenshot(path=str(given.shots / f"{name}_{look}_{scheme}.png"))
     return row
 
