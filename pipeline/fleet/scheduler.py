@@ -106,12 +106,14 @@ class Scheduler:
         Raises Interrupted; RunLocked where another took the fleet over; StageFailed where there are no workers: open scenes are left waiting.
         """
         number: int | None = None
+        ended = True
         try:
             while self._left() and (number := self._stop()) is None and not self._cancelled:
-                self._look()
-                self._admit()
+                if self._look() or ended:  # progress makes no room
+                    self._admit()
+                ended = False
                 for message in self.workers.receive(0.5):
-                    self._heed(message)
+                    ended |= self._heed(message)
                 self._write()
             self._wind_down()
         except StageFailed as error:  # nothing is heard of the tasks any more
@@ -136,11 +138,11 @@ class Scheduler:
     def _all_done(self) -> bool:
         return all(each.state.state == "done" for each in self._all.values())
 
-    def _look(self) -> None:
-        """Now and then: which workers there are, what was requested, whether the fleet is still ours."""
+    def _look(self) -> bool:
+        """Now and then: which workers there are, what was requested, whether the fleet is still ours. Returns whether it was looked at."""
         now = time.monotonic()
         if now < self._next_look:
-            return
+            return False
         self._next_look = now + LOOK_SECONDS
         if (why := self._lost()) is not None:
             raise RunLocked(why)
@@ -148,6 +150,7 @@ class Scheduler:
         self.state.slots = sum(worker.capacity for worker in self._alive)
         self._look_for_workers(now)
         self._take_requests()
+        return True
 
     def _look_for_workers(self, now: float) -> None:
         """Say it where there are none. Raises StageFailed where that has lasted too long."""
@@ -222,8 +225,8 @@ class Scheduler:
         return not (uses and self.device == "cuda"), each.todo is None, each.number
 
     def _demand(self, each: _Progress) -> Demand:
-        stage, memory, largest = self.stages.get(each.what), each.attempts.memory, self._largest()
-        if memory is not None and largest is not None:  # the worker that had more may have gone: what the stage needs it says itself
+        stage, memory = self.stages.get(each.what), each.attempts.memory
+        if memory is not None and (largest := self._largest()) is not None:  # the worker that had more may have gone: what the stage needs it says itself
             memory = min(memory, largest)
         return Demand(uses_gpu=self.device == "cuda" and stage is not None and stage.uses_device, memory=memory)
 
@@ -263,13 +266,14 @@ class Scheduler:
         self._changed = True
         self.workers.start(each.task)
 
-    def _heed(self, message: Message) -> None:
+    def _heed(self, message: Message) -> bool:
+        """Returns whether a task has ended."""
         each = self._tasks.get(message.task)
         if each is None or each.task is None:
-            return  # of a task that was given up
+            return False  # of a task that was given up
         if message.kind == "event":
             self._event(each, message.content)
-            return
+            return False
         task, each.task = each.task, None
         del self._tasks[task.number]
         self._room.give(task)
@@ -279,6 +283,7 @@ class Scheduler:
             self._done(each, task, message.content)
         else:
             self._failed(each, task, message.content)
+        return True
 
     def _event(self, each: _Progress, event: dict[str, Any]) -> None:
         text = printable(event.get("text") or "", LONGEST_LINE)
