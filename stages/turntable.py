@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from msgspec import Meta
 
 from efficientnerf.settings import Auto, given, setting
-from pipeline.files import link_or_copy
 from pipeline.stage import Job, Stage
 from stages.artifacts import TurntableInputs, TurntableOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
@@ -104,7 +104,7 @@ def render_turntable(tree: Any, job: Job, draw: Callable[..., Any] | None = None
     job.say("encoding the video")
     encode_frames([path for path in written if path.suffix == ".png"], TurntableOutputs(job.out).video, options, job.safe_point)
     for path in written:
-        link_or_copy(path, job.out / path.name)  # the scratch goes once this is published
+        shutil.copyfile(path, job.out / path.name)  # no hard link: a run that was killed here has to be resumed, and what is linked is refused
 
 
 STAGE = Stage(name="turntable", version=5, settings=TurntableSettings, needs=needs_of(TurntableInputs), run=run, uses_device=True)

@@ -49,10 +49,10 @@ def space_needed(stage: str, run: Path, sources: Sequence[Path], settings: Mappi
 
 
 def _frames(own: Any) -> int:
-    """Bytes of a turntable for each pixel of a frame; its artifact's frames are those of its scratch, linked."""
+    """Bytes of a turntable for each pixel of a frame: frames are in its scratch and in its artifact."""
     channels = 4 if own.background == "transparent" else 3
     deep = {"off": 0, "first": 1, "all": own.frames}[own.exr]
-    return (channels + VIDEO_PIXEL) * own.frames + EXR_PIXEL * deep
+    return (2 * channels + VIDEO_PIXEL) * own.frames + 2 * EXR_PIXEL * deep
 
 
 def _working_images(own: Any, sources: Sequence[Path]) -> int:

@@ -53,7 +53,7 @@ def test_a_video_needs_the_room_of_its_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("background", "channels"), [("auto", 3), ("transparent", 4)])
 @pytest.mark.parametrize(("exr", "deep"), [("off", 0), ("first", 1), ("all", 3)])
 def test_a_turntables_frames_of_noise_fit_into_what_was_foretold(background: str, channels: int, exr: str, deep: int, tmp_path: Path) -> None:
-    """Nothing is harder to compress; and what is foretold is no more than a third above."""
+    """Nothing is harder to compress; and what is foretold, in scratch and artifact, is no more than a sixth above."""
     own = dataclasses.replace(DEFAULTS["turntable"], frames=3, width=512, height=384, background=background, exr=exr)
     random = np.random.default_rng(0)
     pose = np.eye(4)
@@ -64,9 +64,9 @@ def test_a_turntables_frames_of_noise_fit_into_what_was_foretold(background: str
             colour, normal = random.random((2, own.height, own.width, 3), np.float32)
             opacity, depth = random.random((2, own.height, own.width), np.float32)
             write_exr(tmp_path / f"{number}.exr", colour=colour, opacity=opacity, depth=depth, normal=normal, camera=camera)
-    written = sum(path.stat().st_size for path in tmp_path.iterdir())
+    written = 2 * sum(path.stat().st_size for path in tmp_path.iterdir())
     needed = space_needed("turntable", tmp_path / "run", (), {"turntable": own}) - LEAST
-    assert written < needed < 4 / 3 * written * 1.001
+    assert written < needed < 7 / 6 * written * 1.001
 
 
 def test_pixels_that_do_not_fit_into_memory_are_written(tmp_path: Path) -> None:
