@@ -70,7 +70,7 @@ class DaskWorkers:
         self._messages: queue.SimpleQueue[Message] = queue.SimpleQueue()
         self._futures: dict[int, tuple[Task, Any]] = {}
         self._absent: dict[str, float] = {}
-        self._heard = self._manned = time.monotonic()
+        self._heard = self._worker_seen = time.monotonic()
         self._client.subscribe_topic(self._topic, self._event)
 
     def alive(self) -> Sequence[Worker]:
@@ -86,10 +86,10 @@ class DaskWorkers:
                 raise StageFailed("the scheduler of Dask has gone. Start it, and give the fleet's command again: what is done is kept.")
             return ()
         self._heard = now
-        self._manned = now if found else self._manned
-        if self.queued and self._cluster is not None and now - self._manned > SUBMIT_SECONDS:
+        self._worker_seen = now if found else self._worker_seen
+        if self.queued and self._cluster is not None and now - self._worker_seen > SUBMIT_SECONDS:
             self._cluster.scale(jobs=self._jobs)  # those that still wait in the queue are not asked for twice
-            self._manned = now
+            self._worker_seen = now
         for number, (task, future) in list(self._futures.items()):
             if task.worker in found:
                 self._absent.pop(task.worker, None)

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.errors import UsageError
+from pipeline.executors.dask import DaskWorkers
 from pipeline.fleet.state import check_scenes
 from workflows.asset import WORKFLOW
 from workflows.cli.main import enerf
@@ -83,6 +85,13 @@ def test_slurm_is_asked_for_what_the_template_says() -> None:
     assert "-m distributed.cli.dask_worker tcp://127.0.0.1:" in command
     assert " --nthreads 8 " in command
     assert " --memory-limit " in command
+
+
+def test_jobs_of_several_processes_are_refused() -> None:
+    """dask-jobqueue would not ask for others when they have ended."""
+    pytest.importorskip("dask_jobqueue", reason="dask-jobqueue is not installed")
+    with pytest.raises(UsageError, match=r"--cluster slurm: processes: found 4, expected 1\. Ask for more jobs instead \(jobs\)\."):
+        DaskWorkers("toy", kind="slurm", options={"cores": 8, "memory": "8GB", "processes": 4, "jobs": 2})
 
 
 def test_snakemake_finds_the_jobs(tmp_path: Path) -> None:
