@@ -34,7 +34,7 @@ from pipeline.stage import Job, Stage
 from stages.artifacts import EvaluateInputs, EvaluateOutputs, PosesOutputs, TrainOutputs, inputs_of, needs_of
 from stages.compiling import compiling_kernels
 from stages.evaluation.asset import EvaluatedAsset, evaluated
-from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES, evaluate_view
+from stages.evaluation.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES, evaluate_view
 from stages.evaluation.findings import findings
 from stages.evaluation.lpips_weights import load_lpips
 from stages.evaluation.mesh import FIGURES, EvaluatedMesh, load_mesh, mesh_bytes
@@ -172,7 +172,8 @@ def evaluate(
     if frames is not None:
         write_captured_path(asset, tree, scene, frames, job)
     job.say(in_words(metrics))
-    for text in findings(metrics["gap"]["psnr"], metrics["holes"], metrics["floaters"], metrics["network"]["floaters"], **(refinement or {})):
+    against = [metrics[name] for name in AGAINST_NETWORK]
+    for text in findings(metrics["gap"]["psnr"], *against, network_floaters=metrics["network"]["floaters"], **(refinement or {})):
         job.warn(text)
 
 
@@ -204,7 +205,7 @@ def _check(
         raise ValueError("no metrics of the mesh")
     if splats and not {*SPLATS_FIGURES} <= measured["splats"].keys():
         raise ValueError("no metrics of the Gaussians")
-    if not all(isinstance(measured[name], int | float | None) for name in ("holes", "floaters")):
+    if not all(isinstance(measured[name], int | float | None) for name in AGAINST_NETWORK):
         raise ValueError("no metrics of the asset against the field")
     if with_field and composited and not {*QUALITY} <= measured["asset_with_network_background"].keys():
         raise ValueError("no metrics of the asset over the field")
@@ -242,4 +243,4 @@ def _write_sheet(metrics: dict[str, Any], drawn: Sequence[int], job: Job) -> Non
     contact_sheet(rows, labels, EvaluateOutputs(job.out).contact_sheet, thumbnail=THUMBNAIL, title=title)
 
 
-STAGE = Stage(name="evaluate", version=6, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True)
+STAGE = Stage(name="evaluate", version=7, settings=EvaluateSettings, needs=needs_of(EvaluateInputs), run=run, uses_device=True)

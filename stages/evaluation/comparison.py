@@ -5,6 +5,8 @@ holes     share of those pixels where the asset's opacity is below HOLE and the 
           what lies before the end of the last one: what is beyond has its place in the environment map
 floaters  opacity of the asset nearer than the network's surfaces, less a margin (`efficientnerf.evaluation.surfaces`), over its whole opacity: means over at
           most FLOATER_RAYS pixels. The network's own figure, the same of itself, says how much of that is soft edges
+holes_excess_error, floaters_excess_error  the asset's squared error less the network's, of those pixels and weighed by that opacity, over what `holes` and
+          `floaters` are shares of. Where it is not above 0, the photograph sides with the asset: it is the network's surface that is wrong there
 
 psnr_colour_fitted is the PSNR once the render's colours have had the affine change that fits the photograph best (`metrics.colour_fitted`).
 """
@@ -32,6 +34,7 @@ HOLE, SOLID = 0.5, 0.95
 FLOATER_RAYS = 4096
 QUALITY = ("psnr", "ssim", "psnr_in_box", "psnr_colour_fitted")
 GAP = ("psnr", "ssim", "psnr_colour_fitted")
+AGAINST_NETWORK = ("holes", "floaters", "holes_excess_error", "floaters_excess_error")
 SAMPLE_SHARES = ("valid_share", "pivotal_share", "fine_per_ray")
 
 
@@ -49,7 +52,7 @@ def evaluate_view(
 
     truth = ground_truth(job.inputs[PosesOutputs.stage], view, scene.background)
     unbounded = constant_background(scene) is None
-    metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, "holes": None, "floaters": None}
+    metrics: dict[str, Any] = {"name": view.name, "network": None, "asset_with_network_background": None, "gap": None, **dict.fromkeys(AGAINST_NETWORK)}
     images: list[np.ndarray] = []
     seen = None
     if with_field or (unbounded and asset.inner is None):
@@ -87,7 +90,7 @@ def evaluate_view(
 def differences(
     asset: EvaluatedAsset, camera: Camera, image: np.ndarray, opacity: np.ndarray, seen: Any, truth: GroundTruth, network: dict[str, Any]
 ) -> dict[str, Any]:
-    """gap, holes and floaters of a view, and the network's own floaters, which go to its metrics.
+    """gap and AGAINST_NETWORK of a view, and the network's own floaters, which go to its metrics.
 
     camera          whose pixels are those of all images here
     image, opacity  of the asset
@@ -97,15 +100,26 @@ def differences(
     own = compare(image, truth, None)
     gap = {name: own[name] - network[name] if own[name] is not None and network[name] is not None else None for name in GAP}
     used = np.ones(opacity.shape, bool) if truth.mask is None else truth.mask
-    holes = float(((opacity < HOLE) & (seen.within > SOLID))[used].mean()) if used.any() else None
-    floaters, network["floaters"] = floating(asset, camera, opacity, seen, used)
-    return {"gap": gap, "holes": holes, "floaters": floaters}
+    excess = squared_error(image, truth) - squared_error(seen.colour, truth)
+    open_ = (opacity < HOLE) & (seen.within > SOLID)
+    holes, of_holes = (float(open_[used].mean()), float((open_ * excess)[used].mean())) if used.any() else (None, None)
+    floaters, of_floaters, network["floaters"] = floating(asset, camera, opacity, seen, used, excess)
+    return {"gap": gap, "holes": holes, "floaters": floaters, "holes_excess_error": of_holes, "floaters_excess_error": of_floaters}
 
 
-def floating(asset: EvaluatedAsset, camera: Camera, opacity: np.ndarray, seen: Any, used: np.ndarray) -> tuple[float | None, float | None]:
-    """The share of the asset's opacity that lies away from the network's surfaces, and that of the network's own; None where nothing is opaque.
+def squared_error(image: np.ndarray, truth: GroundTruth) -> np.ndarray:
+    """(H, W) mean over the channels; of pixels without a finite value 0."""
+    return np.nan_to_num(np.square(np.clip(np.asarray(image, np.float64), 0, 1) - truth.colour).mean(axis=-1))
 
-    used  (H, W) bool, pixels that count
+
+def floating(
+    asset: EvaluatedAsset, camera: Camera, opacity: np.ndarray, seen: Any, used: np.ndarray, excess: np.ndarray
+) -> tuple[float | None, float | None, float | None]:
+    """The share of the asset's opacity that lies away from the network's surfaces, its excess error, and the share of the network's own; None where nothing is
+    opaque.
+
+    used    (H, W) bool, pixels that count
+    excess  (H, W) the asset's squared error less the network's
     """
     from efficientnerf.geometry.cameras import rays
 
@@ -116,11 +130,12 @@ def floating(asset: EvaluatedAsset, camera: Camera, opacity: np.ndarray, seen: A
     chosen[step // 2 :: step, step // 2 :: step] = True
     y, x = np.nonzero(chosen & used)
     if not len(y):
-        return None, None
+        return None, None, None
     origins, directions = rays(camera, np.stack([x, y], axis=-1) + 0.5)
     distance = seen.depth[y, x] / np.maximum(directions @ camera.forward, 1e-3)
     nearer = asset.nearer(origins, directions, asset.limits(origins, directions, distance))
-    return _share(nearer, opacity[y, x]), _share(seen.nearer[y, x], seen.opacity[y, x])
+    opaque = opacity[y, x]
+    return _share(nearer, opaque), _share(nearer * excess[y, x], opaque), _share(seen.nearer[y, x], seen.opacity[y, x])
 
 
 def _share(part: np.ndarray, whole: np.ndarray) -> float | None:

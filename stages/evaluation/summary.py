@@ -5,7 +5,7 @@ asset.on_network_views         those of the views that the network was rendered 
 asset_with_network_background  cascade 0 of a whole scene's asset between what the field shows before and behind its box; null for other assets
 mesh            means over the views of what `stages.evaluation.mesh` measures, and how many faces and texels the mesh has
 splats          the same of the 3D Gaussians (`stages.evaluation.splats`); null where there are none
-gap, holes, floaters           means over the views that the network was rendered for (`stages.evaluation.comparison`)
+gap, holes, floaters and the excess error of both  means over the views that the network was rendered for (`stages.evaluation.comparison`)
 refinement      of the asset: its steps, and how many are usual; null where that is not known
 strips          the views whose pictures stand beside, with the figures of these
 views           the metrics of each view
@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from stages.evaluation.comparison import GAP, QUALITY, SAMPLE_SHARES
+from stages.evaluation.comparison import AGAINST_NETWORK, GAP, QUALITY, SAMPLE_SHARES
 from stages.evaluation.mesh import FIGURES
 from stages.evaluation.splats import FIGURES as SPLATS_FIGURES
 
@@ -56,7 +56,7 @@ def summary(
         "splats": None if splats is None else {**means([view["splats"] for view in figures], SPLATS_FIGURES), **splats, "views": len(figures), "scale": 1.0},
         "asset_with_network_background": {**means(composited), "views": len(composited), "background_scale": 1.0 / stride} if composited else None,
         "gap": {**means([view["gap"] for view in drawn], GAP), "views": len(drawn), "scale": 1.0 / stride},
-        **means(drawn, ("holes", "floaters")),
+        **means(drawn, AGAINST_NETWORK),
         "refinement": None if refinement is None else dict(refinement),
         "strips": list(strips),
         "views": list(figures),

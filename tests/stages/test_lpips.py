@@ -10,7 +10,7 @@ import torch
 
 from efficientnerf.evaluation.lpips import CHANNELS, SHIFT, TAPS, Lpips, _layers
 from pipeline.errors import BadInput, UsageError
-from stages.evaluation.comparison import GAP, lpips_metrics
+from stages.evaluation.comparison import AGAINST_NETWORK, GAP, lpips_metrics
 from stages.evaluation.lpips_weights import BACKBONES, load_lpips
 from stages.evaluation.mesh import FIGURES
 from stages.evaluation.summary import summary
@@ -115,7 +115,7 @@ def test_figures_stand_for_each_view_and_in_the_means(tmp_path: Path) -> None:
     assert lpips_metrics(metrics, image[:50], GroundTruth(truth[:50], None, None)) == {"lpips_alex": None}
     some = {"psnr": 20.0, "ssim": 0.5, "psnr_in_box": None, "psnr_colour_fitted": 21.0, **figures}
     network = {**some, "valid_share": 0.1, "pivotal_share": 0.05, "fine_per_ray": 3.0, "floaters": None}
-    against = {"asset_with_network_background": None, "gap": dict.fromkeys(GAP), "holes": 0.0, "floaters": None}
+    against = {"asset_with_network_background": None, "gap": dict.fromkeys(GAP), **dict.fromkeys(AGAINST_NETWORK)}
     views = [{"name": "a", "network": network, "asset": {**some, "lpips_alex": None}, "mesh": dict.fromkeys(FIGURES), **against}]
     found = summary(views, split="test", stride=1, background=None, mesh={"faces": 2}, perceptual=("lpips_alex",))
     assert found["network"]["lpips_alex"] == figures["lpips_alex"]

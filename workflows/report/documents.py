@@ -85,6 +85,8 @@ class Metrics(msgspec.Struct):
     gap: Quality | None = None
     holes: float | None = None
     floaters: float | None = None
+    holes_excess_error: float | None = None
+    floaters_excess_error: float | None = None
     refinement: Refinement | None = None
     strips: list[Strip] = []
     views: list[ViewQuality] = []

@@ -121,7 +121,8 @@ def findings_of(found: Metrics | None) -> list[str]:
         return []
     gap = None if found.gap is None else found.gap.psnr
     floaters = None if found.network is None else found.network.floaters
-    return findings(gap, found.holes, found.floaters, floaters, **({} if found.refinement is None else msgspec.structs.asdict(found.refinement)))
+    steps = {} if found.refinement is None else msgspec.structs.asdict(found.refinement)
+    return findings(gap, found.holes, found.floaters, found.holes_excess_error, found.floaters_excess_error, network_floaters=floaters, **steps)
 
 
 def split_of(found: Metrics | None) -> str:

@@ -74,6 +74,32 @@ def test_floaters_are_what_hangs_before_the_surface(tmp_path: Path) -> None:
     assert "the asset has holes" in warnings
 
 
+def test_photographs_decide_who_is_wrong_where_asset_and_network_differ(tmp_path: Path) -> None:
+    poses = make_scene(tmp_path / "poses", "tt")
+
+    def told(name: str, asset: BallTree, network: BallTree) -> tuple[dict[str, Any], str]:
+        events: list[dict[str, Any]] = []
+        job = job_in(tmp_path / name, poses, report=events.append)
+        measure(asset, lambda: BallField(network, background=WHITE), job)
+        return figures_of(job), " ".join(event["text"] for event in events if event["event"] == "warning")
+
+    larger, smaller = replace(TREE, radius=0.7), replace(TREE, radius=0.45)
+    found, warnings = told("network too large", TREE, larger)
+    assert found["holes"] > 0.03
+    assert found["holes_excess_error"] < -0.001
+    assert "holes" not in warnings
+    found, warnings = told("network too small", TREE, smaller)
+    assert found["floaters"] - found["network"]["floaters"] > 0.02
+    assert found["floaters_excess_error"] < -0.001
+    assert "floaters" not in warnings
+    found, warnings = told("asset too small", smaller, TREE)
+    assert found["holes_excess_error"] > 0.001
+    assert "the asset has holes" in warnings
+    found, warnings = told("asset too large", larger, TREE)
+    assert found["floaters_excess_error"] > 0.001
+    assert "the asset has floaters" in warnings
+
+
 def test_a_colour_cast_is_fitted_away(tmp_path: Path) -> None:
     class Warm(BallTree):
         def render(self, camera: Camera, **more: Any) -> Any:

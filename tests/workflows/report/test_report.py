@@ -157,6 +157,9 @@ def test_the_closing_summary_says_so_too(tmp_path: Path) -> None:
     assert any("gap -1.89 dB, -0.040 SSIM; holes 3.40 %; floaters 5.10 %" in line for line in lines)
     assert any("bake.max_mib" in line for line in lines)
     assert any("strip_worst.png" in line for line in lines)
+    better = in_words(a_run(tmp_path / "better", POOR | {"holes_excess_error": -1e-4, "floaters_excess_error": 0.0}).path, [])
+    assert any("dB behind its network" in line for line in better)
+    assert not any("the asset has" in line for line in better), "the photographs side with the asset there"
     good = a_run(tmp_path / "good", POOR | {"gap": {"psnr": -0.1, "ssim": None}, "holes": 0.0, "floaters": 0.012})
     lines = in_words(good.path, [])
     assert lines[-1].strip() == "gap -0.10 dB; holes 0.00 %; floaters 1.20 %"
