@@ -80,7 +80,7 @@ def read_alpha(path: Path) -> np.ndarray | None:
     """(H, W) uint8 of an image file at full size, after EXIF rotation; None if it has no alpha channel. Raises UnreadableImage."""
     with opened(path) as image:
         orientation = orientation_of(image)
-        alpha = rgb_and_alpha(image)[1]
+        alpha = rgb_and_alpha(image, as_stored=True)[1]
     return None if alpha is None else apply_exif_orientation(alpha, orientation)
 
 

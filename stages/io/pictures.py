@@ -3,12 +3,14 @@
 A file is recognised by its content, among the formats below and no others: Pillow knows more, and runs Ghostscript for one of them. Whatever the decoder
 raises becomes UnreadableImage, so that one bad picture is left out and ends nothing. Pixels become 8 bits by the type of the file, never by their values:
 
-    8 bits a channel            as they are; grey, palette, CMYK and LAB are converted to sRGB by Pillow
+    8 bits a channel            as they are; grey, palette, CMYK and LAB are converted to RGB by Pillow
     1 bit                       0 and 255
     16 bits, grey               value / 257, rounded
     16 bits, colour             the high byte, as Pillow reads it
     other widths, signed,       refused by name: what their white is the file does not say
     floating point
+
+What is not sRGB by the picture's ICC profile is converted to it then (`decoders/colour_profile.py`); a profile that is damaged is left aside.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ import numpy as np
 
 from pipeline.errors import PipelineError
 from pipeline.text import printable
+from stages.io.decoders.colour_profile import AS_IT_IS, Conversion, conversion_of
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "RAW")  # Pillow's names, and our own; a JPEG of several pictures (MPO) comes with JPEG
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")  # most are TIFFs of a thumbnail to other readers
@@ -144,7 +147,7 @@ def _possible(file: _Bounded, formats: Sequence[str]) -> tuple[str, ...]:
 
 def _raw(file: _Bounded) -> Any:
     """A camera's raw picture."""
-    from stages.io.raw import RawFile
+    from stages.io.decoders.raw import RawFile
 
     return RawFile(file)
 
@@ -190,20 +193,42 @@ def holds_eight_bits(image: Any) -> bool:
     return os.pread(image.fp.fileno(), 1, 24) <= b"\x08"  # IHDR's bit depth
 
 
-def rgb_and_alpha(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """(rgb, alpha or None) as uint8, decoded by the rules above; raises UnreadableImage for a type of pixel that has none."""
+def profile_of(image: Any) -> Conversion:
+    """How the colours of an opened image become sRGB."""
+    if image.mode in ("1", "LAB"):
+        return AS_IT_IS  # no colours, or those of Pillow's own conversion
+    grey = image.mode in ("L", "LA", "La") or image.mode.startswith("I")
+    return conversion_of(image.info.get("icc_profile"), "L" if grey else "CMYK" if image.mode == "CMYK" else "RGB")
+
+
+def rgb_and_alpha(image: Any, as_stored: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+    """(rgb, alpha or None) as uint8 sRGB, decoded by the rules above; raises UnreadableImage for a type of pixel that has none.
+
+    as_stored  without the picture's colour profile: of masks, whose levels are no colours
+    """
+    from PIL import Image
+
     _refuse_unknown_samples(image)
     image.load()  # here, and not within NumPy, which takes some errors for another kind of object
+    conversion = AS_IT_IS if as_stored else profile_of(image)
+    alpha = None
     if image.mode.startswith("I"):
         deep = np.asarray(image)
         grey = np.rint(deep / 257.0).astype(np.uint8)
         see_through = image.info.get("transparency")
         alpha = None if see_through is None else np.where(deep == see_through, np.uint8(0), np.uint8(255))
-        return np.repeat(grey[..., None], 3, axis=2), alpha
-    if image.mode in _ALPHA_MODES or "transparency" in image.info:
-        rgba = np.asarray((image.convert("LA") if image.mode == "La" else image).convert("RGBA"))
-        return rgba[..., :3], rgba[..., 3]
-    return np.asarray(image if image.mode == "RGB" else image.convert("RGB")), None
+        colours = Image.fromarray(grey)
+    elif image.mode in _ALPHA_MODES or "transparency" in image.info:
+        colours = (image.convert("LA") if image.mode == "La" else image).convert("RGBA")
+        if conversion.transform is None:
+            rgba = np.asarray(colours)
+            return rgba[..., :3], rgba[..., 3]
+        alpha = np.asarray(colours.getchannel("A"))
+    else:
+        colours = image
+    if conversion.transform is not None:
+        return conversion.rgb_of(colours), alpha
+    return np.asarray(colours if colours.mode == "RGB" else colours.convert("RGB")), alpha
 
 
 def grey_of(image: Any) -> np.ndarray:

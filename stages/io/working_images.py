@@ -17,7 +17,7 @@ from stages.artifacts import PosesOutputs
 from stages.io.capture import Photo, Silhouettes
 from stages.io.matting import without_background
 from stages.io.photo import apply_exif_orientation, same_aspect, upright_mask, working_size
-from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, rgb_and_alpha
+from stages.io.pictures import LOSSY, UnreadableImage, holds_eight_bits, opened, orientation_of, profile_of, rgb_and_alpha
 from stages.io.png import FAST, write_png
 
 MAX_PART = 200  # bytes of a part of the path of a working image
@@ -35,12 +35,14 @@ class Decoded:
     verbatim     whether the file itself holds exactly these pixels in a form that later stages read
     orientation  EXIF's number, 1-8
     lossy        whether the format keeps pixels only about as they were
+    fault        why the file's colour profile is not used, if it has one and it is not
     """
 
     pixels: np.ndarray
     verbatim: bool
     orientation: int
     lossy: bool
+    fault: str | None = None
 
 
 @dataclass(frozen=True)
@@ -54,15 +56,18 @@ class Written:
     warnings: tuple[str, ...] = ()
 
 
-def decode(path: Path) -> Decoded:
-    """Every pixel of an image file; raises UnreadableImage, also where the file ends early."""
+def decode(path: Path, as_stored: bool = False) -> Decoded:
+    """Every pixel of an image file; raises UnreadableImage, also where the file ends early.
+
+    as_stored  without the picture's colour profile
+    """
     with opened(path) as image:
-        orientation = orientation_of(image)
-        verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image)
+        orientation, profile = orientation_of(image), profile_of(image)
+        verbatim = orientation == 1 and "transparency" not in image.info and _is_plain(image) and profile.transform is None
         lossy = image.format in LOSSY
-        rgb, alpha = rgb_and_alpha(image)
+        rgb, alpha = rgb_and_alpha(image, as_stored)
     pixels = rgb if alpha is None else np.dstack([rgb, alpha])
-    return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, lossy)
+    return Decoded(np.ascontiguousarray(apply_exif_orientation(pixels, orientation)), verbatim, orientation, lossy, profile.fault)
 
 
 def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouettes: Silhouettes = NEITHER, may_be_empty: bool = True) -> Written:
@@ -83,16 +88,18 @@ def write(photo: Photo, folder: Path, relative: str, *, max_side: int, silhouett
         raise UnreadableImage(f"unreadable: {width}x{height} pixels, but {photo.camera.width}x{photo.camera.height} by its header, or it was changed")
     size = working_size(width, height, max_side)
     usable: np.ndarray | None = None
-    warnings: list[str] = []
+    warnings = [] if found.fault is None else [f"{photo.camera.name}: its colour profile is {found.fault}; the picture is read as sRGB."]
     whole = found.pixels
     if whole.shape[2] == 4 and not silhouettes.alpha:
         reduced = _resized(whole, size)
         whole, usable = reduced[..., :3], reduced[..., 3] >= OPAQUE
     if photo.mask is not None and silhouettes.masks:
-        levels, warnings = mask_levels(photo, found.orientation)
+        levels, remarks = mask_levels(photo, found.orientation)
+        warnings += remarks
         whole = _cut_out(whole, levels, size)
     elif photo.mask is not None:
-        kept, warnings = _usable(photo, size, found.orientation)
+        kept, remarks = _usable(photo, size, found.orientation)
+        warnings += remarks
         usable = kept if usable is None else usable & kept
     if silhouettes and not may_be_empty and whole.shape[2] == 4 and (whole[..., 3] <= TRANSPARENT).all():
         raise UnreadableImage("has an empty silhouette")
@@ -206,7 +213,7 @@ def _read_mask(photo: Photo, orientation: int) -> tuple[np.ndarray, bool, list[s
     """The photo's mask file as it is meant to be seen, (H, W) uint8, whether its format is lossy, and warnings. Raises UnreadableImage, BadInput."""
     assert photo.mask is not None
     try:
-        decoded = decode(photo.mask)
+        decoded = decode(photo.mask, as_stored=True)
     except UnreadableImage as error:
         raise UnreadableImage(f"its mask {printable(photo.mask.name)} is {error}") from error
     expected = photo.camera.width, photo.camera.height

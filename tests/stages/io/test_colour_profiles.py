@@ -1,0 +1,221 @@
+"""Pictures that are not sRGB: one conversion, for cameras, training and textures alike; profiles that are none harm nothing."""
+
+from __future__ import annotations
+
+import io
+import random
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image, ImageCms
+
+from stages.io import photo, pictures, working_images
+from stages.io.capture import Photo
+from stages.io.decoders import colour_profile
+from stages.verdict import looks
+from tests.stages import captures
+from tests.stages.io import profiles
+from tests.stages.io.profiles import ADOBE_RGB, DISPLAY_P3, PROPHOTO, SRGB, linear_to_srgb, of_colours, of_greys, of_inks, power, srgb_to_linear, to_srgb
+
+P3 = of_colours(DISPLAY_P3, srgb_to_linear)
+SPACES: dict[str, tuple[np.ndarray, profiles.Curve]] = {
+    "Display P3": (DISPLAY_P3, srgb_to_linear),
+    "Adobe RGB": (ADOBE_RGB, power(563 / 256)),
+    "ProPhoto": (PROPHOTO, power(1.8)),
+}
+
+
+def colours(seed: int = 0) -> np.ndarray:
+    """(24, 32, 3) of all kinds, white and black among them."""
+    made = np.random.default_rng(seed).integers(0, 256, (24, 32, 3)).astype(np.uint8)
+    made[0, :2] = [[255] * 3, [0] * 3]
+    return made
+
+
+def saved(path: Path, image: Image.Image, kind: str, profile: bytes | None, **options: Any) -> Path:
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+    image.save(path, kind, **({} if profile is None else {"icc_profile": profile}), **options)
+    return path
+
+
+def read(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    with pictures.opened(path) as image:
+        return pictures.rgb_and_alpha(image)
+
+
+@pytest.mark.parametrize("space", SPACES)
+def test_other_spaces_become_srgb(space: str, tmp_path: Path) -> None:
+    primaries, curve = SPACES[space]
+    path = saved(tmp_path / "a.png", Image.fromarray(colours()), "PNG", of_colours(primaries, curve))
+    found = read(path)[0]
+    assert np.abs(found - to_srgb(colours(), primaries, curve)).max() <= 2
+    assert np.abs(found.astype(int) - colours()).max() > 20  # and that is no small matter
+    np.testing.assert_array_equal(found[0, :2], [[255] * 3, [0] * 3])
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP", "HEIF", "AVIF"])
+def test_profiles_of_every_format(kind: str, tmp_path: Path) -> None:
+    red = np.full((24, 32, 3), (200, 60, 60), np.uint8)
+    path = saved(tmp_path / "a", Image.fromarray(red), kind, P3)
+    expected = to_srgb(red[0, 0], DISPLAY_P3, srgb_to_linear)
+    assert expected[0] - 200 > 10
+    assert np.abs(read(path)[0][12, 16] - expected).max() <= 6
+
+
+def test_all_who_read_a_photograph_see_the_same_colours(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.jpg", Image.fromarray(np.full((24, 32, 3), (200, 60, 60), np.uint8)), "JPEG", P3)
+    decoded = working_images.decode(path)
+    assert not decoded.verbatim  # later stages read the file itself where it is, and know no profiles
+    np.testing.assert_array_equal(photo.read_photo(path, 100).rgb, decoded.pixels)
+    camera = replace(captures.cameras(1)[0], width=32, height=24)
+    written = working_images.write(Photo(camera, path), tmp_path / "scene", "a.jpg", max_side=64)
+    assert (written.image, written.warnings) == ("images/a.png", ())
+    np.testing.assert_array_equal(read(tmp_path / "scene" / written.image)[0], decoded.pixels)
+    with Image.open(tmp_path / "scene" / written.image) as image:
+        assert "icc_profile" not in image.info
+    assert looks.grey_of(path)[12, 16] == looks.grey_of(tmp_path / "scene" / written.image)[12, 16]
+
+
+@pytest.mark.parametrize(
+    "profile", [ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes(), of_colours(SRGB, srgb_to_linear), None], ids=["littlecms", "ours", "none"]
+)
+def test_pictures_in_srgb_keep_their_pixels(profile: bytes | None, tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.png", Image.fromarray(colours()), "PNG", profile)
+    decoded = working_images.decode(path)
+    np.testing.assert_array_equal(decoded.pixels, colours())
+    assert decoded.verbatim
+    assert decoded.fault is None
+
+
+def test_alpha_is_kept_and_palettes_are_converted(tmp_path: Path) -> None:
+    rgba = np.dstack([colours(), np.arange(24 * 32).reshape(24, 32) % 256]).astype(np.uint8)
+    rgb, alpha = read(saved(tmp_path / "a.png", Image.fromarray(rgba), "PNG", P3))
+    np.testing.assert_array_equal(alpha, rgba[..., 3])
+    np.testing.assert_array_equal(rgb, read(saved(tmp_path / "b.png", Image.fromarray(colours()), "PNG", P3))[0])
+    few = Image.fromarray(colours()).quantize(16)
+    expected = to_srgb(np.asarray(few.convert("RGB")), DISPLAY_P3, srgb_to_linear)
+    assert np.abs(read(saved(tmp_path / "p.png", few, "PNG", P3))[0] - expected).max() <= 2
+
+
+def test_grey_pictures(tmp_path: Path) -> None:
+    ramp = np.tile(np.arange(256, dtype=np.uint8), (3, 1))
+    dark = 255 * linear_to_srgb((ramp / 255.0) ** 1.2)
+    profile = of_greys(power(1.2))
+    cases = {
+        "8 bits": Image.fromarray(ramp),
+        "16 bits": Image.fromarray(ramp.astype(np.uint16) * 257),
+        "with alpha": Image.merge("LA", (Image.fromarray(ramp), Image.fromarray(ramp[:, ::-1].copy()))),
+    }
+    for what, image in cases.items():
+        rgb, alpha = read(saved(tmp_path / "a.png", image, "PNG", profile))
+        assert np.abs(rgb - dark[..., None]).max() <= 2, what
+        assert (alpha is not None) == (what == "with alpha")
+    # greys of a space of colours
+    found = read(saved(tmp_path / "b.png", Image.fromarray(ramp), "PNG", of_colours(ADOBE_RGB, power(1.2))))[0]
+    assert np.abs(found - dark[..., None]).max() <= 2
+
+
+def test_cmyk_pictures(tmp_path: Path) -> None:
+    black = np.zeros((24, 32, 4), np.uint8)
+    black[..., 3] = np.linspace(0, 255, 32).astype(np.uint8)
+    lightness = 100 * (1 - (black[..., 3] / 255.0) ** 1.4)
+    luminance = np.where(lightness > 8, ((lightness + 16) / 116) ** 3, lightness / 903.3)
+    for kind in ("TIFF", "JPEG"):
+        path = saved(tmp_path / kind, Image.fromarray(black, "CMYK"), kind, of_inks(power(1.4)))
+        assert np.abs(read(path)[0] - 255 * linear_to_srgb(luminance)[..., None]).max() <= (4 if kind == "TIFF" else 10)
+
+
+# --- what is no profile
+
+
+def edited(at: int, new: bytes) -> bytes:
+    return P3[:at] + new + P3[at + len(new) :]
+
+
+NO_PROFILES = {
+    "no ICC": (b"x" * 500, "damaged"),
+    "a few bytes": (b"\0", "damaged"),
+    "cut short": (P3[:300], "damaged"),
+    "a link": (edited(12, b"link"), "damaged, or none of a picture"),
+    "of greys": (of_greys(power(1.2)), "for L pictures, and this one is RGB"),
+    "of inks": (of_inks(power(1.0)), "for CMYK pictures, and this one is RGB"),
+    "without tags": (P3[:128] + bytes(4), "damaged"),
+    "all black": (of_colours(DISPLAY_P3, lambda values: 0 * values), "damaged: white is not brighter than black"),
+    "too large": (P3 + bytes(9 << 20), "of 9 MiB"),
+}
+
+
+@pytest.mark.parametrize("what", NO_PROFILES)
+def test_a_profile_that_cannot_be_used_is_said_and_harms_nothing(what: str, tmp_path: Path) -> None:
+    profile, reason = NO_PROFILES[what]
+    pixels = captures.picture()
+    path = saved(tmp_path / "a.tif", Image.fromarray(pixels), "TIFF", profile)
+    np.testing.assert_array_equal(read(path)[0], pixels)
+    np.testing.assert_array_equal(photo.read_photo(path, 1000).rgb, pixels)
+    written = working_images.write(Photo(captures.cameras(1)[0], path), tmp_path / "out", "a.tif", max_side=1000)
+    assert len(written.warnings) == 1
+    name = captures.cameras(1)[0].name
+    assert written.warnings[0].startswith(f"{name}: its colour profile is {reason}")
+    assert written.warnings[0].endswith("; the picture is read as sRGB.")
+
+
+def test_mutated_profiles_are_used_or_refused(tmp_path: Path) -> None:
+    rng = random.Random(0)
+    image = Image.fromarray(colours())
+    for profile in (P3, of_inks(power(0.5)), of_greys(power(1.2))):
+        picture = image.convert({b"RGB ": "RGB", b"CMYK": "CMYK", b"GRAY": "L"}[profile[16:20]])
+        for _ in range(60):
+            data = bytearray(profile)
+            for _ in range(rng.choice((1, 4, 16))):
+                at = rng.randrange(min(len(data), 400) if rng.random() < 0.8 else len(data))
+                data[at] = rng.choice((0, 1, 127, 255, rng.randrange(256)))
+            rgb, _ = read(saved(tmp_path / "a.tif", picture, "TIFF", bytes(data)))
+            assert rgb.shape == (24, 32, 3)
+
+
+def test_conversions_are_the_same_every_time_and_on_every_thread(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (300, 400, 3)).astype(np.uint8)
+    path = saved(tmp_path / "a.png", Image.fromarray(pixels), "PNG", P3)
+    first = read(path)[0]
+    colour_profile._conversion.cache_clear()
+    with ThreadPoolExecutor(4) as threads:
+        for found, _ in threads.map(read, [path] * 12):
+            np.testing.assert_array_equal(found, first)
+
+
+def test_a_conversion_takes_no_second_picture_of_memory(tmp_path: Path) -> None:
+    """Beyond what the result takes: a band of rows."""
+    large = Image.fromarray(np.zeros((3000, 1000, 3), np.uint8))
+    conversion = colour_profile.conversion_of(P3, "RGB")
+    tracemalloc.start()
+    try:
+        conversion.rgb_of(large)
+        assert tracemalloc.get_traced_memory()[1] < 1.5 * large.width * large.height * 3
+    finally:
+        tracemalloc.stop()
+
+
+def test_masks_have_levels_and_no_colours(tmp_path: Path) -> None:
+    levels = np.tile(np.linspace(0, 255, captures.WIDTH).astype(np.uint8), (captures.HEIGHT, 1))
+    captures.write_picture(tmp_path / "a.png", captures.picture())
+    one = Photo(captures.cameras(1)[0], tmp_path / "a.png", saved(tmp_path / "m.png", Image.fromarray(levels), "PNG", of_greys(power(0.2))))
+    plain = Photo(one.camera, one.image, saved(tmp_path / "n.png", Image.fromarray(levels), "PNG", None))
+    np.testing.assert_array_equal(working_images.mask_levels(one, 1)[0], working_images.mask_levels(plain, 1)[0])
+    rgba = Image.fromarray(captures.picture(channels=4))
+    np.testing.assert_array_equal(photo.read_alpha(saved(tmp_path / "r.png", rgba, "PNG", P3)), np.asarray(rgba)[..., 3])
+
+
+def test_the_profile_is_read_from_a_jpeg_in_parts(tmp_path: Path) -> None:
+    """A JPEG's segments hold 64 KiB each."""
+    large = of_colours(DISPLAY_P3, srgb_to_linear) + bytes(200_000)
+    buffer = io.BytesIO()
+    Image.fromarray(np.full((24, 32, 3), (200, 60, 60), np.uint8)).save(buffer, "JPEG", icc_profile=large)
+    (tmp_path / "a.jpg").write_bytes(buffer.getvalue())
+    assert np.abs(read(tmp_path / "a.jpg")[0][12, 16] - to_srgb(np.array([200, 60, 60]), DISPLAY_P3, srgb_to_linear)).max() <= 4
