@@ -22,6 +22,7 @@ from stages.video import choice
 from stages.video.reading import Frame, UnreadableVideo, Video, opened
 
 SLOWEST = 12.0  # frames a second that are looked at at least; of videos with more than twice as many, every n-th
+NEAREST = 0.25 / SLOWEST  # seconds between frames that are looked at, at least, of videos of an unknown rate
 _MAKER = 271  # EXIF's tag
 Progress = Callable[..., None]
 
@@ -145,11 +146,11 @@ def _look(path: Path, reader: Reader, threads: int) -> Looked:
     motion = Motion()
     rows: list[tuple[int, float, float, float]] = []
     with opened(path, threads) as video:
-        every = max(1, int(video.rate / SLOWEST / 2))
+        every = max(1, int(video.rate / SLOWEST / 2)) if video.known_rate else 1
         for frame in video.frames():
             reader.safe_point()
             reader.progress(frame.index, max(video.count, frame.index + 1), "looking at frames")
-            if frame.index % every:
+            if frame.index % every or (not video.known_rate and rows and 0 <= frame.time - rows[-1][1] < NEAREST):
                 continue
             grey = frame.grey(DETAIL)
             scale = TRACKED / max(grey.shape)

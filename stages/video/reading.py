@@ -23,6 +23,8 @@ SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".webm", ".mkv", ".avi")
 KNOWN = "mp4, mov, webm, mkv or avi"
 MAX_FRAMES = 1_000_000  # that are looked at
 MAX_DAMAGED = 1_000  # packets that cannot be decoded, after which the rest is not tried
+FASTEST = 240.0  # frames a second that a file is believed to have; WebM that browsers record states no rate, and FFmpeg takes that of its clock, 1000, for it
+USUAL = 30.0  # frames a second of a video of an unknown rate
 HD = 720  # rows, from which a video that does not state its matrix has Rec. 709's
 _BUFFER = 2**20  # bytes of a read
 _UNSPECIFIED, _PQ, _HLG = 2, 16, 18  # of ITU-T H.273: matrix; transfer characteristics
@@ -93,6 +95,8 @@ class Video:
     width, height  of its upright frames with square pixels, once there was one
     stored         (width, height) of a frame as stored
     duration       seconds, as the file states it; 0 where it does not
+    rate           frames a second, as the file states it
+    known_rate     whether it does; else `rate` is a usual one, and the times of frames alone tell
     count          frames, as the file states or by its duration; an estimate
     maker          the camera that took it, where the file says so
     hdr            "HLG" or "PQ" where its colours are of high dynamic range, else ""
@@ -105,7 +109,9 @@ class Video:
         names = [str(about.get(f"com.apple.quicktime.{part}") or about.get(f"com.android.{part}") or "") for part in ("make", "manufacturer", "model")]
         self.maker = printable(" ".join(part for part in names if part), 100)
         self.duration = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else (container.duration or 0) / 1e6
-        self.rate = float(stream.average_rate or stream.guessed_rate or 30)
+        stated = float(stream.average_rate or stream.guessed_rate or 0)
+        self.known_rate = 0 < stated <= FASTEST
+        self.rate = stated if self.known_rate else USUAL
         self.count = int(stream.frames or max(1, round(self.duration * self.rate)))
         self.hdr = {_PQ: "PQ", _HLG: "HLG"}.get(stream.codec_context.color_trc, "")
         self.damaged = 0

@@ -22,7 +22,8 @@ from stages.io.photo import read_photo
 from stages.poses import PosesSettings
 from stages.sfm import reconstruction
 from stages.sfm.images import prepare_images
-from stages.video.frames import Chosen, Reader, frames_of
+from stages.video.frames import Chosen, Reader, frames_of, look
+from stages.video.reading import opened
 from tests.stages import captures, clips
 
 BLURRED = (4, 5, 9, 13, 17, 18)
@@ -205,3 +206,25 @@ def test_panoramas_become_views_and_photographs_beside_them_stay(tmp_path: Path)
     captures.write_picture(tmp_path / "source" / "x.jpg", captures.picture())
     with pytest.raises(BadInput, match=r"x\.jpg: 32x24 pixels; .* twice as wide as high"):
         photographs_of(job, job.warn)
+
+
+def without_rate(path: Path) -> Path:
+    """A WebM file as browsers record it: without its duration, and without that of a frame; FFmpeg then takes the clock's 1000 a second for its rate."""
+    data = bytearray(path.read_bytes())
+    for element in (b"\x23\xe3\x83", b"\x44\x89"):  # DefaultDuration, Duration
+        at = data.index(element)
+        length = data[at + len(element)] & 0x7F
+        data[at : at + len(element) + 1 + length] = b"\xec" + bytes([0x80 | (len(element) - 1 + length)]) + bytes(len(element) - 1 + length)  # Void
+    path.write_bytes(data)
+    return path
+
+
+def test_video_of_an_unknown_rate_is_looked_at_by_its_times(tmp_path: Path) -> None:
+    for milliseconds, expected in ((33, 60), (8, 20)):  # every frame of 30 a second; of 120 every third
+        times = [index * milliseconds + index % 2 for index in range(60)]
+        path = without_rate(clips.write_clip(tmp_path / f"{milliseconds}.webm", clips.pan(60, 2.0), times=times, codec="libvpx-vp9"))
+        with opened(path) as video:
+            assert not video.known_rate
+        looked = look(path, Reader(1, tmp_path / "work", lambda *values: None, lambda: None, lambda text: None))
+        assert len(looked.index) == expected
+        assert np.diff(looked.time).min() >= 0.02
