@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any
 
@@ -60,6 +61,8 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, OSError):
         from pipeline.failures import is_disk_full
 
+        if isinstance(error, FileNotFoundError) and not error.filename and _working_folder_is_gone():
+            return "the working folder is gone: it was deleted or moved, and relative paths lead nowhere. Change to another folder, or give absolute paths."
         what = error.strerror or type(error).__name__
         if is_disk_full(error):
             return f"{error.filename or 'the disk'}: {what}. Free some space and run the same command again; nothing is lost."
@@ -70,6 +73,14 @@ def sentence(error: BaseException) -> str:
         return f"{error.object[:200]}: a file of this name cannot be opened in the encoding {error.encoding}. Set LC_ALL=C.UTF-8."
     text = " ".join(str(error).split())
     return f"internal error: {type(error).__name__}: {text[:300]}. Run it again with --debug for the traceback."
+
+
+def _working_folder_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _shortened(text: str) -> str:

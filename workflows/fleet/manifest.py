@@ -72,7 +72,7 @@ def read_manifest(given: Sequence[str], workflow: Workflow, fleet: Path, *, over
         common, entries = (_toml if path.suffix.lower() == ".toml" else _csv)(_text(path), checker)
         base = path.absolute().parent
     else:
-        base = Path.cwd()
+        base = Path()  # the working folder, which may be gone: absolute sources need none
         found, root = listed_entries(given) if len(given) > 1 else glob_entries(given[0]) if _is_glob(given[0]) else folder_entries(given[0], fleet)
         inside = None if root is None else [root, *roots]
         entries = [Entry(name, [source]) for name, source in found]

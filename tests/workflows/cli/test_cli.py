@@ -108,6 +108,18 @@ def test_a_source_may_move_but_not_change(enerf: Enerf, toys: Path, tmp_path: Pa
     assert moved["ok"]
 
 
+def test_a_working_folder_that_is_gone_is_named(enerf: Enerf, toys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    enerf("run", toys, "--out", tmp_path / "run")
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    refused = enerf("status", "run")
+    assert refused.code == 2
+    assert "the working folder is gone" in refused.err
+    assert enerf("status", tmp_path / "run").code == 0
+
+
 def test_a_dry_run_does_nothing(enerf: Enerf, toys: Path, tmp_path: Path) -> None:
     result = enerf("run", toys, "--out", tmp_path / "run", "--dry-run")
     assert result.code == 0

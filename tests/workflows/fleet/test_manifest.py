@@ -308,3 +308,15 @@ def _has(value: object, path: tuple[str, ...]) -> bool:
             return False
         value = value[name]
     return True
+
+
+def test_absolute_sources_need_no_working_folder(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    shoots = place / "shoots"
+    assert [scene.name for scene in read_manifest([str(shoots)], WORKFLOW, tmp_path / "fleet")] == ["a", "b", "c"]
+    assert [scene.name for scene in read_manifest([str(shoots / "a"), str(shoots / "b")], WORKFLOW, tmp_path / "fleet")] == ["a", "b"]
+    with pytest.raises(FileNotFoundError):
+        read_manifest(["shoots/a", "shoots/b"], WORKFLOW, tmp_path / "fleet")
