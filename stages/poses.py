@@ -208,7 +208,7 @@ def _formats(job: Job, settings: PosesSettings) -> list[str]:
     """What the source can be read as, the one to choose first; of several sources photographs alone. Raises BadInput."""
     found: list[str] = []
     for path in job.sources.values():
-        found = importers.candidates(path, settings.allow_outside) if settings.format == "auto" else [settings.format]
+        found = importers.candidates(path, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else [settings.format]
         if len(job.sources) > 1 and found[0] != "photographs":
             remedy = "Give it alone, or --as photographs, to find all cameras anew."
             raise BadInput(f"{path}: is read as {found[0]}; of several sources photographs and videos alone can be put together. {remedy}")

@@ -12,7 +12,8 @@ from pipeline.files import write_json
 from pipeline.stage import Job
 from stages.artifacts import PosesOutputs
 from stages.io.importers import one_line_errors
-from stages.io.importers.photographs import is_video, masks_of, photographs
+from stages.io.importers.masks import masks_of
+from stages.io.importers.photographs import is_video, photographs
 from stages.io.importers.source import MIN_IMAGES, Source
 from stages.io.pictures import MAX_SIDE
 
@@ -67,7 +68,7 @@ def _material_of(path: Path, allow_outside: bool, warn: Warn) -> Material:
         into |= {source.name_of(file): source.real(file) for file in files}
         if into is found.paths:
             found.masks |= {source.name_of(image): source.real(mask) for image, mask in masks_of(source, files).items()}
-    for sentence in source.run_warnings():
+    for sentence in source.warnings():
         warn(sentence)
     return found
 

@@ -79,7 +79,7 @@ def check(folder: Path, settings: Any, threads: int) -> Verdict:
     Raises BadInput where there is nothing that could be read.
     """
     source = Source(folder, settings.allow_outside)
-    kind = importers.detect(folder, settings.allow_outside) if settings.format == "auto" else settings.format
+    kind = importers.detect(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else settings.format
     files = {source.name_of(path): source.real(path) for path in photographs(source)}
     names = sorted(files)
     chosen = names[:: -(-len(names) // CHOSEN)]

@@ -160,7 +160,7 @@ def _format(settings: Settings, sources: Sequence[Path]) -> str | None:
     if len(sources) != 1:
         return "photographs" if sources else None
     try:
-        return detect(sources[0], stated.allow_outside)
+        return detect(sources[0], stated.allow_outside, stated.llff_factor)
     except (BadInput, OSError):
         return None
 

@@ -61,7 +61,7 @@ def _format(poses: Mapping[str, Any], sources: Sequence[Path]) -> str | None:
     if len(sources) != 1:
         return "photographs"
     try:
-        return detect(sources[0], bool(poses.get("allow_outside", False)))
+        return detect(sources[0], bool(poses.get("allow_outside", False)), poses.get("llff_factor", "auto"))
     except (PipelineError, OSError):
         return None
 

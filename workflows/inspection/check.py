@@ -49,7 +49,7 @@ def with_frames_for_videos(source: Path, poses: Any, work: Path) -> Path:
     from stages.video.frames import Reader, frames_of
     from stages.video.reading import UnreadableVideo
 
-    if (candidates(source, poses.allow_outside)[0] if poses.format == "auto" else poses.format) != "photographs":
+    if (candidates(source, poses.allow_outside, poses.llff_factor)[0] if poses.format == "auto" else poses.format) != "photographs":
         return source
     videos = find_material({"": source}, poses.allow_outside, _nothing).videos
     if not videos:

@@ -98,13 +98,16 @@ IMPORTERS: dict[str, Importer] = {
 FORMATS = ("auto", *IMPORTERS)
 
 
-def detect(folder: Path, allow_outside: bool = False) -> str:
+def detect(folder: Path, allow_outside: bool = False, llff_factor: int | str = "auto") -> str:
     """The name of the format of a source folder; BadInput where it is none."""
-    return candidates(folder, allow_outside)[0]
+    return candidates(folder, allow_outside, llff_factor)[0]
 
 
-def candidates(folder: Path, allow_outside: bool = False) -> list[str]:
-    """Every format that the folder could be read as, the one to choose first; BadInput where there is none."""
+def candidates(folder: Path, allow_outside: bool = False, llff_factor: int | str = "auto") -> list[str]:
+    """Every format that the folder could be read as, the one to choose first; BadInput where there is none.
+
+    llff_factor  of the settings: where it is stated, LLFF is meant
+    """
     if not folder.exists():
         raise BadInput(f"{folder}: no such folder. Expected a folder of photographs, a video or a posed data set.")
     if not folder.is_dir():
@@ -118,10 +121,16 @@ def candidates(folder: Path, allow_outside: bool = False) -> list[str]:
         with one_line_errors(folder):
             photographs(Source(folder, allow_outside))  # anywhere below; says what is there instead
         found.append("photographs")
+    if {"llff", "colmap"} <= set(found) and llff_factor == "auto":
+        from stages.io.importers.llff import holds_less_than_colmap
+
+        if holds_less_than_colmap(folder, allow_outside):
+            found.remove("colmap")
+            found.insert(found.index("llff"), "colmap")
     return found
 
 
 def files(folder: Path, settings: Any) -> list[Path]:
     """What the poses stage depends on: the files of the format in question that it reads."""
-    name = detect(folder, settings.allow_outside) if settings.format == "auto" else settings.format
+    name = detect(folder, settings.allow_outside, settings.llff_factor) if settings.format == "auto" else settings.format
     return sorted(set(IMPORTERS[name].files(folder, settings)))

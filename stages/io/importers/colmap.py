@@ -18,9 +18,9 @@ from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.colmap_model import MAX_NAME, Model, Points, count_images, model_files, read_model
 from stages.io.importers.frames import relocated
-from stages.io.importers.photographs import masks_of
+from stages.io.importers.masks import masks_of
 from stages.io.importers.source import MIN_IMAGES, ImportSettings, Source, abbreviated, missing_images_warning, moved_images_warnings
-from stages.io.pictures import UnreadableImage, read_header
+from stages.io.pictures import Header, UnreadableImage, read_header
 
 _MODEL_PLACES = (".", "sparse", "sparse/*", "colmap", "colmap/sparse", "colmap/sparse/*", "dense/sparse", "dense/*/sparse", "model", "models/*")
 _IMAGE_PLACES = ("images", "input", "rgb", "photos", ".", "../images", "../../images")
@@ -42,6 +42,12 @@ def recognises(folder: Path, allow_outside: bool = False) -> bool:
 def _files(source: Source, place: Path) -> list[Path]:
     """The files of a model, without links."""
     return [source.real(path) for path in model_files(place) or []]
+
+
+def image_names(source: Source) -> list[str]:
+    """The names that the source's best model lists. Raises BadInput."""
+    place = _best(source)
+    return [image.name for image in read_model(place, _files(source, place), points=False).images.values()]
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
@@ -127,6 +133,8 @@ def _photos(
     rejected: list[tuple[str, str, Path]] = []
     warnings: list[str] = []
     seen: set[Path] = set()
+    readable: list[tuple[int, Path]] = []
+    stated: list[tuple[Camera, Header, str]] = []
     remarks_by_kind: dict[str, list[str]] = {}
     for number, path in here.items():
         posed, name = model.images[number], source.name_of(path)
@@ -142,10 +150,12 @@ def _photos(
             warnings.append(f"{name}: {error}; left out.")
             continue
         pose = pose_from_colmap(np.array(posed.quaternion), np.array(posed.translation))
-        stated = lenses.validated(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {posed.camera}")
-        camera, remark = lenses.fit_to_image(stated, header, f"{where}: {printable(posed.name, MAX_NAME)}")
+        camera = lenses.validated(Camera(name, lens.width, lens.height, lens.model, lens.params, pose), f"{where}: camera {posed.camera}")
+        stated.append((camera, header, f"{where}: {printable(posed.name, MAX_NAME)}"))
+        readable.append((number, path))
+    for (number, path), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
         if remark is not None:
-            remarks_by_kind.setdefault(remark, []).append(name)
+            remarks_by_kind.setdefault(remark, []).append(camera.name)
         mask = source.real(masks[path]) if path in masks else None
         kept.append((number, Photo(camera, source.real(path), mask)))
     kept.sort(key=lambda item: item[1].camera.name)

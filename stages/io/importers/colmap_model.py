@@ -35,6 +35,8 @@ MODEL_NUMBERS = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
 }
+# COLMAP's models of fewer parameters that are OPENCV_FISHEYE with the others zero: how many k they have, after f, cx, cy.
+FISHEYE = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2}
 MAX_FILE = 8 << 30  # bytes
 MAX_IMAGES = 100_000
 MAX_NAME = 200  # characters of a name that a message shows
@@ -163,15 +165,28 @@ class _Bytes:
             raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes after its end. Is it a COLMAP model? {_AGAIN}")
 
 
+def count_parameters(model: str) -> int | None:
+    """Of a camera model that is read; None for others."""
+    return 3 + FISHEYE[model] if model in FISHEYE else len(MODELS[model]) if model in MODELS else None
+
+
+def as_traced(model: str, params: tuple[float, ...]) -> tuple[str, tuple[float, ...]]:
+    """A model of COLMAP and its parameters as one of those that rays are traced through."""
+    if model not in FISHEYE:
+        return model, params
+    focal, cx, cy, *radial = params
+    return "OPENCV_FISHEYE", (focal, focal, cx, cy, *radial, *([0.0] * (4 - len(radial))))
+
+
 def _lens(path: Path, number: int, model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
-    if model not in MODELS:
-        raise BadInput(
-            f"{path}: camera {number} is a {printable(model, 40)}; supported are {', '.join(MODELS)}. Undistort with `colmap image_undistorter` first."
-        )
-    if len(params) != len(MODELS[model]):
-        raise BadInput(f"{path}: camera {number}: {model} has {len(MODELS[model])} parameters, found {len(params)}. {_AGAIN}")
+    if (expected := count_parameters(model)) is None:
+        supported = ", ".join([*MODELS, *FISHEYE])
+        raise BadInput(f"{path}: camera {number} is a {printable(model, 40)}; supported are {supported}. Undistort with `colmap image_undistorter` first.")
+    if len(params) != expected:
+        raise BadInput(f"{path}: camera {number}: {model} has {expected} parameters, found {len(params)}. {_AGAIN}")
     if not (0 < width <= 65535 and 0 < height <= 65535):
         raise BadInput(f"{path}: camera {number}: size {width}x{height}. {_AGAIN}")
+    model, params = as_traced(model, params)
     return Lens(model, width, height, params)
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from efficientnerf.settings import Auto
 from stages.io.capture import Capture
 from stages.io.importers import IMPORTERS, candidates, one_line_errors
-from stages.io.importers.photographs import is_video, masks_of, photographs
+from stages.io.importers.masks import masks_of
+from stages.io.importers.photographs import is_video, photographs
 from stages.io.importers.source import Source
 from stages.io.pictures import UnreadableImage, read_header
 
@@ -122,7 +123,7 @@ def _photographs(folder: Path) -> dict[str, Any]:
         sizes.append(header.size)
         turned += header.orientation != 1
     warnings = [f"{entry['name']}: {entry['reason']}" for entry in rejected]
-    warnings += source.run_warnings()
+    warnings += source.warnings()
     if turned:
         warnings.append(f"{turned} images are rotated by their EXIF orientation.")
     if len(set(sizes)) > 1:

@@ -19,7 +19,8 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
-from stages.io.importers.photographs import NOT_PHOTOGRAPHS, masks_of
+from stages.io.importers.masks import masks_of
+from stages.io.importers.photographs import NOT_PHOTOGRAPHS
 from stages.io.importers.source import (
     IMAGE_SUFFIXES,
     MAX_FRAMES,
@@ -29,12 +30,13 @@ from stages.io.importers.source import (
     abbreviated,
     missing_images_warning,
     moved_images_warnings,
+    name_key,
 )
-from stages.io.pictures import UnreadableImage, read_header
+from stages.io.pictures import Header, UnreadableImage, read_header
 
 MAX_NAME = 200  # characters of a listed name that are shown
 USUAL_FOLDERS = ("images", "image", "rgb", "input", "photos", "color")  # which of several that hold a bare name is meant
-_BESIDE_IMAGES = NOT_PHOTOGRAPHS | {"confidence", "thumbnails"}  # folders with files of the names of images
+_BESIDE_IMAGES = NOT_PHOTOGRAPHS | {"confidence"}  # folders with files of the names of images
 REMEDY = "Copy them into the source folder, or export again without them."
 SPLIT_ORDER = {"train": 0, "val": 1, "test": 2, None: 3}
 
@@ -123,9 +125,9 @@ def _best_folder(source: Source, names: Sequence[str], parts: tuple[str, ...], t
     by_folder: dict[Path, dict[str, Path]] = {}
     for name in names:
         last = (_parts(name) or ("",))[-1]
-        stem, suffix = last.lower(), ""
+        stem, suffix = name_key(last), ""
         if PurePosixPath(last).suffix.lower() in IMAGE_SUFFIXES:
-            stem, suffix = PurePosixPath(last).stem.lower(), PurePosixPath(last).suffix.lower()
+            stem, suffix = name_key(PurePosixPath(last).stem), PurePosixPath(last).suffix.lower()
         for path in index.get(stem, ()):
             folder = path.parent
             if path in taken or _BESIDE_IMAGES & {part.lower() for part in folder.relative_to(source.root).parts}:
@@ -235,12 +237,14 @@ def capture_of(
 
 
 def _photos(source: Source, listing: Listing) -> tuple[list[Photo], list[str], list[tuple[str, str, Path]], dict[str, list[str]]]:
-    """Photos, their listed names, the unreadable as (name, reason, file), and what `lenses.fit_to_image` remarks."""
+    """Photos, their listed names, the unreadable as (name, reason, file), and what `lenses.fit_to_images` remarks."""
     photos: list[Photo] = []
     names: list[str] = []
     unreadable: list[tuple[str, str, Path]] = []
     remarks: dict[str, list[str]] = {}
     beside = masks_of(source, [path for frame, path in listing.found if frame.mask is None])
+    readable: list[tuple[Frame, Path]] = []
+    stated: list[tuple[Camera, Header, str]] = []
     for frame, path in listing.found:
         name = source.name_of(path)
         try:
@@ -248,10 +252,11 @@ def _photos(source: Source, listing: Listing) -> tuple[list[Photo], list[str], l
         except UnreadableImage as error:
             unreadable.append((name, str(error), source.real(path)))
             continue
-        stated = lenses.validated(frame.camera(name, header.size), frame.where)
-        camera, remark = lenses.fit_to_image(stated, header, frame.where)
+        stated.append((lenses.validated(frame.camera(name, header.size), frame.where), header, frame.where))
+        readable.append((frame, path))
+    for (frame, path), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
         if remark is not None:
-            remarks.setdefault(remark, []).append(name)
+            remarks.setdefault(remark, []).append(camera.name)
         mask = frame.mask or beside.get(path)
         photos.append(Photo(camera, source.real(path), None if mask is None else source.real(mask), frame.mask_ignore, frame.split))
         names.append(frame.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -73,19 +74,36 @@ def validated(camera: Camera, where: str) -> Camera:
     return camera
 
 
-def fit_to_image(camera: Camera, header: Header, where: str) -> tuple[Camera, str | None]:
+def fit_to_images(stated: Sequence[tuple[Camera, Header, str]]) -> list[tuple[Camera, str | None]]:
+    """`fit_to_image` of all images of a set, as (camera, header, where).
+
+    Turned by 180 degrees, or square, an image does not show for which pixels its camera was stated. Where others of the set show that theirs were stated for
+    the pixels as stored, so were these.
+    """
+    shown = [
+        same_aspect((camera.width, camera.height), header.size)
+        for camera, header, _ in stated
+        if header.orientation >= 5 and not same_aspect(header.size, header.size[::-1])
+    ]
+    as_stored = bool(shown) and not any(shown)
+    return [fit_to_image(camera, header, where, as_stored) for camera, header, where in stated]
+
+
+def fit_to_image(camera: Camera, header: Header, where: str, as_stored: bool = False) -> tuple[Camera, str | None]:
     """The camera of a file's upright image, from a camera that may have been stated at another size or for the pixels as stored.
 
-    returns  the camera and a remark: "resized", "turned", "upright?" (turned by 180 degrees or mirrored, where the stated size
-             does not say for which the camera was stated: taken to be the upright image) or None
+    as_stored  whether cameras of the set are known to be stated for the pixels as stored
+    returns    the camera and a remark: "resized", "turned", "upright?" (turned by 180 degrees or mirrored, where nothing says for which the camera was stated:
+               taken to be the upright image) or None
     Raises BadInput where the aspect does not agree (1 %, or a pixel of rounding).
     """
     width, height = header.size
-    stated = camera.width, camera.height
-    if header.orientation >= 5 and not same_aspect(stated, (width, height)) and same_aspect(stated, (height, width)):
-        if header.orientation not in _QUARTER_TURNS:
-            raise BadInput(f"{where}: the image is mirrored by its EXIF orientation ({header.orientation}) and the camera is not. Write the image upright.")
-        camera = resized(camera, height, width)
+    stated, stored = (camera.width, camera.height), (header.stored_width, header.stored_height)
+    sideways = header.orientation >= 5 and not same_aspect(stated, (width, height)) and same_aspect(stated, stored)
+    if sideways and header.orientation not in _QUARTER_TURNS:
+        raise BadInput(f"{where}: the image is mirrored by its EXIF orientation ({header.orientation}) and the camera is not. Write the image upright.")
+    if sideways or (as_stored and _QUARTER_TURNS.get(header.orientation) and same_aspect(stated, stored)):
+        camera = resized(camera, *stored)
         for _ in range(_QUARTER_TURNS[header.orientation]):
             camera = rotated_clockwise(camera)
         return camera, "turned"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import re
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -17,16 +17,39 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.capture import Capture, Photo
 from stages.io.importers import lenses
-from stages.io.importers.photographs import masks_of
-from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in
+from stages.io.importers.masks import masks_of
+from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, name_key
 from stages.io.json_file import LARGEST_NUMBER
-from stages.io.pictures import UnreadableImage, read_header
+from stages.io.pictures import Header, UnreadableImage, read_header
 
 POSES = "poses_bounds.npy"
 
 
 def recognises(folder: Path, allow_outside: bool = False) -> bool:
     return (folder / POSES).is_file()
+
+
+def holds_less_than_colmap(folder: Path, allow_outside: bool = False) -> bool:
+    """Whether the folder's COLMAP model is of all the images that poses_bounds.npy is of, and they look round about, as in mip-NeRF 360's data.
+
+    The file was made from the model, and has one focal length for its lens and none of its points. Of forward-facing captures its depths give the space that
+    they are trained in.
+    """
+    from stages.framing.forward_facing import MAX_AXIS_ANGLE
+    from stages.io.importers import colmap
+
+    source = Source(folder, allow_outside)
+    try:
+        rows, named = _rows(source), colmap.image_names(source)
+    except BadInput:  # said where it is read
+        return False
+    here = [name_key(path.name) for path in images_in(folder / "images")]
+    if sorted(name_key(PurePosixPath(name).name) for name in named) != sorted(here) or len(here) != len(rows):
+        return False
+    axes = rows[:, :15].reshape(-1, 3, 5)[:, :, 2]
+    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), 1e-12)
+    mean = axes.mean(0) / max(float(np.linalg.norm(axes.mean(0))), 1e-12)
+    return bool((axes @ mean).min() < np.cos(np.radians(MAX_AXIS_ANGLE)))
 
 
 def image_folders(folder: Path) -> dict[int, Path]:
@@ -56,6 +79,8 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
     rejected: list[tuple[str, str]] = []
     rejected_files: dict[str, Path] = {}
     remarks: dict[str, list[str]] = {}
+    readable: list[tuple[Path, float, float]] = []
+    stated: list[tuple[Camera, Header, str]] = []
     for index, (row, image) in enumerate(zip(rows, images, strict=True)):
         name, where = source.name_of(image), f"{POSES}: row {index} ({source.name_of(image)})"
         try:
@@ -65,12 +90,14 @@ def read(folder: Path, settings: ImportSettings) -> Capture:
             rejected_files[name] = source.real(image)
             warnings.append(f"{name}: {error}; left out.")
             continue
-        camera, remark = lenses.fit_to_image(_camera(row, name, where), header, where)
-        if remark in ("turned", "upright?"):  # another size than stated is what the folders are for
-            remarks.setdefault(str(remark), []).append(name)
+        stated.append((_camera(row, name, where), header, where))
         near, far = float(row[15]), float(row[16])
         if not 0 < near < far:
             raise BadInput(f"{where}: near {near:g} and far {far:g}; expected 0 < near < far. Write poses_bounds.npy again.")
+        readable.append((image, near, far))
+    for (image, near, far), (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
+        if remark in ("turned", "upright?"):  # another size than stated is what the folders are for
+            remarks.setdefault(str(remark), []).append(camera.name)
         mask = source.real(masks[image]) if image in masks else None
         photos.append(Photo(camera, source.real(image), mask, near=near, far=far))
     if len(photos) < MIN_IMAGES:

@@ -1,25 +1,34 @@
-"""Folders of photographs or videos: which files are photographs, the masks beside them, and which are videos.
+"""Folders of photographs or videos: which files are photographs, and which are videos.
 
-Videos count where there are no photographs: a phone keeps a short clip beside each of its own.
+Photographs come first: a phone keeps a short clip beside each of its own. Videos count where there are fewer photographs than make a data set.
 
-A mask lies in a folder `masks` beside or inside that of the images, or at the top of the source, at the image's own relative path. That of IMG_1.jpg is called
-IMG_1.png (nerfstudio), IMG_1.jpg.png (COLMAP), IMG_1.mask.png or IMG_1.jpg.mask (Brush), or IMG_1_mask.png; where it is black, the image is left out.
+One picture that lies there twice (IMG_1.HEIC and IMG_1.JPG, as clouds export them) is read once: of two photographs of one name in a folder, which differ by
+their extension, those that were taken at one time, or look alike.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.errors import BadInput
-from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, images_in, one_of_each
+from stages.io.importers.masks import FOLDERS, masks_of
+from stages.io.importers.source import IMAGE_SUFFIXES, MAX_FRAMES, MIN_IMAGES, ImportSettings, Source, abbreviated, images_in, name_key, one_of_each
+from stages.io.pictures import RAW_SUFFIXES, UnreadableImage, exif_of, opened, read_header
 from stages.video.reading import KNOWN, SUFFIXES
 
-MASKS = "masks"
-# What conversions leave beside the photographs: reductions, depth maps, masks.
-NOT_PHOTOGRAPHS = {MASKS, "mask", "depth", "depths", "sparse", "dense", "stereo"}
+# What conversions leave beside the photographs, in any case: reductions, depth maps, masks.
+NOT_PHOTOGRAPHS = {*FOLDERS, "depth", "depths", "sparse", "dense", "stereo", "thumbnails", "thumbs", "@eadir"}
+_REDUCED = re.compile(r"images_\d+")
+_PREFERRED = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".avif", ".webp", ".bmp")  # of one picture in several formats
+_EXIF, _TAKEN, _FRACTION = 34665, 36867, 37521  # directory; DateTimeOriginal, SubSecTimeOriginal
+_SMALL, _ALIKE, _ANYWHERE = 64, 4.0, 48  # px, longest side; levels of 255 that formats differ by, in the mean and anywhere
 
 
 def recognises(folder: Path, allow_outside: bool = False) -> bool:
@@ -38,71 +47,143 @@ def _videos_in(folder: Path) -> list[Path]:
 
 
 def photographs(source: Source) -> list[Path]:
-    """The photographs of a source: directly in it, else in its folder images/, else anywhere below it; sorted by path. Where there are none, its videos.
+    """The photographs of a source: directly in it, in its folder images/, or, where there are too few, anywhere below it; sorted by path. Where there are too
+    few below, too, its videos. What is left aside is said in the source's remarks.
 
     Raises BadInput.
     """
+    return _without_twins(source, _all(source))
+
+
+def _all(source: Source) -> list[Path]:
+    """The same with pictures that are there twice."""
     folder = source.root
-    found = images_in(folder) or images_in(folder / "images") or _videos_in(folder)
-    if not found:
+    found = next((some for some in (images_in(folder), images_in(folder / "images")) if len(some) >= MIN_IMAGES), [])
+    if found:
+        _remark_on_others(source, found)
+    else:
         everything = source.walk()
-        usable = [path for path in everything if not NOT_PHOTOGRAPHS & set(path.relative_to(folder).parts[:-1])]
-        found = one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES)) or sorted(filter(is_video, usable))
-        if not found:
-            raise BadInput(_nothing(folder, everything))
+        usable = [path for path in everything if not _is_beside(path, folder)]
+        found = one_of_each(sorted(path for path in usable if path.suffix.lower() in IMAGE_SUFFIXES))
+        videos = _videos_in(folder) or sorted(filter(is_video, usable))
+        if not found and not videos:
+            raise BadInput(_nothing(source, everything))
+        few = len(found) < MIN_IMAGES
+        if found and videos:
+            unread, names = (found, "photographs") if few else (videos, "videos")
+            source.remarks[f"{folder}: {_count(unread, names, source)} not read, for there are {'videos' if few else 'photographs'}."] = None
+        found = videos if few and videos else found
     if len(found) > MAX_FRAMES:
         raise BadInput(f"{folder}: {len(found)} images; at most {MAX_FRAMES} are read.")
     return [source.check_inside(path) for path in found]
 
 
-def masks_of(source: Source, images: Sequence[Path]) -> dict[Path, Path]:
-    """Image -> mask, of those that have one."""
-    listings: dict[Path, dict[str, Path]] = {}
-    found = {}
-    for image in images:
-        inside = image.parent.relative_to(source.root) if image.parent.is_relative_to(source.root) else Path()
-        # images/a/1.jpg: images/a/masks, images/masks/a, masks/images/a, masks/a
-        places = [image.parent / MASKS, source.root / MASKS / inside]
-        for depth in range(len(inside.parts)):
-            above, below = Path(*inside.parts[:depth]), inside.parts[depth:]
-            places += [source.root / above / MASKS / Path(*below), source.root / above / MASKS / Path(*below[1:])]
-            places.append(source.root / above / below[0] / MASKS / Path(*below[1:]))
-        for place in dict.fromkeys(places):
-            if place not in listings:
-                by_stem: dict[str, Path] = {}
-                for path in [*images_in(place), *_with_mask_as_suffix(place)]:
-                    by_stem.setdefault(path.stem.lower(), path)
-                listings[place] = by_stem
-            stem = image.stem.lower()
-            mask = next((listings[place][name] for name in (image.name.lower(), stem, f"{stem}.mask", f"{stem}_mask") if name in listings[place]), None)
-            if mask is not None:
-                found[image] = source.check_inside(mask)
-                break
-    return found
+def _count(paths: Sequence[Path], what: str, source: Source) -> str:
+    return f"{len(paths)} {what if len(paths) > 1 else what[:-1]} ({abbreviated([source.name_of(path) for path in paths])}) {'are' if len(paths) > 1 else 'is'}"
 
 
-def _with_mask_as_suffix(folder: Path) -> list[Path]:
-    """Pictures that are called IMG_1.mask, whatever format they have."""
-    if not os.path.isdir(folder):
-        return []
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() == ".mask" and not path.name.startswith(".") and path.is_file())
+def _is_beside(path: Path, folder: Path) -> bool:
+    """Whether a file lies in a folder of what conversions leave beside photographs."""
+    return not NOT_PHOTOGRAPHS.isdisjoint(map(name_key, path.relative_to(folder).parts[:-1]))
+
+
+def _remark_on_others(source: Source, found: Sequence[Path]) -> None:
+    """Say which folders hold images that are not read, for there are enough directly in the source, or in images/."""
+    folder, here = source.root, found[0].parent
+    try:
+        everything = source.walk()
+    except BadInput:  # more files than a data set has
+        return
+    images = (path for path in everything if path.suffix.lower() in IMAGE_SUFFIXES and path.parent != here and not _is_beside(path, folder))
+    others = one_of_each([path for path in images if not any(_REDUCED.fullmatch(part) for part in path.relative_to(folder).parts)])
+    if others:
+        names = sorted({source.name_of(path.parent) if path.parent != folder else "." for path in others})
+        source.remarks[
+            f"{folder}: {len(others)} more images in other folders ({abbreviated(names)}) are not read, for {len(found)} lie directly in "
+            f"{here.name if here != folder else 'it'}. Name the folders as sources of their own, or put the photographs together."
+        ] = None
+
+
+def _without_twins(source: Source, found: Sequence[Path]) -> list[Path]:
+    """One of each picture that is there in several formats; the others are named in the source's remarks."""
+    named: dict[tuple[Path, str], list[Path]] = {}
+    for path in found:
+        named.setdefault((path.parent, name_key(path.stem)), []).append(path)
+    left: dict[Path, Path] = {}
+    for same in named.values():
+        kept: list[Path] = []
+        for path in sorted(same, key=lambda path: _preference(source, path)) if len(same) > 1 else ():
+            twin = next((other for other in kept if _is_same_picture(source.real(path), source.real(other))), None)
+            if twin is None:
+                kept.append(path)
+            else:
+                left[path] = twin
+    if left:
+        pairs = abbreviated([f"{source.name_of(path)} is {source.name_of(twin)}" for path, twin in sorted(left.items())])
+        source.remarks[f"{source.root}: {len(left)} pictures lie there twice, in two formats, and are read once ({pairs})."] = None
+    return [path for path in found if path not in left]
+
+
+def _preference(source: Source, path: Path) -> tuple[bool, int, Path]:
+    """Of one picture in several formats that which kept the camera's data, then that which is decoded fastest, comes first."""
+    try:
+        taken = _taken(source.real(path))
+    except UnreadableImage:
+        taken = None
+    suffix = path.suffix.lower()
+    return taken is None, _PREFERRED.index(suffix) if suffix in _PREFERRED else len(_PREFERRED), path
+
+
+def _is_same_picture(path: Path, other: Path) -> bool:
+    suffixes = {path.suffix.lower(), other.suffix.lower()}
+    if len(suffixes) < 2 or suffixes & {*RAW_SUFFIXES, *SUFFIXES}:
+        return False
+    return _are_alike(path, path.stat().st_mtime_ns, other, other.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=MAX_FRAMES)
+def _are_alike(path: Path, changed: int, other: Path, other_changed: int) -> bool:
+    """Whether two files are one picture; asked again where one has changed."""
+    from stages.io.photo import read_photo
+
+    try:
+        headers, times = [read_header(each) for each in (path, other)], [_taken(each) for each in (path, other)]
+        if headers[0].size != headers[1].size or headers[0].alpha != headers[1].alpha:
+            return False
+        if all(times):
+            return times[0] == times[1]
+        small = [read_photo(each, _SMALL).rgb.astype(int) for each in (path, other)]
+    except UnreadableImage:
+        return False
+    difference = np.abs(small[0] - small[1])
+    return bool(difference.mean() <= _ALIKE and difference.max() <= _ANYWHERE)
+
+
+def _taken(path: Path) -> tuple[str, str] | None:
+    """When a photograph was taken, by its EXIF data."""
+    with opened(path) as image:
+        tags = dict(exif_of(image).get_ifd(_EXIF))
+    time = str(tags.get(_TAKEN, "")).strip(" \0")
+    return (time, str(tags.get(_FRACTION, "")).strip(" \0")) if any(digit in time for digit in "123456789") else None
 
 
 def files(folder: Path, settings: ImportSettings) -> list[Path]:
-    """The photographs and their masks, or the videos."""
+    """The photographs and their masks, or the videos; with pictures that are there twice, for what they hold decides."""
     if not folder.is_dir():
         return [folder]
     source = Source(folder, settings.allow_outside)
-    images = photographs(source)
+    images = _all(source)
     return [*images, *masks_of(source, images).values()]
 
 
-def _nothing(folder: Path, everything: Sequence[Path]) -> str:
+def _nothing(source: Source, everything: Sequence[Path]) -> str:
     known = f"png, jpg, webp, tif, bmp, heic, avif or camera raw; {KNOWN}"
+    links = f" It holds {source.linked_folders()}." if source.links else ""
     if not everything:
-        return f"{folder}: the folder is empty. Expected at least {MIN_IMAGES} photographs or a video ({known}), or a posed data set."
+        what = "no files" if source.links else "the folder is empty"
+        return f"{source.root}: {what}. Expected at least {MIN_IMAGES} photographs or a video ({known}), or a posed data set.{links}"
     common = Counter(path.suffix.lower() or "(no extension)" for path in everything).most_common(3)
     return (
-        f"{folder}: no images of a known type, and no videos ({known}); found {', '.join(f'{count} {suffix}' for suffix, count in common)}. "
-        "Convert the photographs to JPEG or PNG, or name another folder."
+        f"{source.root}: no images of a known type, and no videos ({known}); found {', '.join(f'{count} {suffix}' for suffix, count in common)}. "
+        f"Convert the photographs to JPEG or PNG, or name another folder.{links}"
     )

@@ -4,6 +4,8 @@ Data sets travel: lists hold absolute paths of another computer, extensions that
 name is therefore searched for, in this order: as listed; with another extension; by its last parts, from the longest, inside the
 source; absolute paths also by their file name alone.
 
+Names are compared without case, and composed (NFC): archives made on macOS hold `e` and an accent where lists have one letter.
+
 What lies outside the source folder is not read unless the user allows it. `Source.real` is the one gate: it follows the links of a path once, and the path
 that it returns is the one that is opened, whatever becomes of the links later.
 """
@@ -11,6 +13,7 @@ that it returns is the one that is opened, whatever becomes of the links later.
 from __future__ import annotations
 
 import os
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -29,6 +32,7 @@ MAX_PATH = 4096  # characters of a listed name
 MAX_DEPTH = 32  # last parts of a listed name that are searched for below the source
 MIN_IMAGES = 3  # images that make a data set
 MAX_NAMES = 5  # names that a message lists
+MASK_ENDINGS = ("_mask", ".mask")  # of a mask that lies beside its photograph: IMG_1_mask.png
 
 
 class ImportSettings(Protocol):
@@ -45,6 +49,11 @@ class ImportSettings(Protocol):
 def abbreviated(names: Sequence[str]) -> str:
     """The first few names, and how many more there are."""
     return ", ".join(names[:MAX_NAMES]) + (f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else "")
+
+
+def name_key(name: str) -> str:
+    """What names are looked up by."""
+    return unicodedata.normalize("NFC", name).lower()
 
 
 @dataclass(frozen=True)
@@ -66,11 +75,15 @@ class Source:
     root           the folder
     allow_outside  whether files outside it may be read
     runs           run folders below it that a look-up came by: what they hold was made from the source, and is no part of it
+    links          linked folders that a look-up came by and did not follow, for they lead out of it
+    remarks        sentences about what of it is left aside, each once
     """
 
     root: Path
     allow_outside: bool = False
     runs: set[Path] = field(default_factory=set)
+    links: set[Path] = field(default_factory=set)
+    remarks: dict[str, None] = field(default_factory=dict)
     _real: dict[Path, Path] = field(default_factory=dict)
     _names: dict[Path, str] = field(default_factory=dict)
     _taken: set[str] = field(default_factory=set)
@@ -121,12 +134,19 @@ class Source:
 
     def walk(self) -> list[Path]:
         """Every file of the source, without those of run folders in it; see `walk`."""
-        return walk(self.root, self.runs)
+        return walk(self.root, self.runs, self.links, follow=self.allow_outside)
 
-    def run_warnings(self) -> list[str]:
-        """A sentence about the run folders that look-ups came by, if any."""
+    def warnings(self) -> list[str]:
+        """Sentences about what look-ups came by and left aside."""
         names = [self.name_of(path) for path in sorted(self.runs)]
-        return [f"{abbreviated(names)}: {'runs' if len(names) > 1 else 'a run'} inside the source folder; what was made there is not read."] if names else []
+        runs = [f"{abbreviated(names)}: {'runs' if len(names) > 1 else 'a run'} inside the source folder; what was made there is not read."] if names else []
+        links = [f"{self.root}: holds {self.linked_folders()}."] if self.links else []
+        return [*runs, *links, *self.remarks]
+
+    def linked_folders(self) -> str:
+        """What is said of the linked folders that were not followed."""
+        names = [f"{path.relative_to(self.root)} -> {os.path.realpath(path)}" for path in sorted(self.links)]
+        return f"linked folders, which are not followed ({abbreviated(names)}): name the target itself, or pass --allow-outside"
 
     def find(self, name: str, beside: Path | None = None, suffixes: Sequence[str] = IMAGE_SUFFIXES) -> Found:
         """The file that a list names.
@@ -154,7 +174,7 @@ class Source:
             if found.path is not None:
                 return Found(found.path, "elsewhere")
         if absolute and parts:
-            alike = self._index().get(parts[-1].lower(), [])
+            alike = self._index().get(name_key(parts[-1]), [])
             if len(alike) == 1:
                 return Found(self.check_inside(alike[0]), "elsewhere")
             if here is not None and os.path.isfile(here) and not inside:
@@ -165,56 +185,84 @@ class Source:
         if os.path.isfile(path):
             return Found(self.check_inside(path))
         stem = path.stem if path.suffix.lower() in suffixes else path.name
-        alike = self._folder(path.parent).get(stem.lower(), [])
-        usable = [other for other in alike if other.suffix.lower() in suffixes and (other.stem.lower() == stem.lower())]
+        usable = [other for other in self._folder(path.parent).get(name_key(stem), []) if other.suffix.lower() in suffixes]
         if not usable:
             return Found(None)
-        best = min(usable, key=lambda other: (other.stem != stem, suffixes.index(other.suffix.lower())))
-        return Found(self.check_inside(best), "extension" if path.suffix.lower() in suffixes else "listed")
+        composed = [unicodedata.normalize("NFC", name) for name in (stem, path.name)]
+        best = min(usable, key=lambda other: (unicodedata.normalize("NFC", other.stem) != composed[0], suffixes.index(other.suffix.lower())))
+        another = path.suffix.lower() in suffixes and unicodedata.normalize("NFC", best.name) != composed[1]
+        return Found(self.check_inside(best), "extension" if another else "listed")
 
     def _folder(self, folder: Path) -> dict[str, list[Path]]:
-        """The files of a folder by stem in lower case."""
+        """The files of a folder by the key of their stem."""
         if folder not in self._folders:
             stems: dict[str, list[Path]] = {}
             if os.path.isdir(folder) and (self.allow_outside or Path(os.path.realpath(folder)).is_relative_to(self._real[self.root])):
                 for entry in sorted(folder.iterdir()):
-                    stems.setdefault(entry.stem.lower(), []).append(entry)
+                    stems.setdefault(name_key(entry.stem), []).append(entry)
             self._folders[folder] = stems
         return self._folders[folder]
 
     def images_by_stem(self) -> dict[str, list[Path]]:
-        """Every image of the source by stem in lower case; links to folders are not followed."""
+        """Every image of the source by the key of its stem; see `walk`."""
         if self._by_stem is None:
             self._by_stem = {}
             for path in self.walk():
                 if path.suffix.lower() in IMAGE_SUFFIXES:
-                    self._by_stem.setdefault(path.stem.lower(), []).append(path)
+                    self._by_stem.setdefault(name_key(path.stem), []).append(path)
         return self._by_stem
 
     def _index(self) -> dict[str, list[Path]]:
-        """Every file of the source by name in lower case; links to folders are not followed."""
+        """Every file of the source by the key of its name; see `walk`."""
         if self._by_name is None:
             self._by_name = {}
             for path in self.walk():
-                self._by_name.setdefault(path.name.lower(), []).append(path)
+                self._by_name.setdefault(name_key(path.name), []).append(path)
         return self._by_name
 
 
-def walk(folder: Path, runs: set[Path] | None = None) -> list[Path]:
-    """Every file below a folder in sorted order; hidden ones and links to folders are left out, and so are run folders, which go into `runs`."""
+def walk(folder: Path, runs: set[Path] | None = None, links: set[Path] | None = None, *, follow: bool = False) -> list[Path]:
+    """Every file below a folder in sorted order; hidden ones are left out, and so are run folders, which go into `runs`.
+
+    links   where linked folders go that lead out of the folder and are not followed; those that lead to a place within it are left out, for that is walked
+    follow  whether the former are followed, each folder once
+    """
     found: list[Path] = []
-    for parent, folders, names in os.walk(folder):
+    root, seen = os.path.realpath(folder), {_identity(folder)}
+    for parent, folders, names in os.walk(folder, followlinks=True):
         here = Path(parent)
         if here != folder and run.NAME in names and is_run(here):
             folders.clear()
             if runs is not None:
                 runs.add(here)
             continue
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        kept = []
+        for path in [here / name for name in sorted(folders) if not name.startswith(".")]:
+            if path.is_symlink():
+                if Path(os.path.realpath(path)).is_relative_to(root):
+                    continue
+                if not follow:
+                    if links is not None:
+                        links.add(path)
+                    continue
+            if follow:
+                if (identity := _identity(path)) in seen:
+                    continue
+                seen.add(identity)
+            kept.append(path.name)
+        folders[:] = kept
         found += [here / name for name in sorted(names) if not name.startswith(".")]
         if len(found) > MAX_FILES:
             raise BadInput(f"{folder}: more than {MAX_FILES} files. Name the folder of the data set itself.")
     return found
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    try:
+        about = folder.stat()
+    except OSError:  # it has gone since it was listed
+        return -1, -1
+    return about.st_dev, about.st_ino
 
 
 def is_run(folder: Path) -> bool:
@@ -236,15 +284,26 @@ def _is_encodable(name: str) -> bool:
 
 def images_in(folder: Path) -> list[Path]:
     """The image files directly in a folder, sorted by name."""
+    return one_of_each(pictures_in(folder))
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The same with the masks that lie beside them, and with raw pictures that have a JPEG."""
     if not os.path.isdir(folder):
         return []
-    return one_of_each(sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file()))
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".") and path.is_file())
 
 
 def one_of_each(images: Sequence[Path]) -> list[Path]:
-    """Without a camera's raw pictures that lie beside the same as JPEG or the like."""
+    """Without a camera's raw pictures that lie beside the same as JPEG or the like, and without masks that lie beside their photograph."""
     developed = {path.with_suffix("") for path in images if path.suffix.lower() not in RAW_SUFFIXES}
-    return [path for path in images if path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in developed]
+    named = {(path.parent, name_key(name)) for path in images for name in (path.stem, path.name)}
+
+    def is_mask(path: Path) -> bool:
+        key = name_key(path.stem)
+        return any(key.endswith(ending) and (path.parent, key.removesuffix(ending)) in named for ending in MASK_ENDINGS)
+
+    return [path for path in images if (path.suffix.lower() not in RAW_SUFFIXES or path.with_suffix("") not in developed) and not is_mask(path)]
 
 
 def missing_images_warning(where: str, total: int, kept: int, missing: Sequence[str], strict: bool, remedy: str) -> list[str]:

@@ -6,8 +6,8 @@ All state camera-to-world matrices with x right, y up, looking along -z, and are
     nerfstudio   intrinsics at the top or per frame, `mask_path` (black is left out), `train_filenames` etc., points in a PLY file
     instant-ngp  `aabb_scale`, `scale`, `offset`; masks `dynamic_mask_<image>.png` (white is left out); rolling-shutter pairs of matrices
 
-Depth that frames name (PNG; nerfstudio's `depth_file_path`, instant-ngp's `depth_path`) becomes sparse points where images agree on it.
-The capture's frame is that of the matrices; `applied_transform` is recorded only.
+Where a frame names no mask, one that lies beside its image counts. Depth that frames name (PNG; nerfstudio's `depth_file_path`, instant-ngp's `depth_path`)
+becomes sparse points where images agree on it. The capture's frame is that of the matrices; `applied_transform` is recorded only.
 """
 
 from __future__ import annotations
@@ -20,16 +20,18 @@ from typing import Any
 
 import numpy as np
 
+from efficientnerf.geometry.cameras import Camera
 from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.capture import Capture, Photo, SparsePoints
 from stages.io.importers import lenses
 from stages.io.importers.depth import DepthFile, depth_file, with_depth
 from stages.io.importers.frames import relocated
+from stages.io.importers.masks import masks_of
 from stages.io.importers.source import MAX_FRAMES, MIN_IMAGES, Found, ImportSettings, Source, missing_images_warning, moved_images_warnings
 from stages.io.importers.transforms_camera import lens_of, pose_of
 from stages.io.json_file import LARGEST_NUMBER, finite, read_json, shown
-from stages.io.pictures import UnreadableImage, read_header
+from stages.io.pictures import Header, UnreadableImage, read_header
 
 SPLIT_FILES = {f"transforms_{split}.json": split for split in ("train", "val", "test")}
 MAX_PLY = 1 << 30  # bytes
@@ -106,11 +108,10 @@ def files(folder: Path, settings: ImportSettings) -> list[Path]:
         ply = _ply(source, document)
         if ply is not None:
             paths[ply] = None
-    for frame in _list_frames(source).frames:
+    listing = _list_frames(source)
+    paths |= dict.fromkeys(mask for mask, _ in _masks(source, listing).values())
+    for frame in listing.frames:
         paths[frame.image] = None
-        mask, _ = _mask(source, frame)
-        if mask is not None:
-            paths[mask] = None
         depth = _depth(source, frame)
         if depth is not None:
             paths[depth.file] = None
@@ -225,12 +226,14 @@ def _plain(name: str) -> str:
 
 
 def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], list[tuple[str, str, Path]], dict[str, list[str]], list[str]]:
-    """Photos, the unreadable as (name, reason, file), what `lenses.fit_to_image` found remarks, and warnings."""
+    """Photos, the unreadable as (name, reason, file), what `lenses.fit_to_images` remarks, and warnings."""
     photos: list[Photo] = []
     rejected: list[tuple[str, str, Path]] = []
     remarks: dict[str, list[str]] = {}
     warnings: list[str] = []
     rolling = lost_masks = 0
+    readable: list[_Frame] = []
+    stated: list[tuple[Camera, Header, str]] = []
     for frame in listing.frames:
         name = source.name_of(frame.image)
         try:
@@ -241,10 +244,13 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
             continue
         pose = pose_of(frame.entry, frame.where)
         rolling += "transform_matrix" not in frame.entry
-        camera, remark = lenses.fit_to_image(lens_of(frame.document | frame.entry, name, header.size, pose, frame.where), header, frame.where)
+        stated.append((lens_of(frame.document | frame.entry, name, header.size, pose, frame.where), header, frame.where))
+        readable.append(frame)
+    masks = _masks(source, listing)
+    for frame, (camera, remark) in zip(readable, lenses.fit_to_images(stated), strict=True):
         if remark is not None:
-            remarks.setdefault(remark, []).append(name)
-        mask, ignore = _mask(source, frame)
+            remarks.setdefault(remark, []).append(camera.name)
+        mask, ignore = masks.get(frame.image, (None, "black"))
         lost_masks += mask is None and "mask_path" in frame.entry
         photos.append(Photo(camera, source.real(frame.image), None if mask is None else source.real(mask), ignore, frame.split))
     if rolling:
@@ -257,16 +263,24 @@ def _photos(source: Source, listing: _Listing, kind: str) -> tuple[list[Photo], 
     return photos, rejected, remarks, warnings
 
 
-def _mask(source: Source, frame: _Frame) -> tuple[Path | None, str]:
-    """The mask of a frame and which of its pixels are left out."""
-    listed = frame.entry.get("mask_path")
-    if isinstance(listed, str) and listed:
-        return source.find(listed, frame.file.parent).path, "black"
-    for name in (f"dynamic_mask_{frame.image.stem}.png", f"dynamic_mask_{frame.image.name}.png"):
-        beside = frame.image.with_name(name)
-        if os.path.isfile(beside):
-            return source.check_inside(beside), "white"
-    return None, "black"
+def _masks(source: Source, listing: _Listing) -> dict[Path, tuple[Path, str]]:
+    """Image -> its mask and which of the mask's pixels are left out: the mask that its frame names; of frames that name none, that beside the image."""
+    found: dict[Path, tuple[Path, str]] = {}
+    unnamed = []
+    for frame in listing.frames:
+        listed = frame.entry.get("mask_path")
+        mask: Path | None
+        if isinstance(listed, str) and listed:
+            mask, ignore = source.find(listed, frame.file.parent).path, "black"
+        else:
+            names = (f"dynamic_mask_{frame.image.stem}.png", f"dynamic_mask_{frame.image.name}.png")
+            beside = (frame.image.with_name(name) for name in names)
+            mask, ignore = next((source.check_inside(path) for path in beside if os.path.isfile(path)), None), "white"
+            if mask is None:
+                unnamed.append(frame.image)
+        if mask is not None:
+            found[frame.image] = mask, ignore
+    return found | {image: (mask, "black") for image, mask in masks_of(source, unnamed).items()}
 
 
 def _depth(source: Source, frame: _Frame) -> DepthFile | None:

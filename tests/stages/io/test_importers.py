@@ -153,7 +153,8 @@ def test_llff_takes_the_largest_images_and_scales_the_focal_length(tmp_path: Pat
 
 
 def test_masks_beside_photographs(tmp_path: Path) -> None:
-    from stages.io.importers.photographs import masks_of, photographs
+    from stages.io.importers.masks import masks_of
+    from stages.io.importers.photographs import photographs
     from stages.io.importers.source import Source
 
     black = np.zeros((HEIGHT, WIDTH), np.uint8)

@@ -14,7 +14,7 @@ from PIL import Image
 from pipeline.errors import BadInput
 from pipeline.stage import Job
 from stages.io.capture import Capture, Photo
-from stages.io.importers.photographs import masks_of
+from stages.io.importers.masks import masks_of
 from stages.io.importers.source import Source
 from stages.io.photo import read_mask_file, read_photo
 from stages.masking import photographs

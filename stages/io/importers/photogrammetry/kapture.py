@@ -18,6 +18,7 @@ from pipeline.errors import BadInput
 from pipeline.text import printable
 from stages.io.capture import Capture, SparsePoints
 from stages.io.importers import frames
+from stages.io.importers.colmap_model import FISHEYE, as_traced, count_parameters
 from stages.io.importers.source import ImportSettings, Source
 from stages.io.importers.texts import head, number, numbers, read_text
 
@@ -111,12 +112,13 @@ def _devices(source: Source) -> _Devices:
         if values[2] != "camera":
             continue
         model, params = (values[3] if len(values) > 3 else ""), values[4:]
-        if model not in MODELS:
-            raise BadInput(f"{where}: camera model {printable(model, 40) or 'missing'}; supported are {', '.join(MODELS)}. Undistort the images first.")
-        lens = numbers(params, 2 + len(MODELS[model]), where)
+        if (count := count_parameters(model)) is None:
+            supported = ", ".join([*MODELS, *FISHEYE])
+            raise BadInput(f"{where}: camera model {printable(model, 40) or 'missing'}; supported are {supported}. Undistort the images first.")
+        lens = numbers(params, 2 + count, where)
         if (lens[:2] != np.rint(lens[:2])).any() or not 0 < lens[:2].min() <= lens[:2].max() <= 65535:
             raise BadInput(f"{where}: image size {lens[0]:g}x{lens[1]:g}; expected whole pixels. {_AGAIN}")
-        devices.lenses[values[0]] = Camera("", int(lens[0]), int(lens[1]), model, tuple(lens[2:].tolist()), np.eye(4))
+        devices.lenses[values[0]] = Camera("", int(lens[0]), int(lens[1]), *as_traced(model, tuple(lens[2:].tolist())), np.eye(4))
     for where, values in _rows(source, RIGS, 9):
         devices.mounts.setdefault(values[1], []).append((values[0], _transform(values[2:9], where)))
     for where, values in _rows(source, TRAJECTORIES, 9):
