@@ -72,6 +72,10 @@ class KernelFiles(caching.IndexDataCacheFile):
     """The files of a function's compiled forms, those of this package with their SHA-256 at the end.
 
     A file that a power cut left empty, cut short or full of zeros would else end the program: numba unpickles what it finds, and runs the machine code.
+
+    numba numbers the files of compiled forms by what its index holds: two processes that compile different forms of a function at the same moment take the
+    same number, and the index may then lead to the code of the other form. Here a file is named by its form, and written before the index leads to it. Of two
+    indices written at the same moment one stays: a form that it lacks is compiled again.
     """
 
     def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
@@ -79,11 +83,14 @@ class KernelFiles(caching.IndexDataCacheFile):
         self._own = source_stamp == kernel_cache.key()
 
     def save(self, key: Any, data: Any) -> None:
-        try:
+        if not self._own:
             super().save(key, data)
+            return
+        name = self._index_name.removesuffix("nbi") + hashlib.sha256(self._dump(key)).hexdigest()[:32] + ".nbc"
+        try:
+            self._save_data(name, data)
+            self._save_index({**self._load_index(), key: name})
         except OSError as error:
-            if not self._own:
-                raise
             _warn_once(f"{self._cache_path}: {error.strerror or error}; compiled kernels are not kept.")
 
     def load(self, key: Any) -> Any:

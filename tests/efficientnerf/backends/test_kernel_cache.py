@@ -125,6 +125,51 @@ def test_damaged_kernel_files_are_never_unpickled(tmp_path: Path, suffix: str) -
         assert files.load("signature") == ["code"]
 
 
+def test_forms_that_are_compiled_at_the_same_moment_are_never_mixed_up(tmp_path: Path) -> None:
+    """Whatever of its work one process has done when another does all of its own; numba's numbers mix them."""
+    from efficientnerf.backends.numba.runtime import KernelFiles
+
+    for number, step in enumerate(("_load_index", "_save_index", "_save_data")):
+        for after in (False, True):
+            folder = tmp_path / f"{number} {after}"
+            folder.mkdir()
+            files = {form: KernelFiles(str(folder), "kernel", kernel_cache.key()) for form in ("float32", "float64")}
+            known = getattr(files["float32"], step)
+
+            def interrupted(*values: Any, known: Any = known, files: Any = files, after: bool = after) -> Any:
+                before = known(*values) if after else None
+                files["float64"].save("float64", ["code of float64"])
+                return before if after else known(*values)
+
+            setattr(files["float32"], step, interrupted)
+            files["float32"].save("float32", ["code of float32"])
+            delattr(files["float32"], step)
+            found = {form: each.load(form) for form, each in files.items()}
+            assert all(code in (None, [f"code of {form}"]) for form, code in found.items()), (step, after, found)
+            assert any(found.values())
+            for form, each in files.items():
+                each.save(form, [f"code of {form}"])
+            assert {form: each.load(form) for form, each in files.items()} == {form: [f"code of {form}"] for form in files}
+
+
+def test_a_process_that_is_killed_while_it_saves_leaves_no_other_forms_code(tmp_path: Path) -> None:
+    from efficientnerf.backends.numba.runtime import KernelFiles
+
+    files = KernelFiles(str(tmp_path), "kernel", kernel_cache.key())
+    files.save("float32", ["code of float32"])
+    next(tmp_path.glob("*.nbi")).unlink()
+    for step in ("_save_data", "_save_index"):
+        killed = KernelFiles(str(tmp_path), "kernel", kernel_cache.key())
+
+        def kill(*_: Any) -> None:
+            raise KeyboardInterrupt
+
+        setattr(killed, step, kill)
+        with pytest.raises(KeyboardInterrupt):
+            killed.save("float64", ["code of float64"])
+        assert files.load("float64") is None
+
+
 def test_a_disk_that_takes_no_kernels_is_no_error(package: Path, tmp_path: Path) -> None:
     full = PROGRAM.replace(
         "started = []",
